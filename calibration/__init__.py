@@ -1,0 +1,1 @@
+"""Camera, extrinsic and rig calibration: dated result files with residuals."""
