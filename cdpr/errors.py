@@ -1,0 +1,153 @@
+"""The errors a user may see: each says what, where, why and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+
+class CdprError(Exception):
+    """Base of every error of this project.
+
+    Args:
+        what: One sentence that says what is wrong, with measured value, unit and limit.
+        where: File and place, or device, that it is about.
+        why: The likely cause, where it is known.
+        next_step: What the user can do now.
+        values: The numbers behind the text, by name (unit in the name).
+    """
+
+    code: ClassVar[str] = "fault"
+    exit_code: ClassVar[int] = 1
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        why: str = "",
+        next_step: str = "",
+        values: dict[str, float | str] | None = None,
+    ) -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.why = why
+        self.next_step = next_step
+        self.values = dict(values or {})
+
+    def __str__(self) -> str:
+        """The whole message on as many lines as it has parts."""
+        head = f"{self.where}: {self.what}" if self.where else self.what
+        parts = [head]
+        if self.why:
+            parts.append(f"  why: {self.why}")
+        if self.next_step:
+            parts.append(f"  next: {self.next_step}")
+        return "\n".join(parts)
+
+    def as_dict(self) -> dict[str, object]:
+        """The same message for `--json`."""
+        return {
+            "error": self.code,
+            "exit_code": self.exit_code,
+            "what": self.what,
+            "where": self.where,
+            "why": self.why,
+            "next_step": self.next_step,
+            "values": self.values,
+        }
+
+
+class Fault(CdprError):
+    """Something failed while it ran; the machine is left stopped."""
+
+
+class NoSolution(CdprError):
+    """The search ended at its limit without a path."""
+
+    code = "no_solution"
+
+
+class BadInput(CdprError):
+    """A file, an option or a request that cannot be used."""
+
+    code = "bad_input"
+    exit_code = 2
+
+
+class Refused(CdprError):
+    """A safety check said no before anything moved."""
+
+    code = "refused"
+    exit_code = 3
+
+
+class HardwareMissing(CdprError):
+    """A bus, drive or camera that does not answer or cannot be opened."""
+
+    code = "hardware_missing"
+    exit_code = 4
+
+
+class StoppedByOperator(CdprError):
+    """The operator ended the run; drives hold their position."""
+
+    code = "stopped"
+    exit_code = 130
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing wrong in an input file.
+
+    Attributes:
+        key: Path of the key, such as ``winches[2].node_id``.
+        what: What is wrong with it.
+        line: Line in the file, counted from 1, or 0 where it has none.
+        column: Column in the file, counted from 1, or 0 where it has none.
+    """
+
+    key: str
+    what: str
+    line: int = 0
+    column: int = 0
+
+
+class InvalidFile(BadInput):
+    """An input file with one or more problems, all told at once."""
+
+    code = "invalid_file"
+
+    def __init__(
+        self, path: str, problems: Sequence[Problem], next_step: str = ""
+    ) -> None:
+        self.path = path
+        self.problems = tuple(problems)
+        count = len(self.problems)
+        super().__init__(
+            f"{count} problem{'s' if count != 1 else ''} in the file",
+            where=path,
+            next_step=next_step or "mend the lines above and run the command again",
+        )
+
+    def __str__(self) -> str:
+        """A line a problem, each with file:line:column."""
+        lines = [self._line(problem) for problem in self.problems]
+        return "\n".join([*lines, f"  next: {self.next_step}"])
+
+    def _line(self, problem: Problem) -> str:
+        place = self.path
+        if problem.line:
+            place += f":{problem.line}:{problem.column}"
+        key = f" {problem.key}:" if problem.key else ""
+        return f"{place}:{key} {problem.what}"
+
+    def as_dict(self) -> dict[str, object]:
+        """The same message for `--json`, with the list of problems."""
+        problems = [
+            {"key": p.key, "what": p.what, "line": p.line, "column": p.column}
+            for p in self.problems
+        ]
+        return {**super().as_dict(), "problems": problems}

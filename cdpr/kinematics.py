@@ -1,0 +1,155 @@
+"""Kinematics of the platform: cable lengths, structure matrix, pose from lengths.
+
+Source: paper, section 2, Eqs. 1–3 with the corrections of docs/paper.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.cables import Cables, cables_at
+from cdpr.errors import Fault
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
+from cdpr.rig import Rig
+
+
+def cable_lengths(rig: Rig, pose: Pose) -> Array:
+    """Inverse kinematics: lengths from outlet to anchor, shape (m,), [m]."""
+    return cables_at(rig, pose).lengths
+
+
+def structure_matrix(rig: Rig, pose: Pose) -> Array:
+    """Matrix J of J t + w = 0 for tensions t and the wrench w on the platform; shape (6, m).
+
+    Column i is [u_i; (R b_i) × u_i], u_i from anchor to outlet; forces [N], moments about the
+    platform's origin [N·m]. Cable lengths change at the rate −Jᵀ (velocity, angular velocity).
+    """
+    return structure_matrix_of(cables_at(rig, pose), pose.position)
+
+
+def structure_matrix_of(cables: Cables, position: Array) -> Array:
+    """The structure matrices of cables; ``position`` shape (..., 3), [m]; shape (..., 6, m)."""
+    arms = cables.anchors - position[..., None, :]
+    moments = np.cross(arms, cables.directions)
+    columns = np.concatenate([cables.directions, moments], axis=-1)
+    matrix: Array = np.swapaxes(columns, -1, -2)
+    return matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForwardSolution:
+    """A pose found from cable lengths.
+
+    Attributes:
+        pose: ``world_from_platform``.
+        residual: Length of the pose's cables less the given lengths, shape (m,), [m].
+        iterations: Steps it took.
+    """
+
+    pose: Pose
+    residual: Array
+    iterations: int
+
+    @property
+    def worst(self) -> float:
+        """Largest disagreement of one cable, [m]."""
+        return float(np.max(np.abs(self.residual)))
+
+
+def forward_kinematics(
+    rig: Rig, lengths: Array, guess: Pose | None = None, *, tolerance: float = 1e-10
+) -> ForwardSolution:
+    """Pose whose cable lengths come nearest to the given ones (least squares).
+
+    Args:
+        rig: The robot, with point exits or pulleys.
+        lengths: Shape (m,), [m].
+        guess: A pose near the solution (warm); without one (cold) the search starts from several
+            poses of the workspace and the best solution is taken.
+        tolerance: Size of the last step at which the search ends, [m] and [rad].
+
+    Raises:
+        Fault: No start led to a stationary pose.
+    """
+    starts = [guess] if guess is not None else _cold_starts(rig)
+    best: ForwardSolution | None = None
+    for start in starts:
+        found = _levenberg_marquardt(
+            rig, np.asarray(lengths, dtype=np.float64), start, tolerance
+        )
+        if found is None:
+            continue
+        if best is None or found.worst < best.worst:
+            best = found
+        if best.worst < 1e-7:
+            break
+    if best is None:
+        raise Fault(
+            "no pose fits the cable lengths",
+            where="forward kinematics",
+            why="the lengths are not those of this rig, or the guess is far off",
+            next_step="check the drive positions and the reference (home) counts",
+        )
+    return best
+
+
+def _cold_starts(rig: Rig) -> list[Pose]:
+    """Home first, then the centres of the eighths of the workspace."""
+    centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
+    quarter = (rig.workspace_upper - rig.workspace_lower) / 4.0
+    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+    return [
+        rig.home,
+        Pose.level(centre),
+        *(Pose.level(centre + c * quarter) for c in corners),
+    ]
+
+
+def _levenberg_marquardt(
+    rig: Rig, lengths: Array, start: Pose, tolerance: float
+) -> ForwardSolution | None:
+    """Damped Gauss–Newton on the pose; None when it does not settle."""
+    pose, damping = start, 1e-6
+    scale = _step_scale(rig)
+    residual = _residual(rig, pose, lengths)
+    if residual is None:
+        return None
+    for iteration in range(1, 101):
+        jacobian = -structure_matrix(rig, pose).T * scale
+        normal = jacobian.T @ jacobian
+        step = scale * np.linalg.solve(
+            normal + damping * np.eye(6), -(jacobian.T @ residual)
+        )
+        candidate = _moved(pose, step)
+        trial = _residual(rig, candidate, lengths)
+        if trial is not None and trial @ trial <= residual @ residual:
+            pose, residual, damping = candidate, trial, max(damping / 10.0, 1e-15)
+            if np.max(np.abs(step)) < tolerance:
+                return ForwardSolution(pose, read_only(residual), iteration)
+        elif np.max(np.abs(step)) < tolerance:
+            return ForwardSolution(pose, read_only(residual), iteration)
+        else:
+            damping *= 10.0
+    return None
+
+
+def _step_scale(rig: Rig) -> Array:
+    """Makes a unit of rotation move the anchors as far as a unit of translation."""
+    radius = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
+    return np.array([1.0, 1.0, 1.0, 1.0 / radius, 1.0 / radius, 1.0 / radius])
+
+
+def _residual(rig: Rig, pose: Pose, lengths: Array) -> Array | None:
+    try:
+        return cable_lengths(rig, pose) - lengths
+    except ValueError:  # the trial pose puts an anchor inside a pulley
+        return None
+
+
+def _moved(pose: Pose, step: Array) -> Pose:
+    """The pose after a small twist, shape (6,): translation [m], rotation in the world [rad]."""
+    return Pose(
+        pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation
+    )

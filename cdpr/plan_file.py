@@ -1,0 +1,86 @@
+"""The plan file (JSON, version 1): a path with the scene and rig it was made for."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from cdpr.document_types import (
+    Document,
+    NonNegative,
+    Number,
+    PoseDocument,
+    Positive,
+    Vector,
+)
+from cdpr.rig_file import RigDocument
+from cdpr.scene_file import SceneDocument
+
+
+class PlannerDocument(Document):
+    """How the path was searched for."""
+
+    name: Literal["adaptive", "goal-bias"]
+    cost: Literal["kinematic", "length"]
+    mode: Literal["paper", "rewire"]
+    seed: Annotated[int, Field(ge=0)]
+    step_mm: Positive
+    neighbour_radius_mm: Positive
+    goal_radius_mm: Positive
+    max_iterations: Annotated[int, Field(ge=1)]
+
+
+class StatisticsDocument(Document):
+    """What the search cost."""
+
+    nodes: Annotated[int, Field(ge=1)]
+    iterations: Annotated[int, Field(ge=0)]
+    edge_checks: Annotated[int, Field(ge=0)]
+    planning_time_s: NonNegative
+
+
+class NearestDocument(Document):
+    """The smallest distance along the path: which pair, and with the platform where."""
+
+    first: str
+    second: str
+    distance_mm: Number
+    position_mm: Vector
+
+
+class QualityDocument(Document):
+    """What the path is worth, as the planner found it; `cdpr check` finds it anew."""
+
+    length_mm: NonNegative
+    raw_length_mm: NonNegative
+    obstacle_clearance: NearestDocument | None
+    self_clearance: NearestDocument
+    mean_kinematic_cost: NonNegative
+    min_tension_n: Number
+    max_tension_n: Number
+
+
+class TreeDocument(Document):
+    """The search tree, for pictures: positions, and the parent of each node (-1: the root)."""
+
+    positions_mm: list[Vector]
+    parents: list[int]
+
+
+class PlanDocument(Document):
+    """A path from start to goal; `hash` is over everything else in the file."""
+
+    kind: Literal["cdpr-plan"] = "cdpr-plan"
+    schema_version: Literal[1] = 1
+    hash: str
+    rig_hash: str
+    scene_hash: str
+    rig: RigDocument
+    scene: SceneDocument
+    planner: PlannerDocument
+    waypoints: Annotated[list[PoseDocument], Field(min_length=2)]
+    raw_path: Annotated[list[PoseDocument], Field(min_length=2)]
+    tree: TreeDocument
+    statistics: StatisticsDocument
+    quality: QualityDocument

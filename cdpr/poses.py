@@ -1,0 +1,161 @@
+"""Poses and rotations: unit quaternions (w, x, y, z), matrices and rotation vectors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def read_only(values: ArrayLike) -> Array:
+    """A float copy of ``values`` that cannot be written to."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def skew(vector: ArrayLike) -> Array:
+    """Matrix of the cross product: ``skew(a) @ b == a × b``; shape (3, 3)."""
+    x, y, z = np.asarray(vector, dtype=np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Rotation matrix of a unit quaternion (w, x, y, z); shape (3, 3)."""
+    w, x, y, z = np.asarray(quaternion, dtype=np.float64).tolist()
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_matrix(matrix: ArrayLike) -> Array:
+    """Unit quaternion (w ≥ 0) of a rotation matrix; stable for every angle (Shepperd)."""
+    m = np.asarray(matrix, dtype=np.float64)
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    squares = np.array([trace, m[0, 0], m[1, 1], m[2, 2]])
+    largest = int(np.argmax(squares))
+    if largest == 0:
+        q = np.array(
+            [1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
+        )
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = np.empty(4)
+        q[0] = m[k, j] - m[j, k]
+        q[1 + i] = 1 + 2 * m[i, i] - trace
+        q[1 + j] = m[j, i] + m[i, j]
+        q[1 + k] = m[k, i] + m[i, k]
+    q /= np.linalg.norm(q)
+    return q if q[0] >= 0 else -q
+
+
+def matrix_from_rotation_vector(vector: ArrayLike) -> Array:
+    """Rotation matrix exp([vector]×), ``vector`` in rad; shape (3, 3)."""
+    v = np.asarray(vector, dtype=np.float64)
+    angle = float(np.linalg.norm(v))
+    s = skew(v)
+    if angle < 1e-6:  # series: the closed form loses digits near zero
+        return np.eye(3) + s + 0.5 * (s @ s)
+    return (
+        np.eye(3)
+        + (np.sin(angle) / angle) * s
+        + ((1 - np.cos(angle)) / angle**2) * (s @ s)
+    )
+
+
+def rotation_vector_from_matrix(matrix: ArrayLike) -> Array:
+    """Rotation vector (axis times angle in [0, π]) of a rotation matrix; shape (3,), [rad]."""
+    q = quaternion_from_matrix(matrix)
+    sine = float(np.linalg.norm(q[1:]))
+    if sine < 1e-12:
+        return 2.0 * q[1:]
+    return q[1:] * (2.0 * np.arctan2(sine, q[0]) / sine)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Position and orientation of a frame in another, usually ``world_from_platform``.
+
+    Attributes:
+        position: Shape (3,), [m].
+        rotation: Rotation matrix, shape (3, 3).
+    """
+
+    position: Array
+    rotation: Array
+
+    def __post_init__(self) -> None:
+        """Copies the arrays and makes them read-only."""
+        object.__setattr__(self, "position", read_only(self.position))
+        object.__setattr__(self, "rotation", read_only(self.rotation))
+
+    @classmethod
+    def level(cls, position: ArrayLike) -> Pose:
+        """A pose without rotation at ``position`` [m]."""
+        return cls(np.asarray(position, dtype=np.float64), np.eye(3))
+
+    @classmethod
+    def from_quaternion(cls, position: ArrayLike, quaternion: ArrayLike) -> Pose:
+        """A pose from ``position`` [m] and a unit quaternion (w, x, y, z)."""
+        return cls(
+            np.asarray(position, dtype=np.float64), matrix_from_quaternion(quaternion)
+        )
+
+    @property
+    def quaternion(self) -> Array:
+        """Unit quaternion (w, x, y, z), w ≥ 0."""
+        return quaternion_from_matrix(self.rotation)
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""
+        mapped: Array = (
+            np.asarray(points, dtype=np.float64) @ self.rotation.T + self.position
+        )
+        return mapped
+
+    def compose(self, other: Pose) -> Pose:
+        """``a_from_b.compose(b_from_c)`` is ``a_from_c``."""
+        return Pose(self.apply(other.position), self.rotation @ other.rotation)
+
+    def inverse(self) -> Pose:
+        """``a_from_b.inverse()`` is ``b_from_a``."""
+        return Pose(-self.rotation.T @ self.position, self.rotation.T)
+
+    def matrix(self) -> Array:
+        """Homogeneous matrix, shape (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.position
+        return matrix
+
+    def angle_to(self, other: Pose) -> float:
+        """Angle of the rotation between two poses, [rad]."""
+        relative = self.rotation.T @ other.rotation
+        return float(np.linalg.norm(rotation_vector_from_matrix(relative)))
+
+    def distance_to(self, other: Pose) -> float:
+        """Distance of the origins, [m]."""
+        return float(np.linalg.norm(other.position - self.position))
+
+
+def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
+    """Pose between two poses: straight line and constant-axis rotation.
+
+    Args:
+        start: Pose at fraction 0.
+        end: Pose at fraction 1.
+        fraction: Between 0 and 1.
+    """
+    position = start.position + fraction * (end.position - start.position)
+    turn = rotation_vector_from_matrix(start.rotation.T @ end.rotation)
+    if not turn.any():
+        return Pose(position, start.rotation)
+    return Pose(position, start.rotation @ matrix_from_rotation_vector(fraction * turn))

@@ -1,0 +1,257 @@
+"""The rig as the program uses it: checked, read-only, in SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from cdpr.document_types import millimetres
+from cdpr.documents import content_hash, key_path, load_yaml
+from cdpr.errors import BadInput
+from cdpr.poses import Array, Pose, read_only
+from cdpr.rig_file import (
+    CameraDocument,
+    MotionDocument,
+    RigDocument,
+    TagDocument,
+    WinchDocument,
+)
+
+#: Parts of a rig file that a plan's proof does not rest on; they may change under a plan.
+NOT_IN_PLAN_HASH = ("description", "bus", "tags", "cameras", "motion", "winches")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Winch:
+    """A winch: how cable length becomes drive counts.
+
+    Attributes:
+        node_id: CANopen node of its drive.
+        counts_per_metre: Signed counts for one metre of cable paid out.
+        home_counts: Drive position with the platform at home.
+        drum_to_outlet: Cable between drum and outlet, [m].
+        max_speed: Cable speed limit, [m/s].
+        torque_constant: Cable tension at rated torque, [N].
+    """
+
+    node_id: int
+    counts_per_metre: float
+    home_counts: int
+    drum_to_outlet: float
+    max_speed: float
+    torque_constant: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Limits of motion along a path, SI."""
+
+    speed: float
+    acceleration: float
+    jerk: float
+    blend_tolerance: float
+    following_error: float
+    start_tolerance: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tag:
+    """A fiducial tag in the frame of what carries it (x right, y up, z out of the print).
+
+    Attributes:
+        id: Number in its family.
+        size: Side of the black square, [m].
+        pose: ``platform_from_tag`` or ``world_from_tag``.
+    """
+
+    id: int
+    size: float
+    pose: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A calibrated camera.
+
+    Attributes:
+        name: Name in the rig file.
+        width: Picture width, [px].
+        height: Picture height, [px].
+        matrix: Camera matrix, shape (3, 3), [px].
+        distortion: OpenCV coefficients, shape (k,).
+        world_from_camera: Pose; x right, y down, z along the view.
+        rate: Pictures a second, [Hz].
+    """
+
+    name: str
+    width: int
+    height: int
+    matrix: Array
+    distortion: Array
+    world_from_camera: Pose
+    rate: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A checked cable robot with m cables.
+
+    Attributes:
+        document: The file it was made from.
+        outlets: Cable outlet points, world frame, shape (m, 3), [m].
+        anchors: Cable anchor points, platform frame, shape (m, 3), [m].
+        pulley_radius: [m]; 0 for point exits.
+        feed_directions: Travel of the cable entering each pulley, world frame, shape (m, 3).
+        half_size: Half extents of the platform box, shape (3,), [m].
+    """
+
+    document: RigDocument
+    outlets: Array
+    anchors: Array
+    pulley_radius: float
+    feed_directions: Array
+    half_size: Array
+    mass: float
+    centre_of_mass: Array
+    home: Pose
+    workspace_lower: Array
+    workspace_upper: Array
+    cable_radius: float
+    cable_stiffness: float
+    min_tension: float
+    max_tension: float
+    winches: tuple[Winch, ...]
+    motion: Motion
+    tag_family: str
+    platform_tags: tuple[Tag, ...]
+    frame_tags: tuple[Tag, ...]
+    cameras: tuple[Camera, ...]
+
+    @property
+    def name(self) -> str:
+        """Name in the rig file."""
+        return self.document.name
+
+    @property
+    def cable_count(self) -> int:
+        """Number of cables m."""
+        return len(self.outlets)
+
+    @cached_property
+    def plan_hash(self) -> str:
+        """Hash of the parts of the rig that a plan's proof rests on."""
+        document = self.document.model_dump(mode="json")
+        return content_hash(
+            {k: v for k, v in document.items() if k not in NOT_IN_PLAN_HASH}
+        )
+
+    @cached_property
+    def hash(self) -> str:
+        """Hash of the whole rig file's content."""
+        return content_hash(self.document.model_dump(mode="json"))
+
+    @cached_property
+    def platform_corners(self) -> Array:
+        """Corners of the platform box, platform frame, shape (8, 3), [m]."""
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+        return read_only(signs * self.half_size)
+
+
+def load_rig(path: Path) -> Rig:
+    """Reads a rig file.
+
+    Raises:
+        BadInput: The file cannot be read.
+        InvalidFile: With every problem and its place.
+    """
+    return rig_from_document(load_yaml(path, RigDocument))
+
+
+def rig_from_document(document: RigDocument) -> Rig:
+    """The rig that a document describes.
+
+    Raises:
+        BadInput: Parts of the document do not agree.
+    """
+    if document.findings():
+        parts, what = document.findings()[0]
+        raise BadInput(f"{key_path(parts)}: {what}", where=f"rig {document.name}")
+    pulleys, tags = document.pulleys, document.tags
+    count = len(document.outlets_mm)
+    feed = pulleys.feed_directions if pulleys else [[0.0, 0.0, 1.0]] * count
+    return Rig(
+        document=document,
+        outlets=_array(document.outlets_mm),
+        anchors=_array(document.anchors_mm),
+        pulley_radius=pulleys.radius_mm / 1000.0 if pulleys else 0.0,
+        feed_directions=read_only(
+            np.asarray(feed) / np.linalg.norm(feed, axis=1)[:, None]
+        ),
+        half_size=read_only(millimetres(document.platform.size_mm) / 2.0),
+        mass=document.platform.mass_kg,
+        centre_of_mass=read_only(millimetres(document.platform.centre_of_mass_mm)),
+        home=document.platform.home.pose(),
+        workspace_lower=read_only(millimetres(document.workspace.lower_mm)),
+        workspace_upper=read_only(millimetres(document.workspace.upper_mm)),
+        cable_radius=document.cables.radius_mm / 1000.0,
+        cable_stiffness=document.cables.stiffness_n,
+        min_tension=document.cables.min_tension_n,
+        max_tension=document.cables.max_tension_n,
+        winches=tuple(_winch(w) for w in document.winches),
+        motion=_motion(document.motion),
+        tag_family=tags.family if tags else "",
+        platform_tags=tuple(_tag(t) for t in tags.platform) if tags else (),
+        frame_tags=tuple(_tag(t) for t in tags.frame) if tags else (),
+        cameras=tuple(_camera(c) for c in document.cameras),
+    )
+
+
+def _array(points_mm: list[list[float]]) -> Array:
+    return read_only(np.asarray(points_mm) / 1000.0)
+
+
+def _winch(document: WinchDocument) -> Winch:
+    counts_per_rev = document.counts_per_rev * document.gear_ratio * document.direction
+    return Winch(
+        node_id=document.node_id,
+        counts_per_metre=counts_per_rev / (document.drum_mm_per_rev / 1000.0),
+        home_counts=document.home_counts,
+        drum_to_outlet=document.drum_to_outlet_mm / 1000.0,
+        max_speed=document.max_speed_mm_s / 1000.0,
+        torque_constant=document.torque_constant_n,
+    )
+
+
+def _motion(document: MotionDocument) -> Motion:
+    return Motion(
+        speed=document.speed_mm_s / 1000.0,
+        acceleration=document.acceleration_mm_s2 / 1000.0,
+        jerk=document.jerk_mm_s3 / 1000.0,
+        blend_tolerance=document.blend_tolerance_mm / 1000.0,
+        following_error=document.following_error_mm / 1000.0,
+        start_tolerance=document.start_tolerance_mm / 1000.0,
+    )
+
+
+def _tag(document: TagDocument) -> Tag:
+    return Tag(id=document.id, size=document.size_mm / 1000.0, pose=document.pose())
+
+
+def _camera(document: CameraDocument) -> Camera:
+    matrix = [
+        [document.fx_px, 0.0, document.cx_px],
+        [0.0, document.fy_px, document.cy_px],
+        [0.0, 0.0, 1.0],
+    ]
+    return Camera(
+        name=document.name,
+        width=document.width_px,
+        height=document.height_px,
+        matrix=read_only(matrix),
+        distortion=read_only(document.distortion),
+        world_from_camera=document.world_from_camera.pose(),
+        rate=document.rate_hz,
+    )

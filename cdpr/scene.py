@@ -1,0 +1,168 @@
+"""The scene as the program uses it: checked, read-only, in SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from cdpr.document_types import Document, PoseDocument, millimetres
+from cdpr.documents import content_hash, key_path, load_yaml
+from cdpr.errors import BadInput
+from cdpr.poses import Array, Pose, read_only
+from cdpr.scene_file import (
+    BoxDocument,
+    HullDocument,
+    MeshDocument,
+    ObstacleDocument,
+    RoundDocument,
+    SceneDocument,
+    SphereDocument,
+)
+from cdpr.shapes import (
+    Box,
+    Capsule,
+    Cylinder,
+    Obstacle,
+    Shape,
+    Sphere,
+    TriangleMesh,
+    convex_hull,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Load:
+    """What the cables carry beside the platform's own weight.
+
+    Attributes:
+        payload_mass: [kg].
+        payload_centre: In the platform frame, shape (3,), [m].
+        force: Half widths of the external-force box, world axes, shape (3,), [N].
+        moment: Half widths of the external-moment box, world axes, shape (3,), [N·m].
+    """
+
+    payload_mass: float
+    payload_centre: Array
+    force: Array
+    moment: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A checked scene.
+
+    Attributes:
+        document: The file it was made from.
+        obstacles: In the order of the file.
+        obstacle_clearance: Smallest allowed distance of cables and platform to obstacles, [m].
+        self_clearance: Smallest allowed distance between cables and of cables to platform, [m].
+        start: ``world_from_platform`` at the start.
+        goal: ``world_from_platform`` at the goal.
+        load: What the cables carry.
+    """
+
+    document: SceneDocument
+    obstacles: tuple[Obstacle, ...]
+    obstacle_clearance: float
+    self_clearance: float
+    start: Pose
+    goal: Pose
+    load: Load
+
+    @property
+    def name(self) -> str:
+        """Name in the scene file."""
+        return self.document.name
+
+    @cached_property
+    def hash(self) -> str:
+        """Hash of the scene's content."""
+        return content_hash(self.document.model_dump(mode="json"))
+
+    def changed(
+        self,
+        *,
+        start: Pose | None = None,
+        goal: Pose | None = None,
+        clearance: float | None = None,
+    ) -> Scene:
+        """The same scene with another start, goal or obstacle clearance [m]."""
+        document = self.document
+        update: dict[str, object] = {}
+        if start is not None:
+            update["start"] = PoseDocument.of(start)
+        if goal is not None:
+            update["goal"] = PoseDocument.of(goal)
+        if clearance is not None:
+            value = {"obstacle_mm": round(clearance * 1000.0, 9)}
+            update["clearance"] = document.clearance.model_copy(update=value)
+        return scene_from_document(document.model_copy(update=update))
+
+
+def load_scene(path: Path) -> Scene:
+    """Reads a scene file.
+
+    Raises:
+        BadInput: The file cannot be read.
+        InvalidFile: With every problem and its place.
+    """
+    return scene_from_document(load_yaml(path, SceneDocument))
+
+
+def scene_from_document(document: SceneDocument) -> Scene:
+    """The scene that a document describes.
+
+    Raises:
+        BadInput: Parts of the document do not agree.
+    """
+    if document.findings():
+        parts, what = document.findings()[0]
+        raise BadInput(f"{key_path(parts)}: {what}", where=f"scene {document.name}")
+    load = document.load
+    return Scene(
+        document=document,
+        obstacles=tuple(_obstacle(o) for o in document.obstacles),
+        obstacle_clearance=document.clearance.obstacle_mm / 1000.0,
+        self_clearance=document.clearance.self_mm / 1000.0,
+        start=document.start.pose(),
+        goal=document.goal.pose(),
+        load=Load(
+            payload_mass=load.payload_kg,
+            payload_centre=read_only(millimetres(load.payload_centre_mm)),
+            force=read_only(load.force_n),
+            moment=read_only(load.moment_nm),
+        ),
+    )
+
+
+def _obstacle(document: ObstacleDocument) -> Obstacle:
+    pose = PoseDocument(
+        position_mm=document.position_mm, rotation_wxyz=document.rotation_wxyz
+    ).pose()
+    (key, given), *_ = document.shapes().items()
+    try:
+        shape = _shape(key, given)
+    except ValueError as error:
+        raise BadInput(str(error), where=f"obstacle {document.name!r}") from None
+    return Obstacle(document.name, shape, pose)
+
+
+def _shape(key: str, document: Document) -> Shape:
+    match document:
+        case BoxDocument(size_mm=size):
+            return Box(read_only(millimetres(size) / 2.0))
+        case SphereDocument(radius_mm=radius):
+            return Sphere(radius / 1000.0)
+        case RoundDocument(radius_mm=radius, length_mm=length):
+            kind = Cylinder if key == "cylinder" else Capsule
+            return kind(radius / 1000.0, length / 1000.0)
+        case HullDocument(points_mm=points):
+            return convex_hull(np.asarray(points) / 1000.0)
+        case MeshDocument(points_mm=points, triangles=triangles):
+            vertices = read_only(np.asarray(points) / 1000.0)
+            return TriangleMesh(vertices, np.array(triangles, dtype=np.int64))
+        case _:
+            raise ValueError(f"unknown shape {key!r}")
