@@ -44,7 +44,7 @@ class WorkspaceDocument(Document):
 class CableDocument(Document):
     """What all cables have in common."""
 
-    radius_mm: Positive
+    radius_mm: NonNegative
     stiffness_n: Positive = Field(description="axial stiffness E·A")
     min_tension_n: Positive
     max_tension_n: Positive
