@@ -1,0 +1,63 @@
+"""What holds for every test: the same examples every time, and nothing left running behind it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Iterator
+from multiprocessing import resource_tracker
+from pathlib import Path
+
+# Before NumPy is loaded: the suite runs on as many workers as there are cores, one thread each.
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+GRACE_S = 2.0  # for a thread that was told to end and is just returning
+
+settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True)
+settings.register_profile("explore", deadline=None, max_examples=1000, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+def _threads() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if thread.is_alive()}
+
+
+def _children() -> set[int]:
+    """Ids of this process's children, finished but not waited for included."""
+    multiprocessing.active_children()  # reaps multiprocessing's own that have ended
+    found: set[int] = set()
+    for listing in Path("/proc/self/task").glob("*/children"):
+        try:
+            found.update(int(child) for child in listing.read_text().split())
+        except OSError:  # the thread ended while we looked
+            continue
+    # Python keeps one tracker process for shared memory, to the end of the interpreter.
+    tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
+    return found - {tracker}
+
+
+def _command(child: int) -> str:
+    try:
+        words = Path(f"/proc/{child}/cmdline").read_text().split("\0")
+    except OSError:
+        return "ended meanwhile"
+    return " ".join(words).strip() or "just started, or ended and not waited for"
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_running() -> Iterator[None]:
+    """Fails a test that leaves a thread or a child process behind."""
+    threads, children = _threads(), _children()
+    yield
+    for thread in _threads() - threads:
+        thread.join(GRACE_S)
+    left = [f"thread {thread.name!r}" for thread in _threads() - threads]
+    left += [f"process {child} ({_command(child)})" for child in _children() - children]
+    if left:
+        pytest.fail(f"the test left running: {', '.join(sorted(left))}", pytrace=False)

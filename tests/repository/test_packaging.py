@@ -1,0 +1,86 @@
+"""The environment, the wheel, and the import contracts."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def pins() -> dict[str, Version]:
+    """The pinned version of every package in constraints.txt."""
+    found = {}
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        if not line or line.startswith("#"):
+            continue
+        name, _, version = line.partition("==")
+        assert re.fullmatch(r"[A-Za-z0-9._-]+", name), f"not an exact pin: {line}"
+        assert canonicalize_name(name) not in found, f"pinned twice: {name}"
+        found[canonicalize_name(name)] = Version(version)
+    return found
+
+
+def declared() -> list[Requirement]:
+    """Every requirement in pyproject.toml: run-time, extras, build."""
+    extras = PROJECT["project"]["optional-dependencies"].values()
+    lists = [PROJECT["project"]["dependencies"], PROJECT["build-system"]["requires"], *extras]
+    return [Requirement(text) for requirements in lists for text in requirements]
+
+
+@pytest.mark.parametrize("requirement", declared(), ids=str)
+def test_a_declared_dependency_has_a_lower_bound_and_a_pin_that_meets_it(
+    requirement: Requirement,
+) -> None:
+    assert any(part.operator == ">=" for part in requirement.specifier)
+    pin = pins().get(canonicalize_name(requirement.name))
+    assert pin is not None, f"{requirement.name} has no pin in constraints.txt"
+    assert requirement.specifier.contains(pin)
+
+
+def test_the_pins_are_closed_under_dependencies() -> None:
+    """Whatever a pinned package needs here is pinned too, so an install takes nothing unpinned."""
+    pinned = pins()
+    missing = []
+    for name in pinned:
+        for text in metadata.requires(name) or []:
+            requirement = Requirement(text)
+            if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+                continue
+            if canonicalize_name(requirement.name) not in pinned:
+                missing.append(f"{requirement.name} (needed by {name})")
+    assert not missing
+
+
+def test_the_import_contracts_are_kept() -> None:
+    run = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    command = [sys.executable, "-c", run, "--no-cache", "--no-logo"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_a_wheel_holds_every_package_its_type_marker_and_the_ready_rigs(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    build = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert build.returncode == 0, build.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    packages = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    assert {f"{package}/py.typed" for package in packages} <= names
+    configs = {f"cdpr/configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml")}
+    assert configs
+    assert configs <= names
+    tops = {name.split("/")[0] for name in names}
+    assert tops == {*packages, f"cdpr-{PROJECT['project']['version']}.dist-info"}

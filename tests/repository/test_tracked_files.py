@@ -1,0 +1,85 @@
+"""What no file of the repository may hold, and what every package must have."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("cdpr", "planner", "executor", "drivers", "tracking", "calibration", "simulation")
+
+FORBIDDEN = {
+    "an index address": r"--(extra-)?index-url|--find-links|--trusted-host|https?://[^\s\"'<>]*/simple\b",
+    "a path of one machine": r"(?<![\w.$}/-])/(work|root|home|Users|tmp|var/tmp)/[\w.]",
+    "an unfinished note": r"\b(TODO|FIXME|XXX|HACK)\b|(?i:\blorem ipsum\b)",
+    "a conflict marker": r"^(<{7}|>{7}) ",
+}
+NAMES = {"utils", "util", "common", "helpers", "core", "misc"}
+
+
+def files() -> list[Path]:
+    """The files of the repository: tracked, or new and not ignored."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if listing.returncode != 0:
+        pytest.skip(f"not a git work tree: {listing.stderr.strip()}")
+    found = (ROOT / name for name in listing.stdout.split("\0") if name)
+    return [path for path in found if path.is_file() and path != Path(__file__)]
+
+
+@pytest.mark.parametrize("what", FORBIDDEN)
+def test_no_file_holds(what: str) -> None:
+    """Addresses and paths of one machine break every other; notes to oneself belong in an issue."""
+    pattern = re.compile(FORBIDDEN[what], re.MULTILINE)
+    found = []
+    for path in files():
+        data = path.read_bytes()
+        if b"\0" in data:
+            continue
+        text = data.decode()
+        found += [
+            f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, hit.start()) + 1}: {hit[0]!r}"
+            for hit in pattern.finditer(text)
+        ]
+    assert not found, f"{what}:\n" + "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("what", "text"),
+    [
+        ("an index address", "pip install --extra-index-url x"),
+        ("an index address", "https://example.org/simple/"),
+        ("a path of one machine", 'open("/home/anna/rig.yaml")'),
+        ("a path of one machine", "/work/x"),
+        ("an unfinished note", "# TODO: later"),
+        ("a conflict marker", "a\n<<<<<<< ours\n"),
+    ],
+)
+def test_the_patterns_see_what_they_are_for(what: str, text: str) -> None:
+    """A pattern that matches nothing would keep the test above green for ever."""
+    assert re.search(FORBIDDEN[what], text, re.MULTILINE)
+
+
+def test_no_generated_output_is_tracked() -> None:
+    suffixes = {".mcap", ".pyc", ".whl", ".log", ".html"}
+    found = [p for p in files() if p.suffix in suffixes or "__pycache__" in p.parts]
+    assert not found
+
+
+def test_every_package_says_that_it_is_typed() -> None:
+    missing = [p for p in PACKAGES if not (ROOT / p / "py.typed").is_file()]
+    assert not missing
+
+
+def test_no_module_has_a_name_that_says_nothing() -> None:
+    found = [path for path in files() if {path.stem, path.parent.name} & NAMES]
+    assert not found
+
+
+def test_test_files_have_unique_names() -> None:
+    """With pytest's importlib mode a name used twice makes reports ambiguous."""
+    names = [path.name for path in files() if path.match("tests/**/test_*.py")]
+    assert len(names) == len(set(names)), sorted(n for n in set(names) if names.count(n) > 1)
