@@ -1,0 +1,55 @@
+"""The wrench of gravity on the platform and what it carries."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cdpr.errors import BadInput
+
+STANDARD_GRAVITY = 9.80665
+"""[m/s²]. Source: 3rd General Conference on Weights and Measures, 1901."""
+
+
+def gravity_wrench(
+    mass: float,
+    centre_of_mass_offset: ArrayLike,
+    *,
+    payload_mass: float = 0.0,
+    payload_offset: ArrayLike = (0.0, 0.0, 0.0),
+    gravity: float = STANDARD_GRAVITY,
+) -> NDArray[np.float64]:
+    """Return the wrench of the weight of platform and payload about the platform origin.
+
+    Args:
+        mass: Mass of the platform [kg].
+        centre_of_mass_offset: From the platform origin to the platform's centre of mass, shape
+            (..., 3), [m], world frame: the rotation of the platform is already applied.
+        payload_mass: Mass of the payload [kg].
+        payload_offset: From the platform origin to the payload's centre of mass, shape
+            (..., 3), [m], world frame.
+        gravity: [m/s²], along -z of the world frame.
+
+    Returns:
+        External wrench, shape (..., 6), [N, N·m], world frame.
+
+    Raises:
+        BadInput: A mass is negative, a value is not finite, or a shape is wrong.
+    """
+    platform = _weight(mass, centre_of_mass_offset, gravity, "platform")
+    return platform + _weight(payload_mass, payload_offset, gravity, "payload")
+
+
+def _weight(mass: float, offset: ArrayLike, gravity: float, name: str) -> NDArray[np.float64]:
+    arm = np.asarray(offset, dtype=np.float64)
+    if arm.ndim < 1 or arm.shape[-1] != 3:
+        raise BadInput(f"the offset of the {name} has shape {arm.shape}, not (..., 3)")
+    if not (0.0 <= mass < np.inf and np.isfinite(gravity) and np.isfinite(arm).all()):
+        raise BadInput(f"mass {mass} kg, gravity or offset of the {name} is not a usable number")
+    weight = mass * gravity
+    wrench = np.zeros((*arm.shape[:-1], 6))
+    wrench[..., 2] = -weight
+    # offset × (0, 0, -weight), written out.
+    wrench[..., 3] = -arm[..., 1] * weight
+    wrench[..., 4] = arm[..., 0] * weight
+    return wrench
