@@ -1,0 +1,94 @@
+"""The documentation builds, opens without a network, and knows every key of every file."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from pydantic import BaseModel
+
+from cdpr.plan_file import PlanDocument
+from cdpr.rig_file import RigDocument
+from cdpr.scene_file import SceneDocument
+
+ROOT = Path(__file__).parents[2]
+OUTSIDE = re.compile(r"^\s*(https?:)?//", re.IGNORECASE)
+FETCHING = {"src", "srcset", "data", "poster", "action"}
+
+
+class Fetched(HTMLParser):
+    """Collects what a browser fetches by itself; a link that a person clicks is none of it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.outside: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        names = FETCHING | {"href"} if tag == "link" else FETCHING
+        self.outside += [v for k, v in attrs if k in names and v and OUTSIDE.match(v)]
+
+
+def fetched_outside(html: str) -> list[str]:
+    """Addresses on other hosts that a page would load."""
+    parser = Fetched()
+    parser.feed(html)
+    return parser.outside
+
+
+@pytest.mark.slow
+def test_the_documentation_builds_without_a_warning_and_asks_no_other_host(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path / "site")]
+    build = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert build.returncode == 0, build.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > 10
+    styles = re.compile(r"""(?:url\(|@import)\s*['"]?\s*((?:https?:)?//[^'")]*)""", re.IGNORECASE)
+    outside = {page.name: fetched_outside(page.read_text()) for page in pages}
+    outside |= {
+        sheet.name: styles.findall(sheet.read_text())
+        for sheet in (tmp_path / "site").rglob("*.css")
+    }
+    assert not {name: found for name, found in outside.items() if found}
+
+
+def test_the_search_for_outside_addresses_sees_them() -> None:
+    assert fetched_outside('<script src="//cdn.example.org/x.js"></script>')
+    assert fetched_outside('<link rel="stylesheet" href="https://fonts.example.org/a">')
+    assert not fetched_outside('<a href="https://example.org">read</a><img src="img/a.png">')
+
+
+def keys(model: type[BaseModel]) -> set[str]:
+    """Names of the fields of a document and of the documents in it."""
+    found: set[str] = set()
+    for name, field in model.model_fields.items():
+        found.add(name)
+        for inner in _models(field.annotation):
+            found |= keys(inner)
+    return found
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models(part)]
+
+
+@pytest.mark.parametrize(
+    ("page", "model", "elsewhere"),
+    [
+        ("rig-file.md", RigDocument, set()),
+        ("scene-file.md", SceneDocument, set()),
+        ("plan-file.md", PlanDocument, keys(RigDocument) | keys(SceneDocument)),
+    ],
+)
+def test_every_key_of_a_file_is_documented(
+    page: str, model: type[BaseModel], elsewhere: set[str]
+) -> None:
+    words = set(re.findall(r"\w+", (ROOT / "docs" / page).read_text()))
+    assert len(keys(model)) > 8
+    assert not keys(model) - elsewhere - words
