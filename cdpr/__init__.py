@@ -1,1 +1,1 @@
-"""The shared model of a cable-driven parallel robot: files, kinematics, statics, and the command line."""
+"""The shared model of a cable robot: files, kinematics, statics, and the command line."""
