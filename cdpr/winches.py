@@ -30,9 +30,7 @@ class WinchMap:
         self.counts_per_metre = read_only([w.counts_per_metre for w in rig.winches])
         self.home_counts = read_only([w.home_counts for w in rig.winches])
         tensions = working_tensions(rig, rig.home).tensions
-        self.home_unstrained = read_only(
-            self.unstrained(cable_lengths(rig, rig.home), tensions)
-        )
+        self.home_unstrained = read_only(self.unstrained(cable_lengths(rig, rig.home), tensions))
 
     def unstrained(self, lengths: Array, tensions: Array) -> Array:
         """Unstrained lengths of whole cables, shape (..., m), [m].

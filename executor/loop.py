@@ -1,0 +1,368 @@
+"""The cyclic loop: every cycle one set of set-points out, one set of replies in, one decision.
+
+It owns the order of things: ready → enabling → approaching → moving → (stopping) → securing → end.
+Whatever happens, it ends with the drives holding by themselves (quick stop active, torque on), and
+with the fault latched if there was one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.errors import Refused
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
+from executor.clock import Clock
+from executor.feed import Feed, targets_at
+from executor.machine import Event, Machine, State
+from executor.safety.gate import Limits, Purpose, Request, examine
+from executor.safety.watch import Finding, Observation, Reaction, Watch, WatchLimits
+from executor.setpoints import CheckedTable
+
+#: Cycles within which the drives must be enabled, or must hold after a stop.
+PATIENCE = 300
+#: Cycles of holding still before and after the motion.
+SETTLING = 10
+
+
+@dataclass(frozen=True, slots=True)
+class CycleRecord:
+    """One cycle as it was.
+
+    Attributes:
+        cycle: Counted from the first one sent.
+        state: Where the run was.
+        index: Place in the table.
+        targets: What was sent, [counts].
+        actual: What the drives answered, [counts].
+        torques: What they answered, [‰ of rated torque].
+        missing: How many did not answer.
+        following_error: Largest over the cables, [m].
+        lateness: In cycles.
+    """
+
+    cycle: int
+    state: State
+    index: float
+    targets: tuple[int, ...]
+    actual: tuple[int, ...]
+    torques: tuple[int, ...]
+    missing: int
+    following_error: float
+    lateness: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoopEvent:
+    """Something worth telling: in which cycle, a stable code, and a sentence."""
+
+    cycle: int
+    code: str
+    text: str
+
+
+class Loop:
+    """One run of one checked table on one drive group."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        checked: CheckedTable,
+        group: DriveGroup,
+        clock: Clock,
+        *,
+        stop_requested: Callable[[], bool],
+        pump: Callable[[], None] | None = None,
+        on_cycle: Callable[[CycleRecord], None] | None = None,
+        on_event: Callable[[LoopEvent], None] | None = None,
+    ) -> None:
+        """Prepares a run; nothing is sent yet.
+
+        Args:
+            rig: The robot.
+            checked: The checked set-points.
+            group: Configured drives.
+            clock: Real or simulated.
+            stop_requested: Asked every cycle; true begins a stop along the path.
+            pump: Lets drives simulated in this process work, once a cycle.
+            on_cycle: Called after every cycle; it must not take long.
+            on_event: Called for every event.
+        """
+        self.machine = Machine()
+        self._rig, self._checked, self._group, self._clock = rig, checked, group, clock
+        self._stop_requested = stop_requested
+        self._pump = pump or _nothing
+        self._on_cycle = on_cycle or _nothing
+        self._on_event = on_event or _nothing
+        self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
+        self._rated = np.array([w.torque_constant for w in rig.winches])
+        self._limits = _gate_limits(rig, checked)
+        self._watch = Watch.fresh(_watch_limits(rig), rig.cable_count)
+        self._feed = Feed(len(checked.table), checked.table.cycle, rig.motion)
+        self._targets: tuple[int, ...] | None = None
+        self._actual: tuple[int, ...] = ()
+        self._armed = False
+        self._cycle = 0
+        self._told: set[str] = set()
+
+    def read_actual(self) -> Array:
+        """Positions of all drives before anything is enabled, shape (m,), [counts].
+
+        Raises:
+            HardwareMissing: A drive does not answer (from the drive group).
+        """
+        status = self._group.read_positions(self._pump)
+        self._actual = tuple(int(p) for p in status.positions)
+        return np.array(self._actual, dtype=np.float64)
+
+    def arm(self) -> None:
+        """Confirms that the table is the checked one and that the platform stands at its start.
+
+        Raises:
+            Refused: It is not, or the drives are too far from the first set-point.
+        """
+        table = self._checked.table
+        if table.hash != self._checked.hash:
+            raise Refused("the set-point table is not the one that was checked", where="arming")
+        off = (self.read_actual() - table.setpoints[0]) / self._per_metre
+        worst = int(np.abs(off).argmax())
+        if abs(off[worst]) > self._rig.motion.start_tolerance:
+            raise Refused(
+                f"the platform is not at the start of the plan: cable {worst + 1} is"
+                f" {abs(off[worst]) * 1000:.1f} mm off, allowed"
+                f" {self._rig.motion.start_tolerance * 1000:.1f} mm",
+                where="arming",
+                why="the rig stands elsewhere, or its drives were not referenced at home",
+                next_step="move the platform to the plan's start (plan a path from where it is"
+                " with `cdpr plan --start-mm`), or reference the drives; nothing was enabled",
+                values={"off_mm": float(abs(off[worst]) * 1000), "cable": float(worst + 1)},
+            )
+        self._armed = True
+
+    def run(self) -> State:
+        """Runs to the end; returns the last state. The drives hold by themselves afterwards."""
+        try:
+            self.machine.on(Event.ENABLE)
+            while self.machine.state in _ACTIVE:
+                self._one_step()
+        except BaseException:
+            # Whatever broke: stop first, tell afterwards.
+            self._group.quick_stop_now()
+            self.machine.on(Event.FAULT)
+            raise
+        return self.machine.state
+
+    def _one_step(self) -> None:
+        match self.machine.state:
+            case State.ENABLING:
+                self._enable()
+            case State.APPROACHING:
+                self._approach()
+            case State.MOVING | State.STOPPING:
+                self._follow()
+            case _:
+                self._secure()
+
+    def _enable(self) -> None:
+        """All drives together, with targets on their actual positions."""
+        self._group.command(GroupCommand.ENABLE)
+        for _ in range(PATIENCE):
+            status = self._send(Purpose.HOLD, self._targets or self._actual)
+            if self.machine.state is not State.ENABLING:
+                return
+            if status is not None and status.state is GroupState.ENABLED:
+                self.machine.on(Event.ENABLED)
+                self._tell("enabled", "all drives are enabled and hold")
+                return
+        self._fault("enable_timeout", f"the drives were not enabled within {PATIENCE} cycles")
+
+    def _approach(self) -> None:
+        """From where the drives stand to the first row, smoothly; at most the start tolerance."""
+        begin = np.array(self._targets, dtype=np.float64)
+        end = self._checked.table.setpoints[0].astype(np.float64)
+        gap = float(np.max(np.abs((end - begin) / self._per_metre)))
+        steps = SETTLING + int(np.ceil(4.0 * gap / (self._rig.motion.speed * self._cycle_time)))
+        for step in range(1, steps + 1):
+            share = _smooth(step / steps)
+            targets = tuple(int(v) for v in np.rint(begin + share * (end - begin)))
+            self._send(Purpose.MOVE, targets)
+            if self.machine.state is not State.APPROACHING:
+                return
+        self.machine.on(Event.AT_START)
+        self._tell("moving", "at the start; moving along the path")
+
+    def _follow(self) -> None:
+        """One cycle along the table."""
+        if self._feed.at_rest:
+            self.machine.on(Event.AT_REST)
+            return
+        self._send(Purpose.MOVE, targets_at(self._checked.table.setpoints, self._feed.advance()))
+
+    def _secure(self) -> None:
+        """Settles, then lets the drives hold by themselves."""
+        for _ in range(SETTLING):
+            self._send(Purpose.HOLD, self._targets or self._actual)
+            if self.machine.state is not State.SECURING:
+                return
+        self._group.command(GroupCommand.QUICK_STOP)
+        for _ in range(PATIENCE):
+            status = self._send(Purpose.HOLD, self._targets or self._actual)
+            if self.machine.state is not State.SECURING:
+                return
+            if status is not None and status.state is not GroupState.ENABLED:
+                self.machine.on(Event.HELD)
+                self._tell("held", "at rest; the drives hold by themselves under torque")
+                return
+        self._fault("hold_timeout", f"the drives did not go over to hold in {PATIENCE} cycles")
+
+    @property
+    def _cycle_time(self) -> float:
+        return self._checked.table.cycle
+
+    def _send(self, purpose: Purpose, targets: tuple[int, ...]) -> CycleStatus | None:
+        """One cycle: wait, ask the gate, send, let simulated drives work, receive, judge.
+
+        None when the gate denied the targets.
+        """
+        lateness = self._clock.next_cycle()
+        verdict = examine(self._limits, self._request(purpose, targets))
+        if not verdict.allowed:
+            self._fault("gate_denied", f"the safety gate denied a set-point: {verdict.reason}")
+            return None
+        # A drive answers a SYNC with where it is then: what it was told the cycle before.
+        due = self._targets or targets
+        self._group.send_cycle(targets)
+        self._targets = targets
+        self._pump()
+        status = self._group.receive(self._clock.time_left())
+        self._actual = tuple(int(p) for p in status.positions)
+        errors = (np.array(self._actual) - np.array(due)) / self._per_metre
+        self._record(status, errors, lateness)
+        self._judge(status, errors, lateness)
+        return status
+
+    def _request(self, purpose: Purpose, targets: tuple[int, ...]) -> Request:
+        return Request(
+            purpose=purpose,
+            targets=targets,
+            previous=self._targets,
+            actual=self._actual,
+            armed=self._armed,
+            enabled=self._group.state is GroupState.ENABLED,
+            latched=self.machine.state is State.LATCHED,
+        )
+
+    def _record(self, status: CycleStatus, errors: Array, lateness: float) -> None:
+        self._on_cycle(
+            CycleRecord(
+                cycle=self._cycle,
+                state=self.machine.state,
+                index=self._feed.index,
+                targets=self._targets or (),
+                actual=self._actual,
+                torques=tuple(int(t) for t in status.torques),
+                missing=int(np.count_nonzero(status.missing)),
+                following_error=float(np.max(np.abs(errors))),
+                lateness=lateness,
+            )
+        )
+        self._cycle += 1
+
+    def _judge(self, status: CycleStatus, errors: Array, lateness: float) -> None:
+        """Lets the watch look at the cycle and reacts; then looks for the operator's stop."""
+        seen = Observation(
+            following=status.state is GroupState.ENABLED,
+            following_errors=errors.tolist(),
+            tensions=(np.asarray(status.torques) / 1000.0 * self._rated).tolist(),
+            missing=[bool(m) for m in status.missing],
+            faults=[f"node {node}: {text}" for node, text in status.faults],
+            lateness=lateness,
+        )
+        self._watch, findings = self._watch.look(seen)
+        for finding in findings:
+            self._react(finding)
+        if self._stop_requested() and self.machine.state in _STOPPABLE:
+            self._tell("stop", "stop requested; slowing down along the path")
+            self._feed.stop()
+            self.machine.on(Event.STOP)
+
+    def _react(self, finding: Finding) -> None:
+        if self.machine.state is State.LATCHED:
+            return
+        if finding.reaction is Reaction.NOTE:
+            self._tell(finding.code, finding.text)
+        elif finding.reaction is Reaction.PATH_STOP and self.machine.state in _ON_PATH:
+            self._tell(finding.code, f"{finding.text}; stopping along the path")
+            self._feed.stop()
+            self.machine.on(Event.PATH_FAULT)
+        else:
+            self._fault(finding.code, finding.text)
+
+    def _fault(self, code: str, text: str) -> None:
+        """Quick stop for all drives at once, latched."""
+        self._group.quick_stop_now()
+        self.machine.on(Event.FAULT)
+        self._tell(code, f"{text}; quick stop of all drives, fault latched")
+        self._drain()
+
+    def _drain(self) -> None:
+        """A few more cycles, so that what the drives do during a quick stop is on record."""
+        for _ in range(SETTLING):
+            lateness = self._clock.next_cycle()
+            self._group.send_cycle(self._actual)
+            self._targets = self._actual
+            self._pump()
+            status = self._group.receive(self._clock.time_left())
+            self._actual = tuple(int(p) for p in status.positions)
+            errors = (np.array(self._actual) - np.array(self._targets)) / self._per_metre
+            self._record(status, errors, lateness)
+
+    def _tell(self, code: str, text: str) -> None:
+        """Once for the same sentence."""
+        if text not in self._told:
+            self._told.add(text)
+            self._on_event(LoopEvent(self._cycle, code, text))
+
+
+_ACTIVE = frozenset(
+    {State.ENABLING, State.APPROACHING, State.MOVING, State.STOPPING, State.SECURING}
+)
+_ON_PATH = frozenset({State.MOVING, State.STOPPING})
+_STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING})
+
+
+def _nothing(*_: object) -> None:
+    """Does nothing."""
+
+
+def _smooth(share: float) -> float:
+    """0 to 1 with zero speed and acceleration at both ends."""
+    return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+
+
+def _gate_limits(rig: Rig, checked: CheckedTable) -> Limits:
+    """The table's own range with the start tolerance, the winches' speed, the following error."""
+    per_metre = np.abs([w.counts_per_metre for w in rig.winches])
+    margin = np.ceil(per_metre * rig.motion.start_tolerance).astype(int)
+    speeds = np.array([w.max_speed for w in rig.winches])
+    rows = checked.table.setpoints.astype(np.int64)
+    step = np.floor(per_metre * speeds * checked.table.cycle).astype(int) + 1
+    lag = np.floor(per_metre * rig.motion.following_error).astype(int)
+    return Limits(
+        lowest=tuple((rows.min(axis=0) - margin).tolist()),
+        highest=tuple((rows.max(axis=0) + margin).tolist()),
+        largest_step=tuple(step.tolist()),
+        largest_lag=tuple(lag.tolist()),
+    )
+
+
+def _watch_limits(rig: Rig) -> WatchLimits:
+    return WatchLimits(
+        following_error=rig.motion.following_error,
+        min_tension=rig.min_tension,
+        max_tension=rig.max_tension,
+    )

@@ -1,0 +1,96 @@
+"""The states of a run, and the only ways from one to the next."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class State(Enum):
+    """Where a run is."""
+
+    READY = "ready"
+    """Drives are configured and answer; nothing is enabled."""
+    ENABLING = "enabling"
+    """The drives are being enabled together, targets on their actual positions."""
+    APPROACHING = "approaching"
+    """The last fraction of a millimetre to the first set-point."""
+    MOVING = "moving"
+    """Along the path."""
+    STOPPING = "stopping"
+    """Slowing down along the path, all drives together."""
+    SECURING = "securing"
+    """At rest; the drives go over to hold by themselves (quick stop active)."""
+    FINISHED = "finished"
+    """At the goal, held by the drives."""
+    STOPPED = "stopped"
+    """Stopped by the operator on the path, held by the drives."""
+    LATCHED = "latched"
+    """Stopped by a fault; only an operator's command leads out."""
+
+
+class Event(Enum):
+    """What may happen to a run."""
+
+    ENABLE = "enable"
+    ENABLED = "enabled"
+    AT_START = "at_start"
+    STOP = "stop"
+    PATH_FAULT = "path_fault"
+    FAULT = "fault"
+    AT_REST = "at_rest"
+    HELD = "held"
+
+
+class ForbiddenTransition(RuntimeError):
+    """A program error: the event is not foreseen in the state."""
+
+
+_NEXT = {
+    (State.READY, Event.ENABLE): State.ENABLING,
+    (State.ENABLING, Event.ENABLED): State.APPROACHING,
+    (State.ENABLING, Event.STOP): State.SECURING,
+    (State.APPROACHING, Event.AT_START): State.MOVING,
+    (State.APPROACHING, Event.STOP): State.SECURING,
+    (State.MOVING, Event.STOP): State.STOPPING,
+    (State.MOVING, Event.PATH_FAULT): State.STOPPING,
+    (State.MOVING, Event.AT_REST): State.SECURING,
+    (State.STOPPING, Event.STOP): State.STOPPING,
+    (State.STOPPING, Event.PATH_FAULT): State.STOPPING,
+    (State.STOPPING, Event.AT_REST): State.SECURING,
+}
+
+
+class Machine:
+    """Where the run is, whether it was stopped and whether a fault is latched."""
+
+    def __init__(self) -> None:
+        """Starts ready."""
+        self.state = State.READY
+        self.stopped = False
+        self.faulted = False
+
+    def on(self, event: Event) -> State:
+        """Takes one step.
+
+        Raises:
+            ForbiddenTransition: The event is not foreseen here; the caller must stop the rig.
+        """
+        if event is Event.FAULT:
+            self.faulted = True
+            self.state = State.LATCHED
+            return self.state
+        if event is Event.HELD and self.state is State.SECURING:
+            self.state = self._end()
+            return self.state
+        following = _NEXT.get((self.state, event))
+        if following is None:
+            raise ForbiddenTransition(f"{event.value} in state {self.state.value}")
+        self.stopped |= event is Event.STOP
+        self.faulted |= event is Event.PATH_FAULT
+        self.state = following
+        return following
+
+    def _end(self) -> State:
+        if self.faulted:
+            return State.LATCHED
+        return State.STOPPED if self.stopped else State.FINISHED

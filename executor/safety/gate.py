@@ -1,0 +1,126 @@
+"""Every set-point passes here before it is sent. What is not explicitly allowed is denied."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Purpose(Enum):
+    """What a set-point is for."""
+
+    HOLD = "hold"
+    """Keep still: the targets of the cycle before, or the drives' own positions."""
+    MOVE = "move"
+    """Follow the checked table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What set-points may be, one entry a drive, [counts].
+
+    Attributes:
+        lowest: Smallest position.
+        highest: Largest position.
+        largest_step: Largest change from one cycle to the next.
+        largest_lag: Largest distance of a target from the drive's actual position.
+    """
+
+    lowest: tuple[int, ...]
+    highest: tuple[int, ...]
+    largest_step: tuple[int, ...]
+    largest_lag: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One cycle's set-points and the state they are to be sent in.
+
+    Attributes:
+        purpose: Why they are sent.
+        targets: One position a drive, [counts].
+        previous: The targets of the cycle before; None before the first.
+        actual: The drives' positions as last received, [counts].
+        armed: The checked table's hash was confirmed and the operator said go.
+        enabled: All drives report that they follow.
+        latched: A fault is latched.
+    """
+
+    purpose: Purpose
+    targets: Sequence[int]
+    previous: Sequence[int] | None
+    actual: Sequence[int]
+    armed: bool
+    enabled: bool
+    latched: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether set-points may be sent, and why not."""
+
+    allowed: bool
+    reason: str = ""
+
+
+ALLOWED = Verdict(True)
+
+
+def examine(limits: Limits, request: Request) -> Verdict:
+    """Allows or denies one cycle's set-points."""
+    count = len(limits.lowest)
+    if len(request.targets) != count or len(request.actual) != count:
+        return Verdict(False, f"{len(request.targets)} targets for {count} drives")
+    if not all(type(target) is int for target in request.targets):
+        return Verdict(False, "a target is not a whole number")
+    if request.purpose is Purpose.HOLD:
+        return _hold(limits, request)
+    if request.purpose is Purpose.MOVE:
+        return _move(limits, request)
+    return Verdict(False, "unknown purpose")
+
+
+def _hold(limits: Limits, request: Request) -> Verdict:
+    if request.previous is not None and tuple(request.targets) == tuple(request.previous):
+        return ALLOWED
+    if request.enabled:
+        return Verdict(False, "a hold would change the targets of drives that follow them")
+    return _near_actual(limits, request)
+
+
+def _move(limits: Limits, request: Request) -> Verdict:
+    if request.latched:
+        return Verdict(False, "a fault is latched")
+    if not request.armed:
+        return Verdict(False, "not armed")
+    if not request.enabled:
+        return Verdict(False, "not all drives are enabled")
+    if request.previous is None:
+        return Verdict(False, "no targets were sent before")
+    for drive, target in enumerate(request.targets):
+        if not limits.lowest[drive] <= target <= limits.highest[drive]:
+            return Verdict(
+                False,
+                f"drive {drive + 1}: target {target} outside"
+                f" [{limits.lowest[drive]}, {limits.highest[drive]}] counts",
+            )
+        step = abs(target - request.previous[drive])
+        if step > limits.largest_step[drive]:
+            return Verdict(
+                False,
+                f"drive {drive + 1}: step of {step} counts, allowed {limits.largest_step[drive]}",
+            )
+    return _near_actual(limits, request)
+
+
+def _near_actual(limits: Limits, request: Request) -> Verdict:
+    for drive, target in enumerate(request.targets):
+        lag = abs(target - request.actual[drive])
+        if lag > limits.largest_lag[drive]:
+            return Verdict(
+                False,
+                f"drive {drive + 1}: target {lag} counts from the actual position,"
+                f" allowed {limits.largest_lag[drive]}",
+            )
+    return ALLOWED

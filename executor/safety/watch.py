@@ -1,0 +1,171 @@
+"""Watches what the drives report and says when, and how, the rig must stop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Reaction(IntEnum):
+    """What a finding asks for; the larger one wins."""
+
+    NOTE = 0
+    PATH_STOP = 1
+    QUICK_STOP = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that the watch saw.
+
+    Attributes:
+        reaction: What must happen.
+        code: Stable name.
+        text: What, where, measured value and limit.
+    """
+
+    reaction: Reaction
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class WatchLimits:
+    """When the watch speaks up.
+
+    Attributes:
+        following_error: Cable length, [m].
+        min_tension: Slack below this, [N].
+        max_tension: Over-tension above this, [N].
+        slack_cycles: Cycles of slack or over-tension that are one too many.
+        missing_cycles: Missing replies in a row that are one too many.
+        late_periods: Lateness, in cycles, above which the path stops.
+    """
+
+    following_error: float
+    min_tension: float
+    max_tension: float
+    slack_cycles: int = 5
+    missing_cycles: int = 2
+    late_periods: float = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One cycle as it came back; one entry a drive.
+
+    Attributes:
+        following: True when the drives follow their set-points; otherwise following errors and
+            tensions say nothing and are not judged.
+        following_errors: Signed, in cable length, [m].
+        tensions: From the drives' torque, [N].
+        missing: True where a drive did not answer.
+        faults: What drives reported as wrong.
+        lateness: How late the cycle began, in cycles.
+    """
+
+    following: bool
+    following_errors: Sequence[float]
+    tensions: Sequence[float]
+    missing: Sequence[bool]
+    faults: Sequence[str]
+    lateness: float
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Counts in a row, per drive; `look` returns the next watch and what was found."""
+
+    limits: WatchLimits
+    missing: tuple[int, ...]
+    slack: tuple[int, ...]
+    over: tuple[int, ...]
+
+    @classmethod
+    def fresh(cls, limits: WatchLimits, drives: int) -> Watch:
+        """A watch that has seen nothing."""
+        zeros = (0,) * drives
+        return cls(limits, zeros, zeros, zeros)
+
+    def look(self, seen: Observation) -> tuple[Watch, tuple[Finding, ...]]:
+        """Takes in one cycle."""
+        limits = self.limits
+        # "Not at least" and "not at most", so that a tension that is no number counts as wrong.
+        slack = [seen.following and not t >= limits.min_tension for t in seen.tensions]
+        over = [seen.following and not t <= limits.max_tension for t in seen.tensions]
+        # A drive that did not answer says nothing new about its tension.
+        watch = Watch(
+            limits,
+            _counted(self.missing, seen.missing),
+            _counted(self.slack, slack, seen.missing),
+            _counted(self.over, over, seen.missing),
+        )
+        return watch, (
+            *watch._replies(seen),
+            *watch._following(seen),
+            *watch._tensions(seen),
+            *watch._lateness(seen),
+        )
+
+    def _replies(self, seen: Observation) -> list[Finding]:
+        found = [Finding(Reaction.QUICK_STOP, "drive_fault", text) for text in seen.faults]
+        for drive, count in enumerate(self.missing, start=1):
+            if count >= self.limits.missing_cycles:
+                text = f"drive {drive} did not answer for {count} cycles"
+                found.append(Finding(Reaction.QUICK_STOP, "drive_silent", text))
+            elif count:
+                text = f"drive {drive} did not answer for {count} cycle"
+                found.append(Finding(Reaction.NOTE, "reply_lost", text))
+        return found
+
+    def _following(self, seen: Observation) -> list[Finding]:
+        found = []
+        for drive, error in enumerate(seen.following_errors, start=1):
+            if (
+                seen.following and not abs(error) <= self.limits.following_error
+            ):  # also when it is no number
+                text = (
+                    f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
+                    f" allowed {self.limits.following_error * 1000:.2f} mm"
+                )
+                found.append(Finding(Reaction.QUICK_STOP, "following_error", text))
+        return found
+
+    def _tensions(self, seen: Observation) -> list[Finding]:
+        found = []
+        for drive, tension in enumerate(seen.tensions):
+            if self.slack[drive] >= self.limits.slack_cycles:
+                text = (
+                    f"cable {drive + 1} carries {tension:.1f} N,"
+                    f" less than {self.limits.min_tension:.1f} N: it may be slack"
+                )
+                found.append(Finding(Reaction.PATH_STOP, "slack", text))
+            if self.over[drive] >= self.limits.slack_cycles:
+                text = (
+                    f"cable {drive + 1} carries {tension:.1f} N,"
+                    f" more than {self.limits.max_tension:.1f} N"
+                )
+                found.append(Finding(Reaction.PATH_STOP, "over_tension", text))
+        return found
+
+    def _lateness(self, seen: Observation) -> list[Finding]:
+        if seen.lateness > self.limits.late_periods:
+            text = f"a cycle began {seen.lateness:.1f} cycles late"
+            return [Finding(Reaction.PATH_STOP, "late", text)]
+        if seen.lateness > 1.0:
+            return [
+                Finding(Reaction.NOTE, "late", f"a cycle began {seen.lateness:.1f} cycles late")
+            ]
+        return []
+
+
+def _counted(
+    before: Sequence[int], now: Sequence[bool], unknown: Sequence[bool] | None = None
+) -> tuple[int, ...]:
+    """Counts in a row; where nothing is known the count stays."""
+    blind = unknown if unknown is not None else [False] * len(now)
+    return tuple(
+        count if hidden else (count + 1 if hit else 0)
+        for count, hit, hidden in zip(before, now, blind, strict=True)
+    )
