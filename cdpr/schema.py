@@ -1,7 +1,4 @@
-"""The JSON schemas of the rig, scene and plan files, for editors and for other programs.
-
-``python -m cdpr.schema`` writes them into ``docs/schema/`` of the repository (``make schema``).
-"""
+"""The JSON schemas of the files, as committed in docs/schema: ``python -m cdpr.schema``."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from cdpr.plan_file import PlanDocument
 from cdpr.rig_file import RigDocument
 from cdpr.scene_file import SceneDocument
 
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
+FOLDER = Path("docs/schema")
 DOCUMENTS: dict[str, type[Document]] = {
     "rig": RigDocument,
     "scene": SceneDocument,
@@ -21,18 +18,19 @@ DOCUMENTS: dict[str, type[Document]] = {
 }
 
 
-def schema_text(document: type[Document]) -> str:
-    """The JSON schema of a file, as it is committed."""
-    schema = {"$schema": DIALECT, **document.model_json_schema()}
-    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+def schema_text(name: str) -> str:
+    """The JSON schema of a kind of file, as text."""
+    schema = DOCUMENTS[name].model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return json.dumps(schema, indent=2, sort_keys=True) + "\n"
 
 
 def write_schemas(folder: Path) -> None:
-    """Writes ``rig.schema.json``, ``scene.schema.json`` and ``plan.schema.json`` into a folder."""
+    """Writes all schemas into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, document in DOCUMENTS.items():
-        (folder / f"{name}.schema.json").write_text(schema_text(document), encoding="utf-8")
+    for name in DOCUMENTS:
+        (folder / f"{name}.schema.json").write_text(schema_text(name), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    write_schemas(Path(__file__).resolve().parents[1] / "docs" / "schema")
+    write_schemas(FOLDER)

@@ -1,0 +1,73 @@
+"""The `cdpr` command: its verbs, and what happens to errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import traceback
+
+import typer
+
+from cdpr.cli.verbs import add_verbs
+from cdpr.errors import CdprError
+
+EPILOG = (
+    "Exit codes: 0 ok, 1 fault, 2 bad input, 3 refused by a safety check,"
+    " 4 hardware missing, 130 stopped by the operator."
+)
+
+
+def build_app() -> typer.Typer:
+    """The whole command line."""
+    app = typer.Typer(
+        help="Plan, prove, run and measure paths of cable-driven parallel robots.",
+        epilog=EPILOG,
+        no_args_is_help=True,
+        add_completion=True,
+        rich_markup_mode="rich",
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    add_verbs(app)
+    return app
+
+
+def main() -> None:
+    """Runs the command line; every error ends in one message and its exit code."""
+    try:
+        build_app()()
+    except CdprError as error:
+        _tell(error)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output went away (`cdpr … | head`): nobody is left to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except Exception as error:
+        _tell_bug(error)
+        sys.exit(1)
+
+
+def _tell(error: CdprError) -> None:
+    if "--json" in sys.argv:
+        print(json.dumps(error.as_dict(), indent=1))
+    print(f"error: {error}", file=sys.stderr)
+
+
+def _tell_bug(error: Exception) -> None:
+    """An error nobody foresaw: one line for the user, the trace for us in a file."""
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="cdpr-error-", suffix=".txt", delete=False, encoding="utf-8"
+    ) as file:
+        file.write("".join(traceback.format_exception(error)))
+    print(
+        f"error: {type(error).__name__}: {error}\n"
+        "  why: this is a defect of cdpr, not of your input\n"
+        f"  next: please report it with the file {file.name}",
+        file=sys.stderr,
+    )

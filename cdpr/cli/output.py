@@ -1,0 +1,55 @@
+"""How the command line talks: results on stdout, progress and remarks on stderr."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+
+def show_json(document: Any) -> None:
+    """A result for programs."""
+    typer.echo(json.dumps(document, indent=1, allow_nan=False))
+
+
+def show_facts(title: str, facts: list[tuple[str, str]]) -> None:
+    """A result for people: names on the left, values on the right."""
+    table = Table(title=title, show_header=False, box=None, title_justify="left", padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts:
+        table.add_row(name, value)
+    out.print(table)
+
+
+@contextmanager
+def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Callable[[float], None]]:
+    """A bar on stderr; the value given to the callback is how far it is."""
+    columns = (
+        TextColumn("[progress.description]{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}" if total else "{task.completed:.0f}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err, transient=True, disable=not shown) as bar:
+        task = bar.add_task(text, total=total)
+        yield lambda value: bar.update(task, completed=value)
+
+
+@contextmanager
+def spinner(text: str, shown: bool) -> Iterator[None]:
+    """A remark that something takes a moment."""
+    if not shown or not err.is_terminal:
+        yield
+        return
+    with err.status(text):
+        yield

@@ -1,0 +1,173 @@
+"""`cdpr plan`: a path from start to goal."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from cdpr.plan_file import PlanDocument
+    from cdpr.scene import Scene
+
+
+class PlannerName(str, Enum):
+    """How samples are drawn."""
+
+    adaptive = "adaptive"
+    goal_bias = "goal-bias"
+
+
+class CostName(str, Enum):
+    """What makes a path good."""
+
+    kinematic = "kinematic"
+    length = "length"
+
+
+class ModeName(str, Enum):
+    """How far the search goes."""
+
+    rewire = "rewire"
+    paper = "paper"
+
+
+def plan(
+    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    scene: Annotated[Path, typer.Argument(help="scene file (YAML)", metavar="SCENE")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="plan file to write (JSON)")],
+    seed: Annotated[int, typer.Option(min=0, help="random seed; the same seed, the same plan")] = 0,
+    clearance_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
+    ] = None,
+    planner: Annotated[
+        PlannerName, typer.Option(help="adaptive sampling, or half of all samples at the goal")
+    ] = PlannerName.adaptive,
+    cost: Annotated[CostName, typer.Option(help="what the path minimises")] = CostName.kinematic,
+    mode: Annotated[
+        ModeName, typer.Option(help="rewire: RRT*; paper: first solution, no rewiring")
+    ] = ModeName.rewire,
+    max_iterations: Annotated[
+        int | None, typer.Option(min=1, help="give up after so many samples")
+    ] = None,
+    start_mm: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="start instead of the scene's: x y z")
+    ] = None,
+    goal_mm: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="goal instead of the scene's: x y z")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an existing plan file")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
+) -> None:
+    """Plan a collision-free path and write it to a file.
+
+    [dim]Examples:[/dim]
+
+      cdpr plan configs/gachon_8_6.yaml configs/environment_1.yaml -o plan.json
+
+      cdpr plan configs/gachon_8_6.yaml configs/environment_3.yaml -o plan.json
+      --clearance-mm 20 --cost length --seed 7
+    """
+    from cdpr.cli.output import progress_bar, show_facts, show_json
+    from cdpr.plan import save_plan
+    from cdpr.rig import load_rig
+    from cdpr.scene import load_scene
+    from planner.plan import make_plan
+    from planner.settings import PlannerSettings
+
+    the_rig = load_rig(rig)
+    the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
+    _check_output(output, force)
+    options: dict[str, Any] = {} if max_iterations is None else {"max_iterations": max_iterations}
+    settings = PlannerSettings(
+        sampler=planner.value, cost=cost.value, mode=mode.value, seed=seed, **options
+    )
+    with progress_bar("planning", settings.max_iterations, not as_json) as advance:
+        document = make_plan(the_rig, the_scene, settings, progress=lambda p: advance(p.iterations))
+    save_plan(document, output)
+    if as_json:
+        show_json({"plan": str(output), **facts_of(document)})
+    else:
+        show_facts(f"plan {output}", sentences_of(document))
+
+
+def _changed(
+    scene: Scene,
+    start_mm: tuple[float, float, float] | None,
+    goal_mm: tuple[float, float, float] | None,
+    clearance_mm: float | None,
+) -> Scene:
+    from cdpr.document_types import millimetres
+    from cdpr.poses import Pose
+
+    start = None if start_mm is None else Pose.level(millimetres(list(start_mm)))
+    goal = None if goal_mm is None else Pose.level(millimetres(list(goal_mm)))
+    clearance = None if clearance_mm is None else clearance_mm / 1000.0
+    return scene.changed(start=start, goal=goal, clearance=clearance)
+
+
+def _check_output(path: Path, force: bool) -> None:
+    """Before the search: a plan that cannot be written would be lost."""
+    import os
+
+    from cdpr.errors import BadInput
+
+    if path.is_dir():
+        raise BadInput("this is a folder", where=str(path), next_step="name a file")
+    if path.exists() and not force:
+        raise BadInput(
+            "the file exists already",
+            where=str(path),
+            next_step="choose another name, or pass --force to replace it",
+        )
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise BadInput(
+            "the plan cannot be written there",
+            where=str(path),
+            why="the folder does not exist or is read-only",
+            next_step="choose a folder that you may write to",
+        )
+
+
+def facts_of(document: PlanDocument) -> dict[str, Any]:
+    """What a plan is, for programs."""
+    return {
+        "hash": document.hash,
+        "rig": document.rig.name,
+        "scene": document.scene.name,
+        "planner": document.planner.model_dump(mode="json"),
+        "waypoints": len(document.waypoints),
+        "quality": document.quality.model_dump(mode="json"),
+        "statistics": document.statistics.model_dump(mode="json"),
+    }
+
+
+def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
+    """What a plan is, for people."""
+    quality, statistics = document.quality, document.statistics
+    facts = [
+        ("rig, scene", f"{document.rig.name}, {document.scene.name}"),
+        (
+            "length",
+            f"{quality.length_mm:.1f} mm ({len(document.waypoints)} waypoints;"
+            f" {quality.raw_length_mm:.1f} mm before post-processing)",
+        ),
+    ]
+    near = quality.obstacle_clearance
+    if near is not None:
+        facts.append(("clearance", f"{near.distance_mm:.2f} mm, {near.first} to {near.second}"))
+    own = quality.self_clearance
+    facts += [
+        ("self clearance", f"{own.distance_mm:.2f} mm, {own.first} to {own.second}"),
+        ("tension", f"{quality.min_tension_n:.1f} to {quality.max_tension_n:.1f} N"),
+        ("kinematic cost", f"{quality.mean_kinematic_cost:.3f} on average"),
+        (
+            "search",
+            f"{statistics.nodes} nodes, {statistics.iterations} samples,"
+            f" {statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s",
+        ),
+        ("next", "cdpr check, then cdpr run"),
+    ]
+    return facts
