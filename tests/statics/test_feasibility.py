@@ -29,7 +29,7 @@ UNITS = np.repeat([1.0, LENGTH], 3)
 
 
 def random_problem(seed, cables):
-    """Return matrix, limits and an external wrench that is sometimes within reach, sometimes not."""
+    """Return matrix, limits and an external wrench, within reach in some problems only."""
     random = np.random.default_rng(seed)
     matrix = random_matrix(seed, cables)
     low = random.uniform(0.0, 10.0, cables)

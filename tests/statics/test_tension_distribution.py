@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import daqp
 import numpy as np
 import pytest
@@ -226,7 +228,7 @@ def test_tensions_of_ten_cables_are_continuous_in_the_wrench():
 @settings(max_examples=40)
 @given(seed=seeds, cables=cable_counts)
 def test_the_last_wrench_that_can_be_held_is_held(seed, cables):
-    """On the boundary of the wrench set one vector of tensions is left; round-off must not lose it."""
+    """At the edge of the wrench set one vector of tensions is left; round-off must not lose it."""
     matrix, low, high, _ = feasible_problem(seed, cables)
     away = np.random.default_rng(seed).normal(size=6)
     only = np.where(away @ matrix > 0.0, high, low)
@@ -319,16 +321,25 @@ def test_a_solution_cannot_be_changed_and_leaves_the_arguments_writeable():
     assert np.abs(solution.wrench_residual).max() < 1e-10
 
 
-def test_a_wrong_solution_shows_its_residual_and_violation():
+@pytest.mark.parametrize(("change", "violation_limit"), [(200.0, 100.0), (-200.0, 5.0)])
+def test_a_wrong_solution_shows_its_residual_and_violation(change, violation_limit):
     """The proof is computed from the tensions, not remembered."""
     solution = solve_tensions(paper_matrix(), PAPER_WEIGHT, 5.0, 100.0)
-    wrong = type(solution)(
-        solution.tensions + np.eye(8)[0] * 200.0,
-        "centroid",
-        solution.structure_matrix,
-        solution.external_wrench,
-        solution.t_min,
-        solution.t_max,
-    )
+    wrong = replace(solution, tensions=solution.tensions + change * np.eye(8)[0])
     assert np.linalg.norm(wrong.wrench_residual[:3]) == pytest.approx(200.0)
-    assert wrong.bound_violation == pytest.approx(wrong.tensions[0] - 100.0)
+    assert wrong.bound_violation == pytest.approx(abs(wrong.tensions[0] - violation_limit))
+
+
+def test_two_equal_cables_share_the_load_and_are_blamed_together():
+    """Dependent columns span no facet; neither a solution nor a refusal may suffer from it."""
+    matrix = random_matrix(21, 7)
+    doubled = np.column_stack([matrix, matrix[:, 0]])
+    wrench = -matrix @ np.full(7, 40.0)
+    tensions = solve_tensions(doubled, wrench, 0.0, 100.0).tensions
+    assert tensions[0] == pytest.approx(tensions[7])
+    low, high = np.zeros(8), np.full(8, 100.0)
+    with pytest.raises(TensionInfeasible) as refusal:
+        solve_tensions(doubled, 10.0 * wrench, low, high)
+    expected = smallest_relaxation(doubled, low, high, 10.0 * wrench)
+    assert refusal.value.shortfall == pytest.approx(expected, rel=1e-6)
+    assert {0, 7} <= set(refusal.value.at_largest) or not {0, 7} & set(refusal.value.at_largest)
