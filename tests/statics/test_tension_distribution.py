@@ -284,6 +284,24 @@ def test_equal_limits_leave_that_tension_or_nothing():
         assert np.abs(solution.wrench_residual).max() < 1e-9
 
 
+@pytest.mark.parametrize("others", [6, 7])
+def test_a_cable_that_alone_acts_in_a_direction_has_its_tension_fixed(others):
+    """No null-space motion changes it: within its limits it is taken, outside it is refused."""
+    matrix = random_matrix(9, others + 1)
+    alone = matrix[:, -1] / np.linalg.norm(matrix[:, -1])
+    matrix[:, :-1] -= np.outer(alone, alone @ matrix[:, :-1])
+    for method in METHODS:
+        wrench = -matrix @ np.append(np.full(others, 40.0), 60.0)
+        tensions = solve_tensions(matrix, wrench, 0.0, 100.0, method=method).tensions
+        assert tensions[-1] == pytest.approx(60.0)
+        too_much = -matrix @ np.append(np.full(others, 40.0), 103.0)
+        with pytest.raises(TensionInfeasible) as refusal:
+            solve_tensions(matrix, too_much, 0.0, 100.0, method=method)
+        assert refusal.value.shortfall == pytest.approx(3.0)
+        assert refusal.value.at_largest == (others,)
+        assert refusal.value.at_smallest == ()
+
+
 def test_a_reference_within_reach_is_met_exactly():
     balanced = solve_tensions(paper_matrix(), PAPER_WEIGHT, 5.0, 100.0).tensions
     again = solve_tensions(
