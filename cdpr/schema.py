@@ -1,4 +1,7 @@
-"""The JSON schemas of the files, as committed in docs/schema: ``python -m cdpr.schema``."""
+"""The JSON schemas of the rig, scene and plan files, for editors and for other programs.
+
+``python -m cdpr.schema`` writes them into ``docs/schema/`` of the repository (``make schema``).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from cdpr.plan_file import PlanDocument
 from cdpr.rig_file import RigDocument
 from cdpr.scene_file import SceneDocument
 
-FOLDER = Path("docs/schema")
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
 DOCUMENTS: dict[str, type[Document]] = {
     "rig": RigDocument,
     "scene": SceneDocument,
@@ -18,19 +21,18 @@ DOCUMENTS: dict[str, type[Document]] = {
 }
 
 
-def schema_text(name: str) -> str:
-    """The JSON schema of a kind of file, as text."""
-    schema = DOCUMENTS[name].model_json_schema()
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    return json.dumps(schema, indent=2, sort_keys=True) + "\n"
+def schema_text(document: type[Document]) -> str:
+    """The JSON schema of a file, as it is committed."""
+    schema = {"$schema": DIALECT, **document.model_json_schema()}
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
 
 
 def write_schemas(folder: Path) -> None:
-    """Writes all schemas into a folder."""
+    """Writes ``rig.schema.json``, ``scene.schema.json`` and ``plan.schema.json`` into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in DOCUMENTS:
-        (folder / f"{name}.schema.json").write_text(schema_text(name), encoding="utf-8")
+    for name, document in DOCUMENTS.items():
+        (folder / f"{name}.schema.json").write_text(schema_text(document), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    write_schemas(FOLDER)
+    write_schemas(Path(__file__).resolve().parents[1] / "docs" / "schema")
