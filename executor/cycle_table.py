@@ -1,0 +1,169 @@
+"""What happened in every cycle of a run: a row a SYNC."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from cdpr.poses import Array, quaternion_from_matrix
+from executor.run_csv import (
+    Column,
+    Integers,
+    TableFile,
+    integers,
+    numbers,
+    texts,
+    write_table,
+)
+
+_MM, _MS = 1e3, 1e3
+_PER_CABLE = (
+    "set_{}_counts",
+    "actual_{}_counts",
+    "length_{}_mm",
+    "planned_tension_{}_n",
+    "tension_{}_n",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleTable:
+    """The cycles of a run with m cables; n rows. Unknown numbers are NaN.
+
+    Attributes:
+        time: Since the start of the run, shape (n,), [s].
+        state: State of the executor, n texts.
+        path_index: Row of the set-point table that was sent, shape (n,).
+        travelled: Length along the path, shape (n,), [m].
+        lateness: Of the cycle behind its deadline, shape (n,), [s]; 0 in simulated time.
+        missing: Drives that did not answer, shape (n,).
+        planned: Commanded position of the platform, world frame, shape (n, 3), [m].
+        planned_rotation: Commanded ``world_from_platform``, quaternions (w, x, y, z), shape (n, 4).
+        encoder: Position from the drives' actual positions, world frame, shape (n, 3), [m].
+        encoder_rotation: As ``planned_rotation``, from the drives, shape (n, 4).
+        following_error: Largest of all cables, shape (n,), [m].
+        set_counts: Set-points sent, shape (n, m), [counts].
+        actual_counts: Positions answered, shape (n, m), [counts].
+        lengths: Cable lengths from the actual positions, shape (n, m), [m].
+        planned_tensions: Tensions of the plan, shape (n, m), [N].
+        tensions: Tensions from the drives' torques, shape (n, m), [N].
+    """
+
+    time: Array
+    state: tuple[str, ...]
+    path_index: Integers
+    travelled: Array
+    lateness: Array
+    missing: Integers
+    planned: Array
+    planned_rotation: Array
+    encoder: Array
+    encoder_rotation: Array
+    following_error: Array
+    set_counts: Integers
+    actual_counts: Integers
+    lengths: Array
+    planned_tensions: Array
+    tensions: Array
+
+    def __post_init__(self) -> None:
+        """Refuses arrays of different lengths.
+
+        Raises:
+            ValueError: Naming the attribute.
+        """
+        for field in fields(self):
+            rows = len(getattr(self, field.name))
+            if rows != len(self.time):
+                raise ValueError(f"{field.name} has {rows} rows, time has {len(self.time)}")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def cable_count(self) -> int:
+        """Number of cables m."""
+        return int(self.set_counts.shape[1])
+
+    @property
+    def encoder_error(self) -> Array:
+        """Distance of the encoders' position from the planned one, shape (n,), [m]."""
+        error: Array = np.linalg.norm(self.encoder - self.planned, axis=1)
+        return error
+
+    def write_csv(self, path: Path) -> None:
+        """Writes ``cycles.csv``.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        columns = [
+            integers("cycle", np.arange(len(self))),
+            numbers("time_s", self.time),
+            texts("state", self.state),
+            integers("path_index", self.path_index),
+            numbers("path_mm", self.travelled, _MM),
+            numbers("lateness_ms", self.lateness, _MS, 4),
+            integers("missing", self.missing),
+            *_pose("planned", self.planned, self.planned_rotation),
+            *_pose("encoder", self.encoder, self.encoder_rotation),
+            numbers("following_error_mm", self.following_error, _MM),
+        ]
+        for i in range(self.cable_count):
+            columns += self._cable(i)
+        write_table(path, columns)
+
+    def _cable(self, i: int) -> list[Column]:
+        names = [name.format(i + 1) for name in _PER_CABLE]
+        return [
+            integers(names[0], self.set_counts[:, i]),
+            integers(names[1], self.actual_counts[:, i]),
+            numbers(names[2], self.lengths[:, i], _MM),
+            numbers(names[3], self.planned_tensions[:, i], decimals=4),
+            numbers(names[4], self.tensions[:, i], decimals=4),
+        ]
+
+    @classmethod
+    def read_csv(cls, path: Path) -> CycleTable:
+        """Reads ``cycles.csv``.
+
+        Raises:
+            BadInput: The file is missing, cut short or has other columns.
+        """
+        table = TableFile(path)
+        count = table.count(r"set_\d+_counts")
+        names = [[name.format(i + 1) for i in range(count)] for name in _PER_CABLE]
+        return cls(
+            time=table.floats("time_s"),
+            state=table.texts("state"),
+            path_index=table.ints("path_index"),
+            travelled=table.floats("path_mm", _MM),
+            lateness=table.floats("lateness_ms", _MS),
+            missing=table.ints("missing"),
+            planned=table.matrix([f"planned_{axis}_mm" for axis in "xyz"], _MM),
+            planned_rotation=table.matrix([f"planned_q{axis}" for axis in "wxyz"]),
+            encoder=table.matrix([f"encoder_{axis}_mm" for axis in "xyz"], _MM),
+            encoder_rotation=table.matrix([f"encoder_q{axis}" for axis in "wxyz"]),
+            following_error=table.floats("following_error_mm", _MM),
+            set_counts=table.int_matrix(names[0]),
+            actual_counts=table.int_matrix(names[1]),
+            lengths=table.matrix(names[2], _MM),
+            planned_tensions=table.matrix(names[3]),
+            tensions=table.matrix(names[4]),
+        )
+
+
+def _pose(name: str, positions: Array, rotations: Array) -> list[Column]:
+    return [
+        *(numbers(f"{name}_{axis}_mm", positions[:, i], _MM) for i, axis in enumerate("xyz")),
+        *(numbers(f"{name}_q{axis}", rotations[:, i], decimals=9) for i, axis in enumerate("wxyz")),
+    ]
+
+
+def quaternions_of(rotations: Array) -> Array:
+    """Rotation matrices, shape (n, 3, 3), as quaternions (w, x, y, z), shape (n, 4)."""
+    if len(rotations) and (rotations == rotations[0]).all():  # the platform never turns
+        return np.tile(quaternion_from_matrix(rotations[0]), (len(rotations), 1))
+    return np.array([quaternion_from_matrix(r) for r in rotations]).reshape(-1, 4)

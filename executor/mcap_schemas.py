@@ -1,0 +1,116 @@
+"""JSON schemas of the channels of ``run.mcap``: Foxglove's own where one fits, else ours.
+
+Source: the Foxglove schemas, https://docs.foxglove.dev/docs/sdk/schemas (well-known names).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+Schema = dict[str, Any]
+
+_NUMBER: Schema = {"type": ["number", "null"]}
+_TEXT: Schema = {"type": "string"}
+
+
+def _object(**properties: Schema) -> Schema:
+    return {"type": "object", "properties": properties}
+
+
+def _list(items: Schema) -> Schema:
+    return {"type": "array", "items": items}
+
+
+_INTEGER: Schema = {"type": "integer"}
+_TIME = _object(sec=_INTEGER, nsec=_INTEGER)
+_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
+_QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_POSE = _object(position=_VECTOR, orientation=_QUATERNION)
+_COLOR = _object(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
+
+POSE_IN_FRAME = _object(timestamp=_TIME, frame_id=_TEXT, pose=_POSE)
+LOG = _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER)
+COMPRESSED_IMAGE = _object(
+    timestamp=_TIME,
+    frame_id=_TEXT,
+    data={"type": "string", "contentEncoding": "base64"},
+    format=_TEXT,
+)
+_PRIMITIVES = {
+    "cubes": _list(_object(pose=_POSE, size=_VECTOR, color=_COLOR)),
+    "lines": _list(
+        _object(
+            type=_INTEGER,
+            pose=_POSE,
+            thickness=_NUMBER,
+            scale_invariant={"type": "boolean"},
+            points=_list(_VECTOR),
+            color=_COLOR,
+        )
+    ),
+    "triangles": _list(_object(pose=_POSE, points=_list(_VECTOR), color=_COLOR)),
+}
+SCENE_UPDATE = _object(
+    deletions=_list(_object(timestamp=_TIME, type=_INTEGER, id=_TEXT)),
+    entities=_list(
+        _object(
+            timestamp=_TIME,
+            frame_id=_TEXT,
+            id=_TEXT,
+            lifetime=_TIME,
+            frame_locked={"type": "boolean"},
+            **_PRIMITIVES,
+        )
+    ),
+)
+DRIVES = _object(
+    cycle=_INTEGER,
+    state=_TEXT,
+    path_index=_INTEGER,
+    path_mm=_NUMBER,
+    lateness_ms=_NUMBER,
+    missing=_INTEGER,
+    following_error_mm=_NUMBER,
+    drives=_list(
+        _object(
+            set_counts=_INTEGER,
+            actual_counts=_INTEGER,
+            length_mm=_NUMBER,
+            planned_tension_n=_NUMBER,
+            tension_n=_NUMBER,
+        )
+    ),
+)
+TAG_STATUS = _object(
+    frame=_INTEGER,
+    status=_TEXT,
+    tags=_TEXT,
+    reprojection_px=_NUMBER,
+    covariance={
+        **_list(_NUMBER),
+        "description": "6 x 6, row by row: position [m] and rotation vector [rad], world axes",
+    },
+)
+CLEARANCE = _object(
+    source=_TEXT,
+    distance_mm=_NUMBER,
+    uncertainty_mm=_NUMBER,
+    planned_distance_mm=_NUMBER,
+    body=_TEXT,
+    obstacle=_TEXT,
+    obstacles=_list(_object(name=_TEXT, distance_mm=_NUMBER, planned_distance_mm=_NUMBER)),
+)
+
+#: Topic → (name of the schema, schema).
+CHANNELS: dict[str, tuple[str, Schema]] = {
+    "/planned_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
+    "/encoder_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
+    "/tag_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
+    "/tag_status": ("cdpr.TagStatus", TAG_STATUS),
+    "/drives": ("cdpr.Drives", DRIVES),
+    "/clearance": ("cdpr.Clearance", CLEARANCE),
+    "/events": ("foxglove.Log", LOG),
+    "/pictures": ("foxglove.CompressedImage", COMPRESSED_IMAGE),
+    "/scene": ("foxglove.SceneUpdate", SCENE_UPDATE),
+    "/robot": ("foxglove.SceneUpdate", SCENE_UPDATE),
+}

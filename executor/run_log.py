@@ -1,0 +1,91 @@
+"""Collects the cycles of a run in memory and makes their table afterwards."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpr.kinematics import poses_near
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from executor.cycle_table import CycleTable
+from executor.loop import CycleRecord
+from executor.machine import State
+from executor.setpoints import CheckedTable
+
+#: In these states the drives' torques are the cables' tensions.
+_UNDER_TENSION = frozenset(
+    {State.APPROACHING, State.MOVING, State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED}
+)
+
+
+class RunLog:
+    """The cycles of one run, in the order in which they were sent."""
+
+    def __init__(self, rig: Rig, checked: CheckedTable) -> None:
+        """An empty log of a run of a checked table on a rig."""
+        self._rig, self._checked = rig, checked
+        self._records: list[CycleRecord] = []
+
+    def add(self, record: CycleRecord) -> None:
+        """Takes in a cycle; costs next to nothing."""
+        self._records.append(record)
+
+    def __len__(self) -> int:
+        """Number of cycles."""
+        return len(self._records)
+
+    def encoder_poses(self, table: CycleTable) -> tuple[Array, Array]:
+        """Poses from the drives' positions, shapes (n, 3), [m], and (n, 3, 3)."""
+        rows = table.path_index
+        planned = self._checked.table
+        return poses_near(
+            self._rig, table.lengths, planned.positions[rows], planned.rotations[rows]
+        )
+
+    def table(self) -> CycleTable:
+        """Everything that is known of the run's cycles."""
+        records, rig, planned = self._records, self._rig, self._checked.table
+        # A drive answers a SYNC with where it is then: at what it was told one cycle before.
+        index = np.array([0.0, *(r.index for r in records[:-1])])[: len(records)]
+        rows = np.rint(index).astype(np.int64)
+        actual = _matrix([r.actual for r in records], rig.cable_count)
+        rated = np.array([w.torque_constant for w in rig.winches])
+        tensions = _matrix([r.torques for r in records], rig.cable_count) / 1000.0 * rated
+        taut = np.array([r.state in _UNDER_TENSION for r in records], dtype=bool)
+        stretch = np.where(taut[:, None], tensions, planned.tensions[rows])
+        winches = self._checked.winches
+        lengths = winches.strained(winches.unstrained_from_counts(actual), stretch)
+        encoder, _ = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
+        return CycleTable(
+            time=np.array([r.cycle for r in records]) * planned.cycle,
+            state=tuple(r.state.value for r in records),
+            path_index=rows,
+            travelled=_between(planned.travelled, index),
+            lateness=np.array([r.lateness for r in records]) * planned.cycle,
+            missing=np.array([r.missing for r in records], dtype=np.int64),
+            planned=_between(planned.positions, index),
+            encoder=encoder,
+            following_error=np.array([r.following_error for r in records]),
+            set_counts=_matrix([r.targets for r in records], rig.cable_count),
+            actual_counts=actual,
+            lengths=lengths,
+            planned_tensions=_between(planned.tensions, index),
+            tensions=np.where(taut[:, None], tensions, np.nan),
+        )
+
+
+def _matrix(
+    rows: list[tuple[int, ...]], width: int
+) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    return np.array(rows, dtype=np.int64).reshape(len(rows), width)
+
+
+def _between(values: Array, index: Array) -> Array:
+    """Rows of a table at fractional places."""
+    low = np.floor(index).astype(np.int64)
+    high = np.minimum(low + 1, len(values) - 1)
+    share = index - low
+    if values.ndim > 1:
+        share = share[:, None]
+    mixed: Array = (1.0 - share) * values[low] + share * values[high]
+    return mixed

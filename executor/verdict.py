@@ -1,0 +1,232 @@
+"""Whether a run was good: single checks, each a sentence with its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from executor.clearance_table import ClearanceTable
+from executor.cycle_table import CycleTable
+from executor.pose_table import PoseTable
+
+PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
+#: A tension this share of the smallest allowed one counts as slack; torque readings are coarse.
+SLACK_SHARE = 0.5
+#: A tension this much above the largest allowed one counts as too high.
+OVERLOAD_SHARE = 1.01
+#: What the rounding of the tables may cost, [m].
+ROUNDING = 2e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One question about a run and its answer.
+
+    Attributes:
+        name: Short stable name.
+        passed: The answer.
+        text: One sentence with the numbers behind it.
+    """
+
+    name: str
+    passed: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The answer for the whole run.
+
+    Attributes:
+        word: ``PASSED``, ``FAILED`` or ``STOPPED``.
+        sentence: What happened, in one sentence.
+        checks: Every single check.
+    """
+
+    word: str
+    sentence: str
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """True only for a run that reached the goal and met every check."""
+        return self.word == PASSED
+
+    @property
+    def reasons(self) -> list[str]:
+        """The sentences of the checks that failed; of all checks when none did."""
+        failed = [check.text for check in self.checks if not check.passed]
+        return failed or [check.text for check in self.checks]
+
+
+def judge(
+    final_state: str,
+    last_event: str,
+    simulated: bool,
+    rig: Rig,
+    scene: Scene,
+    cycles: CycleTable,
+    poses: PoseTable,
+    clearance: ClearanceTable,
+) -> Verdict:
+    """The verdict over a run.
+
+    Args:
+        final_state: ``finished``, ``stopped`` or any other for a fault.
+        last_event: What a run that did not finish says about it.
+        simulated: The drives were simulated, so that no reply may be lost.
+        rig: The rig that was run.
+        scene: Its scene.
+        cycles: What the drives did.
+        poses: What the camera saw.
+        clearance: How near it came.
+    """
+    measured = [
+        following(cycles, rig.motion.following_error),
+        replies(cycles, simulated),
+        *tensions(cycles, rig),
+        *distances(clearance, scene.obstacle_clearance),
+        *camera(poses),
+    ]
+    failures = [check for check in measured if not check.passed]
+    at = f"after {_time(cycles):.1f} s and {_travelled(cycles):.0f} mm"
+    if final_state == "finished":
+        end = Check("finished", True, f"The platform reached the goal {at}.")
+        if failures:
+            many = f"{len(failures)} checks" if len(failures) > 1 else "one check"
+            sentence = f"The run reached the goal, but {many} failed."
+            return Verdict(FAILED, sentence, (end, *measured))
+        sentence = "The run reached the goal within every limit that was measured."
+        return Verdict(PASSED, sentence, (end, *measured))
+    told = last_event.rstrip(".") or f"the final state is {final_state!r}"
+    end = Check("finished", False, f"The run ended {at}, before the goal: {told}.")
+    if final_state == "stopped" and not failures:
+        return Verdict(STOPPED, "The run was stopped before the goal.", (end, *measured))
+    word = "was stopped" if final_state == "stopped" else "ended with a fault"
+    return Verdict(FAILED, f"The run {word} before the goal.", (end, *measured))
+
+
+def _time(cycles: CycleTable) -> float:
+    return float(cycles.time[-1]) if len(cycles) else 0.0
+
+
+def _travelled(cycles: CycleTable) -> float:
+    return float(cycles.travelled[-1]) * 1e3 if len(cycles) else 0.0
+
+
+def following(cycles: CycleTable, limit: float) -> Check:
+    """Every cable within ``limit`` [m] of its set-point, in every cycle."""
+    known = np.flatnonzero(np.isfinite(cycles.following_error))
+    if not known.size:
+        return Check("following_error", False, "No drive position was ever received.")
+    worst = known[np.argmax(cycles.following_error[known])]
+    value = float(cycles.following_error[worst])
+    passed = value <= limit
+    text = (
+        f"Every cable followed its set-point within {value * 1e3:.3f} mm"
+        f" (limit {limit * 1e3:g} mm)."
+        if passed
+        else f"A cable was {value * 1e3:.3f} mm off its set-point at {cycles.time[worst]:.2f} s;"
+        f" the limit is {limit * 1e3:g} mm."
+    )
+    return Check("following_error", passed, text)
+
+
+def replies(cycles: CycleTable, simulated: bool) -> Check:
+    """No reply lost on simulated drives; on a real bus the loop itself stops for too many."""
+    lost = int(cycles.missing.sum())
+    asked = len(cycles) * cycles.cable_count
+    if not lost:
+        return Check("lost_replies", True, f"All {asked} replies of the drives arrived.")
+    text = f"{lost} of {asked} replies of the drives were lost"
+    if simulated:
+        return Check("lost_replies", False, f"{text}; simulated drives lose none.")
+    return Check("lost_replies", True, f"{text}, never so many that the run had to stop.")
+
+
+def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
+    """No slack and no overloaded cable; nothing when the drives report no torque."""
+    if not np.isfinite(cycles.tensions).any():
+        return []
+    low, high = float(np.nanmin(cycles.tensions)), float(np.nanmax(cycles.tensions))
+    limits = f"limits {rig.min_tension:g} and {rig.max_tension:g} N"
+    if low < SLACK_SHARE * rig.min_tension:
+        at, cable = _where(cycles.tensions, low)
+        text = f"Cable {cable} went slack: {low:.2f} N at {cycles.time[at]:.2f} s ({limits})."
+        return [Check("tension", False, text)]
+    if high > OVERLOAD_SHARE * rig.max_tension:
+        at, cable = _where(cycles.tensions, high)
+        text = f"Cable {cable} pulled {high:.2f} N at {cycles.time[at]:.2f} s ({limits})."
+        return [Check("tension", False, text)]
+    return [Check("tension", True, f"Tensions stayed in {low:.1f} to {high:.1f} N ({limits}).")]
+
+
+def _where(
+    values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], value: float
+) -> tuple[int, int]:
+    row, column = np.argwhere(values == value)[0]
+    return int(row), int(column) + 1
+
+
+def distances(clearance: ClearanceTable, required: float) -> list[Check]:
+    """Nowhere nearer than the scene allows, and nowhere nearer than planned by the camera.
+
+    A distance is too small only when it is so by more than its own uncertainty.
+    """
+    checks = []
+    for source, teller in (("tag", "the camera"), ("encoder", "the drives")):
+        rows = clearance.of(source)
+        if len(rows) and np.isfinite(rows.distance).any():
+            checks.append(_against_required(rows, required, teller))
+            if source == "tag":
+                checks.append(_against_plan(rows))
+    return checks
+
+
+def _against_required(rows: ClearanceTable, required: float, teller: str) -> Check:
+    reach = rows.distance + rows.uncertainty
+    passed = not bool(np.any(reach < required - ROUNDING))
+    worst = int(np.nanargmin(rows.distance if passed else reach))
+    distance, spread = rows.distance[worst] * 1e3, rows.uncertainty[worst] * 1e3
+    text = (
+        f"The smallest clearance seen by {teller} was {distance:.1f} ± {spread:.1f} mm"
+        f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
+        f" the scene asks for {required * 1e3:g} mm."
+    )
+    return Check(f"clearance_{rows.source[worst]}", passed, text)
+
+
+def _against_plan(rows: ClearanceTable) -> Check:
+    shortfall = rows.planned_distance - rows.distance
+    beyond = shortfall - rows.uncertainty
+    passed = not bool(np.any(beyond > ROUNDING))
+    worst = int(np.nanargmax(shortfall if passed else beyond))
+    short, spread = shortfall[worst] * 1e3, rows.uncertainty[worst] * 1e3
+    text = (
+        f"Measured clearance was at most {max(short, 0.0):.2f} mm below the planned one,"
+        f" within its uncertainty of {spread:.2f} mm there."
+        if passed
+        else f"Measured clearance was {short:.2f} mm below the planned one at"
+        f" {rows.time[worst]:.1f} s, more than its uncertainty of {spread:.2f} mm."
+    )
+    return Check("clearance_plan", passed, text)
+
+
+def camera(poses: PoseTable) -> list[Check]:
+    """The camera saw the platform in at least one picture; nothing for a run without one."""
+    if not len(poses):
+        return []
+    seen = int(poses.ok.sum())
+    if not seen:
+        text = f"None of {len(poses)} pictures gave a pose: {poses.status[0]}."
+        return [Check("camera", False, text)]
+    error = poses.error[poses.ok] * 1e3
+    rms = float(np.sqrt(np.mean(error**2)))
+    text = (
+        f"The camera measured {seen} of {len(poses)} pictures, {rms:.2f} mm RMS from the plan"
+        f" (largest {error.max():.2f} mm)."
+    )
+    return [Check("camera", True, text)]
