@@ -1,0 +1,169 @@
+"""The synthetic camera: pictures of the rig with an exactly known pose.
+
+Tags, platform and obstacles are met by the undistorted ray of every sample, 2 × 2 samples a pixel.
+What stands still is drawn once; a picture redraws the platform's surroundings and the cables.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.cables import cables_at
+from cdpr.errors import BadInput
+from cdpr.poses import Pose
+from cdpr.rig import Camera, Rig
+from cdpr.scene import Scene
+from simulation.camera_background import ROOM, draw_background, draw_tag, shade
+from simulation.camera_cables import draw_cables
+from simulation.camera_canvas import (
+    SAMPLES,
+    Canvas,
+    Image8,
+    Image32,
+    Region,
+    draw_quad,
+    region_of,
+    sample_rays,
+)
+
+#: Brightness of the platform's faces in full light.
+PLATFORM = 168.0
+#: Slack of the precomputed noise, in which each picture takes another place, [px].
+NOISE_SLACK = 96
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """What the sensor and the lens do to brightness.
+
+    Attributes:
+        noise: Standard deviation, [grey levels of 255].
+        vignetting: Light lost in the corners of the picture, share of 1.
+        blur: Standard deviation of the lens's and focus's blur, [px].
+    """
+
+    noise: float = 1.5
+    vignetting: float = 0.25
+    blur: float = 0.0
+
+
+class SyntheticCamera:
+    """Takes pictures of a simulated rig.
+
+    Args:
+        rig: Its platform, tags and cables.
+        scene: Its obstacles.
+        camera: One of the rig's cameras, or another.
+        seed: Of the noise: the same seed, pose and frame give the same picture.
+        optics: Imperfections of lens and sensor.
+
+    Raises:
+        BadInput: The rig has no tags.
+    """
+
+    def __init__(
+        self, rig: Rig, scene: Scene, camera: Camera, seed: int = 0, optics: Optics | None = None
+    ) -> None:
+        if not rig.tag_family:
+            raise BadInput(
+                "the rig has no tags, a camera can measure nothing",
+                where=f"rig {rig.name}",
+                next_step="add a `tags` section to the rig file",
+            )
+        self.rig, self.camera, self.seed = rig, camera, seed
+        self.optics = optics or Optics()
+        self._camera_from_world = camera.world_from_camera.inverse()
+        self._background = Canvas.blank(camera, sample_rays(camera), ROOM)
+        draw_background(self._background, rig, scene, self._camera_from_world)
+        self._light = _vignette(camera, self.optics.vignetting)
+        self._still = self._exposed(self._background, self._light)
+        self._depth = self._background.depth[1::SAMPLES, 1::SAMPLES].copy()
+        self._noise = _noise(camera, self.optics.noise, seed)
+
+    def render(self, pose: Pose, frame: int = 0) -> Image8:
+        """The picture with the platform at ``pose`` (``world_from_platform``).
+
+        Args:
+            pose: Exact truth of the picture.
+            frame: Number of the picture; it picks the noise.
+
+        Returns:
+            Grey picture, shape (height, width).
+        """
+        picture, depth = self._still.copy(), self._depth
+        region = self._platform_region(pose)
+        if not region.empty:
+            canvas = self._background.part(region).copy()
+            self._draw_platform(canvas, pose)
+            rows, columns = region.slices()
+            picture[rows, columns] = self._exposed(canvas, self._light[rows, columns])
+            depth = depth.copy()
+            depth[rows, columns] = canvas.depth[1::SAMPLES, 1::SAMPLES]
+        cables = cables_at(self.rig, pose)
+        radius = self.rig.cable_radius
+        draw_cables(picture, depth, self.camera, cables, self._camera_from_world, radius)
+        return self._with_noise(picture, frame)
+
+    def _platform_region(self, pose: Pose) -> Region:
+        corners = self._camera_from_world.apply(pose.apply(self.rig.platform_corners))
+        if np.all(corners[:, 2] < 0.02):
+            return Region(0, 0, 0, 0)
+        return region_of(self.camera, corners, margin=8)
+
+    def _draw_platform(self, canvas: Canvas, pose: Pose) -> None:
+        for face, half_size in _faces(self.rig):
+            world_from_face = pose.compose(face)
+            light = np.float32(PLATFORM * shade(world_from_face.rotation[:, 2]))
+            texture = np.full((32, 32), light, dtype=np.float32)
+            texture[[0, -1]] *= np.float32(0.8)
+            texture[:, [0, -1]] *= np.float32(0.8)
+            draw_quad(canvas, self._camera_from_world.compose(world_from_face), half_size, texture)
+        for tag in self.rig.platform_tags:
+            draw_tag(canvas, self.rig.tag_family, tag, self._camera_from_world, pose)
+
+    def _exposed(self, canvas: Canvas, light: Image32) -> Image8:
+        pixels = canvas.pixels()
+        if self.optics.blur > 0:
+            pixels = np.asarray(cv2.GaussianBlur(pixels, (0, 0), self.optics.blur), np.float32)
+        return np.asarray(np.clip(pixels * light + 0.5, 0, 255), dtype=np.uint8)
+
+    def _with_noise(self, picture: Image8, frame: int) -> Image8:
+        if self.optics.noise <= 0:
+            return picture
+        down, right = np.random.default_rng([self.seed, frame]).integers(0, NOISE_SLACK, 2)
+        height, width = picture.shape
+        noise = np.ascontiguousarray(self._noise[down : down + height, right : right + width])
+        return np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def _faces(rig: Rig) -> list[tuple[Pose, tuple[float, float]]]:
+    """``platform_from_face`` (z outward) and half width and height of the box's faces, [m]."""
+    faces = []
+    for axis in range(3):
+        across, up = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (1.0, -1.0):
+            rotation = np.zeros((3, 3))
+            rotation[across, 0], rotation[up, 1], rotation[axis, 2] = sign, 1.0, sign
+            centre = rotation[:, 2] * rig.half_size[axis]
+            half = (float(rig.half_size[across]), float(rig.half_size[up]))
+            faces.append((Pose(centre, rotation), half))
+    return faces
+
+
+def _vignette(camera: Camera, loss: float) -> Image32:
+    """Share of light that reaches each pixel."""
+    x = (np.arange(camera.width) - (camera.width - 1) / 2.0) / (camera.width / 2.0)
+    y = (np.arange(camera.height) - (camera.height - 1) / 2.0) / (camera.width / 2.0)
+    radius = x[None, :] ** 2 + y[:, None] ** 2
+    return np.asarray(1.0 - loss * radius / radius.max(), dtype=np.float32)
+
+
+def _noise(camera: Camera, deviation: float, seed: int) -> NDArray[np.int16]:
+    """Noise somewhat larger than a picture."""
+    shape = (camera.height + NOISE_SLACK, camera.width + NOISE_SLACK)
+    values = np.random.default_rng([seed, 0xCA3E]).standard_normal(shape, dtype=np.float32)
+    return np.round(values * np.float32(deviation)).astype(np.int16)
