@@ -1,0 +1,209 @@
+"""The CAN bus a rig names: settings from the rig file, opened through python-can."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+
+from cdpr.errors import BadInput, Fault, HardwareMissing
+from cdpr.rig import Rig
+
+UDP_DEFAULT_GROUP = "239.74.163.2"
+"""python-can's own IPv4 group. Source: python-can, interfaces/udp_multicast."""
+
+RECEIVE_BUFFER_BYTES = 4 * 2**20
+"""A socket of the default size drops the newest frames after 278 without a word."""
+
+MIN_TRANSMIT_QUEUE = 64
+"""Frames a kernel CAN interface must queue: a cycle and a stop in one burst, with room to spare."""
+
+INTERFACES = Path("/sys/class/net")
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """How a bus is opened.
+
+    Attributes:
+        interface: python-can's name, such as ``socketcan``, ``udp_multicast`` or ``virtual``.
+        channel: What the interface calls its channel. For ``udp_multicast``: ``group[:port]``.
+        bitrate: [bit/s]; where the interface sets it (socketcan's is set with ``ip link``).
+    """
+
+    interface: str
+    channel: str
+    bitrate: int = 1_000_000
+
+    @classmethod
+    def of(cls, rig: Rig) -> BusSettings:
+        """The bus of a rig file."""
+        bus = rig.document.bus
+        return cls(bus.interface, bus.channel, bus.bitrate)
+
+    def __str__(self) -> str:
+        """Interface and channel, as messages name the bus."""
+        return f"{self.interface} {self.channel}".strip()
+
+
+def open_bus(settings: BusSettings) -> can.BusABC:
+    """Opens a bus; the caller shuts it down.
+
+    Raises:
+        BadInput: python-can has no such interface, or the channel is not one of its channels.
+        HardwareMissing: It cannot be opened; with the cause and the next step.
+    """
+    known = sorted(can.VALID_INTERFACES)
+    if settings.interface not in known:
+        raise BadInput(
+            f"unknown CAN interface {settings.interface!r}",
+            where="bus.interface",
+            next_step=f"use one of: {', '.join(known)}",
+        )
+    if settings.interface == "socketcan":
+        _check_kernel_interface(settings)
+    options = _options(settings)
+    try:
+        bus = can.Bus(interface=settings.interface, ignore_config=True, **options)
+    # Back ends raise whatever their maker's library raises: every one means that it did not open.
+    except Exception as error:
+        raise _cannot_open(settings, error) from error
+    _prepare_socket(bus)
+    return bus
+
+
+def _options(settings: BusSettings) -> dict[str, Any]:
+    if settings.interface == "udp_multicast":
+        return _udp_options(settings)
+    return {"channel": settings.channel, "bitrate": settings.bitrate}
+
+
+def _udp_options(settings: BusSettings) -> dict[str, Any]:
+    """A hop limit of 0 keeps the frames on this machine; set-points do not go out to a network."""
+    group, _, port = settings.channel.partition(":") if "." in settings.channel else ("", "", "")
+    if settings.channel and not group:
+        group = settings.channel  # an IPv6 group; its colons are its own
+    options: dict[str, Any] = {
+        "channel": group or UDP_DEFAULT_GROUP,
+        "hop_limit": 0,
+        "fd": False,
+    }
+    if port:
+        if not port.isdecimal() or not 0 < int(port) < 65536:
+            raise BadInput(
+                f"port {port!r} is not a number from 1 to 65535",
+                where="bus.channel",
+                next_step=f"write group:port, such as {UDP_DEFAULT_GROUP}:43113",
+            )
+        options["port"] = int(port)
+    return options
+
+
+def _check_kernel_interface(settings: BusSettings) -> None:
+    """Raises what python-can finds only at the first frame: no interface, down, short queue."""
+    folder = INTERFACES / settings.channel
+    if not settings.channel or not folder.exists():
+        there = sorted(p.name for p in INTERFACES.glob("*can*"))
+        raise HardwareMissing(
+            f"there is no network interface {settings.channel!r}",
+            where=f"bus {settings}",
+            why=f"CAN interfaces here: {', '.join(there) or 'none'}",
+            next_step=_bring_up(settings),
+        )
+    if not int((folder / "flags").read_text(), 16) & 1:  # IFF_UP
+        raise HardwareMissing(
+            f"the network interface {settings.channel} is down",
+            where=f"bus {settings}",
+            next_step=_bring_up(settings),
+        )
+    queue = int((folder / "tx_queue_len").read_text())
+    if queue < MIN_TRANSMIT_QUEUE:
+        raise HardwareMissing(
+            f"the transmit queue of {settings.channel} holds {queue} frames,"
+            f" at least {MIN_TRANSMIT_QUEUE} are needed",
+            where=f"bus {settings}",
+            why="a stop is sent as one batch and must not be refused because a cycle is queued",
+            next_step=f"sudo ip link set {settings.channel} txqueuelen 128",
+            values={"tx_queue_len": queue},
+        )
+
+
+def _bring_up(settings: BusSettings) -> str:
+    name = settings.channel or "can0"
+    if name.startswith("vcan"):
+        return (
+            f"sudo modprobe vcan && sudo ip link add dev {name} type vcan"
+            f" && sudo ip link set {name} up txqueuelen 128"
+        )
+    return f"sudo ip link set {name} up txqueuelen 128 type can bitrate {settings.bitrate}"
+
+
+def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
+    cause = error.__cause__ or error
+    number = getattr(cause, "errno", None)
+    step = "check the adapter, its driver and the channel's name, then run `cdpr doctor`"
+    if settings.interface == "socketcan":
+        step = _bring_up(settings)
+        if number == errno.EAFNOSUPPORT:
+            step = "load the kernel's CAN support: sudo modprobe can_raw"
+    elif settings.interface == "udp_multicast":
+        step = "let multicast through the loopback: sudo ip route add 239.0.0.0/8 dev lo"
+    return HardwareMissing(
+        "the bus cannot be opened",
+        where=f"bus {settings}",
+        why=f"{type(cause).__name__}: {cause}",
+        next_step=step,
+    )
+
+
+def _prepare_socket(bus: can.BusABC) -> None:
+    """Room for frames that wait, and on IP sockets no frames of groups joined by others."""
+    try:
+        descriptor = bus.fileno()
+    except NotImplementedError:  # not every bus has a socket
+        return
+    if descriptor < 0:
+        return
+    with socket.socket(fileno=os.dup(descriptor)) as bus_socket:
+        bus_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        if bus_socket.family == socket.AF_INET:
+            ip_multicast_all = 49  # Source: linux/in.h; Python names it from 3.14
+            bus_socket.setsockopt(socket.IPPROTO_IP, ip_multicast_all, 0)
+
+
+def transmit(bus: can.BusABC, message: can.Message) -> None:
+    """Sends one frame.
+
+    Raises:
+        Fault: The bus did not take it. A full queue is a fault too: a set-point sent late is wrong.
+    """
+    try:
+        bus.send(message)
+    except can.CanError as error:
+        raise _failed(bus, "did not take a frame", error) from error
+
+
+def take(bus: can.BusABC, timeout: float) -> can.Message | None:
+    """The next frame, or None when there is none within the time [s].
+
+    Raises:
+        Fault: The bus failed.
+    """
+    try:
+        return bus.recv(timeout)
+    except can.CanError as error:
+        raise _failed(bus, "cannot be read", error) from error
+
+
+def _failed(bus: can.BusABC, what: str, error: can.CanError) -> Fault:
+    return Fault(
+        f"the bus {what}: {error}",
+        where=f"bus {bus.channel_info}",
+        why="the interface went down, the controller went bus-off, or its queue is full",
+        next_step="the drives stop by themselves; check cable and termination, then start again",
+    )

@@ -1,0 +1,81 @@
+"""How much of a CAN bus the cyclic traffic needs, at worst."""
+
+from __future__ import annotations
+
+import math
+
+from cdpr.errors import Refused
+from cdpr.rig import Rig
+
+MAX_LOAD = 0.70
+"""Above it, a stop frame may wait too long behind others."""
+
+HEARTBEAT_PERIOD = 0.03
+"""Between two heartbeats of the master and of each drive, [s]; two may be lost."""
+
+HEARTBEAT_TIMEOUT = 0.1
+"""Without the heartbeat of master or peer for so long a drive stops itself, [s]."""
+
+_PDO_BYTES = 8
+_SYNC_BYTES = 0
+_HEARTBEAT_BYTES = 1
+
+
+def frame_bits(data_bytes: int) -> int:
+    """Longest a CAN 2.0A data frame can be on the wire, with the space after it, [bit].
+
+    Source: R. I. Davis et al., "Controller Area Network (CAN) schedulability analysis", 2007,
+    Eq. 1: 34 of the 47 bits of overhead and all data bits are stuffed, one bit after each four.
+    """
+    stuffed = 34 + 8 * data_bytes
+    return 47 + 8 * data_bytes + (stuffed - 1) // 4
+
+
+def cycle_bits(drives: int) -> int:
+    """Bits of one cycle: a set-point and a reply a drive and the SYNC, worst stuffing."""
+    return 2 * drives * frame_bits(_PDO_BYTES) + frame_bits(_SYNC_BYTES)
+
+
+def heartbeat_cycles(cycle: float) -> int:
+    """Cycles between two heartbeats of the master; ``cycle`` in [s]."""
+    return max(1, math.floor(HEARTBEAT_PERIOD / cycle + 1e-9))
+
+
+def heartbeat_timeout(cycle: float) -> float:
+    """When a heartbeat is missed, [s]; more than three of its periods, ``cycle`` in [s]."""
+    return max(HEARTBEAT_TIMEOUT, 3.5 * cycle * heartbeat_cycles(cycle))
+
+
+def bus_load(drives: int, cycle: float, bitrate: int) -> float:
+    """Share of the bus that cyclic frames and heartbeats need, worst stuffing.
+
+    Args:
+        drives: Number of drives m.
+        cycle: [s].
+        bitrate: [bit/s].
+    """
+    heartbeats = (drives + 1) * frame_bits(_HEARTBEAT_BYTES) / heartbeat_cycles(cycle)
+    return (cycle_bits(drives) + heartbeats) / (cycle * bitrate)
+
+
+def check_bus_load(rig: Rig) -> float:
+    """The load of a rig's bus.
+
+    Raises:
+        Refused: It is above 70 %.
+    """
+    bus = rig.document.bus
+    cycle = bus.cycle_ms / 1000.0
+    load = bus_load(rig.cable_count, cycle, bus.bitrate)
+    if load > MAX_LOAD:
+        slowest = 1000.0 * cycle * load / MAX_LOAD
+        raise Refused(
+            f"{rig.cable_count} drives every {bus.cycle_ms:g} ms need {load:.0%} of a bus of"
+            f" {bus.bitrate} bit/s; the limit is {MAX_LOAD:.0%}",
+            where=f"rig {rig.name}: bus",
+            why=f"a cycle is {cycle_bits(rig.cable_count)} bits at worst; a stop must get through",
+            next_step=f"set bus.cycle_ms to {math.ceil(10 * slowest) / 10:g} or more,"
+            " or raise the bitrate",
+            values={"load": load, "limit": MAX_LOAD, "cycle_ms": bus.cycle_ms},
+        )
+    return load

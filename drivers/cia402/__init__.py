@@ -1,0 +1,1 @@
+"""CANopen CiA 402 drives in cyclic synchronous position mode."""

@@ -1,0 +1,156 @@
+"""Sets all drives of a rig up and reads every object back; nothing is enabled here."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+
+import can
+
+from cdpr.errors import HardwareMissing, Refused
+from cdpr.rig import Rig
+from cdpr.winches import WinchMap
+from drivers.cia402.frames import NmtCommand
+from drivers.cia402.objects import (
+    AFTER,
+    BEFORE,
+    HEARTBEAT_CONSUMERS,
+    PDO_INVALID,
+    UNUSED_PDOS,
+    Expectation,
+    Setting,
+    heartbeat_consumers,
+    settings_for,
+)
+from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.states import DriveState, state_of
+from drivers.drive_group import Pump
+
+
+def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> None:
+    """Writes and reads back every object of every drive, then starts their process data.
+
+    Raises:
+        HardwareMissing: Drives do not answer; with all their nodes.
+        Refused: A drive is no CiA 402 drive, is enabled already, refuses an object or does not
+            keep it; or another master sends SYNC on this bus.
+        BadInput: A value of the rig does not fit its object.
+        Fault: The bus does not take frames.
+    """
+    winch_map = WinchMap(rig)
+    settings = [settings_for(rig, i, winch_map) for i in range(rig.cable_count)]
+    network = SetupNetwork(bus, pump)
+    network.discard_waiting()
+    nodes = [winch.node_id for winch in rig.winches]
+    _find_all(network, nodes)
+    for drive, node in enumerate(nodes):
+        _check_idle(network, node)
+        network.command(NmtCommand.PRE_OPERATIONAL, node)
+        _write_all(network, node, settings[drive])
+        _watch_heartbeats(network, node, rig, drive)
+        _switch_off_unused(network, node)
+        _expect(network, node, AFTER)
+    if network.foreign_sync:
+        raise Refused(
+            "another program sends SYNC on this bus",
+            where="configuring the drives",
+            why="two masters would move the same drives",
+            next_step="end the other program, or wait until its run is over",
+        )
+    for node in nodes:
+        network.command(NmtCommand.START, node)
+
+
+def _find_all(network: SetupNetwork, nodes: Iterable[int]) -> None:
+    """Every drive answers and is one; the silent ones are named together."""
+    silent: list[HardwareMissing] = []
+    for node in nodes:
+        try:
+            _expect(network, node, BEFORE)
+        except HardwareMissing as error:
+            silent.append(error)
+    if len(silent) > 1:
+        names = ", ".join(str(error.values["node"]) for error in silent)
+        first = silent[0]
+        raise HardwareMissing(
+            f"drives {names} do not answer",
+            where="configuring the drives",
+            why=first.why,
+            next_step=first.next_step,
+            values={"nodes": names},
+        )
+    if silent:
+        raise silent[0]
+
+
+def _expect(network: SetupNetwork, node: int, expectations: Sequence[Expectation]) -> None:
+    for expected in expectations:
+        data = network.client(node).read(expected.index, expected.sub, expected.name)
+        value = int.from_bytes(data, "little")
+        if value & expected.mask != expected.expected:
+            raise _wrong(
+                node, str(expected), f"{value:X}h", f"{expected.expected:X}h", expected.why
+            )
+
+
+def _check_idle(network: SetupNetwork, node: int) -> None:
+    """A drive that is enabled belongs to somebody; one that holds in quick stop may be taken."""
+    data = network.client(node).read(0x6041, 0, "status word")
+    if state_of(int.from_bytes(data, "little")) is DriveState.OPERATION_ENABLED:
+        raise Refused(
+            f"drive {node} is enabled already",
+            where=f"drive {node}, object 6041h:00 status word",
+            why="another program moves it, or it did not stop when its master went away",
+            next_step="end the other program; otherwise press the emergency stop",
+            values={"node": node},
+        )
+
+
+def _write_all(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> None:
+    client = network.client(node)
+    for setting in settings:
+        client.write(setting.index, setting.sub, setting.data(), setting.name)
+        if setting.transient:
+            continue
+        kept = client.read(setting.index, setting.sub, setting.name)
+        if kept != setting.data():
+            found = _number(kept, setting.form)
+            raise _wrong(node, str(setting), found, str(setting.value), setting.why)
+
+
+def _watch_heartbeats(network: SetupNetwork, node: int, rig: Rig, drive: int) -> None:
+    data = network.client(node).read(HEARTBEAT_CONSUMERS, 0, "consumer heartbeat entries")
+    entries = int.from_bytes(data, "little")
+    if entries < 1:
+        raise _wrong(
+            node, "1016h:00 consumer heartbeat entries", "0", "1 or more", "watch the master"
+        )
+    _write_all(network, node, heartbeat_consumers(rig, drive, entries))
+
+
+def _switch_off_unused(network: SetupNetwork, node: int) -> None:
+    """Process data that nobody asked for would only fill the bus."""
+    client = network.client(node)
+    for index in UNUSED_PDOS:
+        data = client.read_if_there(index, 1, "PDO identifier")
+        if data is None or int.from_bytes(data, "little") & PDO_INVALID:
+            continue
+        value = int.from_bytes(data, "little") | PDO_INVALID
+        off = Setting(index, 1, "<I", value, "PDO identifier", "not used, switched off")
+        _write_all(network, node, [off])
+
+
+def _number(data: bytes, form: str) -> str:
+    if len(data) != struct.calcsize(form):
+        return f"{len(data)} bytes ({data.hex()})"
+    return str(struct.unpack(form, data)[0])
+
+
+def _wrong(node: int, place: str, found: str, wanted: str, why: str) -> Refused:
+    return Refused(
+        f"the drive holds {found}, it must hold {wanted}",
+        where=f"drive {node}, object {place}",
+        why=f"needed because: {why}",
+        next_step="look the object up in the drive's manual; the drives stay as they are",
+        values={"node": node, "object": place, "found": found, "wanted": wanted},
+    )

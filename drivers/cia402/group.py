@@ -1,0 +1,366 @@
+"""All CiA 402 drives of a rig as one group: one thread, one bus, one step a cycle."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import can
+import numpy as np
+
+from cdpr.errors import Fault, HardwareMissing, Refused
+from cdpr.rig import Rig
+from drivers.bus import take, transmit
+from drivers.bus_load import check_bus_load, heartbeat_cycles
+from drivers.cia402.configure import configure_drives
+from drivers.cia402.frames import (
+    HEARTBEAT_BASE,
+    MASTER_NODE,
+    RPDO1_BASE,
+    SYNC_ID,
+    NmtState,
+    make_heartbeat,
+    make_set_point,
+    make_sync,
+)
+from drivers.cia402.sequence import Goal, next_words
+from drivers.cia402.states import FAULTED, TORQUE_ON, ControlWord, DriveState
+from drivers.cia402.watch import DriveWatch
+from drivers.drive_group import (
+    Capabilities,
+    Counts,
+    CycleStatus,
+    GroupCommand,
+    GroupState,
+    Pump,
+)
+from drivers.torque import winding_signs
+
+STEP_TIMEOUT = 1.0
+"""For enabling and for powering off, [s]: a brake takes a few tenths to open or close."""
+
+RESET_CYCLES = 10
+"""Cycles a drive has to leave the state FAULT after a reset."""
+
+FIRST_READING_ATTEMPTS = 10
+FIRST_READING_TIMEOUT = 0.1
+"""A drive that was just started may let the first SYNC pass; [s] for each."""
+
+
+class Cia402Group:
+    """CiA 402 drives in cyclic synchronous position mode; see `drivers.drive_group.DriveGroup`."""
+
+    def __init__(self, rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> None:
+        """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
+        check_bus_load(rig)
+        self._rig, self._bus, self._pump = rig, bus, pump
+        self._nodes = tuple(winch.node_id for winch in rig.winches)
+        self._signs = winding_signs(rig)
+        cycle = rig.document.bus.cycle_ms / 1000.0
+        self._heartbeat_cycles = heartbeat_cycles(cycle)
+        self._patience = max(3, round(STEP_TIMEOUT / cycle))
+        self._set_points = [_frame(RPDO1_BASE + node) for node in self._nodes]
+        self._sync = _frame(SYNC_ID, make_sync())
+        alive = make_heartbeat(NmtState.OPERATIONAL)
+        self._heartbeat = _frame(HEARTBEAT_BASE + MASTER_NODE, alive)
+        self._state = GroupState.OFFLINE
+        self._reset_memory()
+
+    def _reset_memory(self) -> None:
+        count = len(self._nodes)
+        self._watch = DriveWatch(self._nodes)
+        self._goal = Goal.IDLE
+        self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
+        self._released = [False] * count
+        self._targets = [0] * count
+        self._demands = [0] * count
+        self._faults: list[tuple[int, str]] = []
+        self._cycle = 0
+        self._cycles_to_goal = 0
+        self._known = False
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """CiA 402 drives as `configure` sets them up; brakes are not declared in the rig file."""
+        return Capabilities(
+            sync=True,
+            holds_on_comm_loss=True,
+            holds_on_quick_stop=True,
+            has_brake=False,
+            max_hz=250.0,
+        )
+
+    @property
+    def state(self) -> GroupState:
+        """Where the group stands."""
+        return self._state
+
+    @property
+    def targets(self) -> Counts:
+        """Targets last sent, shape (m,), [counts]."""
+        return np.array(self._targets, dtype=np.int64)
+
+    def configure(self) -> None:
+        """Sets every drive up and reads every setting back; see `DriveGroup.configure`."""
+        if self._state in (GroupState.ENABLING, GroupState.ENABLED):
+            raise Refused(
+                "the drives are enabled; they cannot be set up now",
+                where="configuring the drives",
+                next_step="stop them first",
+            )
+        self._state = GroupState.OFFLINE
+        self._reset_memory()
+        configure_drives(self._rig, self._bus, self._pump)
+        self._state = GroupState.CONFIGURED
+
+    def read_positions(self, pump: Pump | None = None) -> CycleStatus:
+        """Sends SYNC until every drive has told its position; see `DriveGroup.read_positions`."""
+        for _ in range(FIRST_READING_ATTEMPTS):
+            self.send_cycle(self._watch.positions)
+            if pump is not None:
+                pump()
+            status = self.receive(FIRST_READING_TIMEOUT)
+            if not status.missing.any():
+                return status
+        silent = [n for n, missing in zip(self._nodes, status.missing, strict=True) if missing]
+        names = ", ".join(str(node) for node in silent)
+        raise HardwareMissing(
+            f"no position from drive{'s' if len(silent) > 1 else ''} {names}",
+            where="reading the drives' positions",
+            why="the drive lost power or the bus since it was set up",
+            next_step="check power and wiring, then start again",
+            values={"nodes": names},
+        )
+
+    def send_cycle(self, targets: Sequence[int]) -> None:
+        """Sends one cycle; see `DriveGroup.send_cycle`."""
+        self._online()
+        self._discard_stale()
+        following = self._state is GroupState.ENABLED
+        words = next_words(self._goal, self._watch.states, self._released)
+        self._demands = self._targets if self._known else list(self._watch.positions)
+        if following:
+            self._targets = [int(target) for target in targets]
+        elif ControlWord.ENABLE_OPERATION not in self._words:
+            # Not under power, or held by the drives themselves: the targets follow the drives.
+            # Once enabling has begun they stay, so that a sagging drive is not followed down.
+            self._targets = list(self._watch.positions)
+        self._send_batch(words)
+        self._known = True
+        self._cycle += 1
+        if self._cycle % self._heartbeat_cycles == 0:
+            transmit(self._bus, self._heartbeat)
+
+    def receive(self, timeout_s: float) -> CycleStatus:
+        """Takes the replies of this cycle; see `DriveGroup.receive`."""
+        self._online()
+        if self._pump is not None:
+            self._pump()
+            timeout_s = 0.0
+        self._take_replies(timeout_s)
+        self._watch.end_cycle()
+        self._look_for_faults()
+        self._advance()
+        return self._status()
+
+    def command(self, command: GroupCommand) -> None:
+        """Sets where the group goes; see `DriveGroup.command`."""
+        self._online()
+        if command is GroupCommand.QUICK_STOP:
+            self._stop()
+        elif command is GroupCommand.ENABLE:
+            self._begin_enabling()
+        elif command is GroupCommand.HALT_POWER:
+            self._begin_power_off()
+        else:
+            self._reset_fault()
+
+    def quick_stop_now(self) -> None:
+        """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
+        self._send_batch((ControlWord.QUICK_STOP,) * len(self._nodes))
+        self._stop()
+
+    def close(self) -> None:
+        """Lets go of the bus without sending anything."""
+        self._state = GroupState.OFFLINE
+
+    def _online(self) -> None:
+        if self._state is GroupState.OFFLINE:
+            raise Refused(
+                "the drives are not set up",
+                where="drive group",
+                next_step="call configure() first",
+            )
+
+    def _send_batch(self, words: tuple[ControlWord, ...]) -> None:
+        """One set-point a drive, then SYNC. A frame that fails does not hold up the others."""
+        failure: Fault | None = None
+        for message, word, target in zip(self._set_points, words, self._targets, strict=True):
+            message.data = bytearray(make_set_point(word, target))
+            try:
+                transmit(self._bus, message)
+            except Fault as error:
+                failure = failure or error
+        transmit(self._bus, self._sync)
+        self._words = words
+        self._note_released()
+        self._watch.begin_cycle()
+        if failure is not None:
+            raise failure
+
+    def _note_released(self) -> None:
+        for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):
+            if state is not DriveState.QUICK_STOP_ACTIVE:
+                self._released[drive] = False
+            elif word is ControlWord.QUICK_STOP:
+                self._released[drive] = True
+
+    def _discard_stale(self) -> None:
+        """Replies that came too late for their cycle are thrown away, never used as new ones."""
+        while (message := take(self._bus, 0.0)) is not None:
+            if _is_data(message):
+                self._watch.take(message.arbitration_id, message.data, stale=True)
+
+    def _take_replies(self, timeout: float) -> None:
+        deadline = time.monotonic() + timeout
+        left = timeout
+        while not self._watch.complete:
+            message = take(self._bus, left)
+            if message is None:
+                return
+            if _is_data(message):
+                self._watch.take(message.arbitration_id, message.data)
+            left = max(0.0, deadline - time.monotonic()) if timeout else 0.0
+
+    def _look_for_faults(self) -> None:
+        powered = self._goal in (Goal.ENABLE, Goal.POWER_OFF)
+        found = self._watch.news()
+        if not powered:  # an emergency of a drive that moves nothing becomes its state's reason
+            found = [(node, text) for node, text in found if node in self._watch.restarted]
+        dropped = self._watch.dropped()
+        if self._goal is Goal.ENABLE:
+            found += dropped
+        found += self._watch.state_faults(powered=powered)
+        if self._goal is not Goal.RESET_FAULT:
+            self._latch(found)
+
+    def _latch(self, found: list[tuple[int, str]]) -> None:
+        for fault in found:
+            if fault not in self._faults:
+                self._faults.append(fault)
+        if found:
+            self._goal, self._state = Goal.STOP, GroupState.FAULT
+
+    def _advance(self) -> None:
+        """Sees whether the goal is reached, or was not in time."""
+        states = self._watch.states
+        self._cycles_to_goal += 1
+        if self._goal is Goal.RESET_FAULT:
+            if self._cycles_to_goal > RESET_CYCLES or DriveState.FAULT not in states:
+                self._goal = Goal.IDLE
+        elif self._state is GroupState.ENABLING:
+            if all(state is DriveState.OPERATION_ENABLED for state in states):
+                self._state = GroupState.ENABLED
+            elif self._cycles_to_goal > self._patience:
+                self._latch(self._late(DriveState.OPERATION_ENABLED))
+        elif self._goal is Goal.POWER_OFF:
+            if all(_is_off(state) for state in states):
+                self._goal, self._state = Goal.IDLE, GroupState.DISABLED
+            elif self._cycles_to_goal > self._patience:
+                self._latch(self._late(DriveState.READY_TO_SWITCH_ON))
+
+    def _late(self, wanted: DriveState) -> list[tuple[int, str]]:
+        return [
+            (node, f"drive {node} stays in {state.value} on the way to {wanted.value}")
+            for node, state in zip(self._nodes, self._watch.states, strict=True)
+            if state is not wanted
+        ]
+
+    def _status(self) -> CycleStatus:
+        watch = self._watch
+        positions = np.array(watch.positions, dtype=np.int64)
+        demands = np.array(self._demands, dtype=np.int64)
+        torques = np.array(watch.torques, dtype=np.int64) * self._signs
+        words = np.array(watch.status_words, dtype=np.int64)
+        missing = ~np.array(watch.answered)
+        for array in (positions, demands, torques, words, missing):
+            array.setflags(write=False)
+        return CycleStatus(
+            positions=positions,
+            demands=demands,
+            torques=torques,
+            status_words=words,
+            missing=missing,
+            faults=tuple(self._faults),
+            state=self._state,
+            holding=all(
+                s in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+                for s in watch.states
+            ),
+            rejected=watch.rejected,
+        )
+
+    def _stop(self) -> None:
+        self._goal = Goal.STOP
+        if self._state not in (GroupState.FAULT, GroupState.OFFLINE):
+            self._state = GroupState.QUICK_STOP
+
+    def _begin_enabling(self) -> None:
+        if self._state is GroupState.ENABLED:
+            return
+        self._refuse_latched("enable the drives")
+        self._goal, self._state, self._cycles_to_goal = Goal.ENABLE, GroupState.ENABLING, 0
+
+    def _begin_power_off(self) -> None:
+        self._refuse_latched("take the torque off")
+        self._goal, self._cycles_to_goal = Goal.POWER_OFF, 0
+        if self._state in (GroupState.ENABLING, GroupState.ENABLED):
+            self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
+
+    def _refuse_latched(self, wish: str) -> None:
+        if self._state is not GroupState.FAULT:
+            return
+        raise Refused(
+            f"cannot {wish}: a fault is latched",
+            where="drive group",
+            why="; ".join(text for _, text in self._faults),
+            next_step="find the cause, then reset the fault",
+        )
+
+    def _reset_fault(self) -> None:
+        """Clears the latch; a drive in fault is reset only when no other holds the platform."""
+        states = self._watch.states
+        restarted = sorted(self._watch.restarted)
+        if restarted:
+            raise Refused(
+                f"drive {restarted[0]} restarted: its set-up and its position are lost",
+                where="drive group",
+                next_step="set the drives up again and check the reference (home) positions",
+            )
+        faulted = [n for n, s in zip(self._nodes, states, strict=True) if s in FAULTED]
+        if faulted and any(s in TORQUE_ON for s in states):
+            raise Refused(
+                f"drive {faulted[0]} cannot be reset while other drives hold the platform",
+                where="drive group",
+                why="resetting one drive of a platform under tension moves it",
+                next_step="support the platform, press the emergency stop so that no drive holds,"
+                " release it, then reset the fault",
+            )
+        self._cycles_to_goal = 0
+        self._faults.clear()
+        self._watch.forget_emergencies()
+        if self._state is GroupState.FAULT:
+            self._goal = Goal.RESET_FAULT if faulted else Goal.STOP
+            self._state = GroupState.CONFIGURED if faulted else GroupState.QUICK_STOP
+
+
+def _frame(can_id: int, data: bytes = b"") -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+def _is_data(message: can.Message) -> bool:
+    return not (message.is_extended_id or message.is_error_frame or message.is_remote_frame)
+
+
+def _is_off(state: DriveState) -> bool:
+    return state in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)

@@ -1,0 +1,140 @@
+"""What the drives told, and what of it is a fault of the group. No bus, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drivers.cia402.frames import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    TPDO1_BASE,
+    NmtState,
+    Reply,
+    parse_emergency,
+    parse_heartbeat,
+    parse_reply,
+)
+from drivers.cia402.states import FAULTED, DriveState, state_of
+from drivers.cia402.texts import emergency_text
+
+MISSED_REPLIES = 3
+"""Replies in a row that a drive under power must not miss."""
+
+
+class DriveWatch:
+    """The last word of every drive: replies, emergencies, heartbeats."""
+
+    def __init__(self, nodes: Sequence[int]) -> None:
+        """Takes the node ids in the order of the winches."""
+        count = len(nodes)
+        self.nodes = tuple(nodes)
+        self.status_words = [0] * count
+        self.positions = [0] * count
+        self.torques = [0] * count
+        self.states = [DriveState.NOT_READY] * count
+        self.answered = [False] * count
+        self.missed = [0] * count
+        self.rejected = 0
+        self.restarted: set[int] = set()
+        self._news: list[tuple[int, str]] = []
+        self._dropped: list[tuple[int, str]] = []
+        self._emergencies: dict[int, str] = {}
+        self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
+        self._others = {EMCY_BASE + node: self._emergency for node in nodes}
+        self._others |= {HEARTBEAT_BASE + node: self._heartbeat for node in nodes}
+
+    def begin_cycle(self) -> None:
+        """From now on replies count for a new cycle."""
+        self.answered = [False] * len(self.nodes)
+
+    def end_cycle(self) -> None:
+        """Counts the replies that did not come."""
+        self.missed = [
+            0 if answered else missed + 1
+            for answered, missed in zip(self.answered, self.missed, strict=True)
+        ]
+
+    @property
+    def complete(self) -> bool:
+        """Every drive has answered in this cycle."""
+        return all(self.answered)
+
+    def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
+        """Takes in one frame.
+
+        Args:
+            can_id: Its identifier.
+            data: Its data.
+            stale: A reply in it belongs to a cycle that is over and is thrown away.
+        """
+        drive = self._replies.get(can_id)
+        if drive is None:
+            other = self._others.get(can_id)
+            if other is not None:
+                other(can_id & 0x7F, data)
+            return
+        reply = parse_reply(data)
+        if reply is None:
+            self.rejected += 1
+        elif not stale:
+            self._note(drive, reply)
+
+    def _note(self, drive: int, reply: Reply) -> None:
+        self.status_words[drive], self.positions[drive], self.torques[drive] = reply
+        self.answered[drive] = True
+        state, before = state_of(reply.status_word), self.states[drive]
+        self.states[drive] = state
+        if before is DriveState.OPERATION_ENABLED and state is not before:
+            node = self.nodes[drive]
+            self._dropped.append((node, f"drive {node} stopped by itself: {state.value}"))
+
+    def news(self) -> list[tuple[int, str]]:
+        """Emergencies, restarts and NMT states told since the last call, by node."""
+        news, self._news = self._news, []
+        return news
+
+    def dropped(self) -> list[tuple[int, str]]:
+        """Drives that left OPERATION ENABLED since the last call, by node."""
+        dropped, self._dropped = self._dropped, []
+        return dropped
+
+    def state_faults(self, *, powered: bool) -> list[tuple[int, str]]:
+        """What is wrong with the drives as they stand, by node.
+
+        Args:
+            powered: The group is under power or on its way there; silence is a fault then.
+        """
+        found: list[tuple[int, str]] = []
+        for node, state, missed in zip(self.nodes, self.states, self.missed, strict=True):
+            if state in FAULTED:
+                cause = self._emergencies.get(node, "it sent no reason")
+                found.append((node, f"drive {node} is in {state.value}: {cause}"))
+            if powered and missed >= MISSED_REPLIES:
+                found.append((node, f"drive {node} does not answer"))
+        return found
+
+    def forget_emergencies(self) -> None:
+        """After a reset by the operator."""
+        self._emergencies.clear()
+        self._news.clear()
+
+    def _emergency(self, node: int, data: bytes | bytearray) -> None:
+        message = parse_emergency(data)
+        if message is None:
+            self.rejected += 1
+        elif message.code & 0xFF00:
+            text = emergency_text(message.code)
+            self._emergencies[node] = text
+            self._news.append((node, f"drive {node}: {text}"))
+
+    def _heartbeat(self, node: int, data: bytes | bytearray) -> None:
+        state = parse_heartbeat(data)
+        if state is None:
+            self.rejected += 1
+        elif state == NmtState.BOOT_UP:
+            self.restarted.add(node)
+            self._news.append(
+                (node, f"drive {node} restarted: its set-up and its position are lost")
+            )
+        elif state != NmtState.OPERATIONAL:
+            self._news.append((node, f"drive {node} left the NMT state operational"))

@@ -1,0 +1,198 @@
+"""What the executor sees of the drives, whatever their protocol: one group, commanded together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Protocol
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.rig import Rig
+
+Counts = NDArray[np.int64]
+Pump = Callable[[], None]
+"""Lets drives that live in the caller's process work off what the bus holds for them."""
+
+
+class GroupState(Enum):
+    """Where the whole group stands; it never moves towards power without a command."""
+
+    OFFLINE = auto()
+    """Not configured."""
+    CONFIGURED = auto()
+    """Set up and read back; positions are valid after the first cycle; no drive is enabled."""
+    ENABLING = auto()
+    """On the way to ENABLED; each drive is told to stay where it is."""
+    ENABLED = auto()
+    """All drives follow the set-points."""
+    QUICK_STOP = auto()
+    """All drives were told to stop and hold under torque."""
+    FAULT = auto()
+    """As QUICK_STOP, because of a fault; latched until RESET_FAULT."""
+    DISABLED = auto()
+    """Powered off in order: operation disabled, brakes closed, torque off."""
+
+
+class GroupCommand(Enum):
+    """What an operator or the executor may ask of the group."""
+
+    ENABLE = auto()
+    QUICK_STOP = auto()
+    HALT_POWER = auto()
+    """Disable operation, then shut down once every drive has closed its brake."""
+    RESET_FAULT = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What drives do by themselves; arming decides on it.
+
+    Attributes:
+        sync: All drives take their set-points at one SYNC.
+        holds_on_comm_loss: A drive that loses its master stops and holds under torque.
+        holds_on_quick_stop: A quick stop ends in holding under torque.
+        has_brake: Every winch has a brake that closes before the torque goes.
+        max_hz: Highest tested rate of cycles, [Hz].
+    """
+
+    sync: bool
+    holds_on_comm_loss: bool
+    holds_on_quick_stop: bool
+    has_brake: bool
+    max_hz: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleStatus:
+    """What the drives told in one cycle; arrays are read-only and in the order of the winches.
+
+    Attributes:
+        positions: Actual positions at the cycle's SYNC, shape (m,), [counts]; the last known one
+            where a drive is missing.
+        demands: Positions that the drives were to reach by this SYNC, shape (m,), [counts]: the
+            targets of one cycle before. `positions - demands` is the following error.
+        torques: Actual torques, positive where they pull the cable in, shape (m,), [per mille of
+            rated torque]. Tension at rest is torque / 1000 times the winch's `torque_constant`.
+        status_words: As received, shape (m,).
+        missing: True for drives that did not answer in this cycle, shape (m,).
+        faults: Node and text of every fault since the last reset, oldest first.
+        state: State of the group.
+        holding: Every drive holds under torque (enabled or in quick stop).
+        rejected: Replies thrown away since `configure` because their length was wrong.
+    """
+
+    positions: Counts
+    demands: Counts
+    torques: Counts
+    status_words: Counts
+    missing: NDArray[np.bool_]
+    faults: tuple[tuple[int, str], ...]
+    state: GroupState
+    holding: bool
+    rejected: int
+
+
+class DriveGroup(Protocol):
+    """All drives of a rig, enabled, moved and stopped together."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What the drives do by themselves."""
+        ...
+
+    @property
+    def state(self) -> GroupState:
+        """Where the group stands."""
+        ...
+
+    @property
+    def targets(self) -> Counts:
+        """Targets last sent, shape (m,), [counts]; motion after ENABLING starts from them."""
+        ...
+
+    def configure(self) -> None:
+        """Sets every drive up and reads every setting back.
+
+        Raises:
+            HardwareMissing: A drive does not answer.
+            Refused: A drive refuses a setting, does not keep it, or is being moved by another.
+        """
+        ...
+
+    def read_positions(self, pump: Pump | None = None) -> CycleStatus:
+        """Sends SYNC until every drive has told its position; changes no drive's state.
+
+        Args:
+            pump: As for `make_drive_group`; not needed when it was given there.
+
+        Raises:
+            HardwareMissing: A drive does not answer; with its node.
+            Fault: The bus failed.
+        """
+        ...
+
+    def send_cycle(self, targets: Sequence[int]) -> None:
+        """Sends one cycle: set-points, SYNC, and the master's heartbeat when it is due.
+
+        Args:
+            targets: One position a drive, [counts]. They count in state ENABLED; in every other
+                state each drive is told to stay where it is.
+
+        Raises:
+            Fault: The bus did not take a frame.
+        """
+        ...
+
+    def receive(self, timeout_s: float) -> CycleStatus:
+        """Takes the replies of this cycle until all are there or the time is over.
+
+        Args:
+            timeout_s: [s]; 0 takes only what has already arrived.
+
+        Raises:
+            Fault: The bus failed.
+        """
+        ...
+
+    def command(self, command: GroupCommand) -> None:
+        """Sets where the group goes; the way is one step a cycle, all drives together.
+
+        Raises:
+            Refused: The command would leave the platform less safe than it is.
+        """
+        ...
+
+    def quick_stop_now(self) -> None:
+        """Sends the stop to all drives in one batch; waits for nothing.
+
+        Raises:
+            Fault: The bus did not take a frame; the others were sent all the same.
+        """
+        ...
+
+    def close(self) -> None:
+        """Lets go of the bus without sending anything; the bus itself is the caller's."""
+        ...
+
+
+def make_drive_group(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveGroup:
+    """The drives of a rig, not yet configured.
+
+    Args:
+        rig: The robot; its winches name the nodes.
+        bus: An open bus; it stays the caller's.
+        pump: Given when the drives are simulated in this process (`Rehearsal.pump`): called
+            wherever an answer is waited for, and nothing is waited for after it.
+
+    Raises:
+        Refused: The bus is too slow for the rig's cycle.
+        BadInput: The rig's numbers do not fit the drives' objects.
+    """
+    # The protocol's library is loaded only by those who talk to drives.
+    from drivers.cia402.group import Cia402Group
+
+    return Cia402Group(rig, bus, pump)
