@@ -1,0 +1,314 @@
+"""From pictures to poses of the platform."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cdpr.errors import BadInput
+from cdpr.poses import Array, Pose, read_only
+from cdpr.rig import Camera, Rig, Tag
+from tracking.bits import carries_tag
+from tracking.bundle import BundlePose, TagView, solve_bundle
+from tracking.camera_check import CameraCheck, refuse_moved_camera
+from tracking.detector import Detection, Image, Region, TagDetector
+from tracking.edges import refine
+from tracking.marks import modules_across, tag_corners
+from tracking.measurement import NoPose, Observation, PoseMeasurement
+from tracking.projection import pixels_from_ideal, pixels_of
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerSettings:
+    """When a pose is believed.
+
+    Attributes:
+        reprojection_px: Largest RMS error of the corners.
+        view_angle: Tags seen more aslant than this are left out, [rad].
+        position_deviation: Largest standard deviation of the position along any direction, [m].
+        jump: Largest way from the last pose beside what speed allows, [m].
+        jump_angle: Largest turn from the last pose, [rad].
+        speed: Fastest the platform is expected to go, [m/s].
+        single_tag_margin: By how much, in variances, a single tag's pose must fit better than its
+            mirror pose.
+        camera_moved_px: Frame tags farther off than this mean that the camera was moved.
+        camera_check_period: Pictures between checks of the camera.
+    """
+
+    reprojection_px: float = 1.0
+    view_angle: float = float(np.radians(76.0))
+    position_deviation: float = 0.01
+    jump: float = 0.03
+    jump_angle: float = 0.25
+    speed: float = 0.2
+    single_tag_margin: float = 30.0
+    camera_moved_px: float = 1.0
+    camera_check_period: int = 10
+
+
+class Tracker:
+    """Measures the platform's pose in one camera's pictures, one after the other.
+
+    The last pose says where to look next; without it, or when that fails, the whole picture is
+    searched. Tags on the frame show whether the camera still stands where the rig file says.
+
+    Args:
+        rig: Its tags and platform.
+        camera: The camera that took the pictures.
+        settings: When a pose is believed.
+
+    Raises:
+        BadInput: The rig has no tags.
+    """
+
+    def __init__(self, rig: Rig, camera: Camera, settings: TrackerSettings | None = None) -> None:
+        if not rig.platform_tags:
+            raise BadInput(
+                "the rig has no tags on its platform, so no camera can measure it",
+                where=f"rig {rig.name}",
+                next_step="add a `tags` section to the rig file",
+            )
+        self.rig, self.camera = rig, camera
+        self.settings = settings or TrackerSettings()
+        self.camera_check: CameraCheck | None = None
+        self._detector = TagDetector(rig.tag_family)
+        self._modules = modules_across(rig.tag_family)
+        self._platform = {tag.id: tag for tag in rig.platform_tags}
+        self._frame = {tag.id: tag for tag in rig.frame_tags}
+        self._camera_from_world = camera.world_from_camera.inverse()
+        self._last: PoseMeasurement | None = None
+        self._pictures = 0
+
+    @property
+    def expected_tags(self) -> tuple[int, ...]:
+        """Numbers of the platform's tags."""
+        return tuple(self._platform)
+
+    def forget(self) -> None:
+        """Searches the whole of the next picture."""
+        self._last = None
+
+    def observe(self, image: Image, time: float) -> Observation:
+        """Measures the platform in a picture.
+
+        Args:
+            image: Grey picture of the camera's size.
+            time: When it was taken, [s].
+
+        Raises:
+            BadInput: The picture is not a grey one of the camera's size.
+            CameraMoved: The frame tags are not where they should be.
+        """
+        self._refuse_wrong_size(image)
+        self._pictures += 1
+        result: Observation | None = None
+        if self._last is not None:
+            result = self._follow(image, time, self._last)
+        if result is None:
+            result = self._search(image, time)
+        elif self._pictures % self.settings.camera_check_period == 0:
+            self._check_camera(image, self._frame_detections(image))
+        self._last = result if isinstance(result, PoseMeasurement) else None
+        return result
+
+    def _refuse_wrong_size(self, image: Image) -> None:
+        wanted = (self.camera.height, self.camera.width)
+        if image.shape != wanted or image.dtype != np.uint8:
+            size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))
+            raise BadInput(
+                f"a picture has {size} px ({image.dtype}, {image.ndim} dimensions); camera"
+                f" {self.camera.name!r} takes grey 8-bit pictures of {wanted[1]} x {wanted[0]} px",
+                where=f"rig {self.rig.name}",
+                next_step="use pictures of this camera in full size, or mend the rig file",
+            )
+
+    def _follow(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
+        """The pose near the last one, or None when it must be searched for."""
+        region = self._platform_region(last.pose)
+        detections = self._detector.detect(image, region) if region is not None else []
+        found = self._measure(image, time, detections, last.pose, "tracked")
+        if isinstance(found, NoPose) or not self._reachable(found, last):
+            return None
+        return found
+
+    def _search(self, image: Image, time: float) -> Observation:
+        detections = self._detector.detect(image)
+        self._check_camera(image, detections)
+        return self._measure(image, time, detections, None, "found")
+
+    def _reachable(self, found: PoseMeasurement, last: PoseMeasurement) -> bool:
+        limit = self.settings.jump + self.settings.speed * abs(found.time - last.time)
+        if found.pose.distance_to(last.pose) > limit:
+            return False
+        return found.pose.angle_to(last.pose) <= self.settings.jump_angle
+
+    def _platform_region(self, pose: Pose) -> Region | None:
+        """The pixels around the platform at a pose, or None out of view."""
+        corners = self._camera_from_world.apply(pose.apply(self.rig.platform_corners))
+        if np.any(corners[:, 2] < 0.02):
+            return None
+        return self._region(pixels_of(self.camera, corners), slack=0.2)
+
+    def _region(self, pixels: Array, slack: float) -> Region | None:
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        border = slack * (high - low).max() + 8.0
+        size = np.array([self.camera.width, self.camera.height])
+        left, top = np.clip(np.floor(low - border), 0, size).astype(int).tolist()
+        right, bottom = np.clip(np.ceil(high + border), 0, size).astype(int).tolist()
+        if right - left < 16 or bottom - top < 16:
+            return None
+        return Region(left, top, right, bottom)
+
+    def _frame_detections(self, image: Image) -> list[Detection]:
+        """Frame tags near where they should be."""
+        found = []
+        for tag in self._frame.values():
+            corners = self._camera_from_world.apply(tag_corners(tag))
+            if np.any(corners[:, 2] < 0.02):
+                continue
+            region = self._region(pixels_of(self.camera, corners), slack=0.5)
+            if region is not None:
+                found += [d for d in self._detector.detect(image, region) if d.id == tag.id]
+        return found
+
+    def _check_camera(self, image: Image, detections: Sequence[Detection]) -> None:
+        views = self._views(image, detections, self._frame)
+        limit = self.settings.camera_moved_px
+        check = refuse_moved_camera(self.camera, views, limit)
+        self.camera_check = check or self.camera_check
+
+    def _views(
+        self, image: Image, detections: Sequence[Detection], tags: dict[int, Tag]
+    ) -> list[TagView]:
+        """The refined squares of those detections that are among ``tags``."""
+        mine = [d for d in detections if d.id in tags]
+        corners = np.array([d.corners for d in mine]).reshape(-1, 4, 2)
+        squares = refine(image, self.camera, corners, self._modules)
+        pairs = zip(mine, squares, strict=True)
+        return [TagView(tags[d.id], square) for d, square in pairs if square is not None]
+
+    def _measure(
+        self,
+        image: Image,
+        time: float,
+        detections: Sequence[Detection],
+        expected: Pose | None,
+        status: str,
+    ) -> Observation:
+        seen = tuple(d.id for d in detections)
+        views = self._views(image, detections, self._platform)
+        prior = None if expected is None else self._camera_from_world.compose(expected)
+        first = solve_bundle(self.camera, views, prior) if views else None
+        start = prior if first is None else first.camera_from_body
+        if start is None:
+            return NoPose(time, self._why_nothing(seen), seen)
+        views += self._looked_for(image, start, {v.tag.id for v in views})
+        fitted = self._fitted(views, start)
+        if fitted is None:
+            return NoPose(time, "no tag of the platform fits a pose", seen)
+        views, bundle = fitted
+        reason = self._doubt(views, bundle, prior)
+        if reason:
+            return NoPose(time, reason, seen)
+        return self._measurement(time, views, bundle, status)
+
+    def _why_nothing(self, seen: tuple[int, ...]) -> str:
+        wanted = ", ".join(map(str, self._platform))
+        others = [number for number in seen if number not in self._frame]
+        also = f"; seen instead: {', '.join(map(str, others))}" if others else ""
+        return f"no tag of the platform ({self.rig.tag_family} {wanted}) is to be seen{also}"
+
+    def _looked_for(self, image: Image, pose: Pose, known: set[int]) -> list[TagView]:
+        """Tags that the detector missed, looked for where a pose puts them.
+
+        A cable across the white border breaks the detector's outline, not the square's edges.
+        """
+        missed = [t for t in self.rig.platform_tags if t.id not in known and self._faces(t, pose)]
+        rough = [pixels_of(self.camera, pose.apply(tag_corners(tag))) for tag in missed]
+        squares = refine(image, self.camera, np.array(rough).reshape(-1, 4, 2), self._modules)
+        views = []
+        for tag, square in zip(missed, squares, strict=True):
+            if square is None:
+                continue
+            corners = pixels_from_ideal(self.camera, square.corners)
+            if carries_tag(image, corners, self.rig.tag_family, tag.id):
+                views.append(TagView(tag, square))
+        return views
+
+    def _faces(self, tag: Tag, camera_from_platform: Pose) -> bool:
+        """Whether the camera sees a tag's front, not too much aslant."""
+        camera_from_tag = camera_from_platform.compose(tag.pose)
+        away = camera_from_tag.position / np.linalg.norm(camera_from_tag.position)
+        return bool(-camera_from_tag.rotation[:, 2] @ away > np.cos(self.settings.view_angle))
+
+    def _fitted(self, views: list[TagView], start: Pose) -> tuple[list[TagView], BundlePose] | None:
+        """The pose of all views, without tags seen aslant and edges that do not belong."""
+        views = [view for view in views if self._faces(view.tag, start)]
+        for _ in range(4):
+            bundle = solve_bundle(self.camera, views, start) if views else None
+            if bundle is None:
+                return None
+            kept = _without_outliers(views, bundle)
+            if kept is None:
+                return views, bundle
+            views, start = kept, bundle.camera_from_body
+        return None
+
+    def _doubt(self, views: list[TagView], bundle: BundlePose, prior: Pose | None) -> str:
+        """Why a pose is not believed, empty when it is."""
+        limits = self.settings
+        if bundle.reprojection > limits.reprojection_px:
+            return (
+                f"the corners fit to {bundle.reprojection:.2f} px only,"
+                f" the limit is {limits.reprojection_px:g} px"
+            )
+        if len(views) == 1 and bundle.rival_cost - bundle.cost < limits.single_tag_margin:
+            near = prior is not None and prior.angle_to(bundle.camera_from_body) < 0.1
+            if not near:
+                return f"only tag {views[0].tag.id} is to be seen, and it allows two poses"
+        largest = float(np.sqrt(np.linalg.norm(bundle.covariance[:3, :3], 2)))
+        if not largest <= limits.position_deviation:
+            return (
+                f"the position is uncertain to {largest * 1e3:.1f} mm,"
+                f" the limit is {limits.position_deviation * 1e3:g} mm"
+            )
+        return ""
+
+    def _measurement(
+        self, time: float, views: list[TagView], bundle: BundlePose, status: str
+    ) -> PoseMeasurement:
+        turn = np.kron(np.eye(2), self.camera.world_from_camera.rotation)
+        return PoseMeasurement(
+            time,
+            self.camera.world_from_camera.compose(bundle.camera_from_body),
+            read_only(turn @ bundle.covariance @ turn.T),
+            tuple(sorted(view.tag.id for view in views)),
+            bundle.reprojection,
+            status,
+        )
+
+
+def _without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] | None:
+    """Views without edges that lie far off beside the others, or None when all belong."""
+    errors = bundle.edge_errors
+    measured = np.array([view.seen.edges for view in views])
+    usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # of two normal errors
+    off = measured & (errors > 6.0 * usual)
+    if not off.any():
+        return None
+    kept = []
+    for view, wrong in zip(views, off, strict=True):
+        edges = view.seen.edges & ~wrong
+        if edges.sum() < 2:
+            continue
+        keep = np.repeat(edges, 2)
+        seen = replace(
+            view.seen,
+            edges=edges,
+            whitening=read_only(view.seen.whitening * keep[:, None]),
+            target=read_only(view.seen.target * keep),
+        )
+        kept.append(TagView(view.tag, seen))
+    return kept
