@@ -47,6 +47,10 @@ class CdprError(Exception):
             parts.append(f"  next: {self.next_step}")
         return "\n".join(parts)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Travels between processes whole, whatever arguments a subclass takes."""
+        return _restored, (type(self), self.args, self.__dict__)
+
     def as_dict(self) -> dict[str, object]:
         """The same message for `--json`."""
         return {
@@ -58,6 +62,12 @@ class CdprError(Exception):
             "next_step": self.next_step,
             "values": self.values,
         }
+
+
+def _restored(kind: type[CdprError], args: tuple[object, ...], state: dict[str, object]) -> object:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(state)
+    return error
 
 
 class Fault(CdprError):
@@ -120,9 +130,7 @@ class InvalidFile(BadInput):
 
     code = "invalid_file"
 
-    def __init__(
-        self, path: str, problems: Sequence[Problem], next_step: str = ""
-    ) -> None:
+    def __init__(self, path: str, problems: Sequence[Problem], next_step: str = "") -> None:
         self.path = path
         self.problems = tuple(problems)
         count = len(self.problems)

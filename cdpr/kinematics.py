@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpr.cables import Cables, cables_at
+from cdpr.cables import Cables, cables_at, cables_to
 from cdpr.errors import Fault
 from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
 from cdpr.rig import Rig
@@ -76,9 +76,7 @@ def forward_kinematics(
     starts = [guess] if guess is not None else _cold_starts(rig)
     best: ForwardSolution | None = None
     for start in starts:
-        found = _levenberg_marquardt(
-            rig, np.asarray(lengths, dtype=np.float64), start, tolerance
-        )
+        found = _levenberg_marquardt(rig, np.asarray(lengths, dtype=np.float64), start, tolerance)
         if found is None:
             continue
         if best is None or found.worst < best.worst:
@@ -93,6 +91,36 @@ def forward_kinematics(
             next_step="check the drive positions and the reference (home) counts",
         )
     return best
+
+
+def poses_near(
+    rig: Rig, lengths: Array, positions: Array, rotations: Array, *, steps: int = 4
+) -> tuple[Array, Array]:
+    """Forward kinematics of many poses at once, each near a known one (Gauss–Newton).
+
+    Args:
+        rig: The robot, with point exits or pulleys.
+        lengths: Shape (n, m), [m].
+        positions: Guesses, world frame, shape (n, 3), [m].
+        rotations: Guesses, ``world_from_platform``, shape (n, 3, 3).
+        steps: Gauss–Newton steps; each squares an error of millimetres, so four reach round-off.
+
+    Returns:
+        Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
+    """
+    scale = _step_scale(rig)
+    for _ in range(steps):
+        anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
+        cables = cables_to(rig, anchors)
+        matrices = structure_matrix_of(cables, positions) * scale[:, None]
+        residuals = cables.lengths - lengths
+        normal = matrices @ np.swapaxes(matrices, 1, 2)
+        right = matrices @ residuals[:, :, None]
+        twists = np.linalg.solve(normal, right)[:, :, 0] * scale
+        positions = positions + twists[:, :3]
+        turns = np.array([matrix_from_rotation_vector(v) for v in twists[:, 3:]])
+        rotations = turns @ rotations
+    return positions, rotations
 
 
 def _cold_starts(rig: Rig) -> list[Pose]:
@@ -119,9 +147,7 @@ def _levenberg_marquardt(
     for iteration in range(1, 101):
         jacobian = -structure_matrix(rig, pose).T * scale
         normal = jacobian.T @ jacobian
-        step = scale * np.linalg.solve(
-            normal + damping * np.eye(6), -(jacobian.T @ residual)
-        )
+        step = scale * np.linalg.solve(normal + damping * np.eye(6), -(jacobian.T @ residual))
         candidate = _moved(pose, step)
         trial = _residual(rig, candidate, lengths)
         if trial is not None and trial @ trial <= residual @ residual:
@@ -150,6 +176,4 @@ def _residual(rig: Rig, pose: Pose, lengths: Array) -> Array | None:
 
 def _moved(pose: Pose, step: Array) -> Pose:
     """The pose after a small twist, shape (6,): translation [m], rotation in the world [rad]."""
-    return Pose(
-        pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation
-    )
+    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)

@@ -233,17 +233,20 @@ class Loop:
         if not verdict.allowed:
             self._fault("gate_denied", f"the safety gate denied a set-point: {verdict.reason}")
             return None
-        # A drive answers a SYNC with where it is then: what it was told the cycle before.
-        due = self._targets or targets
         self._group.send_cycle(targets)
         self._targets = targets
         self._pump()
         status = self._group.receive(self._clock.time_left())
         self._actual = tuple(int(p) for p in status.positions)
-        errors = (np.array(self._actual) - np.array(due)) / self._per_metre
+        errors = self._following_errors(status)
         self._record(status, errors, lateness)
         self._judge(status, errors, lateness)
         return status
+
+    def _following_errors(self, status: CycleStatus) -> Array:
+        """Signed, in cable length, shape (m,), [m]."""
+        errors: Array = (status.positions - status.demands) / self._per_metre
+        return errors
 
     def _request(self, purpose: Purpose, targets: tuple[int, ...]) -> Request:
         return Request(
@@ -318,8 +321,7 @@ class Loop:
             self._pump()
             status = self._group.receive(self._clock.time_left())
             self._actual = tuple(int(p) for p in status.positions)
-            errors = (np.array(self._actual) - np.array(self._targets)) / self._per_metre
-            self._record(status, errors, lateness)
+            self._record(status, self._following_errors(status), lateness)
 
     def _tell(self, code: str, text: str) -> None:
         """Once for the same sentence."""

@@ -1,0 +1,115 @@
+"""Opens the camera of a run, real or synthetic, in its own process."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING
+
+from cdpr.errors import BadInput
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from cdpr.rig import Camera, Rig
+    from cdpr.rig_file import RigDocument
+    from cdpr.scene import Scene
+    from cdpr.scene_file import SceneDocument
+    from executor.camera_process import CameraProcess
+    from executor.observer import Observer
+
+SYNTHETIC = "synthetic"
+#: About so many pictures of a run are kept for its report.
+KEPT_PICTURES = 12
+
+
+def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool) -> str | None:
+    """Where pictures come from: ``synthetic``, a camera's index or address, or None.
+
+    Raises:
+        BadInput: The wish cannot be met; nothing is left out silently.
+    """
+    if without:
+        if wanted is not None:
+            raise BadInput("--camera and --no-camera contradict each other")
+        return None
+    if not rig.cameras or not rig.platform_tags:
+        raise BadInput(
+            "the rig file has no camera or no tags",
+            where=rig.name,
+            next_step="add cameras and tags to the rig file, or pass --no-camera",
+        )
+    if wanted is None:
+        if not in_process:
+            raise BadInput(
+                "no camera was named",
+                where="--camera",
+                why="the drives are not simulated in this process, so no picture can be rendered",
+                next_step="pass --camera INDEX for a real camera, or --no-camera",
+            )
+        return SYNTHETIC
+    if wanted == SYNTHETIC and not in_process:
+        raise BadInput(
+            "the synthetic camera needs drives that are simulated in this process",
+            where="--camera",
+            next_step="use the interface 'virtual', a real camera, or --no-camera",
+        )
+    return wanted
+
+
+@contextmanager
+def open_camera(
+    rig: Rig, scene: Scene, name: str | None, folder: Path, pictures: int, simulated_time: bool
+) -> Iterator[CameraProcess | None]:
+    """Starts the camera's process; None without a camera.
+
+    Args:
+        rig: The robot; its first camera is used.
+        scene: What the camera sees beside it.
+        name: From `choose_camera`.
+        folder: The run folder.
+        pictures: How many are expected; some of them are kept.
+        simulated_time: A late picture holds the run up instead of being dropped.
+    """
+    if name is None:
+        yield None
+        return
+    from executor.camera_process import CameraProcess
+
+    keep_every = max(1, pictures // KEPT_PICTURES)
+    make = partial(make_observer, rig.document, scene.document, name, folder, keep_every)
+    process = CameraProcess(make, may_wait=simulated_time)
+    try:
+        yield process
+    finally:
+        process.close()
+
+
+def make_observer(
+    rig_document: RigDocument,
+    scene_document: SceneDocument,
+    name: str,
+    folder: Path,
+    keep_every: int,
+) -> Observer:
+    """Builds the observer inside the camera's process."""
+    from cdpr.rig import rig_from_document
+    from cdpr.scene import scene_from_document
+    from executor.observer import Observer
+    from executor.run_folder import RunFolder
+
+    rig, scene = rig_from_document(rig_document), scene_from_document(scene_document)
+    camera = rig.cameras[0]
+    source = _source(rig, scene, camera, name)
+    return Observer(rig, scene, camera, source, RunFolder(folder), keep_every)
+
+
+def _source(rig: Rig, scene: Scene, camera: Camera, name: str):  # type: ignore[no-untyped-def]
+    if name == SYNTHETIC:
+        from simulation.camera import SyntheticCamera
+
+        return SyntheticCamera(rig, scene, camera)
+    from drivers.cameras import CameraIndex
+
+    return CameraIndex(name, camera)

@@ -1,0 +1,86 @@
+"""`cdpr demo`: the whole way on the paper's rig, simulated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
+
+RIG = "gachon_8_6.yaml"
+
+
+def demo(
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="folder to make", metavar="DIR")
+    ] = None,
+    environment: Annotated[
+        int, typer.Option(min=1, max=3, help="which of the paper's environments")
+    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
+) -> None:
+    """Plan, check, run on simulated drives, track with a synthetic camera, and report.
+
+    [dim]Example:[/dim]
+
+      cdpr demo --environment 3
+    """
+    from cdpr.cli.cameras import SYNTHETIC
+    from cdpr.cli.output import out, progress_bar, show_facts
+    from cdpr.cli.plan import sentences_of
+    from cdpr.cli.run import exit_code, prepared_run, run_prepared
+    from cdpr.cli.run_summary import show_prepared, show_summary
+    from cdpr.plan import save_plan
+    from cdpr.rig import load_rig
+    from cdpr.scene import load_scene
+    from executor.run_folder import RunFolder
+    from planner.plan import make_plan
+    from planner.settings import PlannerSettings
+
+    folder = output or _free_folder()
+    RunFolder.require_free(folder)
+    rig = load_rig(configs() / RIG)
+    scene = load_scene(configs() / f"environment_{environment}.yaml")
+    settings = PlannerSettings(seed=seed)
+    with progress_bar("planning", settings.max_iterations, True) as advance:
+        document = make_plan(rig, scene, settings, progress=lambda p: advance(p.iterations))
+    show_facts("plan", sentences_of(document)[:-1])
+    with TemporaryDirectory(prefix="cdpr-demo-") as temporary:
+        plan_path = Path(temporary) / "plan.json"
+        save_plan(document, plan_path)
+        prepared = prepared_run(plan_path, rig, quiet=False)
+    show_prepared(prepared, simulated=True)
+    summary = run_prepared(prepared, folder, SYNTHETIC, fast=True, start=None, quiet=False)
+    show_summary(summary, folder, as_json=False)
+    out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
+    raise typer.Exit(exit_code(summary))
+
+
+def configs() -> Path:
+    """The folder of the ready rigs and scenes: in the package, or in the repository."""
+    import cdpr
+
+    package = Path(cdpr.__file__).resolve().parent
+    inside = package / "configs"
+    return inside if inside.is_dir() else package.parent / "configs"
+
+
+def _free_folder() -> Path:
+    """``runs/demo``, or with the first free number; makes ``runs`` where it is missing."""
+    from itertools import count
+
+    from cdpr.errors import BadInput
+
+    runs = Path("runs")
+    try:
+        runs.mkdir(exist_ok=True)
+    except OSError as error:
+        raise BadInput(
+            "the folder for runs cannot be made",
+            where=str(runs),
+            why=error.strerror or str(error),
+            next_step="change to a folder that you may write to, or name one with -o",
+        ) from None
+    names = (runs / ("demo" if n == 1 else f"demo-{n}") for n in count(1))
+    return next(path for path in names if not path.exists())

@@ -1,0 +1,226 @@
+"""`cdpr run`: runs a plan on the drives and measures it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from cdpr.poses import Pose
+    from cdpr.rig import Rig
+    from executor.camera_process import CameraProcess
+    from executor.observer import Look
+    from executor.prepare import PreparedRun
+    from executor.run import Execution, Outcome
+    from executor.run_folder import RunFolder
+
+
+def run(
+    plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
+    rig: Annotated[Path, typer.Option("--rig", help="rig file (YAML)", metavar="RIG")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUNDIR")
+    ],
+    fast: Annotated[
+        bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
+    ] = False,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="'synthetic' (the default with the interface 'virtual'), or a camera's index"
+        ),
+    ] = None,
+    no_camera: Annotated[bool, typer.Option("--no-camera", help="run without a camera")] = False,
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the rig file's")
+    ] = None,
+    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    simulated_start_mm: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="where the simulated platform stands: x y z (default: at the start)"),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
+) -> None:
+    """Run a plan: prove it, make its set-points, arm the drives, move, measure, report.
+
+    With the interface 'virtual' the drives, the platform and the camera are simulated in this
+    process. Ctrl-C and `cdpr stop` slow all drives down together along the path; they then hold.
+
+    [dim]Examples:[/dim]
+
+      cdpr run plan.json --rig configs/gachon_8_6.yaml -o runs/first --fast
+
+      cdpr run plan.json --rig rig.yaml -o runs/second --camera 0
+    """
+    from cdpr.cli.cameras import choose_camera
+    from cdpr.cli.drives import IN_PROCESS
+    from cdpr.cli.run_summary import show_prepared, show_summary
+    from executor.run_folder import RunFolder
+
+    the_rig = rig_on_bus(rig, interface, channel)
+    in_process = the_rig.document.bus.interface == IN_PROCESS
+    camera_name = choose_camera(the_rig, camera, no_camera, in_process)
+    start = _simulated_start(simulated_start_mm, in_process, fast)
+    RunFolder.require_free(output)
+    prepared = prepared_run(plan, the_rig, quiet=as_json)
+    if not as_json:
+        show_prepared(prepared, in_process)
+    if not (in_process or yes):
+        typer.confirm("Move the platform now?", abort=True)
+    summary = run_prepared(prepared, output, camera_name, fast=fast, start=start, quiet=as_json)
+    show_summary(summary, output, as_json)
+    raise typer.Exit(exit_code(summary))
+
+
+def rig_on_bus(path: Path, interface: str | None, channel: str | None) -> Rig:
+    """The rig of a file, on another bus when one is named."""
+    from cdpr.rig import load_rig, rig_from_document
+
+    document = load_rig(path).document
+    changes = {"interface": interface, "channel": channel}
+    given = {key: value for key, value in changes.items() if value is not None}
+    bus = document.bus.model_copy(update=given)
+    return rig_from_document(document.model_copy(update={"bus": bus}))
+
+
+def _simulated_start(
+    start_mm: tuple[float, float, float] | None, in_process: bool, fast: bool
+) -> Pose | None:
+    from cdpr.document_types import millimetres
+    from cdpr.errors import BadInput
+    from cdpr.poses import Pose
+
+    if fast and not in_process:
+        raise BadInput(
+            "--fast needs drives that are simulated in this process",
+            where="--fast",
+            why="time on a real bus cannot be made faster",
+            next_step="leave --fast out, or use the interface 'virtual'",
+        )
+    if start_mm is None:
+        return None
+    if not in_process:
+        raise BadInput(
+            "only a platform that is simulated in this process can be placed",
+            where="--simulated-start-mm",
+            next_step="leave it out, or use the interface 'virtual'",
+        )
+    return Pose.level(millimetres(list(start_mm)))
+
+
+def prepared_run(plan: Path, rig: Rig, *, quiet: bool) -> PreparedRun:
+    """The checked set-points of a plan file, for a rig.
+
+    Raises:
+        BadInput: The plan cannot be read, or is for another rig.
+        Refused: The plan, or the curve it would be run on, does not pass the checks.
+    """
+    from cdpr.cli.output import spinner
+    from cdpr.cli.plan_for_rig import require_same_rig
+    from cdpr.plan import load_plan
+    from executor.prepare import prepare
+    from planner.check import verify
+
+    the_plan = load_plan(plan)
+    require_same_rig(the_plan, rig, plan)
+    with spinner("checking the plan and its set-points", not quiet):
+        return prepare(verify(the_plan), rig)
+
+
+def run_prepared(
+    prepared: PreparedRun,
+    output: Path,
+    camera_name: str | None,
+    *,
+    fast: bool,
+    start: Pose | None,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Arms, moves, measures and writes the run folder; returns the run's summary.
+
+    A run that is refused before anything moved leaves no folder.
+
+    Args:
+        prepared: The checked run.
+        output: The run folder to make.
+        camera_name: From `choose_camera`.
+        fast: Simulated time.
+        start: Where the simulated platform stands; None at the plan's start.
+        quiet: No progress.
+    """
+    from cdpr.cli.cameras import open_camera
+    from cdpr.cli.drives import IN_PROCESS, open_drives
+    from cdpr.cli.output import spinner
+    from executor.clock import RealClock, SimulatedClock
+    from executor.run import Execution, conclude
+    from executor.run_folder import RunFolder
+    from executor.running import announced, stop_requests
+
+    rig, scene = prepared.rig, prepared.scene
+    pictures = int(prepared.law.duration * (rig.cameras[0].rate if camera_name else 0.0))
+    folder = RunFolder.create(output)
+    moved = False
+    try:
+        with (
+            stop_requests() as stop_requested,
+            announced(),
+            open_camera(rig, scene, camera_name, output, pictures, fast) as camera,
+            open_drives(rig, start or scene.start) as drives,
+        ):
+            clock = SimulatedClock() if fast else RealClock(prepared.checked.table.cycle)
+            execution = Execution(
+                prepared, drives.group, clock, stop_requested=stop_requested, pump=drives.pump
+            )
+            execution.loop.arm()
+            moved = True
+            outcome, looks = _move(execution, folder, camera, drives.true_pose, quiet)
+    finally:
+        if not moved:
+            folder.discard()
+    interface = rig.document.bus.interface
+    with spinner("writing the run folder and its report", not quiet):
+        folder.write_plan(prepared.plan.plan.document)
+        folder.write_rig(rig.document)
+        return conclude(
+            prepared,
+            outcome,
+            folder,
+            looks,
+            interface=interface,
+            simulated=interface == IN_PROCESS,
+            fast=fast,
+        )
+
+
+def _move(
+    execution: Execution,
+    folder: RunFolder,
+    camera: CameraProcess | None,
+    true_pose: Any,
+    quiet: bool,
+) -> tuple[Outcome, list[Look]]:
+    from cdpr.cli.output import progress_bar
+
+    rows = len(execution.prepared.checked.table)
+    if camera is None:
+        with progress_bar("moving", rows, not quiet) as advance:
+            return execution.run(folder, progress=advance), []
+
+    def trigger(time: float, planned: Pose) -> None:
+        camera.trigger(time, planned, true_pose() if true_pose else None)
+
+    rate = execution.prepared.rig.cameras[0].rate
+    with progress_bar("moving", rows, not quiet) as advance:
+        outcome = execution.run(folder, trigger=trigger, camera_rate=rate, progress=advance)
+    with progress_bar("measuring pictures", camera.triggered, not quiet) as advance:
+        return outcome, camera.finish(advance)
+
+
+def exit_code(summary: dict[str, Any]) -> int:
+    """0 for a run that passed, 130 when the operator stopped it, 1 otherwise."""
+    if summary["passed"]:
+        return 0
+    return 130 if summary["verdict"] == "STOPPED" else 1

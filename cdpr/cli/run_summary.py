@@ -1,0 +1,47 @@
+"""What `cdpr run` and `cdpr demo` show before and after a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cdpr.cli.output import out, show_facts, show_json
+
+if TYPE_CHECKING:
+    from executor.prepare import PreparedRun
+
+COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
+
+
+def show_prepared(prepared: PreparedRun, simulated: bool) -> None:
+    """What is going to happen."""
+    rig, bus = prepared.rig, prepared.rig.document.bus
+    start, goal = prepared.scene.start.position * 1000, prepared.scene.goal.position * 1000
+    table = prepared.checked.table
+    show_facts(
+        "ready to run",
+        [
+            ("rig, scene", f"{rig.name}, {prepared.scene.name}"),
+            ("from", f"{start[0]:.1f}, {start[1]:.1f}, {start[2]:.1f} mm"),
+            ("to", f"{goal[0]:.1f}, {goal[1]:.1f}, {goal[2]:.1f} mm"),
+            (
+                "motion",
+                f"{prepared.path.length * 1000:.1f} mm in {prepared.law.duration:.1f} s,"
+                f" at most {rig.motion.speed * 1000:g} mm/s",
+            ),
+            ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),
+            ("bus", f"{bus.interface} {bus.channel}{', simulated drives' if simulated else ''}"),
+        ],
+    )
+
+
+def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
+    """What happened."""
+    if as_json:
+        show_json({"run": str(folder), **summary})
+        return
+    colour = COLOURS[summary["verdict"]]
+    out.print(f"[bold {colour}]{summary['verdict']}[/] {summary['sentence']}")
+    for reason in summary["reasons"]:
+        out.print(f"  {reason}")
+    out.print(f"report: {folder / 'report.html'}", soft_wrap=True)

@@ -1,0 +1,78 @@
+"""`cdpr sim`: the drives of a rig, simulated in a process of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def sim(
+    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the rig file's")
+    ] = None,
+    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    start_mm: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--at-mm", help="where the platform stands: x y z (default: home)"),
+    ] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="put the platform at the start of this plan")
+    ] = None,
+) -> None:
+    """Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.
+
+    [dim]Examples:[/dim]
+
+      cdpr sim configs/gachon_8_6.yaml --interface udp_multicast --channel 239.74.163.2
+      --plan plan.json
+
+      cdpr run plan.json --rig configs/gachon_8_6.yaml --interface udp_multicast
+      --channel 239.74.163.2 --no-camera -o runs/udp --yes
+    """
+    from cdpr.cli.drives import IN_PROCESS
+    from cdpr.cli.output import out
+    from cdpr.cli.run import rig_on_bus
+    from cdpr.errors import BadInput
+    from drivers.bus import BusSettings, open_bus
+    from executor.running import stop_requests
+    from simulation.rehearsal import Rehearsal
+
+    the_rig = rig_on_bus(rig, interface, channel)
+    if the_rig.document.bus.interface == IN_PROCESS:
+        raise BadInput(
+            "the interface 'virtual' reaches no other process",
+            where="bus",
+            why="`cdpr run` simulates the drives itself on that interface",
+            next_step="pass --interface udp_multicast, or socketcan with a vcan channel",
+        )
+    pose = _start(the_rig, start_mm, plan)
+    bus = open_bus(BusSettings.of(the_rig))
+    try:
+        rehearsal = Rehearsal(the_rig, bus, pose)
+        x, y, z = pose.position * 1000.0
+        out.print(
+            f"{the_rig.cable_count} simulated drives of {the_rig.name} on"
+            f" {BusSettings.of(the_rig)}; platform at {x:.1f}, {y:.1f}, {z:.1f} mm; Ctrl-C ends it",
+            soft_wrap=True,
+        )
+        with stop_requests() as stop_requested:
+            rehearsal.serve(stop_requested)
+    finally:
+        bus.shutdown()
+    out.print("the simulated drives are gone")
+
+
+def _start(rig, start_mm, plan):  # type: ignore[no-untyped-def]
+    from cdpr.document_types import millimetres
+    from cdpr.errors import BadInput
+    from cdpr.plan import load_plan
+    from cdpr.poses import Pose
+
+    if start_mm is not None and plan is not None:
+        raise BadInput("--at-mm and --plan contradict each other")
+    if plan is not None:
+        return load_plan(plan).scene.start
+    return rig.home if start_mm is None else Pose.level(millimetres(list(start_mm)))

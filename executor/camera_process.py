@@ -1,0 +1,142 @@
+"""The camera's own process, so that pictures never delay the loop.
+
+The loop triggers; the process takes (or renders) a picture, measures the pose and answers once at
+the end. Triggers are small and go through a pipe; when the process is too far behind, a trigger is
+dropped and counted instead of making the loop wait.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import select
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+from cdpr.errors import CdprError, Fault
+from cdpr.poses import Pose
+from executor.observer import Look, MakeObserver, Trigger
+
+#: How long the process may take to import its libraries and open its camera, [s].
+START_TIMEOUT = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    """An error of the camera's process, as it travels to the parent."""
+
+    error: CdprError | str
+
+
+class CameraProcess:
+    """Takes pictures when told to and measures the platform in them."""
+
+    def __init__(self, make_observer: MakeObserver, *, may_wait: bool) -> None:
+        """Starts the process and waits until its camera is ready.
+
+        Args:
+            make_observer: Called in the process; picklable.
+            may_wait: In simulated time a trigger waits for its place; in real time it is dropped.
+
+        Raises:
+            CdprError: The camera cannot be used, for the reason told.
+        """
+        self.dropped = 0
+        self._may_wait = may_wait
+        self._closed = False
+        self.triggered = 0
+        context = multiprocessing.get_context("spawn")
+        self._link, far_end = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(make_observer, far_end), name="cdpr-camera", daemon=True
+        )
+        self._process.start()
+        far_end.close()
+        try:
+            if not self._link.poll(START_TIMEOUT):
+                raise Fault(f"the camera's process was not ready within {START_TIMEOUT:.0f} s")
+            self._receive()
+        except BaseException:
+            self.close()
+            raise
+
+    def trigger(self, time: float, planned: Pose, true_pose: Pose | None) -> None:
+        """Asks for a picture now.
+
+        Args:
+            time: Since the start of the run, [s].
+            planned: Where the platform should be.
+            true_pose: Where the simulated platform is; None with a real camera.
+        """
+        ready = self._may_wait or select.select([], [self._link.fileno()], [], 0.0)[1]
+        if not ready:
+            self.dropped += 1
+            return
+        self._link.send(Trigger(self.triggered, time, planned, true_pose))
+        self.triggered += 1
+
+    def finish(self, progress: Callable[[float], None]) -> list[Look]:
+        """Waits until the last picture is measured; returns all of them and ends the process.
+
+        Raises:
+            CdprError: The process failed, for the reason told.
+        """
+        try:
+            self._link.send(None)
+            while True:
+                answer = self._receive()
+                if isinstance(answer, list):
+                    return answer
+                progress(float(answer))
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Ends the process, whatever it does; further calls change nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._link.close()
+        self._process.join(timeout=2.0)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join()
+        self._process.close()
+
+    def _receive(self) -> list[Look] | int:
+        try:
+            answer = self._link.recv()
+        except (EOFError, ConnectionResetError):
+            raise Fault("the camera's process ended without an answer") from None
+        if isinstance(answer, _Failure):
+            raise answer.error if isinstance(answer.error, CdprError) else Fault(answer.error)
+        return answer  # type: ignore[no-any-return]  # what our own process sends
+
+
+def _serve(make_observer: MakeObserver, link: Connection) -> None:
+    """The process: a picture a trigger, then all answers at once."""
+    # Ctrl-C reaches every process of the terminal; when to end is the parent's decision.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        with make_observer() as observer:
+            link.send(0)
+            looks = []
+            while (trigger := link.recv()) is not None:
+                looks.append(observer.look(trigger))
+                if len(looks) % 10 == 0:
+                    _tell_progress(link, len(looks))
+            link.send(looks)
+    except EOFError:
+        return  # the parent is gone
+    except CdprError as error:
+        link.send(_Failure(error))
+    except Exception as error:
+        link.send(_Failure(f"the camera's process failed: {type(error).__name__}: {error}"))
+
+
+def _tell_progress(link: Connection, done: int) -> None:
+    """Only when the pipe has room: during the run nobody reads progress."""
+    if select.select([], [link.fileno()], [], 0.0)[1]:
+        link.send(done)

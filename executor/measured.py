@@ -1,0 +1,67 @@
+"""Clearance along a run: from the drives' positions and, with a camera, from the tags."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.clearance import ClearanceModel, Nearest
+from cdpr.poses import Array, Pose
+from executor.clearance_table import ClearanceTable, no_clearance
+
+#: What a clearance from drive positions may be off by: counts, torque resolution, one cycle, [m].
+ENCODER_UNCERTAINTY = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClearanceRow:
+    """Distances at one measured pose, one entry an obstacle.
+
+    Attributes:
+        time: [s].
+        source: ``tag`` or ``encoder``.
+        measured: At the measured pose.
+        uncertainty: Of the smallest of them, [m].
+        planned: At the planned pose of the same time.
+    """
+
+    time: float
+    source: str
+    measured: tuple[Nearest, ...]
+    uncertainty: float
+    planned: tuple[Nearest, ...]
+
+
+def encoder_rows(
+    model: ClearanceModel, times: Array, measured: Sequence[Pose], planned: Sequence[Pose]
+) -> list[ClearanceRow]:
+    """A row for each pose that follows from the drives' positions."""
+    return [
+        ClearanceRow(
+            float(time), "encoder", model.obstacles(at), ENCODER_UNCERTAINTY, model.obstacles(due)
+        )
+        for time, at, due in zip(times, measured, planned, strict=True)
+    ]
+
+
+def clearance_table(names: tuple[str, ...], rows: Sequence[ClearanceRow]) -> ClearanceTable:
+    """Rows as a table; a scene without obstacles has none."""
+    if not rows or not names:
+        return no_clearance(names)
+    nearest = [min(row.measured, key=lambda n: n.distance) for row in rows]
+    measured = np.array([[n.distance for n in row.measured] for row in rows])
+    planned = np.array([[n.distance for n in row.planned] for row in rows])
+    return ClearanceTable(
+        time=np.array([row.time for row in rows]),
+        source=tuple(row.source for row in rows),
+        distance=measured.min(axis=1),
+        uncertainty=np.array([row.uncertainty for row in rows]),
+        body=tuple(n.first for n in nearest),
+        obstacle=tuple(n.second for n in nearest),
+        planned_distance=planned.min(axis=1),
+        obstacles=names,
+        distances=measured,
+        planned_distances=planned,
+    )

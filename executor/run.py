@@ -1,0 +1,215 @@
+"""One run from a prepared table to a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from cdpr.clearance import ClearanceModel
+from cdpr.poses import Pose
+from drivers.drive_group import DriveGroup
+from executor.clearance_table import ClearanceTable
+from executor.clock import Clock
+from executor.cycle_table import CycleTable
+from executor.loop import CycleRecord, Loop, LoopEvent
+from executor.machine import State
+from executor.mcap_log import write_mcap
+from executor.measured import clearance_table, encoder_rows
+from executor.observer import Look
+from executor.path import poses_of
+from executor.pose_table import PoseTable, no_poses
+from executor.prepare import PreparedRun
+from executor.report import build_report
+from executor.run_folder import RunEvent, RunFolder
+from executor.run_log import RunLog
+from executor.summary import RunContext, summarize
+from executor.versions import versions
+
+#: Clearances from drive positions are computed this often along a run, [Hz].
+CLEARANCE_RATE = 10.0
+
+Trigger = Callable[[float, Pose], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What the motion left behind.
+
+    Attributes:
+        state: Where the run ended.
+        log: Its cycles.
+        started: When, UTC.
+        error: What broke the loop itself, if anything did.
+    """
+
+    state: State
+    log: RunLog
+    started: datetime
+    error: BaseException | None
+
+
+class Execution:
+    """The motion of one prepared run on configured drives."""
+
+    def __init__(
+        self,
+        prepared: PreparedRun,
+        group: DriveGroup,
+        clock: Clock,
+        *,
+        stop_requested: Callable[[], bool],
+        pump: Callable[[], None] | None = None,
+    ) -> None:
+        """Prepares the loop; nothing is sent.
+
+        Args:
+            prepared: The checked run.
+            group: Configured drives.
+            clock: Real or simulated.
+            stop_requested: Asked every cycle.
+            pump: Lets drives simulated in this process work.
+        """
+        self.prepared = prepared
+        self._log = RunLog(prepared.rig, prepared.checked)
+        self._folder: RunFolder | None = None
+        self._triggers: Trigger | None = None
+        self._progress: Callable[[float], None] = lambda _share: None
+        self._every = 1
+        self.loop = Loop(
+            prepared.rig,
+            prepared.checked,
+            group,
+            clock,
+            stop_requested=stop_requested,
+            pump=pump,
+            on_cycle=self._on_cycle,
+            on_event=self._on_event,
+        )
+
+    def run(
+        self,
+        folder: RunFolder,
+        *,
+        trigger: Trigger | None = None,
+        camera_rate: float = CLEARANCE_RATE,
+        progress: Callable[[float], None] | None = None,
+    ) -> Outcome:
+        """Moves along the path; ends with the drives holding by themselves.
+
+        Args:
+            folder: Where events are written as they happen.
+            trigger: Called for every picture with its time [s] and the planned pose.
+            camera_rate: Pictures a second, [Hz].
+            progress: Called with the number of rows that are done.
+        """
+        cycle = self.prepared.checked.table.cycle
+        self._folder, self._triggers = folder, trigger
+        self._every = max(1, round(1.0 / (camera_rate * cycle)))
+        self._progress = progress or self._progress
+        started = datetime.now(UTC)
+        error: BaseException | None = None
+        try:
+            self.loop.run()
+        except Exception as broken:  # the drives were stopped; what is known is still recorded
+            error = broken
+            self._on_event(LoopEvent(len(self._log), "broken", f"the run broke: {broken}"))
+        return Outcome(self.loop.machine.state, self._log, started, error)
+
+    def _on_cycle(self, record: CycleRecord) -> None:
+        self._log.add(record)
+        if record.cycle % self._every:
+            return
+        self._progress(record.index)
+        if self._triggers is not None:
+            table = self.prepared.checked.table
+            row = int(record.index)
+            due = Pose(table.positions[row], table.rotations[row])
+            self._triggers(record.cycle * table.cycle, due)
+
+    def _on_event(self, event: LoopEvent) -> None:
+        if self._folder is not None:
+            time = event.cycle * self.prepared.checked.table.cycle
+            self._folder.append_event(RunEvent(time, event.code, event.text))
+
+
+def conclude(
+    prepared: PreparedRun,
+    outcome: Outcome,
+    folder: RunFolder,
+    looks: Sequence[Look],
+    *,
+    interface: str,
+    simulated: bool,
+    fast: bool,
+) -> dict[str, Any]:
+    """Writes everything that the run left behind, its summary and its report.
+
+    Returns:
+        The summary.
+    """
+    cycles = outcome.log.table()
+    poses = _pose_table(looks)
+    clearance = _clearance(prepared, outcome, cycles, looks)
+    folder.write_cycles(cycles)
+    folder.write_poses(poses)
+    folder.write_clearance(clearance)
+    context = RunContext(
+        plan=prepared.plan.plan,
+        rig=prepared.rig,
+        interface=interface,
+        simulated=simulated,
+        fast=fast,
+        started=outcome.started,
+        duration=len(cycles) * prepared.checked.table.cycle,
+        final_state=outcome.state.value,
+        events=tuple(folder.events()),
+        versions=versions(),
+    )
+    summary = summarize(context, cycles, poses, clearance)
+    folder.write_summary(summary)
+    write_mcap(folder)
+    build_report(folder)
+    return summary
+
+
+def _pose_table(looks: Sequence[Look]) -> PoseTable:
+    if not looks:
+        return no_poses()
+    nowhere = Pose(np.full(3, np.nan), np.full((3, 3), np.nan))
+    poses = [look.pose or nowhere for look in looks]
+    unknown = np.full(4, np.nan)
+    return PoseTable(
+        frame=np.array([look.frame for look in looks], dtype=np.int64),
+        time=np.array([look.time for look in looks]),
+        status=tuple(look.status for look in looks),
+        position=np.array([pose.position for pose in poses]),
+        rotation=np.array([look.pose.quaternion if look.pose else unknown for look in looks]),
+        covariance=np.array([look.covariance for look in looks]),
+        tags=tuple(" ".join(map(str, look.tags)) for look in looks),
+        reprojection=np.array([look.reprojection for look in looks]),
+        planned=np.array([look.planned.position for look in looks]),
+        picture=tuple(look.picture for look in looks),
+    )
+
+
+def _clearance(
+    prepared: PreparedRun, outcome: Outcome, cycles: CycleTable, looks: Sequence[Look]
+) -> ClearanceTable:
+    model = ClearanceModel(prepared.rig, prepared.scene)
+    rows = [look.clearance for look in looks if look.clearance is not None]
+    if model.obstacle_names:
+        table = prepared.checked.table
+        chosen = np.arange(0, len(cycles), max(1, round(1.0 / (CLEARANCE_RATE * table.cycle))))
+        positions, rotations = outcome.log.encoder_poses(cycles)
+        index = cycles.path_index[chosen]
+        rows += encoder_rows(
+            model,
+            cycles.time[chosen],
+            poses_of(positions[chosen], rotations[chosen]),
+            poses_of(cycles.planned[chosen], table.rotations[index]),
+        )
+    return clearance_table(model.obstacle_names, rows)
