@@ -18,7 +18,8 @@ from executor.measured import ClearanceRow
 from executor.pose_table import OK
 from executor.run_folder import RunFolder
 from tracking.measured_clearance import clearance_of
-from tracking.tracker import PoseMeasurement, Tracker
+from tracking.measurement import PoseMeasurement
+from tracking.tracker import Tracker
 
 
 @dataclass(frozen=True, slots=True, eq=False)

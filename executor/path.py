@@ -86,8 +86,8 @@ class Segment:
         if self.straight:
             return (1.0 - t) * self.control[0] + t * self.control[1]
         powers = np.arange(6)
-        basis = _QUINTIC * t**powers * (1.0 - t) ** (5 - powers)
-        return basis @ self.control
+        points: Array = (_QUINTIC * t**powers * (1.0 - t) ** (5 - powers)) @ self.control
+        return points
 
     def at(self, travelled: Array) -> tuple[Array, Array]:
         """Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3), after given lengths [m]."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cdpr.clearance import ClearanceModel
-from cdpr.poses import Pose
+from cdpr.poses import Array, Pose
 from drivers.drive_group import DriveGroup
 from executor.clearance_table import ClearanceTable
 from executor.clock import Clock
@@ -20,7 +20,6 @@ from executor.machine import State
 from executor.mcap_log import write_mcap
 from executor.measured import clearance_table, encoder_rows
 from executor.observer import Look
-from executor.path import poses_of
 from executor.pose_table import PoseTable, no_poses
 from executor.prepare import PreparedRun
 from executor.report import build_report
@@ -153,7 +152,7 @@ def conclude(
     """
     cycles = outcome.log.table()
     poses = _pose_table(looks)
-    clearance = _clearance(prepared, outcome, cycles, looks)
+    clearance = _clearance(prepared, cycles, looks)
     folder.write_cycles(cycles)
     folder.write_poses(poses)
     folder.write_clearance(clearance)
@@ -171,7 +170,7 @@ def conclude(
     )
     summary = summarize(context, cycles, poses, clearance)
     folder.write_summary(summary)
-    write_mcap(folder)
+    write_mcap(folder, context, cycles, poses, clearance)
     build_report(folder)
     return summary
 
@@ -196,20 +195,21 @@ def _pose_table(looks: Sequence[Look]) -> PoseTable:
     )
 
 
-def _clearance(
-    prepared: PreparedRun, outcome: Outcome, cycles: CycleTable, looks: Sequence[Look]
-) -> ClearanceTable:
+def _poses(positions: Array, quaternions: Array) -> list[Pose]:
+    pairs = zip(positions, quaternions, strict=True)
+    return [Pose.from_quaternion(position, quaternion) for position, quaternion in pairs]
+
+
+def _clearance(prepared: PreparedRun, cycles: CycleTable, looks: Sequence[Look]) -> ClearanceTable:
     model = ClearanceModel(prepared.rig, prepared.scene)
     rows = [look.clearance for look in looks if look.clearance is not None]
     if model.obstacle_names:
-        table = prepared.checked.table
-        chosen = np.arange(0, len(cycles), max(1, round(1.0 / (CLEARANCE_RATE * table.cycle))))
-        positions, rotations = outcome.log.encoder_poses(cycles)
-        index = cycles.path_index[chosen]
+        every = max(1, round(1.0 / (CLEARANCE_RATE * prepared.checked.table.cycle)))
+        chosen = np.arange(0, len(cycles), every)
         rows += encoder_rows(
             model,
             cycles.time[chosen],
-            poses_of(positions[chosen], rotations[chosen]),
-            poses_of(cycles.planned[chosen], table.rotations[index]),
+            _poses(cycles.encoder[chosen], cycles.encoder_rotation[chosen]),
+            _poses(cycles.planned[chosen], cycles.planned_rotation[chosen]),
         )
     return clearance_table(model.obstacle_names, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -61,13 +62,7 @@ class RunFolder:
         Raises:
             BadInput: The path exists, its parent is missing, or it cannot be written to.
         """
-        if path.exists() or path.is_symlink():
-            raise BadInput(
-                "exists already",
-                where=str(path),
-                why="a run never writes into the folder of another",
-                next_step="choose another folder or remove this one",
-            )
+        cls.require_free(path)
         try:
             path.mkdir()
         except OSError as error:
@@ -90,6 +85,28 @@ class RunFolder:
                 next_step="free some space or choose another place",
             ) from None
         return folder
+
+    @staticmethod
+    def require_free(path: Path) -> None:
+        """Says before a long preparation that a folder cannot be made there.
+
+        Raises:
+            BadInput: The path exists, or its parent is missing or read-only.
+        """
+        if path.exists() or path.is_symlink():
+            raise BadInput(
+                "exists already",
+                where=str(path),
+                why="a run never writes into the folder of another",
+                next_step="choose another folder or remove this one",
+            )
+        if not path.parent.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
+            raise BadInput(
+                "the run folder cannot be made",
+                where=str(path),
+                why=f"{path.parent} is no folder that you may write to",
+                next_step="choose a place whose folder exists and that you may write to",
+            )
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpr.kinematics import poses_near
-from cdpr.poses import Array
+from cdpr.poses import Array, quaternion_from_matrix
 from cdpr.rig import Rig
 from executor.cycle_table import CycleTable
 from executor.loop import CycleRecord
@@ -34,14 +34,6 @@ class RunLog:
         """Number of cycles."""
         return len(self._records)
 
-    def encoder_poses(self, table: CycleTable) -> tuple[Array, Array]:
-        """Poses from the drives' positions, shapes (n, 3), [m], and (n, 3, 3)."""
-        rows = table.path_index
-        planned = self._checked.table
-        return poses_near(
-            self._rig, table.lengths, planned.positions[rows], planned.rotations[rows]
-        )
-
     def table(self) -> CycleTable:
         """Everything that is known of the run's cycles."""
         records, rig, planned = self._records, self._rig, self._checked.table
@@ -54,8 +46,10 @@ class RunLog:
         taut = np.array([r.state in _UNDER_TENSION for r in records], dtype=bool)
         stretch = np.where(taut[:, None], tensions, planned.tensions[rows])
         winches = self._checked.winches
-        lengths = winches.strained(winches.unstrained_from_counts(actual), stretch)
-        encoder, _ = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
+        lengths = winches.strained(
+            winches.unstrained_from_counts(actual.astype(np.float64)), stretch
+        )
+        encoder, turned = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
         return CycleTable(
             time=np.array([r.cycle for r in records]) * planned.cycle,
             state=tuple(r.state.value for r in records),
@@ -64,7 +58,9 @@ class RunLog:
             lateness=np.array([r.lateness for r in records]) * planned.cycle,
             missing=np.array([r.missing for r in records], dtype=np.int64),
             planned=_between(planned.positions, index),
+            planned_rotation=_quaternions(planned.rotations[rows]),
             encoder=encoder,
+            encoder_rotation=_quaternions(turned),
             following_error=np.array([r.following_error for r in records]),
             set_counts=_matrix([r.targets for r in records], rig.cable_count),
             actual_counts=actual,
@@ -72,6 +68,10 @@ class RunLog:
             planned_tensions=_between(planned.tensions, index),
             tensions=np.where(taut[:, None], tensions, np.nan),
         )
+
+
+def _quaternions(rotations: Array) -> Array:
+    return np.array([quaternion_from_matrix(r) for r in rotations]).reshape(-1, 4)
 
 
 def _matrix(

@@ -145,11 +145,10 @@ def _number_violations(table: SetpointTable) -> list[str]:
         row = int(np.flatnonzero(~np.isfinite(table.counts).all(axis=1))[0])
         return [f"row {row} holds a set-point that is no number"]
     if np.abs(table.counts).max() > INT32_MAX - 1:
-        row, cable = np.unravel_index(int(np.abs(table.counts).argmax()), table.counts.shape)
-        return [
-            f"row {row}, cable {cable + 1}: {table.counts[row, cable]:.0f} counts do not fit"
-            " into 32 bits"
-        ]
+        largest = int(np.abs(table.counts).argmax())
+        row, cable = divmod(largest, table.counts.shape[1])
+        value = table.counts[row, cable]
+        return [f"row {row}, cable {cable + 1}: {value:.0f} counts do not fit into 32 bits"]
     return []
 
 

@@ -6,18 +6,24 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
-from cdpr.errors import BadInput
+from cdpr.errors import BadInput, Fault
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
     from cdpr.rig_file import RigDocument
     from cdpr.scene import Scene
     from cdpr.scene_file import SceneDocument
     from executor.camera_process import CameraProcess
-    from executor.observer import Observer
+    from drivers.cameras import LiveCamera
+    from executor.observer import Observer, PictureSource
+    from simulation.camera import SyntheticCamera
 
 SYNTHETIC = "synthetic"
 #: About so many pictures of a run are kept for its report.
@@ -105,11 +111,42 @@ def make_observer(
     return Observer(rig, scene, camera, source, RunFolder(folder), keep_every)
 
 
-def _source(rig: Rig, scene: Scene, camera: Camera, name: str):  # type: ignore[no-untyped-def]
+def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
     if name == SYNTHETIC:
         from simulation.camera import SyntheticCamera
 
-        return SyntheticCamera(rig, scene, camera)
-    from drivers.cameras import CameraIndex
+        return RenderedPictures(SyntheticCamera(rig, scene, camera))
+    from drivers.cameras import LiveCamera
 
-    return CameraIndex(name, camera)
+    return LivePictures(LiveCamera(name, camera))
+
+
+class RenderedPictures:
+    """The synthetic camera as the run's source of pictures."""
+
+    def __init__(self, camera: SyntheticCamera) -> None:
+        self._camera = camera
+
+    def picture(self, true_pose: Pose | None, frame: int) -> NDArray[np.uint8]:
+        """Renders the platform where it truly is."""
+        if true_pose is None:
+            raise Fault("the synthetic camera was not told where the platform is")
+        return self._camera.render(true_pose, frame)
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+class LivePictures:
+    """A real camera as the run's source of pictures."""
+
+    def __init__(self, camera: LiveCamera) -> None:
+        self._camera = camera
+
+    def picture(self, _true_pose: Pose | None, _frame: int) -> NDArray[np.uint8]:
+        """The picture of this moment."""
+        return self._camera.read().image
+
+    def close(self) -> None:
+        """Lets go of the camera."""
+        self._camera.close()

@@ -24,7 +24,7 @@ def report(
 
     folder = RunFolder.open(run)
     if as_json:
-        show_json(folder.read_summary())
+        show_json(folder.summary())
         return
     with spinner("writing the report", True):
         page = build_report(folder)

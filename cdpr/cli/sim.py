@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from cdpr.poses import Pose
+    from cdpr.rig import Rig
 
 
 def sim(
@@ -65,7 +69,7 @@ def sim(
     out.print("the simulated drives are gone")
 
 
-def _start(rig, start_mm, plan):  # type: ignore[no-untyped-def]
+def _start(rig: Rig, start_mm: tuple[float, float, float] | None, plan: Path | None) -> Pose:
     from cdpr.document_types import millimetres
     from cdpr.errors import BadInput
     from cdpr.plan import load_plan
