@@ -1,0 +1,68 @@
+"""How the motor of a simulated drive moves: following set-points, ramping down, holding. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class Motor:
+    """Position of a motor shaft and what it is made to do.
+
+    Attributes:
+        position: Actual position, [counts].
+        demand: Position the controller wants now, [counts].
+        speed: Of the demand, [counts/s].
+        top_speed: The motor cannot turn faster, [counts/s].
+        jammed: The shaft does not turn at all (set from outside).
+    """
+
+    position: float
+    demand: float
+    top_speed: float
+    speed: float = 0.0
+    jammed: bool = False
+
+    @property
+    def following_error(self) -> float:
+        """Demand less actual position, [counts]."""
+        return self.demand - self.position
+
+    def follow(self, target: float, time_left: float, elapsed: float, load: int) -> None:
+        """Interpolates towards a target that is to be reached after ``time_left`` [s].
+
+        Args:
+            target: [counts].
+            time_left: Until the target is due, before this step, [s].
+            elapsed: Length of this step, [s].
+            load: Sign of the direction in which the torque limit lets the motor not move; or 0.
+        """
+        if time_left <= elapsed:
+            moved = target - self.demand
+        else:
+            moved = (target - self.demand) * elapsed / time_left
+        self.speed = moved / elapsed if elapsed > 0.0 else 0.0
+        self.demand += moved
+        self._turn(elapsed, load)
+
+    def ramp_down(self, deceleration: float, elapsed: float, load: int) -> None:
+        """Slows down at a rate [counts/s²] and then holds; ``load`` as for `follow`."""
+        stopping = min(elapsed, abs(self.speed) / deceleration)
+        slowed = self.speed - math.copysign(deceleration * stopping, self.speed)
+        self.demand += 0.5 * (self.speed + slowed) * stopping
+        self.speed = slowed
+        self._turn(elapsed, load)
+
+    def release(self) -> None:
+        """Torque off, brake closed: the shaft stays, the demand goes to it."""
+        self.demand, self.speed = self.position, 0.0
+
+    def _turn(self, elapsed: float, load: int) -> None:
+        if self.jammed:
+            return
+        wanted = self.demand - self.position
+        reachable = self.top_speed * elapsed
+        moved = max(-reachable, min(reachable, wanted))
+        if moved * load <= 0.0:
+            self.position += moved

@@ -1,0 +1,225 @@
+"""The rig behind its drives: drums, elastic cables that only pull, a platform under gravity.
+
+The platform is taken to be in static equilibrium at every moment: at 20 mm/s its inertia is a
+matter of millinewtons. Deterministic: the same lengths from the same start give the same pose.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpr.cables import Cables, cables_at
+from cdpr.errors import Fault
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only, skew
+from cdpr.rig import Rig
+from cdpr.scene import Load
+from cdpr.statics.gravity import STANDARD_GRAVITY
+from cdpr.statics.working import working_tensions
+from cdpr.winches import WinchMap
+
+FORCE_TOLERANCE = 1e-7
+"""Largest force [N] and moment over the platform's reach [N] left at an equilibrium."""
+
+MAX_STEPS = 200
+
+
+class Plant:
+    """Platform on elastic cables; `settle` moves it to the equilibrium of given lengths.
+
+    A cable of axial stiffness EA wound off to the unstrained length L0 pulls with
+    EA · max(0, (l + d) / L0 − 1), l from outlet to anchor and d from drum to outlet.
+    """
+
+    def __init__(self, rig: Rig, pose: Pose, load: Load | None = None) -> None:
+        """Puts the platform at a pose under its working tensions.
+
+        Args:
+            rig: The robot.
+            pose: ``world_from_platform``.
+            load: What the platform carries.
+
+        Raises:
+            TensionInfeasible: The cables cannot hold the platform there.
+        """
+        self._rig = rig
+        self.winch_map = WinchMap(rig)
+        self._behind = self.winch_map.behind_outlet
+        self._weight, self._centre = _weight(rig, load)
+        self._reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
+        self.pose = pose
+        tensions = working_tensions(rig, pose, load).tensions
+        self._unstrained = self.winch_map.unstrained(cables_at(rig, pose).lengths, tensions)
+        self.tensions: Array = read_only(tensions)
+        self.settle(self._unstrained)
+
+    def counts_for(self, pose: Pose, tensions: Array) -> Array:
+        """Drive positions that hold a pose with given tensions, not rounded, shape (m,).
+
+        Args:
+            pose: ``world_from_platform``.
+            tensions: Shape (m,), [N]; in equilibrium there, or the platform will settle elsewhere.
+        """
+        lengths = cables_at(self._rig, pose).lengths
+        return self.winch_map.counts(self.winch_map.unstrained(lengths, tensions))
+
+    def settle_counts(self, counts: Array) -> None:
+        """`settle` at drive positions, shape (m,), [counts]."""
+        self.settle(self.winch_map.unstrained_from_counts(counts))
+
+    def settle(self, unstrained: Array) -> None:
+        """Moves the platform to its equilibrium; the search starts where it is.
+
+        Args:
+            unstrained: Unstrained lengths of the whole cables, shape (m,), [m].
+
+        Raises:
+            Fault: No equilibrium is found: the platform hangs on nothing, or a length is absurd.
+        """
+        if not (np.isfinite(unstrained).all() and (unstrained > 0.0).all()):
+            raise self._lost("an unstrained length is not a positive number", unstrained)
+        self._unstrained = np.array(unstrained)
+        pose = self.pose
+        cables, tensions = self._pulled(pose)
+        for _ in range(MAX_STEPS):
+            gradient = self._gradient(pose, cables, tensions)
+            if self._small(gradient):
+                self.pose, self.tensions = pose, read_only(tensions)
+                return
+            step = self._newton_step(pose, cables, tensions, gradient)
+            pose, cables, tensions = self._descend(pose, cables, tensions, gradient, step)
+        raise self._lost(f"no equilibrium after {MAX_STEPS} steps", unstrained)
+
+    def energy(self, pose: Pose) -> float:
+        """Elastic and potential energy with the platform at a pose, [J]."""
+        _, tensions = self._pulled(pose)
+        return self._energy(pose, tensions)
+
+    def residual(self, pose: Pose) -> Array:
+        """Wrench left over at a pose, about the platform's origin, shape (6,), [N, N·m]."""
+        cables, tensions = self._pulled(pose)
+        return -self._gradient(pose, cables, tensions)
+
+    def _pulled(self, pose: Pose) -> tuple[Cables, Array]:
+        """The cables at a pose and their tensions, [N]."""
+        try:
+            cables = cables_at(self._rig, pose)
+        except ValueError as error:  # an anchor inside its pulley
+            raise self._lost(str(error), self._unstrained) from error
+        strain = (cables.lengths + self._behind) / self._unstrained - 1.0
+        tensions: Array = self._rig.cable_stiffness * np.maximum(strain, 0.0)
+        return cables, tensions
+
+    def _energy(self, pose: Pose, tensions: Array) -> float:
+        elastic = (tensions * tensions) @ self._unstrained / (2.0 * self._rig.cable_stiffness)
+        height = pose.position[2] + pose.rotation[2] @ self._centre
+        return float(elastic + self._weight * height)
+
+    def _gradient(self, pose: Pose, cables: Cables, tensions: Array) -> Array:
+        """Energy by a twist (translation, rotation in the world): minus the wrench, shape (6,)."""
+        forces = cables.directions * tensions[:, None]
+        arms = cables.anchors - pose.position
+        arm_x, arm_y = (pose.rotation @ self._centre)[:2]
+        gradient = np.empty(6)
+        gradient[:3] = -forces.sum(axis=0)
+        gradient[2] += self._weight
+        gradient[3:] = -_cross(arms, forces).sum(axis=0)
+        gradient[3] += arm_y * self._weight
+        gradient[4] -= arm_x * self._weight
+        return gradient
+
+    def _small(self, gradient: Array) -> bool:
+        largest = max(np.abs(gradient[:3]).max(), np.abs(gradient[3:]).max() / self._reach)
+        return bool(largest < FORCE_TOLERANCE)
+
+    def _newton_step(self, pose: Pose, cables: Cables, tensions: Array, gradient: Array) -> Array:
+        """A descent direction; damped until the stiffness is positive definite."""
+        stiffness: Array = self._stiffness(pose, cables, tensions)
+        scale = np.array([1.0, 1.0, 1.0, self._reach, self._reach, self._reach])
+        damping = 0.0
+        while True:
+            damped: Array = stiffness + np.diag(damping * scale * scale)
+            try:
+                np.linalg.cholesky(damped)
+            except np.linalg.LinAlgError:
+                damping = max(10.0 * damping, 1e-3 * self._weight / self._reach)
+                continue
+            step: Array = np.linalg.solve(damped, -gradient)
+            longest = max(np.abs(step[:3]).max(), np.abs(step[3:]).max() * self._reach)
+            shortened: Array = step * min(1.0, self._reach / longest)
+            return shortened
+
+    def _stiffness(self, pose: Pose, cables: Cables, tensions: Array) -> Array:
+        """Second derivative of the energy by the twist, shape (6, 6).
+
+        Over a pulley the exit moves with the anchor; that part is left out, which costs steps
+        and no accuracy, since the equilibrium is decided by the gradient.
+        """
+        arms = cables.anchors - pose.position
+        directions = cables.directions
+        columns = np.hstack([directions, _cross(arms, directions)])
+        taut = np.where(tensions > 0.0, self._rig.cable_stiffness / self._unstrained, 0.0)
+        straight = np.linalg.norm(cables.exits - cables.anchors, axis=1)
+        swing = tensions / straight
+        stiffness: Array = (columns.T * (taut - swing)) @ columns
+        # Sum of swing · Gᵀ G with G = [1, −[a]×], the motion of an anchor under the twist.
+        weighted = swing @ arms
+        coupling = skew(weighted)
+        stiffness[:3, :3] += swing.sum() * np.eye(3)
+        stiffness[:3, 3:] -= coupling
+        stiffness[3:, :3] += coupling
+        spread = (arms.T * swing) @ arms
+        stiffness[3:, 3:] += np.trace(spread) * np.eye(3) - spread
+        # Turning also bends the arms of the forces themselves.
+        forces = directions * tensions[:, None]
+        moment = forces.T @ arms
+        moment[2] -= self._weight * (pose.rotation @ self._centre)
+        stiffness[3:, 3:] += np.trace(moment) * np.eye(3) - (moment + moment.T) / 2.0
+        return stiffness
+
+    def _descend(
+        self, pose: Pose, cables: Cables, tensions: Array, gradient: Array, step: Array
+    ) -> tuple[Pose, Cables, Array]:
+        """The pose after the step, shortened until the energy does not grow."""
+        before = self._energy(pose, tensions)
+        slack = 1e-12 * (abs(before) + self._weight * self._reach)
+        slope = float(gradient @ step)
+        share = 1.0
+        for _ in range(40):
+            moved = _moved(pose, share * step)
+            cables, tensions = self._pulled(moved)
+            if self._energy(moved, tensions) <= before + 1e-4 * share * slope + slack:
+                return moved, cables, tensions
+            share /= 2.0
+        raise self._lost("the search for the equilibrium is stuck", self._unstrained)
+
+    def _lost(self, what: str, unstrained: Array) -> Fault:
+        return Fault(
+            f"the simulated platform is lost: {what}",
+            where=f"plant of rig {self._rig.name}",
+            why="cables were paid out or wound in far from any pose of the platform; lengths "
+            + ", ".join(f"{length:.3f}" for length in unstrained)
+            + " m",
+            next_step="check what the drives were told",
+        )
+
+
+def _weight(rig: Rig, load: Load | None) -> tuple[float, Array]:
+    """Weight of platform and payload [N] and their centre, platform frame, shape (3,), [m]."""
+    payload = load.payload_mass if load else 0.0
+    mass = rig.mass + payload
+    centre = rig.mass * rig.centre_of_mass
+    if load:
+        centre = centre + payload * np.asarray(load.payload_centre)
+    return mass * STANDARD_GRAVITY, read_only(centre / mass)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Rows' cross products, shape (m, 3); for a few rows faster than `numpy.cross`."""
+    x, y, z = a[:, 0], a[:, 1], a[:, 2]
+    u, v, w = b[:, 0], b[:, 1], b[:, 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+
+
+def _moved(pose: Pose, step: Array) -> Pose:
+    rotation = matrix_from_rotation_vector(step[3:]) @ pose.rotation
+    return Pose(pose.position + step[:3], rotation)
