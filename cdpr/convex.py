@@ -11,6 +11,7 @@ search (Wolfe), which has the same proof as its stopping rule.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import fcl
@@ -26,7 +27,6 @@ from cdpr.shapes import (
     Shape,
     Sphere,
     TriangleMesh,
-    convex_hull,
     shape_points,
 )
 
@@ -35,6 +35,7 @@ PROOF_TOLERANCE = 1e-7
 #: Radius of the capsule or ball that stands for a segment or point in FCL, [m]; far less than the
 #: proof's tolerance, and the proof is for the segment or point itself.
 _THREAD = 1e-8
+_NOWHERE = fcl.Transform()
 _REQUEST = fcl.DistanceRequest(enable_nearest_points=True)
 _NONE = np.zeros((0, 3))
 
@@ -178,9 +179,13 @@ def polytope_body(points: Array, triangles: np.ndarray[Any, Any]) -> ConvexBody:
 
 
 def hull_body(points: Array) -> ConvexBody:
-    """The convex hull of points that span a volume, shape (k, 3), [m]."""
-    hull = convex_hull(points)
-    return _body_of_faces(hull.vertices, hull.triangles)
+    """The convex hull of at most 31 points, flat or not, shape (3 ≤ k < 32, 3), [m].
+
+    FCL walks along the faces of a convex shape only from 32 points on; below that it looks at the
+    points alone, so that any faces will do.
+    """
+    geometry = fcl.Convex(points, len(points) - 2, _fan(len(points)))
+    return ConvexBody(points, 0.0, fcl.CollisionObject(geometry, _NOWHERE))
 
 
 def _body_of_faces(points: Array, triangles: np.ndarray[Any, Any]) -> ConvexBody:
@@ -193,23 +198,65 @@ def _body_of_faces(points: Array, triangles: np.ndarray[Any, Any]) -> ConvexBody
     return ConvexBody(points, 0.0, collision, _unit(normals), _unit(sides))
 
 
+@cache
+def _fan(count: int) -> Any:
+    """Triangles over ``count`` points as FCL wants them."""
+    return np.array([[3, 0, i, i + 1] for i in range(1, count - 1)]).ravel()
+
+
 def separation(first: ConvexBody, second: ConvexBody) -> Separation:
     """The proved distance of two convex bodies.
 
     Raises:
         Fault: The search did not settle; never seen, and no distance is given then.
     """
+    named = _named_by_fcl(first, second)
+    if named is None:
+        return _searched(first, second, first.points[0] - second.points[0])
+    near_first, near_second, normal = named
+    gap = _gap(first, second, normal)
+    length = float((near_second - near_first) @ normal)
+    if gap >= length - first.radius - second.radius - PROOF_TOLERANCE:
+        return _apart(first, second, gap, normal, near_first, near_second)
+    return _searched(first, second, near_second - near_first)
+
+
+def is_apart(first: ConvexBody, second: ConvexBody, required: float) -> tuple[bool, Array | None]:
+    """Whether two convex bodies are at least ``required`` [m] apart, and a plane between them.
+
+    A yes is proved by the plane. A no is FCL's word where FCL sees less than that, which spares
+    the search: for a planner a wrong no is a lost edge, a wrong yes a collision.
+
+    Returns:
+        The answer, and the unit normal of a plane between the bodies, None where they touch.
+
+    Raises:
+        Fault: As for `separation`.
+    """
+    named = _named_by_fcl(first, second)
+    if named is None:
+        return False, None
+    near_first, near_second, normal = named
+    if _gap(first, second, normal) >= required:
+        return True, normal
+    length = float((near_second - near_first) @ normal)
+    if length - first.radius - second.radius < required:
+        return False, normal
+    found = separation(first, second)
+    return found.distance >= required, found.normal
+
+
+def _named_by_fcl(first: ConvexBody, second: ConvexBody) -> tuple[Array, Array, Array] | None:
+    """FCL's nearest points and the unit vector between them; None where it sees them touch."""
     result = fcl.DistanceResult()
-    fcl.distance(first.collision, second.collision, _REQUEST, result)
-    points = [np.asarray(p, dtype=np.float64) for p in result.nearest_points]
-    between = points[1] - points[0]
+    if fcl.distance(first.collision, second.collision, _REQUEST, result) <= PROOF_TOLERANCE:
+        return None
+    near_first, near_second = (np.asarray(p, dtype=np.float64) for p in result.nearest_points)
+    between = near_second - near_first
     length = float(np.linalg.norm(between))
-    if result.min_distance > PROOF_TOLERANCE and length > PROOF_TOLERANCE:
-        normal = between / length
-        gap = _gap(first, second, normal)
-        if gap >= length - first.radius - second.radius - PROOF_TOLERANCE:
-            return _apart(first, second, gap, normal, points[0], points[1])
-    return _searched(first, second, between)
+    if not length > PROOF_TOLERANCE:
+        return None
+    return near_first, near_second, between / length
 
 
 def _gap(first: ConvexBody, second: ConvexBody, normal: Array) -> float:

@@ -1,0 +1,98 @@
+"""What a path costs: its length, or the line integral of the kinematic cost.
+
+The kinematic cost of a pose is c = γ_d + γ_f: the condition number of the structure matrix and the
+inverse volume of the force set, each scaled to 0..1 between its extremes over the workspace
+(paper, Eqs. 4, 5, 8 and section 3.2; see docs/paper.md for the corrections).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from cdpr.cables import cables_to
+from cdpr.kinematics import structure_matrix_of
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from cdpr.statics.dexterity import condition_number, rms_anchor_radius
+from cdpr.statics.wrench_set import force_volume
+from planner.lattice import Lattice, corners_and_weights
+
+_SAMPLING = 0.010
+
+
+class Cost(Protocol):
+    """A cost of straight edges between coordinates."""
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Cost of the straight edge from ``start`` to ``end``, shape (n,) each."""
+        ...
+
+
+class LengthCost:
+    """The length of an edge, [m]."""
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Length of the edge, [m]."""
+        return float(np.linalg.norm(end - start))
+
+
+class KinematicCost:
+    """The line integral of c = γ_d + γ_f, [m], for the platform at one orientation.
+
+    The extremes for the scaling, and the values that the search interpolates between, are those on
+    a lattice over the workspace box. It is computed anew for every plan: on both ready rigs that
+    takes less time than reading it from a file would save.
+    """
+
+    def __init__(self, rig: Rig, rotation: Array) -> None:
+        """Computes the lattice for ``rotation``, ``world_from_platform``, shape (3, 3)."""
+        self.rig = rig
+        self._rotation = rotation
+        self._lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
+        condition, inverse = self._indices(self._lattice.points(np.arange(self._lattice.count)))
+        self._extremes = [(float(v.min()), float(v.max())) for v in (condition, inverse)]
+        self._values = self._scaled(condition, inverse)
+
+    def at(self, positions: Array) -> Array:
+        """The cost c of poses, exact; positions shape (k, 3), [m]; shape (k,)."""
+        return self._scaled(*self._indices(positions))
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Line integral of c along the edge (trapezoids between samples 10 mm apart), [m]."""
+        length = float(np.linalg.norm(end - start))
+        count = max(2, int(np.ceil(length / _SAMPLING)) + 1)
+        points = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
+        corners, weights = corners_and_weights(self._lattice, points)
+        values = np.sum(self._values[corners] * weights, axis=-1)
+        inner = float(values.sum()) - (float(values[0]) + float(values[-1])) / 2.0
+        return length * inner / (count - 1)
+
+    def mean_along(self, waypoints: Array) -> float:
+        """Mean of c over the length of a path, exact at samples; waypoints shape (k, 3), [m]."""
+        total, length = 0.0, 0.0
+        for start, end in zip(waypoints[:-1], waypoints[1:], strict=True):
+            part = float(np.linalg.norm(end - start))
+            count = max(2, int(np.ceil(part / _SAMPLING)) + 1)
+            points = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
+            values = self.at(points)
+            total += part * float(np.mean((values[1:] + values[:-1]) / 2.0))
+            length += part
+        return total / length if length > 0.0 else float(self.at(waypoints[:1])[0])
+
+    def _indices(self, positions: Array) -> tuple[Array, Array]:
+        """Condition number and inverse volume of the force set, shape (k,) each."""
+        rig = self.rig
+        anchors = rig.anchors @ self._rotation.T + positions[:, None, :]
+        matrices = structure_matrix_of(cables_to(rig, anchors), positions)
+        condition = condition_number(matrices, rms_anchor_radius(rig.anchors))
+        return condition, 1.0 / force_volume(matrices, rig.max_tension - rig.min_tension)
+
+    def _scaled(self, condition: Array, inverse: Array) -> Array:
+        scaled = [
+            (v - low) / (high - low) if high > low else np.zeros_like(v)
+            for v, (low, high) in zip((condition, inverse), self._extremes, strict=True)
+        ]
+        total: Array = scaled[0] + scaled[1]
+        return total
