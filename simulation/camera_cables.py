@@ -57,7 +57,7 @@ def _seen(pixels: Array, distance: Array, depth: Image32) -> NDArray[np.bool_]:
     inside = (distance > NEAR) & np.all(pixels > -0.5, axis=1)
     inside &= (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5)
     column, row = np.where(inside[:, None], np.round(pixels), 0).astype(np.int64).T
-    return inside & (distance < depth[row, column] + HIDDEN)
+    return np.asarray(inside & (distance < depth[row, column] + HIDDEN))
 
 
 def _runs(shown: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -63,7 +63,7 @@ def pixels_of(camera: Camera, points_in_camera: Array) -> Array:
 
 
 def region_of(camera: Camera, points_in_camera: Array, margin: int = 2) -> Region:
-    """Pixels that the hull of points, shape (n, 3), [m], can cover; all when it is partly behind."""
+    """Pixels that the hull of points, shape (n, 3), [m], can cover; all if it is partly behind."""
     if np.any(points_in_camera[:, 2] < 0.02):
         return Region(0, 0, camera.width, camera.height)
     pixels = pixels_of(camera, points_in_camera)

@@ -37,5 +37,5 @@ def tag_print(family: str, number: int, texels: int) -> Image32:
     modules = modules_across(family)
     picture = cv2.aruco.generateImageMarker(dictionary, number, modules)
     upright = np.pad(picture[::-1, ::-1], 1, constant_values=255)  # OpenCV's stand on their head
-    print_ = np.where(upright > 127, np.float32(PAPER), np.float32(INK))
-    return np.kron(print_, np.ones((texels, texels), dtype=np.float32))
+    print_: Image32 = np.where(upright > 127, PAPER, INK).astype(np.float32)
+    return print_.repeat(texels, axis=0).repeat(texels, axis=1)

@@ -29,7 +29,8 @@ def carries_tag(image: Image, corners: Array, family: str, number: int) -> bool:
     centre = np.arange(side) + 0.5
     grid = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 1, 2)
     places = cv2.perspectiveTransform(grid, turn).astype(np.float32).reshape(side, side, 2)
-    values = cv2.remap(image, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    column, row = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+    values = cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen = np.asarray(values, dtype=np.float64)[1:-1, 1:-1].ravel()
     wanted = official_modules(family, number)[1:-1, 1:-1].ravel().astype(np.float64)
     seen, wanted = seen - seen.mean(), wanted - wanted.mean()

@@ -96,7 +96,7 @@ class _Squares:
             focal = self.camera.matrix[axis, axis]
             by_point[..., axis, axis] = focal / depth
             by_point[..., axis, 2] = -focal * points[..., axis] / depth**2
-        by_turn = np.cross(arms[..., None, :], by_point)  # d(turn × arm) seen through by_point
+        by_turn = _cross(arms[..., None, :], by_point)  # d(turn × arm) seen through by_point
         flat = np.concatenate([by_point, by_turn], axis=-1).reshape(len(points), 8, 6)
         return np.asarray(self.whitening @ flat)
 
@@ -120,15 +120,25 @@ def solve_bundle(
     starts = [pose for pose in starts if _in_front(squares, pose)]
     ranked = sorted(starts, key=lambda pose: _huber(squares.errors(pose)))
     found: list[tuple[float, Pose]] = []
-    for start in ranked[:1] + _different(ranked[1:], ranked[:1])[:1]:
+    rivals = _different(ranked[1:], ranked[:1])[:1]
+    for start in ranked[:1] + rivals:
         pose = _improved(squares, start)
         found.append((_huber(squares.errors(pose)), pose))
     if not found:
         return None
     found.sort(key=lambda item: item[0])
     cost, best = found[0]
-    rivals = [c for c, pose in found[1:] if not _same(pose, best)]
-    return _result(squares, views, best, cost, min(rivals, default=float("inf")))
+    others = [c for c, pose in found[1:] if not _same(pose, best)]
+    return _result(squares, views, best, cost, min(others, default=float("inf")))
+
+
+def polish_bundle(camera: Camera, views: Sequence[TagView], start: Pose) -> BundlePose | None:
+    """The pose nearest to a start that is known to be the right one; knows of no rival."""
+    squares = _Squares.of(camera, views)
+    if not _in_front(squares, start):
+        return None
+    pose = _improved(squares, start)
+    return _result(squares, views, pose, _huber(squares.errors(pose)), float("inf"))
 
 
 def _square_poses(camera: Camera, view: TagView) -> list[Pose]:
@@ -152,6 +162,18 @@ def _square_poses(camera: Camera, view: TagView) -> list[Pose]:
     return poses
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """Cross product along the last axis; np.cross takes four times as long on small arrays."""
+    return np.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
+
+
 def _in_front(squares: _Squares, pose: Pose) -> bool:
     return bool(np.all(pose.apply(squares.corners)[..., 2] > 1e-3))
 
@@ -172,7 +194,8 @@ def _edge_sizes(errors: Array) -> Array:
 
 def _huber(errors: Array) -> float:
     size = _edge_sizes(errors)
-    return float(np.sum(np.where(size < HUBER, size**2, HUBER * (2.0 * size - HUBER))))
+    near = np.minimum(size, HUBER)
+    return float(np.sum(near * (2.0 * size - near)))
 
 
 def _weights(errors: Array) -> Array:
@@ -189,13 +212,14 @@ def _improved(squares: _Squares, pose: Pose) -> Pose:
         jacobian = squares.jacobian(pose).reshape(-1, 6)
         weighted = jacobian * _weights(errors)[:, None]
         normal, gradient = jacobian.T @ weighted, weighted.T @ errors.reshape(-1)
-        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), gradient)
+        damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
+        step: Array = np.asarray(-np.linalg.solve(damped, gradient), dtype=np.float64)
         candidate = moved(pose, step)
         if _in_front(squares, candidate):
             trial = squares.errors(candidate)
             trial_cost = _huber(trial)
             if trial_cost <= cost:
-                settled = cost - trial_cost < 1e-9 * (1.0 + cost)
+                settled = cost - trial_cost < 1e-7 * (1.0 + cost)
                 pose, errors, cost = candidate, trial, trial_cost
                 damping = max(damping / 10.0, 1e-12)
                 if settled:
@@ -209,9 +233,7 @@ def _improved(squares: _Squares, pose: Pose) -> Pose:
 
 def moved(pose: Pose, step: Array) -> Pose:
     """The pose after a shift [m] and a turn [rad] along the outer frame's axes, shape (6,)."""
-    return Pose(
-        pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation
-    )
+    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)
 
 
 def _result(

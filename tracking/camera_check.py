@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cdpr.errors import Fault
-from cdpr.poses import Array, Pose, read_only
+from cdpr.poses import Array, Pose, read_only, skew
 from cdpr.rig import Camera
 from tracking.bundle import TagView, solve_bundle
 from tracking.marks import tag_corners
@@ -71,12 +71,12 @@ def measured_camera(camera: Camera, views: Sequence[TagView]) -> tuple[Pose, Arr
     if found is None or not np.all(np.isfinite(found.covariance)):
         return None
     pose = found.camera_from_body.inverse()
-    # camera_from_world changes by (shift, turn) along the camera's axes: world_from_camera turns by
-    # −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift + Rᵀ (turn × p) = −Rᵀ shift − Rᵀ p × turn.
-    back, p = pose.rotation, found.camera_from_body.position
-    cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
+    # When camera_from_world (R, p) shifts and turns about the camera's axes, world_from_camera turns
+    # by −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift − Rᵀ (p × turn).
+    back = pose.rotation
     change = np.zeros((6, 6))
-    change[:3, :3], change[:3, 3:], change[3:, 3:] = -back, -back @ cross, -back
+    change[:3, :3] = change[3:, 3:] = -back
+    change[:3, 3:] = -back @ skew(found.camera_from_body.position)
     return pose, read_only(change @ found.covariance @ change.T)
 
 

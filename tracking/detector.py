@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from cdpr.poses import Array, read_only
 from tracking.marks import FAMILIES, dictionary, upright_corners
 
+#: Shortest outline of a tag that is looked for, [px].
+LEAST_PERIMETER = 44.0
+
 Image = NDArray[np.uint8]
 
 
@@ -55,7 +58,7 @@ class TagDetector:
         self.family = family
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-        parameters.minMarkerPerimeterRate = 0.02
+        self._parameters = parameters
         self._detector = cv2.aruco.ArucoDetector(dictionary(family), parameters)
 
     def detect(self, image: Image, region: Region | None = None) -> list[Detection]:
@@ -68,11 +71,14 @@ class TagDetector:
         return self._detect(np.ascontiguousarray(part), np.array([region.left, region.top]))
 
     def _detect(self, image: Image, origin: Array) -> list[Detection]:
+        # OpenCV counts this limit in shares of the picture: in a small region noise would pass it.
+        self._parameters.minMarkerPerimeterRate = LEAST_PERIMETER / max(image.shape)
+        self._detector.setDetectorParameters(self._parameters)
         corners, numbers, _ = self._detector.detectMarkers(image)
         if numbers is None:
             return []
         best: dict[int, Array] = {}
-        for number, points in zip(np.ravel(numbers).tolist(), corners, strict=True):
+        for number, points in zip([int(n) for n in np.ravel(numbers)], corners, strict=True):
             found = np.asarray(points, dtype=np.float64).reshape(4, 2) + origin
             if number not in best or _area(found) > _area(best[number]):
                 best[number] = found

@@ -28,7 +28,7 @@ LEAST_SHARE = 0.4
 #: Points that scatter more than this about their line are not those of an edge, [px].
 MOST_NOISE = 0.6
 #: What pixels and lens do to an edge beside noise, so that no edge claims to be exact, [px].
-FLOOR = 0.008
+FLOOR = 0.014
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,9 +78,7 @@ class _Lines:
     blur: Array  # (e,) width over which brightness rises, [px]
 
 
-def refine(
-    image: Image, camera: Camera, corners: Array, modules: int
-) -> list[RefinedTag | None]:
+def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[RefinedTag | None]:
     """Refines the corners of tags.
 
     Args:
@@ -342,6 +340,4 @@ def _refined(corners: Array, lines: _Lines, tag: int) -> RefinedTag | None:
         whitening[2 * edge + 1, start] = -normal / length / tilt
         whitening[2 * edge + 1, end] = normal / length / tilt
     noise = float(np.sqrt(np.mean(lines.noise[4 * tag : 4 * tag + 4][edges] ** 2)))
-    return RefinedTag(
-        read_only(quad), read_only(whitening), read_only(target), edges.copy(), noise
-    )
+    return RefinedTag(read_only(quad), read_only(whitening), read_only(target), edges.copy(), noise)

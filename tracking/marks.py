@@ -1,7 +1,7 @@
 """Tag families: their official pictures and the corners of a tag.
 
-OpenCV draws every AprilTag family turned by 180° against the pictures of the AprilTag project, which
-labs print. A tag's frame here is that of the official picture: x right, y up, z out of the print.
+OpenCV draws every AprilTag family turned by 180° against the pictures of the AprilTag project,
+which labs print. A tag's frame here is that of the official picture: x right, y up, z out of it.
 """
 
 from __future__ import annotations

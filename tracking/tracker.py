@@ -11,7 +11,7 @@ from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, read_only
 from cdpr.rig import Camera, Rig, Tag
 from tracking.bits import carries_tag
-from tracking.bundle import BundlePose, TagView, solve_bundle
+from tracking.bundle import BundlePose, TagView, polish_bundle, solve_bundle
 from tracking.camera_check import CameraCheck, refuse_moved_camera
 from tracking.detector import Detection, Image, Region, TagDetector
 from tracking.edges import refine
@@ -247,7 +247,8 @@ class Tracker:
         """The pose of all views, without tags seen aslant and edges that do not belong."""
         views = [view for view in views if self._faces(view.tag, start)]
         for _ in range(4):
-            bundle = solve_bundle(self.camera, views, start) if views else None
+            solve = solve_bundle if len(views) == 1 else polish_bundle  # one tag alone has a rival
+            bundle = solve(self.camera, views, start) if views else None
             if bundle is None:
                 return None
             kept = _without_outliers(views, bundle)

@@ -1,0 +1,284 @@
+"""Where pictures come from: a folder of files, a video, a camera."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.errors import BadInput, Fault, HardwareMissing
+from cdpr.rig import Camera
+
+Image = NDArray[np.uint8]
+
+#: Endings of picture files, in lower case.
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
+#: Pictures a camera may fail to give in a row before it counts as gone.
+LOST_PICTURES = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One picture.
+
+    Attributes:
+        time: When it was taken, [s]; since the first picture for files.
+        image: Grey, shape (height, width).
+        name: File name, or number in the video or of the camera.
+    """
+
+    time: float
+    image: Image
+    name: str
+
+
+class ImageFolder:
+    """The pictures of a folder in the order of their names, numbers counted as numbers.
+
+    Args:
+        folder: Where they are.
+        camera: The camera that took them.
+        rate: Pictures a second; the camera's when left out.
+        on_unreadable: Told the name of each file that is no picture; the others are still used.
+
+    Raises:
+        BadInput: The folder is missing or has no pictures.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        camera: Camera,
+        rate: float | None = None,
+        on_unreadable: Callable[[str], None] | None = None,
+    ) -> None:
+        if not folder.is_dir():
+            raise BadInput("no such folder", where=str(folder), next_step="check the path")
+        found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS]
+        if not found:
+            raise BadInput(
+                f"the folder has no pictures ({', '.join(PICTURE_ENDINGS)})", where=str(folder)
+            )
+        self.files = tuple(sorted(found, key=lambda path: _natural(path.name)))
+        self.unreadable: list[str] = []
+        self._folder, self._camera = folder, camera
+        self._rate = rate or camera.rate
+        self._on_unreadable = on_unreadable
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The readable pictures.
+
+        Raises:
+            BadInput: One is not of the camera's size, or none can be read.
+        """
+        self.unreadable.clear()
+        for number, path in enumerate(self.files):
+            image = _read_picture(path)
+            if image is None:
+                self.unreadable.append(path.name)
+                if self._on_unreadable is not None:
+                    self._on_unreadable(path.name)
+                continue
+            refuse_wrong_size(image, self._camera, str(path))
+            yield Frame(number / self._rate, image, path.name)
+        if len(self.unreadable) == len(self.files):
+            raise BadInput(
+                f"none of the {len(self.files)} files is a picture that can be read",
+                where=str(self._folder),
+                next_step="check that the files were copied whole",
+            )
+
+
+class VideoFile:
+    """The pictures of a video.
+
+    Args:
+        path: The file.
+        camera: The camera that took it.
+
+    Raises:
+        BadInput: The file is missing or no video.
+    """
+
+    def __init__(self, path: Path, camera: Camera) -> None:
+        if not path.is_file():
+            raise BadInput("no such file", where=str(path), next_step="check the path")
+        self._path, self._camera = path, camera
+        capture = _opened(str(path))
+        if not capture.isOpened():
+            raise BadInput("the file is no video that can be read", where=str(path))
+        self._count = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        capture.release()
+
+    def __len__(self) -> int:
+        """Number of pictures as the file states it, for progress."""
+        return self._count
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Every picture.
+
+        Raises:
+            BadInput: They are not of the camera's size, or none can be read.
+        """
+        capture = _opened(str(self._path))
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        rate = rate if np.isfinite(rate) and rate > 0 else self._camera.rate
+        number = 0
+        try:
+            while True:
+                good, picture = capture.read()
+                if not good:
+                    break
+                image = _grey(np.asarray(picture))
+                if number == 0:
+                    refuse_wrong_size(image, self._camera, str(self._path))
+                yield Frame(number / rate, image, f"picture {number}")
+                number += 1
+        finally:
+            capture.release()
+        if number == 0:
+            raise BadInput("the video has no picture that can be read", where=str(self._path))
+
+
+class LiveCamera:
+    """A camera on this machine or on the network.
+
+    Args:
+        source: Its index, such as ``0``, its device file or its address.
+        camera: What the rig file says about it.
+        clock: Monotonic time, [s].
+
+    Raises:
+        HardwareMissing: It does not open or gives no picture.
+        BadInput: It gives pictures of another size.
+    """
+
+    def __init__(
+        self, source: int | str, camera: Camera, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.name = str(source)
+        self._camera, self._clock, self._number = camera, clock, 0
+        numbered = isinstance(source, int) or source.isdigit()
+        self._capture = _opened(int(source) if numbered else str(source))
+        if not self._capture.isOpened():
+            self._capture.release()
+            raise HardwareMissing(
+                "the camera cannot be opened",
+                where=f"camera {self.name}",
+                why="it is not connected, another program uses it, or you may not read it",
+                next_step="check the cable and `ls -l /dev/video*`, close other programs, or pass"
+                " another camera",
+            )
+        self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
+        self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # or pictures wait in the queue
+        try:
+            refuse_wrong_size(self.read().image, camera, f"camera {self.name}")
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> LiveCamera:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Pictures without end.
+
+        Raises:
+            Fault: The camera stopped giving pictures.
+        """
+        while True:
+            yield self.read()
+
+    def read(self) -> Frame:
+        """The next picture, with the time at which it arrived.
+
+        Raises:
+            HardwareMissing: It never gave a picture.
+            Fault: It stopped giving pictures.
+        """
+        for _ in range(LOST_PICTURES):
+            good, picture = self._capture.read()
+            now = self._clock()
+            if good:
+                self._number += 1
+                return Frame(now, _grey(np.asarray(picture)), f"picture {self._number - 1}")
+        kind = Fault if self._number else HardwareMissing
+        raise kind(
+            f"the camera gave no picture {LOST_PICTURES} times in a row",
+            where=f"camera {self.name}",
+            why="it was unplugged, or the bus it hangs on is too slow for its pictures",
+            next_step="check the cable, then start again",
+        )
+
+    def close(self) -> None:
+        """Lets go of the camera."""
+        self._capture.release()
+
+
+def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
+    """Pictures of another size than the camera was calibrated for would measure wrongly.
+
+    Raises:
+        BadInput: The size is another one.
+    """
+    height, width = image.shape
+    if (width, height) != (camera.width, camera.height):
+        raise BadInput(
+            f"the picture has {width} x {height} px, camera {camera.name!r} has {camera.width} x"
+            f" {camera.height} px",
+            where=where,
+            why="it is of another camera, or was cut or scaled",
+            next_step="use full pictures of this camera, or calibrate it in this size",
+        )
+
+
+def _opened(source: int | str) -> cv2.VideoCapture:
+    """Opens quietly: what OpenCV and FFmpeg print about it, our own message says better."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    before = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.VideoCapture(source)  # type: ignore[call-overload,no-any-return]  # either way
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+
+
+def _read_picture(path: Path) -> Image | None:
+    """A grey picture, or None when the file holds none; also for names that OpenCV cannot open."""
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError:
+        return None
+    if not data.size:
+        return None
+    try:
+        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        return None
+    return None if picture is None else np.asarray(picture, dtype=np.uint8)
+
+
+def _grey(picture: NDArray[np.generic]) -> Image:
+    if picture.ndim == 3:
+        return np.asarray(cv2.cvtColor(picture.astype(np.uint8), cv2.COLOR_BGR2GRAY), np.uint8)
+    return picture.astype(np.uint8)
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorts ``frame_10`` behind ``frame_9``."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(1, int(p), "") if p.isdigit() else (0, 0, p) for p in parts]

@@ -1,0 +1,84 @@
+"""Measured poses as rows of a table, and the file ``poses.csv`` of ``cdpr track``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+
+from cdpr.documents import write_atomic
+from tracking.measurement import NoPose, Observation
+
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
+_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
+_SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
+_PAIRS = tuple(combinations_with_replacement(range(6), 2))
+
+
+def _covariance_name(i: int, j: int) -> str:
+    units = f"{_UNITS[i]}2" if _UNITS[i] == _UNITS[j] else f"{_UNITS[i]}_{_UNITS[j]}"
+    return f"cov_{_AXES[i]}_{_AXES[j]}_{units}"
+
+
+#: Names of the columns, units in the names. Rotations are about the world's axes.
+POSE_COLUMNS = (
+    "frame",
+    "time_s",
+    "status",
+    *(f"{axis}_mm" for axis in "xyz"),
+    *(f"q{axis}" for axis in "wxyz"),
+    *(f"std_{axis}_{unit}" for axis, unit in zip(_AXES, _UNITS, strict=True)),
+    *(_covariance_name(i, j) for i, j in _PAIRS),
+    "tags",
+    "reprojection_px",
+    "picture",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoggedPicture:
+    """One picture's name and what was measured in it."""
+
+    name: str
+    observation: Observation
+
+
+def pose_row(frame: int, logged: LoggedPicture) -> tuple[str, ...]:
+    """The values of one row, in the order of `POSE_COLUMNS`; empty where there is no pose."""
+    found = logged.observation
+    head = (str(frame), f"{found.time:.6f}")
+    if isinstance(found, NoPose):
+        nothing = ("",) * (len(POSE_COLUMNS) - 4)
+        return (*head, found.reason, *nothing, logged.name)
+    covariance = found.covariance * np.outer(_SCALES, _SCALES)
+    return (
+        *head,
+        "ok",
+        *(f"{1e3 * x:.6f}" for x in found.pose.position),
+        *(f"{q:.9f}" for q in found.pose.quaternion),
+        *(f"{d:.6f}" for d in np.sqrt(np.diag(covariance))),
+        *(f"{covariance[i, j]:.6e}" for i, j in _PAIRS),
+        " ".join(map(str, found.tags)),
+        f"{found.reprojection:.4f}",
+        logged.name,
+    )
+
+
+def write_pose_log(path: Path, pictures: Sequence[LoggedPicture]) -> None:
+    """Writes ``poses.csv`` whole or not at all.
+
+    Raises:
+        BadInput: The folder cannot be written to.
+    """
+    rows = [pose_row(frame, logged) for frame, logged in enumerate(pictures)]
+    lines = [",".join(_quoted(value) for value in row) for row in (POSE_COLUMNS, *rows)]
+    write_atomic(path, "\n".join(lines) + "\n")
+
+
+def _quoted(text: str) -> str:
+    if not any(sign in text for sign in ',"\r\n'):
+        return text
+    return '"' + text.replace('"', '""').replace("\r", " ").replace("\n", " ") + '"'
