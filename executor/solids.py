@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cdpr.poses import Array
+from cdpr.poses import Array, Pose
 from cdpr.shapes import (
     Box,
     Capsule,
@@ -54,11 +54,9 @@ def solid_of(obstacle: Obstacle) -> Solid:
     return Solid(world, faces, _sharp_edges(world, faces))
 
 
-def box_solid(half_size: Array, vertices_of: Array | None = None) -> Solid:
-    """A box about its centre, or the same box with its eight corners moved to ``vertices_of``."""
-    vertices, faces = _box(half_size)
-    placed = vertices if vertices_of is None else vertices_of
-    return Solid(placed, faces, _sharp_edges(placed, faces))
+def box_solid(half_size: Array, pose: Pose | None = None) -> Solid:
+    """A box about its centre, ``pose`` is ``world_from_box``; at the origin when left out."""
+    return solid_of(Obstacle("box", Box(half_size), pose or Pose.level(np.zeros(3))))
 
 
 def _surface(shape: Shape) -> tuple[Array, tuple[Face, ...]]:
@@ -109,28 +107,24 @@ def _arc(radius: float, height: float, start: float, end: float) -> list[tuple[f
 
 
 def _turned(profile: Sequence[tuple[float, float]]) -> tuple[Array, tuple[Face, ...]]:
-    """The surface that a profile of (radius, height) makes when turned about z."""
+    """The surface of a profile of (radius, height), its ends on the axis, turned about z."""
     angles = np.arange(_SIDES) * 2.0 * np.pi / _SIDES
     rings = [
         np.column_stack([r * np.cos(angles), r * np.sin(angles), np.full(_SIDES, h)])
         for r, h in profile
     ]
     faces: list[Face] = []
-    for ring in range(len(profile) - 1):
+    for ring in range(1, len(profile) - 2):  # the first and the last ring are the poles
         low, high = ring * _SIDES, (ring + 1) * _SIDES
         for k in range(_SIDES):
             after = (k + 1) % _SIDES
-            if profile[ring + 1][0] < 1e-12:
-                continue
-            if profile[ring][0] < 1e-12:
-                continue
             faces.append((low + k, low + after, high + after, high + k))
     faces += _caps(profile)
     return np.vstack(rings), tuple(faces)
 
 
 def _caps(profile: Sequence[tuple[float, float]]) -> list[Face]:
-    """The flat polygons next to the two poles of a turned profile."""
+    """The flat polygons that close a turned profile at the rings next to its two poles."""
     last = (len(profile) - 2) * _SIDES
     return [tuple(range(2 * _SIDES - 1, _SIDES - 1, -1)), tuple(range(last, last + _SIDES))]
 

@@ -1,0 +1,27 @@
+"""The report of a run: one page with the verdict, the scene, the plots and the facts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cdpr.documents import write_atomic
+from executor.run_folder import RunFolder
+
+
+def build_report(folder: RunFolder) -> Path:
+    """Makes ``report.html`` from the other files of a run folder.
+
+    Args:
+        folder: A run that ended (`RunFolder.open`).
+
+    Returns:
+        Where the page is.
+
+    Raises:
+        BadInput: A file of the run is missing or was changed, or the folder cannot be written to.
+    """
+    from executor.report.page import page
+    from executor.report.run_data import read_run
+
+    write_atomic(folder.report, page(read_run(folder)))
+    return folder.report
