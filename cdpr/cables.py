@@ -12,9 +12,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
+
+
+class NoCable(BadInput, ValueError):
+    """A pose at which a cable cannot run: its anchor lies at its outlet or inside its pulley."""
+
+    code = "no_cable"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +43,11 @@ class Cables:
 
 
 def cables_at(rig: Rig, pose: Pose) -> Cables:
-    """The cables with the platform at ``pose`` (``world_from_platform``)."""
+    """The cables with the platform at ``pose`` (``world_from_platform``).
+
+    Raises:
+        NoCable: An anchor lies at its outlet, inside its pulley or on its swivel axis.
+    """
     return cables_to(rig, pose.apply(rig.anchors))
 
 
@@ -43,11 +55,12 @@ def cables_to(rig: Rig, anchors_in_world: Array) -> Cables:
     """The cables that end at given anchors, world frame, shape (..., m, 3), [m].
 
     Raises:
-        ValueError: An anchor lies inside its pulley or on its swivel axis.
+        NoCable: An anchor lies at its outlet, inside its pulley or on its swivel axis.
     """
     if rig.pulley_radius == 0.0:
         straight = rig.outlets - anchors_in_world
         lengths = np.linalg.norm(straight, axis=-1)
+        _demand(lengths > 0.0, "its anchor lies at its outlet")
         exits = np.broadcast_to(rig.outlets, anchors_in_world.shape)
         return Cables(exits, anchors_in_world, straight / lengths[..., None], lengths)
     return _over_pulleys(rig, anchors_in_world)
@@ -61,16 +74,27 @@ def _over_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
     reach = np.linalg.norm(radial, axis=-1)
     outward = reach - radius  # from the pulley's centre, in the pulley's plane
     centre_distance = np.hypot(outward, along)
-    if np.any(reach <= 0.0) or np.any(centre_distance <= radius):
-        raise ValueError("an anchor lies inside its pulley or on its swivel axis")
+    _demand(reach > 0.0, "its anchor lies on the swivel axis of its pulley")
+    _demand(centre_distance > radius, "its anchor lies inside its pulley")
     swivel = radial / reach[..., None]
     straight = np.sqrt(centre_distance**2 - radius**2)
     # The tangent point, as an angle about the pulley's centre from the swivel direction to k.
     angle = np.arctan2(along, outward) + np.arccos(radius / centre_distance)
     wrap = np.mod(np.pi - angle, 2.0 * np.pi)
     centre = rig.outlets + radius * swivel
-    exits = centre + radius * (
-        np.cos(angle)[..., None] * swivel + np.sin(angle)[..., None] * feed
-    )
+    exits = centre + radius * (np.cos(angle)[..., None] * swivel + np.sin(angle)[..., None] * feed)
     directions = (exits - anchors_in_world) / straight[..., None]
     return Cables(exits, anchors_in_world, directions, radius * wrap + straight)
+
+
+def _demand(sound: NDArray[np.bool_], what: str) -> None:
+    """Raises `NoCable` for the first cable, along the last axis, that is not sound."""
+    if sound.all():
+        return
+    number = int(np.argwhere(~sound)[0][-1]) + 1
+    raise NoCable(
+        f"cable {number} cannot run: {what}",
+        why="the pose is out of the rig's reach, or holds a value that is not a number",
+        next_step="choose a pose inside the workspace",
+        values={"cable": number},
+    )

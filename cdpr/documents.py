@@ -1,4 +1,4 @@
-"""Reading and writing the project's files: positions of keys, content hashes, atomic writes."""
+"""Reading and writing the project's files: all problems at once, content hashes, atomic writes."""
 
 from __future__ import annotations
 
@@ -6,17 +6,29 @@ import hashlib
 import json
 import os
 import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
-from cdpr.document_types import Document
+from cdpr.document_types import Document, Finding
 from cdpr.errors import BadInput, InvalidFile, Problem
+from cdpr.file_problems import key_path, model_in, place_of, problems_of
+from cdpr.yaml_tree import KeyPath, Places, YamlSyntaxError, parse_yaml
+
+__all__ = [
+    "check_version",
+    "content_hash",
+    "key_path",
+    "load_yaml",
+    "problems_of",
+    "read_text",
+    "write_atomic",
+]
 
 Model = TypeVar("Model", bound=Document)
-Places = dict[tuple[str | int, ...], tuple[int, int]]
 
 
 def read_text(path: Path) -> str:
@@ -26,18 +38,19 @@ def read_text(path: Path) -> str:
         BadInput: The file is missing, a folder, unreadable or not UTF-8.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
     except FileNotFoundError:
-        raise BadInput(
-            "no such file", where=str(path), next_step="check the path and its spelling"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(
-            "the file cannot be read",
-            where=str(path),
-            why=str(error),
-            next_step="check the file",
-        ) from None
+        what, why, hint = "no such file", "", "check the path and its spelling"
+    except IsADirectoryError:
+        what, why, hint = "this is a folder", "", "name a file"
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        what = f"the file is not UTF-8 text: byte 0x{error.object[error.start]:02x} in line {line}"
+        why, hint = "it is no text file, or in another encoding", "save it as UTF-8"
+    except OSError as error:
+        what, why = "the file cannot be read", error.strerror or str(error)
+        hint = "check the path and who may read it"
+    raise BadInput(what, where=str(path), why=why, next_step=hint)
 
 
 def load_yaml(path: Path, model: type[Model]) -> Model:
@@ -47,134 +60,92 @@ def load_yaml(path: Path, model: type[Model]) -> Model:
         BadInput: The file cannot be read.
         InvalidFile: It is not YAML, has a key twice, or does not fit the model.
     """
-    text = read_text(path)
-    places: Places = {}
-    problems: list[Problem] = []
     try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-        if node is not None:
-            _walk(node, (), places, problems)
-        data = yaml.safe_load(text)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
-        what = f"not valid YAML: {error.problem or error}"
-        raise InvalidFile(str(path), [Problem("", what, line, column)]) from None
-    if not isinstance(data, dict):
-        problems.append(Problem("", "must be a mapping of keys to values", 1, 1))
-        raise InvalidFile(str(path), problems)
+        tree = parse_yaml(read_text(path))
+    except YamlSyntaxError as error:
+        hint = "check the indentation, colons, quotes and brackets there"
+        problem = Problem("", error.what, error.line, error.column)
+        raise InvalidFile(str(path), [problem], hint) from None
+    problems = [Problem(key_path(f.key), f.what, f.line, f.column) for f in tree.faults]
+    if isinstance(tree.data, dict):
+        check_version(tree.data, model, path, tree.places)
+        document, found = _validated(tree.data, model, tree.places)
+        problems += found
+        if document is not None and not problems:
+            return document
+    elif not problems:
+        empty = tree.data is None
+        what = "the file is empty" if empty else "the file must hold keys and values"
+        problems.append(Problem("", what, 1, 1))
+    raise InvalidFile(str(path), sorted(problems, key=lambda p: (p.line, p.column)))
+
+
+def check_version(
+    data: Mapping[str, Any], model: type[Document], path: Path, places: Places, next_step: str = ""
+) -> None:
+    """Refuses a file of another schema version before anything else in it is judged.
+
+    Raises:
+        InvalidFile: With that one problem.
+    """
+    field, key = model.model_fields.get("schema_version"), "schema_version"
+    version = data.get(key)
+    if field is None or type(version) is not int:
+        return
+    (known,) = field.annotation.__args__  # type: ignore[union-attr]
+    if version != known:
+        what = f"the file is of schema version {version}; this program reads version {known}"
+        hint = next_step or f"bring the file to version {known}, or use the program it was made for"
+        raise InvalidFile(str(path), [Problem(key, what, *place_of((key,), places))], hint)
+
+
+def _validated(
+    data: dict[str, Any], model: type[Model], places: Places
+) -> tuple[Model | None, list[Problem]]:
     try:
         document = model.model_validate(data)
     except ValidationError as error:
-        problems += problems_of(error, model, places)
-        raise InvalidFile(
-            str(path), sorted(problems, key=lambda p: (p.line, p.column))
-        ) from None
-    for parts, what in document.findings():
-        problems.append(Problem(key_path(parts), what, *_place(parts, places)))
-    if problems:
-        raise InvalidFile(str(path), problems)
-    return document
+        problems = problems_of(error, model, places)
+        found = _findings_of_sound_parts(data, model, error)
+    else:
+        problems, found = [], document.findings()
+    problems += [Problem(key_path(parts), what, *place_of(parts, places)) for parts, what in found]
+    return (document if not problems else None), problems
 
 
-def _walk(
-    node: yaml.Node,
-    path: tuple[str | int, ...],
-    places: Places,
-    problems: list[Problem],
-) -> None:
-    mark = node.start_mark
-    places.setdefault(path, (mark.line + 1, mark.column + 1))
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            inner = (*path, str(key.value))
-            if inner in places:
-                problems.append(
-                    Problem(
-                        key_path(inner),
-                        "this key stands twice",
-                        key.start_mark.line + 1,
-                        key.start_mark.column + 1,
-                    )
-                )
-            places[inner] = (key.start_mark.line + 1, key.start_mark.column + 1)
-            _walk(value, inner, places, problems)
-    elif isinstance(node, yaml.SequenceNode):
-        for index, value in enumerate(node.value):
-            _walk(value, (*path, index), places, problems)
-
-
-def key_path(parts: tuple[str | int, ...]) -> str:
-    """``("winches", 2, "node_id")`` as ``winches[2].node_id``."""
-    text = ""
-    for part in parts:
-        text += f"[{part}]" if isinstance(part, int) else f"{'.' if text else ''}{part}"
-    return text
-
-
-def problems_of(
-    error: ValidationError, model: type[BaseModel], places: Places
-) -> list[Problem]:
-    """Pydantic's findings as our problems, each with its place in the file."""
-    found = []
-    for item in error.errors(include_url=False):
-        parts = tuple(p for p in item["loc"] if not _is_tag(p))
-        line, column = _place(parts, places)
-        found.append(
-            Problem(key_path(parts), _sentence(item, model, parts), line, column)
-        )
+def _findings_of_sound_parts(
+    data: dict[str, Any], model: type[Document], error: ValidationError
+) -> list[Finding]:
+    """What the rules between parts find, where the parts they read are sound."""
+    unsound = {
+        item["loc"]
+        for item in error.errors(include_url=False)
+        if item["type"] not in ("missing", "extra_forbidden")
+    }
+    partial: Any = _unchecked(model, data, (), unsound)
+    found: list[Finding] = []
+    for rule in partial.rules():
+        with suppress(AttributeError, TypeError):  # the rule reads a part that is not sound
+            found += rule()
     return found
 
 
-def _is_tag(part: str | int) -> bool:
-    """True for the parts that pydantic adds for functions and unions."""
-    return isinstance(part, str) and ("[" in part or "(" in part)
-
-
-def _place(parts: tuple[str | int, ...], places: Places) -> tuple[int, int]:
-    while parts and parts not in places:
-        parts = parts[:-1]
-    return places.get(parts, (1, 1))
-
-
-def _sentence(item: Any, model: type[BaseModel], parts: tuple[str | int, ...]) -> str:
-    kind, message = str(item["type"]), str(item["msg"])
-    if kind == "extra_forbidden":
-        known = _known_keys(model, parts[:-1])
-        hint = f"; the keys here are: {', '.join(known)}" if known else ""
-        return f"unknown key {parts[-1]!r}{hint}"
-    if kind == "missing":
-        return "this key is missing"
-    if kind == "value_error":
-        return message.removeprefix("Value error, ")
-    text = message[0].lower() + message[1:]
-    value = item.get("input")
-    if isinstance(value, str | int | float | bool):
-        text += f" (it is {value!r})"
-    return text
-
-
-def _known_keys(model: type[BaseModel], parts: tuple[str | int, ...]) -> list[str]:
-    """The keys a model knows at a place; follows nested models and lists of models."""
-    current: Any = model
-    for part in parts:
-        if isinstance(part, int):
-            continue
-        field = getattr(current, "model_fields", {}).get(part)
-        current = _inner_model(field.annotation) if field is not None else None
-        if current is None:
-            return []
-    return list(current.model_fields)
-
-
-def _inner_model(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        inner = _inner_model(argument)
-        if inner is not None:
-            return inner
-    return None
+def _unchecked(annotation: Any, value: Any, path: KeyPath, unsound: set[KeyPath]) -> Any:
+    """Documents of plain data; in place of an unsound value an object that nothing can use."""
+    if path in unsound:
+        return object()
+    model = model_in(annotation)
+    if isinstance(value, dict) and model is not None:
+        fields = model.model_fields
+        parts = {
+            key: _unchecked(fields[key].annotation, part, (*path, key), unsound)
+            for key, part in value.items()
+            if key in fields
+        }
+        return model.model_construct(**parts)
+    if isinstance(value, list):
+        return [_unchecked(annotation, v, (*path, i), unsound) for i, v in enumerate(value)]
+    return value
 
 
 def content_hash(document: Any) -> str:
@@ -187,27 +158,32 @@ def write_atomic(path: Path, text: str) -> None:
     """Writes a whole file or nothing.
 
     Raises:
-        BadInput: The folder is missing or cannot be written to.
+        BadInput: The folder is missing, cannot be written to or is full.
     """
+    if path.is_dir():
+        raise BadInput("this is a folder", where=str(path), next_step="name a file")
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     except OSError as error:
-        raise BadInput(
-            "the file cannot be written",
-            where=str(path),
-            why=error.strerror or str(error),
-            next_step="choose a folder that exists and that you may write to",
-        ) from None
+        hint = "choose a folder that exists and that you may write to"
+        raise _not_written(path, error, hint) from None
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
             stream.write(text)
+            stream.flush()
+            os.fsync(handle)  # or a power cut could leave the new name on an empty file
         Path(temporary).chmod(0o644)
         Path(temporary).replace(path)
     except OSError as error:
-        Path(temporary).unlink(missing_ok=True)
-        raise BadInput(
-            "the file cannot be written",
-            where=str(path),
-            why=error.strerror or str(error),
-            next_step="free some space or choose another folder",
-        ) from None
+        raise _not_written(path, error, "free some space or choose another folder") from None
+    finally:
+        Path(temporary).unlink(missing_ok=True)  # gone already when all went well
+
+
+def _not_written(path: Path, error: OSError, next_step: str) -> BadInput:
+    return BadInput(
+        "the file cannot be written",
+        where=str(path),
+        why=error.strerror or str(error),
+        next_step=next_step,
+    )

@@ -9,12 +9,14 @@ from typing import Any, NoReturn
 
 from pydantic import ValidationError
 
-from cdpr.documents import content_hash, problems_of, read_text, write_atomic
+from cdpr.documents import check_version, content_hash, problems_of, read_text, write_atomic
 from cdpr.errors import BadInput, InvalidFile
 from cdpr.plan_file import PlanDocument
 from cdpr.poses import Pose
 from cdpr.rig import Rig, rig_from_document
 from cdpr.scene import Scene, scene_from_document
+
+ANEW = "make the plan anew with `cdpr plan`"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,50 +72,62 @@ def load_plan(path: Path) -> Plan:
         BadInput: It cannot be read, is no JSON, holds NaN, or its hash does not match.
         InvalidFile: With every key that does not fit.
     """
-    text = read_text(path)
-    try:
-        data = json.loads(text, parse_constant=_no_constant)
-    except json.JSONDecodeError as error:
-        raise BadInput(
-            f"not valid JSON: {error.msg}",
-            where=f"{path}:{error.lineno}:{error.colno}",
-            next_step="make the plan anew with `cdpr plan`",
-        ) from None
-    except ValueError as error:
-        raise BadInput(
-            str(error), where=str(path), next_step="make the plan anew with `cdpr plan`"
-        ) from None
+    data = _json_object(path)
+    if data.get("kind") != "cdpr-plan":
+        raise BadInput("this is not a plan file", where=str(path), next_step=ANEW)
+    check_version(data, PlanDocument, path, {}, ANEW)
     try:
         document = PlanDocument.model_validate(data)
     except ValidationError as error:
-        problems = problems_of(error, PlanDocument, {})
-        raise InvalidFile(
-            str(path), problems, "make the plan anew with `cdpr plan`"
+        raise InvalidFile(str(path), problems_of(error, PlanDocument, {}), ANEW) from None
+    _check_hash("hash", document.hash, _digest(data), path)
+    plan = plan_from_document(document)
+    _check_hash("rig_hash", document.rig_hash, plan.rig.plan_hash, path)
+    _check_hash("scene_hash", document.scene_hash, plan.scene.hash, path)
+    return plan
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    text, where = read_text(path), str(path)
+    try:
+        data = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_unique_keys)
+    except json.JSONDecodeError as error:
+        where = f"{path}:{error.lineno}:{error.colno}"
+        why = "the file was cut off or edited" if text.strip() else "the file is empty"
+        raise BadInput(
+            f"not valid JSON: {error.msg}", where=where, why=why, next_step=ANEW
         ) from None
-    _check_hashes(document, data, path)
-    return plan_from_document(document)
+    except ValueError as error:
+        raise BadInput(str(error), where=where, next_step=ANEW) from None
+    except RecursionError:
+        raise BadInput("nested too deeply for a plan", where=where, next_step=ANEW) from None
+    if not isinstance(data, dict):
+        raise BadInput("this is not a plan file", where=where, next_step=ANEW)
+    return data
 
 
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"the plan holds {name}, which is no number")
 
 
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    data = dict(pairs)
+    if len(data) != len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} stands twice")
+    return data
+
+
 def _digest(data: dict[str, Any]) -> str:
     return content_hash({key: value for key, value in data.items() if key != "hash"})
 
 
-def _check_hashes(document: PlanDocument, data: dict[str, Any], path: Path) -> None:
-    plan = plan_from_document(document)
-    expected = {
-        "hash": _digest(data),
-        "rig_hash": plan.rig.plan_hash,
-        "scene_hash": plan.scene.hash,
-    }
-    for key, value in expected.items():
-        if data[key] != value:
-            raise BadInput(
-                f"the plan's {key} does not match its content",
-                where=str(path),
-                why="the file was edited or damaged after it was written",
-                next_step="make the plan anew with `cdpr plan`; a plan cannot be edited by hand",
-            )
+def _check_hash(key: str, stated: str, actual: str, path: Path) -> None:
+    if stated != actual:
+        raise BadInput(
+            f"the plan's {key} does not match its content",
+            where=str(path),
+            why="the file was edited or damaged after it was written",
+            next_step=f"{ANEW}; a plan cannot be edited by hand",
+        )

@@ -42,9 +42,7 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     squares = np.array([trace, m[0, 0], m[1, 1], m[2, 2]])
     largest = int(np.argmax(squares))
     if largest == 0:
-        q = np.array(
-            [1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
-        )
+        q = np.array([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
     else:
         i = largest - 1
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -63,12 +61,11 @@ def matrix_from_rotation_vector(vector: ArrayLike) -> Array:
     angle = float(np.linalg.norm(v))
     s = skew(v)
     if angle < 1e-6:  # series: the closed form loses digits near zero
-        return np.eye(3) + s + 0.5 * (s @ s)
-    return (
-        np.eye(3)
-        + (np.sin(angle) / angle) * s
-        + ((1 - np.cos(angle)) / angle**2) * (s @ s)
-    )
+        first, second = 1.0, 0.5
+    else:
+        first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
+    matrix: Array = np.eye(3) + first * s + second * (s @ s)
+    return matrix
 
 
 def rotation_vector_from_matrix(matrix: ArrayLike) -> Array:
@@ -77,7 +74,8 @@ def rotation_vector_from_matrix(matrix: ArrayLike) -> Array:
     sine = float(np.linalg.norm(q[1:]))
     if sine < 1e-12:
         return 2.0 * q[1:]
-    return q[1:] * (2.0 * np.arctan2(sine, q[0]) / sine)
+    vector: Array = q[1:] * (2.0 * np.arctan2(sine, q[0]) / sine)
+    return vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,9 +103,7 @@ class Pose:
     @classmethod
     def from_quaternion(cls, position: ArrayLike, quaternion: ArrayLike) -> Pose:
         """A pose from ``position`` [m] and a unit quaternion (w, x, y, z)."""
-        return cls(
-            np.asarray(position, dtype=np.float64), matrix_from_quaternion(quaternion)
-        )
+        return cls(np.asarray(position, dtype=np.float64), matrix_from_quaternion(quaternion))
 
     @property
     def quaternion(self) -> Array:
@@ -116,9 +112,7 @@ class Pose:
 
     def apply(self, points: ArrayLike) -> Array:
         """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""
-        mapped: Array = (
-            np.asarray(points, dtype=np.float64) @ self.rotation.T + self.position
-        )
+        mapped: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.position
         return mapped
 
     def compose(self, other: Pose) -> Pose:

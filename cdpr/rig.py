@@ -144,9 +144,7 @@ class Rig:
     def plan_hash(self) -> str:
         """Hash of the parts of the rig that a plan's proof rests on."""
         document = self.document.model_dump(mode="json")
-        return content_hash(
-            {k: v for k, v in document.items() if k not in NOT_IN_PLAN_HASH}
-        )
+        return content_hash({k: v for k, v in document.items() if k not in NOT_IN_PLAN_HASH})
 
     @cached_property
     def hash(self) -> str:
@@ -176,9 +174,9 @@ def rig_from_document(document: RigDocument) -> Rig:
     Raises:
         BadInput: Parts of the document do not agree.
     """
-    if document.findings():
-        parts, what = document.findings()[0]
-        raise BadInput(f"{key_path(parts)}: {what}", where=f"rig {document.name}")
+    findings = [f"{key_path(parts)}: {what}" for parts, what in document.findings()]
+    if findings:
+        raise BadInput("; ".join(findings), where=f"rig {document.name}")
     pulleys, tags = document.pulleys, document.tags
     count = len(document.outlets_mm)
     feed = pulleys.feed_directions if pulleys else [[0.0, 0.0, 1.0]] * count
@@ -187,9 +185,7 @@ def rig_from_document(document: RigDocument) -> Rig:
         outlets=_array(document.outlets_mm),
         anchors=_array(document.anchors_mm),
         pulley_radius=pulleys.radius_mm / 1000.0 if pulleys else 0.0,
-        feed_directions=read_only(
-            np.asarray(feed) / np.linalg.norm(feed, axis=1)[:, None]
-        ),
+        feed_directions=read_only(np.asarray(feed) / np.linalg.norm(feed, axis=1)[:, None]),
         half_size=read_only(millimetres(document.platform.size_mm) / 2.0),
         mass=document.platform.mass_kg,
         centre_of_mass=read_only(millimetres(document.platform.centre_of_mass_mm)),

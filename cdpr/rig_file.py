@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from cdpr.document_types import (
     Document,
+    Finding,
     NonNegative,
     Number,
     PoseDocument,
     Positive,
     PositiveVector,
+    UnitVector,
     Vector,
 )
 
@@ -32,13 +35,13 @@ class WorkspaceDocument(Document):
     lower_mm: Vector
     upper_mm: Vector
 
-    @model_validator(mode="after")
-    def _ordered(self) -> WorkspaceDocument:
-        if any(
-            low >= high for low, high in zip(self.lower_mm, self.upper_mm, strict=True)
-        ):
-            raise ValueError("every lower_mm must be less than its upper_mm")
-        return self
+    @field_validator("upper_mm")
+    @classmethod
+    def _above_lower(cls, upper: list[float], info: ValidationInfo) -> list[float]:
+        for axis, low, high in zip("xyz", info.data.get("lower_mm", ()), upper, strict=False):
+            if low >= high:
+                raise ValueError(f"{axis} = {high:g} must be more than lower_mm's {low:g}")
+        return upper
 
 
 class CableDocument(Document):
@@ -49,31 +52,23 @@ class CableDocument(Document):
     min_tension_n: Positive
     max_tension_n: Positive
 
-    @model_validator(mode="after")
-    def _ordered(self) -> CableDocument:
-        if self.min_tension_n >= self.max_tension_n:
-            raise ValueError("min_tension_n must be less than max_tension_n")
-        return self
+    @field_validator("max_tension_n")
+    @classmethod
+    def _above_min(cls, high: float, info: ValidationInfo) -> float:
+        low = info.data.get("min_tension_n")
+        if low is not None and low >= high:
+            raise ValueError(f"must be more than min_tension_n ({low:g} N); it is {high:g} N")
+        return high
 
 
 class PulleysDocument(Document):
     """Swivelling pulleys at the outlets; left out, cables leave at the outlet points."""
 
     radius_mm: Positive
-    feed_directions: Annotated[list[Vector], Field(min_length=1)] = Field(
+    feed_directions: Annotated[list[UnitVector], Field(min_length=1)] = Field(
         description="per cable: unit direction of travel of the cable where it enters the pulley,"
         " along the swivel axis"
     )
-
-    @model_validator(mode="after")
-    def _unit(self) -> PulleysDocument:
-        for index, direction in enumerate(self.feed_directions):
-            length = sum(x * x for x in direction) ** 0.5
-            if abs(length - 1.0) > 1e-6:
-                raise ValueError(
-                    f"feed_directions[{index}] must have length 1; its length is {length:.6g}"
-                )
-        return self
 
 
 class WinchDocument(Document):
@@ -81,12 +76,8 @@ class WinchDocument(Document):
 
     node_id: Annotated[int, Field(ge=1, le=126)]
     drum_mm_per_rev: Positive
-    gear_ratio: Positive = Field(
-        default=1.0, description="motor turns for one drum turn"
-    )
-    counts_per_rev: Annotated[int, Field(ge=1)] = Field(
-        description="of the motor shaft"
-    )
+    gear_ratio: Positive = Field(default=1.0, description="motor turns for one drum turn")
+    counts_per_rev: Annotated[int, Field(ge=1)] = Field(description="of the motor shaft")
     direction: Literal[-1, 1] = Field(description="+1: positive counts pay cable out")
     home_counts: int = Field(default=0, description="drive position at the home pose")
     drum_to_outlet_mm: NonNegative = Field(
@@ -106,9 +97,7 @@ class MotionDocument(Document):
         default=1.0,
         description="largest distance of a rounded corner from the planned one",
     )
-    following_error_mm: Positive = Field(
-        default=2.0, description="cable length; more is a fault"
-    )
+    following_error_mm: Positive = Field(default=2.0, description="cable length; more is a fault")
     start_tolerance_mm: Positive = Field(
         default=1.0,
         description="cable length; a run starts only this close to its plan",
@@ -139,14 +128,6 @@ class TagsDocument(Document):
     platform: Annotated[list[TagDocument], Field(min_length=1)]
     frame: list[TagDocument] = []
 
-    @model_validator(mode="after")
-    def _unique(self) -> TagsDocument:
-        ids = [tag.id for tag in [*self.platform, *self.frame]]
-        twice = sorted({i for i in ids if ids.count(i) > 1})
-        if twice:
-            raise ValueError(f"tag ids must be unique; twice: {twice}")
-        return self
-
 
 class CameraDocument(Document):
     """One camera: intrinsics (OpenCV pinhole) and pose (x right, y down, z along the view)."""
@@ -163,6 +144,13 @@ class CameraDocument(Document):
     )
     world_from_camera: PoseDocument
     rate_hz: Positive = 10.0
+
+    @field_validator("distortion")
+    @classmethod
+    def _opencv_count(cls, distortion: list[float]) -> list[float]:
+        if len(distortion) not in (0, 4, 5, 8, 12, 14):
+            raise ValueError(f"needs 0, 4, 5, 8, 12 or 14 coefficients, it has {len(distortion)}")
+        return distortion
 
 
 class RigDocument(Document):
@@ -183,46 +171,59 @@ class RigDocument(Document):
     tags: TagsDocument | None = None
     cameras: list[CameraDocument] = []
 
-    def findings(self) -> list[tuple[tuple[str | int, ...], str]]:
+    def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Counts that do not agree, numbers given twice, a home pose outside the workspace."""
-        return [*self._counts(), *self._repeated(), *self._home()]
+        return (
+            self._enough_cables,
+            self._an_anchor_each,
+            self._a_winch_each,
+            self._a_pulley_each,
+            self._nodes_once,
+            self._tags_once,
+            self._cameras_once,
+            self._home_inside,
+        )
 
-    def _counts(self) -> list[tuple[tuple[str | int, ...], str]]:
+    def _enough_cables(self) -> list[Finding]:
         m = len(self.outlets_mm)
-        found: list[tuple[tuple[str | int, ...], str]] = []
-        if m < 6:
-            what = (
-                f"{m} outlets: a platform with six degrees of freedom needs 6 or more"
-            )
-            found.append((("outlets_mm",), what))
-        if len(self.anchors_mm) != m:
-            found.append(
-                (("anchors_mm",), f"{len(self.anchors_mm)} anchors for {m} outlets")
-            )
-        if len(self.winches) != m:
-            found.append((("winches",), f"{len(self.winches)} winches for {m} outlets"))
-        if self.pulleys is not None and len(self.pulleys.feed_directions) != m:
-            count = len(self.pulleys.feed_directions)
-            place = ("pulleys", "feed_directions")
-            found.append((place, f"{count} feed_directions for {m} outlets"))
-        return found
+        what = f"{m} outlets: a platform with six degrees of freedom needs 6 or more"
+        return [(("outlets_mm",), what)] if m < 6 else []
 
-    def _repeated(self) -> list[tuple[tuple[str | int, ...], str]]:
-        ids = [winch.node_id for winch in self.winches]
-        names = [camera.name for camera in self.cameras]
-        found: list[tuple[tuple[str | int, ...], str]] = [
-            (("winches", i, "node_id"), f"node_id {node} stands twice")
-            for i, node in enumerate(ids)
-            if node in ids[:i]
-        ]
-        found += [
-            (("cameras", i, "name"), f"camera name {name!r} stands twice")
-            for i, name in enumerate(names)
-            if name in names[:i]
-        ]
-        return found
+    def _an_anchor_each(self) -> list[Finding]:
+        return self._one_each(("anchors_mm",), len(self.anchors_mm))
 
-    def _home(self) -> list[tuple[tuple[str | int, ...], str]]:
+    def _a_winch_each(self) -> list[Finding]:
+        return self._one_each(("winches",), len(self.winches))
+
+    def _a_pulley_each(self) -> list[Finding]:
+        if self.pulleys is None:
+            return []
+        return self._one_each(("pulleys", "feed_directions"), len(self.pulleys.feed_directions))
+
+    def _one_each(self, place: tuple[str, ...], count: int) -> list[Finding]:
+        m, things = len(self.outlets_mm), place[-1].removesuffix("_mm").replace("_", " ")
+        return [(place, f"{count} {things} for {m} outlets")] if count != m else []
+
+    def _nodes_once(self) -> list[Finding]:
+        nodes = [(("winches", i, "node_id"), w.node_id) for i, w in enumerate(self.winches)]
+        return _repeated("node_id", nodes)
+
+    def _tags_once(self) -> list[Finding]:
+        if self.tags is None:
+            return []
+        groups = {"platform": self.tags.platform, "frame": self.tags.frame}
+        ids = [
+            (("tags", group, i, "id"), tag.id)
+            for group, tags in groups.items()
+            for i, tag in enumerate(tags)
+        ]
+        return _repeated("tag id", ids)
+
+    def _cameras_once(self) -> list[Finding]:
+        names = [(("cameras", i, "name"), camera.name) for i, camera in enumerate(self.cameras)]
+        return _repeated("camera name", names)
+
+    def _home_inside(self) -> list[Finding]:
         box = zip(
             "xyz",
             self.workspace.lower_mm,
@@ -238,3 +239,15 @@ class RigDocument(Document):
             for axis, low, value, high in box
             if not low <= value <= high
         ]
+
+
+def _repeated(
+    kind: str, values: Sequence[tuple[tuple[str | int, ...], int | str]]
+) -> list[Finding]:
+    seen: set[int | str] = set()
+    found: list[Finding] = []
+    for place, value in values:
+        if value in seen:
+            found.append((place, f"{kind} {value!r} stands twice"))
+        seen.add(value)
+    return found

@@ -30,6 +30,7 @@ from cdpr.shapes import (
     Sphere,
     TriangleMesh,
     convex_hull,
+    read_only_indices,
 )
 
 
@@ -89,8 +90,17 @@ class Scene:
         goal: Pose | None = None,
         clearance: float | None = None,
     ) -> Scene:
-        """The same scene with another start, goal or obstacle clearance [m]."""
+        """The same scene with another start, goal or obstacle clearance [m].
+
+        Raises:
+            BadInput: A number is not finite, or the clearance is negative.
+        """
         document = self.document
+        for name, pose in (("start", start), ("goal", goal)):
+            if pose is not None and not np.all(np.isfinite(pose.matrix())):
+                raise BadInput(f"the {name} holds a value that is not a finite number")
+        if clearance is not None and not 0.0 <= clearance < np.inf:
+            raise BadInput(f"the clearance must be 0 mm or more (it is {clearance * 1000.0:g} mm)")
         update: dict[str, object] = {}
         if start is not None:
             update["start"] = PoseDocument.of(start)
@@ -118,9 +128,9 @@ def scene_from_document(document: SceneDocument) -> Scene:
     Raises:
         BadInput: Parts of the document do not agree.
     """
-    if document.findings():
-        parts, what = document.findings()[0]
-        raise BadInput(f"{key_path(parts)}: {what}", where=f"scene {document.name}")
+    findings = [f"{key_path(parts)}: {what}" for parts, what in document.findings()]
+    if findings:
+        raise BadInput("; ".join(findings), where=f"scene {document.name}")
     load = document.load
     return Scene(
         document=document,
@@ -163,6 +173,6 @@ def _shape(key: str, document: Document) -> Shape:
             return convex_hull(np.asarray(points) / 1000.0)
         case MeshDocument(points_mm=points, triangles=triangles):
             vertices = read_only(np.asarray(points) / 1000.0)
-            return TriangleMesh(vertices, np.array(triangles, dtype=np.int64))
+            return TriangleMesh(vertices, read_only_indices(triangles))
         case _:
             raise ValueError(f"unknown shape {key!r}")

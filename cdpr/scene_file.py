@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from cdpr.document_types import (
     Document,
+    Finding,
     NonNegative,
     NonNegativeVector,
     PoseDocument,
     Positive,
     PositiveVector,
     Quaternion,
+    Triple,
     Vector,
 )
+
+SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
 
 
 class BoxDocument(Document):
@@ -47,10 +53,7 @@ class MeshDocument(Document):
     """A surface of triangles; each triangle names three points, counted from 0."""
 
     points_mm: Annotated[list[Vector], Field(min_length=3)]
-    triangles: Annotated[
-        list[Annotated[list[int], Field(min_length=3, max_length=3)]],
-        Field(min_length=1),
-    ]
+    triangles: Annotated[list[Triple], Field(min_length=1)]
 
 
 class ObstacleDocument(Document):
@@ -68,14 +71,7 @@ class ObstacleDocument(Document):
 
     def shapes(self) -> dict[str, Document]:
         """The shapes that were given, by key."""
-        given = {
-            "box": self.box,
-            "sphere": self.sphere,
-            "cylinder": self.cylinder,
-            "capsule": self.capsule,
-            "convex": self.convex,
-            "mesh": self.mesh,
-        }
+        given = {key: getattr(self, key) for key in SHAPES}
         return {key: shape for key, shape in given.items() if shape is not None}
 
 
@@ -85,9 +81,7 @@ class ClearanceDocument(Document):
     obstacle_mm: NonNegative = Field(
         default=10.0, description="cables and platform to every obstacle"
     )
-    self_mm: NonNegative = Field(
-        default=5.0, description="cable to cable and cable to platform"
-    )
+    self_mm: NonNegative = Field(default=5.0, description="cable to cable and cable to platform")
 
 
 class LoadDocument(Document):
@@ -115,28 +109,54 @@ class SceneDocument(Document):
     goal: PoseDocument
     obstacles: list[ObstacleDocument] = []
 
-    def findings(self) -> list[tuple[tuple[str | int, ...], str]]:
+    def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Obstacles without exactly one shape, names given twice, wrong triangles, flat hulls."""
-        found: list[tuple[tuple[str | int, ...], str]] = []
-        names = [obstacle.name for obstacle in self.obstacles]
+        return (self._one_shape_each, self._names_once, self._shapes_whole)
+
+    def _one_shape_each(self) -> list[Finding]:
+        found: list[Finding] = []
         for i, obstacle in enumerate(self.obstacles):
-            place = ("obstacles", i)
             given = list(obstacle.shapes())
             if len(given) != 1:
-                what = f"needs exactly one shape, it has {', '.join(given) or 'none'}"
-                found.append((place, f"obstacle {obstacle.name!r} {what}"))
-            if obstacle.name in names[:i]:
-                found.append(
-                    ((*place, "name"), f"obstacle name {obstacle.name!r} stands twice")
-                )
-            if obstacle.mesh is not None:
-                count = len(obstacle.mesh.points_mm)
-                wrong = [
-                    t
-                    for t in obstacle.mesh.triangles
-                    if not all(0 <= i < count for i in t)
-                ]
-                if wrong:
-                    what = f"triangle {wrong[0]} names a point outside 0..{count - 1}"
-                    found.append(((*place, "mesh", "triangles"), what))
+                has = f"it has {', '.join(given)}" if given else f"one of {', '.join(SHAPES)}"
+                what = f"obstacle {obstacle.name!r} needs exactly one shape: {has}"
+                found.append((("obstacles", i), what))
         return found
+
+    def _names_once(self) -> list[Finding]:
+        names = [obstacle.name for obstacle in self.obstacles]
+        return [
+            (("obstacles", i, "name"), f"obstacle name {name!r} stands twice")
+            for i, name in enumerate(names)
+            if name in names[:i]
+        ]
+
+    def _shapes_whole(self) -> list[Finding]:
+        found: list[Finding] = []
+        for i, obstacle in enumerate(self.obstacles):
+            if obstacle.convex is not None and _is_flat(obstacle.convex.points_mm):
+                what = "the points lie in a plane; a convex body needs a volume"
+                found.append((("obstacles", i, "convex", "points_mm"), what))
+            if obstacle.mesh is not None:
+                place = ("obstacles", i, "mesh", "triangles")
+                found += [((*place, t), what) for t, what in _wrong_triangles(obstacle.mesh)]
+        return found
+
+
+def _is_flat(points_mm: list[list[float]]) -> bool:
+    points = np.asarray(points_mm)
+    centred = points - points.mean(axis=0)
+    size = float(np.max(np.abs(centred)))
+    return size == 0.0 or int(np.linalg.matrix_rank(centred / size, tol=1e-9)) < 3
+
+
+def _wrong_triangles(mesh: MeshDocument) -> list[tuple[int, str]]:
+    """Triangles that name points which do not exist, or one point twice: number and sentence."""
+    count = len(mesh.points_mm)
+    found: list[tuple[int, str]] = []
+    for number, triangle in enumerate(mesh.triangles):
+        if not all(0 <= i < count for i in triangle):
+            found.append((number, f"{triangle} names a point outside 0..{count - 1}"))
+        elif len(set(triangle)) < 3:
+            found.append((number, f"{triangle} names one point twice"))
+    return found

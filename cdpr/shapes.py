@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cdpr.poses import Array, Pose, read_only
+
+Indices = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +47,7 @@ class ConvexHull:
     """The convex hull of ``vertices``, shape (n, 3), [m]; ``triangles`` shape (t, 3)."""
 
     vertices: Array
-    triangles: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    triangles: Indices
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +55,7 @@ class TriangleMesh:
     """A surface of triangles: ``vertices`` shape (n, 3), [m]; ``triangles`` shape (t, 3)."""
 
     vertices: Array
-    triangles: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    triangles: Indices
 
 
 Shape = Box | Sphere | Cylinder | Capsule | ConvexHull | TriangleMesh
@@ -85,6 +88,13 @@ class Obstacle:
     pose: Pose
 
 
+def read_only_indices(triangles: Sequence[Sequence[int]]) -> Indices:
+    """Corner numbers of triangles, shape (t, 3), in an array that cannot be written to."""
+    array = np.array(triangles, dtype=np.int64)
+    array.setflags(write=False)
+    return array
+
+
 def convex_hull(points: Array) -> ConvexHull:
     """The hull of points, shape (n ≥ 4, 3), [m], triangles counter-clockwise from outside.
 
@@ -106,4 +116,4 @@ def convex_hull(points: Array) -> ConvexHull:
         normal = np.cross(points[b] - points[a], points[c] - points[a])
         ordered = (a, b, c) if normal @ equation[:3] > 0 else (a, c, b)
         triangles.append([number[i] for i in ordered])
-    return ConvexHull(read_only(vertices), np.array(triangles, dtype=np.int64))
+    return ConvexHull(read_only(vertices), read_only_indices(triangles))
