@@ -252,7 +252,7 @@ def _opened(source: int | str) -> cv2.VideoCapture:
     before = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.VideoCapture(source)  # type: ignore[call-overload,no-any-return]  # either way
+        return cv2.VideoCapture(source)
     finally:
         cv2.utils.logging.setLogLevel(before)
 

@@ -71,8 +71,8 @@ def measured_camera(camera: Camera, views: Sequence[TagView]) -> tuple[Pose, Arr
     if found is None or not np.all(np.isfinite(found.covariance)):
         return None
     pose = found.camera_from_body.inverse()
-    # When camera_from_world (R, p) shifts and turns about the camera's axes, world_from_camera turns
-    # by −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift − Rᵀ (p × turn).
+    # When camera_from_world (R, p) shifts and turns along the camera's axes, world_from_camera
+    # turns by −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift − Rᵀ (p × turn).
     back = pose.rotation
     change = np.zeros((6, 6))
     change[:3, :3] = change[3:, 3:] = -back
