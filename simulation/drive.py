@@ -111,6 +111,7 @@ class SimulatedDrive:
         self._since_sync: float | None = None
         self._since_set_point: float | None = None
         self._since_heartbeat: dict[int, float] = {}
+        self._watched = self._heartbeat_consumers()
         self._to_own_heartbeat = 0.0
         self._error_time = 0.0
         self._send(HEARTBEAT_BASE + self.node, make_heartbeat(NmtState.BOOT_UP))
@@ -170,6 +171,7 @@ class SimulatedDrive:
             self._server.on_request(  # type: ignore[no-untyped-call]
                 self._server.rx_cobid, data, 0.0
             )
+            self._watched = self._heartbeat_consumers()
 
     def on_nmt(self, command: int, node: int) -> None:
         """An NMT command."""
@@ -188,7 +190,7 @@ class SimulatedDrive:
 
     def on_heartbeat(self, node: int, data: Frame) -> None:
         """The heartbeat of another node; watched from the first one on."""
-        if not self.silent and node in self._watched() and parse_heartbeat(data) is not None:
+        if not self.silent and node in self._watched and parse_heartbeat(data) is not None:
             self._since_heartbeat[node] = 0.0
 
     def fail(self, code: int) -> None:
@@ -246,16 +248,15 @@ class SimulatedDrive:
             if deadline and self._since_set_point > deadline + 1e-9:
                 self._since_set_point = None
                 self._lose_bus(SET_POINT_OVERDUE)
-        watched = self._watched()
         for node in list(self._since_heartbeat):
             self._since_heartbeat[node] += elapsed
-            if node not in watched:
+            if node not in self._watched:
                 del self._since_heartbeat[node]
-            elif self._since_heartbeat[node] > watched[node] + 1e-9:
+            elif self._since_heartbeat[node] > self._watched[node] + 1e-9:
                 del self._since_heartbeat[node]
                 self._lose_bus(LIFE_GUARD)
 
-    def _watched(self) -> dict[int, float]:
+    def _heartbeat_consumers(self) -> dict[int, float]:
         """Nodes and times [s] of the heartbeat consumer, 1016h."""
         entries = (self.objects[0x1016, sub] for sub in range(1, 9))
         return {e >> 16 & 0x7F: (e & 0xFFFF) / 1000.0 for e in entries if e & 0xFFFF}

@@ -20,6 +20,7 @@ from cdpr.winches import WinchMap
 FORCE_TOLERANCE = 1e-7
 """Largest force [N] and moment over the platform's reach [N] left at an equilibrium."""
 
+QUICK_STEPS = 8
 MAX_STEPS = 200
 
 
@@ -78,16 +79,50 @@ class Plant:
         if not (np.isfinite(unstrained).all() and (unstrained > 0.0).all()):
             raise self._lost("an unstrained length is not a positive number", unstrained)
         self._unstrained = np.array(unstrained)
+        if not self._settle_taut():
+            self._settle_anyhow()
+
+    def _settle_taut(self) -> bool:
+        """The quick way, for an equilibrium in which every cable is taut.
+
+        Newton's method with cables that push as well: on the way a step of the drums may press some
+        of them together. False when one would push in the end, or it does not come to an end.
+        """
+        pose = self.pose
+        for _ in range(QUICK_STEPS):
+            try:
+                cables = cables_at(self._rig, pose)
+            except ValueError:  # an anchor inside its pulley
+                return False
+            strain = (cables.lengths + self._behind) / self._unstrained - 1.0
+            tensions = self._rig.cable_stiffness * strain
+            columns = _columns(pose, cables)
+            gradient = self._gradient(pose, columns, tensions)
+            if self._small(gradient):
+                if tensions.min() < 0.0:
+                    return False
+                self.pose, self.tensions = pose, read_only(tensions)
+                return True
+            axial = self._rig.cable_stiffness / self._unstrained
+            stiffness = self._stiffness(pose, cables, axial, np.maximum(tensions, 0.0))
+            try:
+                pose = _moved(pose, np.asarray(np.linalg.solve(stiffness, -gradient)))
+            except np.linalg.LinAlgError:
+                return False
+        return False
+
+    def _settle_anyhow(self) -> None:
+        """Down the energy, step by step, with cables that only pull."""
         pose = self.pose
         cables, tensions = self._pulled(pose)
         for _ in range(MAX_STEPS):
-            gradient = self._gradient(pose, cables, tensions)
+            gradient = self._gradient(pose, _columns(pose, cables), tensions)
             if self._small(gradient):
                 self.pose, self.tensions = pose, read_only(tensions)
                 return
             step = self._newton_step(pose, cables, tensions, gradient)
-            pose, cables, tensions = self._descend(pose, cables, tensions, gradient, step)
-        raise self._lost(f"no equilibrium after {MAX_STEPS} steps", unstrained)
+            pose, cables, tensions = self._descend(pose, gradient, step, tensions)
+        raise self._lost(f"no equilibrium after {MAX_STEPS} steps", self._unstrained)
 
     def energy(self, pose: Pose) -> float:
         """Elastic and potential energy with the platform at a pose, [J]."""
@@ -97,7 +132,7 @@ class Plant:
     def residual(self, pose: Pose) -> Array:
         """Wrench left over at a pose, about the platform's origin, shape (6,), [N, N·m]."""
         cables, tensions = self._pulled(pose)
-        return -self._gradient(pose, cables, tensions)
+        return -self._gradient(pose, _columns(pose, cables), tensions)
 
     def _pulled(self, pose: Pose) -> tuple[Cables, Array]:
         """The cables at a pose and their tensions, [N]."""
@@ -114,15 +149,11 @@ class Plant:
         height = pose.position[2] + pose.rotation[2] @ self._centre
         return float(elastic + self._weight * height)
 
-    def _gradient(self, pose: Pose, cables: Cables, tensions: Array) -> Array:
+    def _gradient(self, pose: Pose, columns: Array, tensions: Array) -> Array:
         """Energy by a twist (translation, rotation in the world): minus the wrench, shape (6,)."""
-        forces = cables.directions * tensions[:, None]
-        arms = cables.anchors - pose.position
-        arm_x, arm_y = (pose.rotation @ self._centre)[:2]
-        gradient = np.empty(6)
-        gradient[:3] = -forces.sum(axis=0)
+        gradient: Array = -(tensions @ columns)
+        arm_x, arm_y = (pose.rotation @ self._centre)[:2].tolist()
         gradient[2] += self._weight
-        gradient[3:] = -_cross(arms, forces).sum(axis=0)
         gradient[3] += arm_y * self._weight
         gradient[4] -= arm_x * self._weight
         return gradient
@@ -133,34 +164,40 @@ class Plant:
 
     def _newton_step(self, pose: Pose, cables: Cables, tensions: Array, gradient: Array) -> Array:
         """A descent direction; damped until the stiffness is positive definite."""
-        stiffness: Array = self._stiffness(pose, cables, tensions)
+        taut = np.where(tensions > 0.0, self._rig.cable_stiffness / self._unstrained, 0.0)
+        stiffness = self._stiffness(pose, cables, taut, tensions)
         scale = np.array([1.0, 1.0, 1.0, self._reach, self._reach, self._reach])
         damping = 0.0
         while True:
-            damped: Array = stiffness + np.diag(damping * scale * scale)
+            damped = stiffness + np.diag(damping * scale * scale)
             try:
                 np.linalg.cholesky(damped)
             except np.linalg.LinAlgError:
                 damping = max(10.0 * damping, 1e-3 * self._weight / self._reach)
                 continue
-            step: Array = np.linalg.solve(damped, -gradient)
+            step = np.asarray(np.linalg.solve(damped, -gradient))
             longest = max(np.abs(step[:3]).max(), np.abs(step[3:]).max() * self._reach)
             shortened: Array = step * min(1.0, self._reach / longest)
             return shortened
 
-    def _stiffness(self, pose: Pose, cables: Cables, tensions: Array) -> Array:
+    def _stiffness(self, pose: Pose, cables: Cables, axial: Array, tensions: Array) -> Array:
         """Second derivative of the energy by the twist, shape (6, 6).
 
         Over a pulley the exit moves with the anchor; that part is left out, which costs steps
         and no accuracy, since the equilibrium is decided by the gradient.
+
+        Args:
+            pose: ``world_from_platform``.
+            cables: The cables there.
+            axial: Tension by length of each cable, 0 for a slack one, shape (m,), [N/m].
+            tensions: Shape (m,), [N].
         """
         arms = cables.anchors - pose.position
         directions = cables.directions
-        columns = np.hstack([directions, _cross(arms, directions)])
-        taut = np.where(tensions > 0.0, self._rig.cable_stiffness / self._unstrained, 0.0)
+        columns = _columns(pose, cables)
         straight = np.linalg.norm(cables.exits - cables.anchors, axis=1)
         swing = tensions / straight
-        stiffness: Array = (columns.T * (taut - swing)) @ columns
+        stiffness: Array = (columns.T * (axial - swing)) @ columns
         # Sum of swing · Gᵀ G with G = [1, −[a]×], the motion of an anchor under the twist.
         weighted = swing @ arms
         coupling = skew(weighted)
@@ -177,7 +214,7 @@ class Plant:
         return stiffness
 
     def _descend(
-        self, pose: Pose, cables: Cables, tensions: Array, gradient: Array, step: Array
+        self, pose: Pose, gradient: Array, step: Array, tensions: Array
     ) -> tuple[Pose, Cables, Array]:
         """The pose after the step, shortened until the energy does not grow."""
         before = self._energy(pose, tensions)
@@ -211,6 +248,12 @@ def _weight(rig: Rig, load: Load | None) -> tuple[float, Array]:
     if load:
         centre = centre + payload * np.asarray(load.payload_centre)
     return mass * STANDARD_GRAVITY, read_only(centre / mass)
+
+
+def _columns(pose: Pose, cables: Cables) -> Array:
+    """Columns of the structure matrix, one a row, shape (m, 6)."""
+    arms = cables.anchors - pose.position
+    return np.concatenate([cables.directions, _cross(arms, cables.directions)], axis=1)
 
 
 def _cross(a: Array, b: Array) -> Array:
