@@ -9,10 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpr.cables import Cables, cables_at, cables_to
-from cdpr.errors import Fault
+from cdpr.cables import Cables, NoCable, cables_at, cables_to
+from cdpr.errors import BadInput, Fault
 from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
 from cdpr.rig import Rig
+
+LEAST_DAMPING = 1e-12
+"""Keeps the steps of forward kinematics defined at poses where the platform is not held."""
 
 
 def cable_lengths(rig: Rig, pose: Pose) -> Array:
@@ -71,12 +74,19 @@ def forward_kinematics(
         tolerance: Size of the last step at which the search ends, [m] and [rad].
 
     Raises:
+        BadInput: Not a finite length for each cable.
         Fault: No start led to a stationary pose.
     """
+    wanted = np.asarray(lengths, dtype=np.float64)
+    if wanted.shape != (rig.cable_count,) or not np.all(np.isfinite(wanted)):
+        raise BadInput(
+            f"needs a finite length for each of {rig.cable_count} cables",
+            where="forward kinematics",
+        )
     starts = [guess] if guess is not None else _cold_starts(rig)
     best: ForwardSolution | None = None
     for start in starts:
-        found = _levenberg_marquardt(rig, np.asarray(lengths, dtype=np.float64), start, tolerance)
+        found = _levenberg_marquardt(rig, wanted, start, tolerance)
         if found is None:
             continue
         if best is None or found.worst < best.worst:
@@ -151,7 +161,7 @@ def _levenberg_marquardt(
         candidate = _moved(pose, step)
         trial = _residual(rig, candidate, lengths)
         if trial is not None and trial @ trial <= residual @ residual:
-            pose, residual, damping = candidate, trial, max(damping / 10.0, 1e-15)
+            pose, residual, damping = candidate, trial, max(damping / 10.0, LEAST_DAMPING)
             if np.max(np.abs(step)) < tolerance:
                 return ForwardSolution(pose, read_only(residual), iteration)
         elif np.max(np.abs(step)) < tolerance:
@@ -170,7 +180,7 @@ def _step_scale(rig: Rig) -> Array:
 def _residual(rig: Rig, pose: Pose, lengths: Array) -> Array | None:
     try:
         return cable_lengths(rig, pose) - lengths
-    except ValueError:  # the trial pose puts an anchor inside a pulley
+    except NoCable:  # the trial pose puts an anchor inside a pulley
         return None
 
 
