@@ -1,0 +1,291 @@
+"""The independent check: distances of primitive shapes at dense poses, with proved bounds between.
+
+It shares neither the swept hulls nor the rules of the search, only the model. Every quantity is
+sampled along the path, and between samples bounded by how fast it can change (`planner.bounds`):
+
+* obstacle clearance: no faster than the motion, as no point of the robot moves farther;
+* self clearance: with level point exits no faster than the motion, else by a stated multiple;
+* capacity margin: by the sum of what each cable's wrench can change at its largest tension.
+
+Tensions and cable speeds are those at the samples, at most 5 mm apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from cdpr.cables import cables_at
+from cdpr.clearance import ClearanceModel, Nearest
+from cdpr.errors import Refused
+from cdpr.kinematics import structure_matrix
+from cdpr.plan import Plan
+from cdpr.poses import Array, Pose
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from cdpr.statics.dexterity import rms_anchor_radius
+from cdpr.statics.feasibility import WrenchBox, capacity_margin
+from cdpr.statics.gravity import STANDARD_GRAVITY
+from cdpr.statics.tension_solution import TensionInfeasible
+from cdpr.statics.working import weight_wrench, working_tensions
+from planner.bounds import Smallest, smallest_along
+from planner.check_report import CheckReport, Closest, VerifiedPlan, Violation, verified
+from planner.track import Track
+
+SPACING = 0.005
+CLEARANCE_TOLERANCE = 0.1e-3
+"""How exactly the smallest clearances are found, [m]."""
+MARGIN_TOLERANCE = 0.005
+"""How exactly the smallest capacity margin is found, part of the largest tension."""
+END_TOLERANCE = 1e-6
+"""How far a path may begin and end from the scene's start and goal, [m] and [rad]."""
+
+
+def verify(plan: Plan) -> VerifiedPlan:
+    """Proves a plan for the rig and the scene it carries.
+
+    Raises:
+        Refused: With every violation, what by how much and where.
+    """
+    report = check_path(plan.rig, plan.scene, plan.waypoints)
+    if not report.passed:
+        listed = "; ".join(v.sentence() for v in report.violations)
+        raise Refused(
+            f"the plan fails its check: {listed}",
+            where=f"plan for {plan.rig.name} in {plan.scene.name}",
+            next_step="make the plan anew with `cdpr plan`; nothing has moved",
+            values={f"violation_{i + 1}": v.sentence() for i, v in enumerate(report.violations)},
+        )
+    return verified(plan, report)
+
+
+def check_path(
+    rig: Rig, scene: Scene, poses: Sequence[Pose], *, ends: bool = True
+) -> CheckReport:
+    """Checks a path, whether a few corners or thousands of poses of an executed curve.
+
+    Args:
+        rig: The robot.
+        scene: Obstacles, clearances, load, start and goal.
+        poses: ``world_from_platform``; between two the platform moves straight.
+        ends: Whether the path must begin at the scene's start and end at its goal.
+    """
+    return _Check(rig, scene, Track(rig, poses)).report(ends)
+
+
+class _Check:
+    """One check of one path."""
+
+    def __init__(self, rig: Rig, scene: Scene, track: Track) -> None:
+        self.rig, self.scene, self.track = rig, scene, track
+        self.model = ClearanceModel(rig, scene)
+        self.places = track.places(SPACING)
+        self.violations: list[Violation] = []
+        self.length_unit = rms_anchor_radius(rig.anchors)
+        self._poses = {place: track.pose(place) for place in self.places.tolist()}
+
+    def report(self, ends: bool) -> CheckReport:
+        self._check_workspace()
+        if ends:
+            self._check_ends()
+        self._check_pulleys()
+        obstacle, obstacle_proof = self._obstacle_clearance()
+        own, own_proof = self._self_clearance()
+        margin = self._margin()
+        tensions, speed = self._tensions(), self._cable_speed()
+        return CheckReport(
+            length=self.track.length,
+            samples=obstacle_proof.samples if obstacle_proof else own_proof.samples,
+            obstacle_clearance=obstacle,
+            proved_obstacle_clearance=obstacle_proof.proved if obstacle_proof else float("inf"),
+            required_obstacle_clearance=self.scene.obstacle_clearance,
+            self_clearance=own,
+            proved_self_clearance=own_proof.proved,
+            required_self_clearance=self.scene.self_clearance,
+            min_tension=tensions[0],
+            max_tension=tensions[1],
+            capacity_margin=margin.value,
+            proved_capacity_margin=margin.proved,
+            max_cable_speed=speed,
+            violations=tuple(self.violations),
+        )
+
+    def _pose(self, place: float) -> Pose:
+        return self._poses.get(place) or self.track.pose(place)
+
+    def _check_workspace(self) -> None:
+        positions = np.array([pose.position for pose in self.track.poses])
+        outside = np.maximum(
+            self.rig.workspace_lower - positions, positions - self.rig.workspace_upper
+        ).max(axis=1)
+        worst = int(np.argmax(outside))
+        if outside[worst] > END_TOLERANCE:
+            what = "the path leaves the workspace box"
+            self._violation(what, float(outside[worst]), 0.0, "mm", positions[worst])
+
+    def _check_ends(self) -> None:
+        scene, poses = self.scene, self.track.poses
+        for name, pose, wanted in (
+            ("start", poses[0], scene.start),
+            ("goal", poses[-1], scene.goal),
+        ):
+            away = max(pose.distance_to(wanted), pose.angle_to(wanted))
+            if away > END_TOLERANCE:
+                what = f"the path does not meet the scene's {name}"
+                self._violation(what, away, END_TOLERANCE, "mm", pose.position)
+
+    def _check_pulleys(self) -> None:
+        """The bounds rest on exits that move at most half as fast as anchors."""
+        radius = self.rig.pulley_radius
+        if radius == 0.0:
+            return
+        for place in self.places.tolist():
+            pose = self._pose(place)
+            offset = pose.apply(self.rig.anchors) - self.rig.outlets
+            along = np.sum(offset * self.rig.feed_directions, axis=-1, keepdims=True)
+            reach = np.linalg.norm(offset - along * self.rig.feed_directions, axis=-1)
+            near = float(min(reach.min() - 4.0 * radius, np.linalg.norm(offset, axis=-1).min()))
+            if near - 3.0 * radius < SPACING and reach.min() - SPACING < 4.0 * radius:
+                k = int(np.argmin(reach))
+                what = f"cable {k + 1} comes too near to its pulley's axis for its motion to be bounded"
+                self._violation(what, float(reach[k]), 4.0 * radius, "mm", pose.position)
+                return
+
+    def _obstacle_clearance(self) -> tuple[Closest | None, Smallest | None]:
+        if not self.scene.obstacles:
+            return None, None
+
+        def nearest(pose: Pose) -> Nearest:
+            found = self.model.smallest(pose)
+            if found is None:
+                raise ValueError("a scene with obstacles has a nearest one")
+            return found
+
+        required = self.scene.obstacle_clearance
+        closest, proof = self._closest(nearest, 1.0, required)
+        self._clearance_violation("obstacle clearance", closest, proof, required)
+        return closest, proof
+
+    def _self_clearance(self) -> tuple[Closest, Smallest]:
+        required = self.scene.self_clearance
+        closest, proof = self._closest(self.model.self_clearance, self._self_slope(), required)
+        self._clearance_violation("self clearance", closest, proof, required)
+        return closest, proof
+
+    def _self_slope(self) -> float:
+        """Two points of cables whose anchors move alike part by at most the motion; exits on pulleys
+        add half of it each; turning adds the levers of anchors and, to the platform, of exits."""
+        slope = 1.0 if self.rig.pulley_radius == 0.0 else 2.0
+        if self.track.turns:
+            positions = np.array([pose.position for pose in self.track.poses])
+            levers = np.linalg.norm(self.rig.outlets - positions[:, None, :], axis=-1)
+            farthest = float(levers.max()) + 2.0 * self.rig.pulley_radius
+            slope = max(2.0 * slope, 2.0 + farthest / self.track.radius)
+        return slope
+
+    def _closest(
+        self, nearest: Callable[[Pose], Nearest], slope: float, required: float
+    ) -> tuple[Closest, Smallest]:
+        def evaluate(places: Array) -> Array:
+            return np.array([nearest(self._pose(p)).distance for p in places.tolist()])
+
+        proof = smallest_along(self.places, evaluate, slope, required, CLEARANCE_TOLERANCE)
+        pose = self._pose(proof.at)
+        return Closest(nearest(pose), pose, proof.at), proof
+
+    def _clearance_violation(
+        self, name: str, closest: Closest, proof: Smallest, required: float
+    ) -> None:
+        pair = f"{closest.nearest.first} – {closest.nearest.second}"
+        if proof.value < required:
+            what = f"{name} too small, {pair}"
+            self._violation(what, proof.value, required, "mm", closest.pose.position)
+        elif proof.proved < required:
+            what = f"{name} not proved between samples, {pair}"
+            self._violation(what, proof.proved, required, "mm", closest.pose.position)
+
+    def _margin(self) -> Smallest:
+        load = self.scene.load
+        disturbance = np.concatenate([load.force, load.moment])
+
+        def evaluate(places: Array) -> Array:
+            poses = [self._pose(p) for p in places.tolist()]
+            matrices = np.array([structure_matrix(self.rig, pose) for pose in poses])
+            weights = np.array([weight_wrench(self.rig, pose, load) for pose in poses])
+            spread = np.broadcast_to(disturbance, weights.shape)
+            box = WrenchBox(weights, spread)
+            return capacity_margin(
+                matrices, self.rig.min_tension, self.rig.max_tension, box, self.length_unit
+            )
+
+        tolerance = MARGIN_TOLERANCE * self.rig.max_tension
+        found = smallest_along(self.places, evaluate, self._margin_slope(), 0.0, tolerance)
+        if found.proved < 0.0:
+            what = "the cables cannot hold every load asked for: capacity margin"
+            place = self._pose(found.at).position
+            self._violation(what, min(found.value, found.proved), 0.0, "N", place)
+        return found
+
+    def _margin_slope(self) -> float:
+        """How fast the set of wrenches can change, [N] per metre of motion.
+
+        A cable's direction turns by at most the motion of its ends over its free length; its wrench
+        changes by that, with its arm over the unit of length for the moment; and the arm itself
+        turns with the platform, as does the weight's.
+        """
+        free = np.min(
+            [
+                np.linalg.norm(c.exits - c.anchors, axis=-1)
+                for c in (cables_at(self.rig, self._pose(p)) for p in self.places.tolist())
+            ],
+            axis=0,
+        )
+        ends = 1.0 if self.rig.pulley_radius == 0.0 else 1.5
+        arms = np.linalg.norm(self.rig.anchors, axis=1) / self.length_unit
+        turn = ends / np.maximum(free - SPACING * ends, 1e-6)
+        change = turn * np.sqrt(1.0 + arms**2)
+        slope = float(np.sum(self.rig.max_tension * change))
+        if self.track.turns:
+            load = self.scene.load
+            moment = self.rig.mass * float(np.linalg.norm(self.rig.centre_of_mass))
+            moment += load.payload_mass * float(np.linalg.norm(load.payload_centre))
+            levers = self.rig.max_tension * float(arms.sum())
+            levers += moment * STANDARD_GRAVITY / self.length_unit
+            slope += levers / self.track.radius
+        return slope
+
+    def _tensions(self) -> tuple[float, float]:
+        low, high = np.inf, -np.inf
+        for place in self.places.tolist():
+            pose = self._pose(place)
+            try:
+                tensions = working_tensions(self.rig, pose, self.scene.load).tensions
+            except TensionInfeasible as error:
+                what = "no tensions within the limits hold the weight; short by"
+                self._violation(what, error.shortfall, 0.0, "N", pose.position)
+                return float("nan"), float("nan")
+            low, high = min(low, float(tensions.min())), max(high, float(tensions.max()))
+        return low, high
+
+    def _cable_speed(self) -> float:
+        """The largest speed of a cable at the rig's path speed, [m/s]."""
+        directions = self.track.directions(self.places)
+        limits = np.array([winch.max_speed for winch in self.rig.winches])
+        largest = 0.0
+        for place, direction in zip(self.places.tolist(), directions, strict=True):
+            pose = self._pose(place)
+            twist = np.concatenate([self.rig.motion.speed * direction, np.zeros(3)])
+            speeds = np.abs(structure_matrix(self.rig, pose).T @ twist)
+            largest = max(largest, float(speeds.max()))
+            over = int(np.argmax(speeds - limits))
+            if speeds[over] > limits[over]:
+                what = f"cable {over + 1} would have to run faster than its winch"
+                self._violation(what, speeds[over], limits[over], "mm/s", pose.position)
+                break
+        return largest
+
+    def _violation(
+        self, what: str, measured: float, limit: float, unit: str, position: Array
+    ) -> None:
+        self.violations.append(Violation(what, float(measured), float(limit), unit, position))

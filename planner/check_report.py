@@ -1,0 +1,171 @@
+"""What a check found: figures with pair and place, violations, and the plan that has been proved."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from cdpr.clearance import Nearest
+from cdpr.plan import Plan
+from cdpr.poses import Array, Pose
+
+_SCALE = {"mm": 1000.0, "mm/s": 1000.0, "N": 1.0}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closest:
+    """The smallest distance along a path.
+
+    Attributes:
+        nearest: The two bodies and their distance.
+        pose: Of the platform there.
+        place: Motion from the path's start to there, [m].
+    """
+
+    nearest: Nearest
+    pose: Pose
+    place: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`, and with the keys of a plan's quality."""
+        return {
+            "first": self.nearest.first,
+            "second": self.nearest.second,
+            "distance_mm": self.nearest.distance * 1000.0,
+            "position_mm": [float(x) * 1000.0 for x in self.pose.position],
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Violation:
+    """One thing that a path does not keep.
+
+    Attributes:
+        what: What it is, without figures.
+        measured: SI.
+        limit: SI.
+        unit: In which people are told: "mm", "mm/s" or "N".
+        position: Of the platform there, shape (3,), [m].
+    """
+
+    what: str
+    measured: float
+    limit: float
+    unit: str
+    position: Array
+
+    def sentence(self) -> str:
+        """The violation in words, with figures and place."""
+        scale = _SCALE[self.unit]
+        x, y, z = (float(c) * 1000.0 for c in self.position)
+        return (
+            f"{self.what}: {self.measured * scale:.4g} {self.unit}"
+            f" (limit {self.limit * scale:.4g} {self.unit})"
+            f" with the platform at [{x:.1f}, {y:.1f}, {z:.1f}] mm"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckReport:
+    """The figures of a checked path, SI.
+
+    A ``proved`` value holds everywhere on the path, between samples too; it is at most the smallest
+    sample, which stands beside it with its place.
+
+    Attributes:
+        length: Way of the platform's origin, [m].
+        samples: Poses at which distances were computed.
+        obstacle_clearance: The smallest; None in a scene without obstacles.
+        proved_obstacle_clearance: [m]; infinite without obstacles.
+        required_obstacle_clearance: [m].
+        self_clearance: The smallest.
+        proved_self_clearance: [m].
+        required_self_clearance: [m].
+        min_tension: Smallest working tension at samples, [N]; NaN where there are none.
+        max_tension: Largest, likewise.
+        capacity_margin: The smallest at samples, [N].
+        proved_capacity_margin: [N].
+        max_cable_speed: At the rig's path speed, at samples, [m/s].
+        violations: What the path does not keep; empty when it passed.
+    """
+
+    length: float
+    samples: int
+    obstacle_clearance: Closest | None
+    proved_obstacle_clearance: float
+    required_obstacle_clearance: float
+    self_clearance: Closest
+    proved_self_clearance: float
+    required_self_clearance: float
+    min_tension: float
+    max_tension: float
+    capacity_margin: float
+    proved_capacity_margin: float
+    max_cable_speed: float
+    violations: tuple[Violation, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the path keeps everything that was asked."""
+        return not self.violations
+
+    @property
+    def exactness(self) -> float:
+        """How far the true smallest obstacle clearance may be below the reported one, [m]."""
+        if self.obstacle_clearance is None:
+            return 0.0
+        return self.obstacle_clearance.nearest.distance - self.proved_obstacle_clearance
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`: units in the keys, no NaN and no infinity."""
+        obstacle = self.obstacle_clearance
+        return {
+            "passed": self.passed,
+            "violations": [v.sentence() for v in self.violations],
+            "length_mm": self.length * 1000.0,
+            "samples": self.samples,
+            "obstacle_clearance": obstacle.as_dict() if obstacle else None,
+            "proved_obstacle_clearance_mm": _finite(self.proved_obstacle_clearance * 1000.0),
+            "required_obstacle_clearance_mm": self.required_obstacle_clearance * 1000.0,
+            "self_clearance": self.self_clearance.as_dict(),
+            "proved_self_clearance_mm": self.proved_self_clearance * 1000.0,
+            "required_self_clearance_mm": self.required_self_clearance * 1000.0,
+            "exactness_mm": self.exactness * 1000.0,
+            "min_tension_n": _finite(self.min_tension),
+            "max_tension_n": _finite(self.max_tension),
+            "capacity_margin_n": _finite(self.capacity_margin),
+            "proved_capacity_margin_n": _finite(self.proved_capacity_margin),
+            "max_cable_speed_mm_s": self.max_cable_speed * 1000.0,
+        }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+_PROOF = object()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VerifiedPlan:
+    """A plan that `planner.check.verify` has passed; nothing else makes one.
+
+    Attributes:
+        plan: The plan.
+        report: What the check found.
+    """
+
+    plan: Plan
+    report: CheckReport
+    proof: object
+
+    def __post_init__(self) -> None:
+        """Refuses to exist without the check."""
+        if self.proof is not _PROOF or not self.report.passed:
+            raise TypeError("a VerifiedPlan comes only from planner.check.verify")
+
+
+def verified(plan: Plan, report: CheckReport) -> VerifiedPlan:
+    """For `planner.check.verify` alone."""
+    return VerifiedPlan(plan, report, _PROOF)

@@ -1,0 +1,101 @@
+"""Whether a start and a goal can be planned from and to, told in words when they cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpr.clearance import ClearanceModel, Nearest
+from cdpr.errors import BadInput
+from cdpr.poses import Pose
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from planner.feasibility import capacity_margins
+from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+
+
+def require_usable_ends(rig: Rig, scene: Scene) -> None:
+    """Refuses a start or a goal that no path can begin or end at.
+
+    Raises:
+        BadInput: One of them is outside the workspace box, too near to an obstacle, too near to
+            itself or cannot be held; or they are turned differently.
+    """
+    model = ClearanceModel(rig, scene)
+    for name, pose in (("start", scene.start), ("goal", scene.goal)):
+        _require_in_workspace(rig, name, pose)
+        _require_clear(scene, model, name, pose)
+        _require_holdable(rig, scene, name, pose)
+    angle = scene.start.angle_to(scene.goal)
+    if angle > 1e-9:
+        raise BadInput(
+            f"start and goal are turned against each other by {np.degrees(angle):.3g} deg",
+            where=f"scene {scene.name}",
+            why="the search keeps the platform's orientation",
+            next_step="give the goal the rotation_wxyz of the start",
+            values={"angle_deg": float(np.degrees(angle))},
+        )
+
+
+def _require_in_workspace(rig: Rig, name: str, pose: Pose) -> None:
+    below = rig.workspace_lower - pose.position
+    above = pose.position - rig.workspace_upper
+    outside = float(np.max(np.maximum(below, above)))
+    if outside <= 1e-9:
+        return
+    axis = int(np.argmax(np.maximum(below, above)))
+    low, high = rig.workspace_lower[axis] * 1e3, rig.workspace_upper[axis] * 1e3
+    raise BadInput(
+        f"the {name} is {outside * 1e3:.1f} mm outside the workspace:"
+        f" {'xyz'[axis]} = {pose.position[axis] * 1e3:.1f} mm, allowed {low:g} to {high:g} mm",
+        where=f"scene {name}",
+        next_step=f"move the {name} into the workspace box of the rig file",
+        values={"outside_mm": outside * 1e3},
+    )
+
+
+def _require_clear(scene: Scene, model: ClearanceModel, name: str, pose: Pose) -> None:
+    nearest = model.smallest(pose)
+    pairs = [(model.self_clearance(pose), scene.self_clearance, "self_mm")]
+    if nearest is not None:
+        pairs.insert(0, (nearest, scene.obstacle_clearance, "obstacle_mm"))
+    for near, asked, key in pairs:
+        needed = asked + CLEARANCE_RESERVE
+        if near.distance < needed:
+            raise _too_near(name, near, needed, key)
+
+
+def _too_near(name: str, near: Nearest, needed: float, key: str) -> BadInput:
+    distance, limit = near.distance * 1e3, needed * 1e3
+    if near.distance <= 0.0:
+        what = f"at the {name} {near.first} touches {near.second} ({-distance:.1f} mm inside)"
+    else:
+        what = (
+            f"at the {name} {near.first} is {distance:.2f} mm from {near.second},"
+            f" which is less than the {limit:.2f} mm asked for"
+        )
+    return BadInput(
+        what,
+        where=f"scene {name}",
+        why=f"the scene's clearance.{key}, and 0.05 mm that the planner keeps in reserve",
+        next_step=f"move the {name} or the obstacle, or ask for less clearance",
+        values={"distance_mm": distance, "required_mm": limit, "pair": _pair(near)},
+    )
+
+
+def _pair(near: Nearest) -> str:
+    return f"{near.first} – {near.second}"
+
+
+def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
+    margin = float(capacity_margins(rig, scene, pose.position[None, :], pose.rotation)[0])
+    reserve = MARGIN_RESERVE * rig.max_tension
+    if margin >= reserve:
+        return
+    raise BadInput(
+        f"at the {name} the cables cannot hold the platform: the capacity margin is"
+        f" {margin:.2f} N, needed {reserve:.2f} N",
+        where=f"scene {name}",
+        why="weight, payload and disturbances need tensions outside min_tension_n..max_tension_n",
+        next_step=f"move the {name} inward, lower the load, or widen the tension limits",
+        values={"margin_n": margin, "required_n": reserve},
+    )

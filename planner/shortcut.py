@@ -1,0 +1,127 @@
+"""Algorithm 3 as meant, and the drawing tight of what it leaves.
+
+As printed, Algorithm 3 takes shortcuts that are NOT free; meant is the farthest node that can be
+reached. A shortcut keeps everything that edges keep. Under the kinematic cost a straight line can
+cost more than the way it replaces, so a shortcut must not be dearer; under the length it never is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cdpr.poses import Array
+from planner.cost import Cost
+
+IsFree = Callable[[Array, Array], bool]
+_ROUND_OFF = 1e-12
+
+
+def shortcut(path: Array, is_free: IsFree, cost: Cost) -> Array:
+    """Algorithm 3: from each kept node straight to the farthest node that can be reached.
+
+    Args:
+        path: Free from node to node, shape (k, n).
+        is_free: Whether an edge is allowed.
+        cost: Of edges.
+
+    Returns:
+        Some of the nodes, the first and the last among them, shape (j, n).
+    """
+    along = _costs_along(path, cost)
+    kept, i, last = [0], 0, len(path) - 1
+    while i < last:
+        i = next(
+            j
+            for j in range(last, i, -1)
+            if j == i + 1
+            or (
+                cost.edge(path[i], path[j]) <= along[j] - along[i] + _ROUND_OFF
+                and is_free(path[i], path[j])
+            )
+        )
+        kept.append(i)
+    return path[kept]
+
+
+def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -> Array:
+    """The cheapest way from start to end through points spread over a path.
+
+    Unlike Algorithm 3 it does not jump as far as it can but as well as it can (a shortest-path
+    search over all pairs of points).
+
+    Args:
+        path: Free from node to node, shape (k, n).
+        is_free: Whether an edge is allowed.
+        cost: Of edges.
+        spacing: Distance of the points spread over the edges, [m].
+    """
+    points = _spread(path, spacing)
+    best = np.append(0.0, np.full(len(points) - 1, np.inf))
+    parent = np.zeros(len(points), dtype=np.int64)
+    for j in range(1, len(points)):
+        edges = np.array([cost.edge(points[i], points[j]) for i in range(j)])
+        totals = best[:j] + edges
+        for i in np.argsort(totals, kind="stable").tolist():
+            if i == j - 1 or is_free(points[i], points[j]):
+                best[j], parent[j] = totals[i], i
+                break
+    way = [len(points) - 1]
+    while way[-1] != 0:
+        way.append(int(parent[way[-1]]))
+    return points[way[::-1]]
+
+
+def drawn_tight(
+    path: Array, is_free: IsFree, cost: Cost, steps: tuple[float, ...] = (0.02, 0.01, 0.005, 0.002)
+) -> Array:
+    """Moves corners, one coordinate direction at a time, while the path gets cheaper.
+
+    Args:
+        path: Free from node to node, shape (k, n).
+        is_free: Whether an edge is allowed.
+        cost: Of edges.
+        steps: Sizes of the moves tried, largest first, [m].
+    """
+    tight = path.copy()
+    for step in steps:
+        for _ in range(10):
+            moved = [_move_corner(tight, k, step, is_free, cost) for k in range(1, len(tight) - 1)]
+            if not any(moved):
+                break
+    return tight
+
+
+def _move_corner(path: Array, k: int, step: float, is_free: IsFree, cost: Cost) -> bool:
+    """Tries moves of one corner in place: along its bisector and along the axes."""
+    before, corner, after = path[k - 1], path[k].copy(), path[k + 1]
+    now = cost.edge(before, corner) + cost.edge(corner, after)
+    inward = (before + after) / 2.0 - corner
+    size = float(np.linalg.norm(inward))
+    ways = np.concatenate([np.eye(len(corner)), -np.eye(len(corner))])
+    if size > 0.0:
+        ways = np.concatenate([inward[None, :] / size, ways])
+    tried = corner + step * ways
+    totals = [cost.edge(before, t) + cost.edge(t, after) for t in tried]
+    for i in np.argsort(totals, kind="stable").tolist():
+        if totals[i] >= now * (1.0 - 1e-6):
+            return False
+        if is_free(before, tried[i]) and is_free(tried[i], after):
+            path[k] = tried[i]
+            return True
+    return False
+
+
+def _spread(path: Array, spacing: float) -> Array:
+    points = [path[:1]]
+    for start, end in zip(path[:-1], path[1:], strict=True):
+        count = max(1, int(np.ceil(np.linalg.norm(end - start) / spacing)))
+        shares = np.arange(1, count) / count
+        points += [start + shares[:, None] * (end - start), end[None, :]]
+    return np.concatenate(points)
+
+
+def _costs_along(path: Array, cost: Cost) -> Array:
+    edges = [cost.edge(a, b) for a, b in zip(path[:-1], path[1:], strict=True)]
+    return np.append(0.0, np.cumsum(edges))
