@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -10,12 +11,16 @@ import numpy as np
 
 from cdpr.poses import Array
 from executor.run_csv import Column, Integers, TableFile, integers, numbers, texts, write_table
+from tracking.pose_log import POSE_COLUMNS
 
 _MM, _DEG = 1e3, float(np.degrees(1.0))
-_AXES = ("x", "y", "z", "rx", "ry", "rz")
-_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 _SCALES = np.array([_MM, _MM, _MM, _DEG, _DEG, _DEG])
 _PAIRS = tuple(combinations_with_replacement(range(6), 2))
+#: As `cdpr track` names them: ``std_x_mm`` …, ``cov_x_rz_mm_deg`` … in the order of the pairs.
+_STD = tuple(name for name in POSE_COLUMNS if name.startswith("std_"))
+_COVARIANCE = dict(
+    zip(_PAIRS, (name for name in POSE_COLUMNS if name.startswith("cov_")), strict=True)
+)
 OK = "ok"
 
 
@@ -91,7 +96,7 @@ class PoseTable:
             texts("status", self.status),
             *_side_by_side([f"{axis}_mm" for axis in "xyz"], self.position * _MM),
             *_side_by_side([f"q{axis}" for axis in "wxyz"], self.rotation, decimals=9),
-            *_side_by_side(_std_names(), std),
+            *_side_by_side(_STD, std),
             *(_covariance(self.covariance, pair) for pair in _PAIRS),
             texts("tags", self.tags),
             numbers("reprojection_px", self.reprojection, decimals=4),
@@ -111,7 +116,7 @@ class PoseTable:
         time = table.floats("time_s")
         covariance = np.empty((len(time), 6, 6))
         for i, j in _PAIRS:
-            entry = table.floats(_covariance_name(i, j), float(_SCALES[i] * _SCALES[j]))
+            entry = table.floats(_COVARIANCE[i, j], float(_SCALES[i] * _SCALES[j]))
             covariance[:, i, j] = covariance[:, j, i] = entry
         return cls(
             frame=table.ints("frame"),
@@ -127,24 +132,14 @@ class PoseTable:
         )
 
 
-def _side_by_side(names: list[str], values: Array, decimals: int = 6) -> list[Column]:
+def _side_by_side(names: Sequence[str], values: Array, decimals: int = 6) -> list[Column]:
     return [numbers(n, values[:, i], decimals=decimals) for i, n in enumerate(names)]
-
-
-def _std_names() -> list[str]:
-    return [f"std_{axis}_{unit}" for axis, unit in zip(_AXES, _UNITS, strict=True)]
-
-
-def _covariance_name(i: int, j: int) -> str:
-    """``cov_x_rz_mm_deg``: between x in mm and the rotation about z in degrees."""
-    units = f"{_UNITS[i]}2" if _UNITS[i] == _UNITS[j] else f"{_UNITS[i]}_{_UNITS[j]}"
-    return f"cov_{_AXES[i]}_{_AXES[j]}_{units}"
 
 
 def _covariance(covariance: Array, pair: tuple[int, int]) -> Column:
     i, j = pair
     scale = float(_SCALES[i] * _SCALES[j])
-    return Column(_covariance_name(i, j), covariance[:, i, j] * scale, "%.6e")
+    return Column(_COVARIANCE[i, j], covariance[:, i, j] * scale, "%.6e")
 
 
 def no_poses() -> PoseTable:

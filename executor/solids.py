@@ -21,7 +21,8 @@ from cdpr.shapes import (
 )
 
 Face = tuple[int, ...]
-_SIDES, _RINGS = 24, 6
+_SIDES = 24
+_STEP = 15.0  # degrees of a round profile to a ring
 #: Neighbouring faces that bend less than this are one smooth surface, whose edge is not drawn.
 _SMOOTH = np.cos(np.radians(20.0))
 
@@ -102,7 +103,7 @@ def _box(half: Array) -> tuple[Array, tuple[Face, ...]]:
 
 
 def _arc(radius: float, height: float, start: float, end: float) -> list[tuple[float, float]]:
-    angles = np.radians(np.linspace(start, end, _RINGS + 1))
+    angles = np.radians(np.arange(start, end + _STEP / 2.0, _STEP))
     return [(radius * float(np.cos(a)), height + radius * float(np.sin(a))) for a in angles]
 
 

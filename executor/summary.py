@@ -46,6 +46,7 @@ class RunContext:
         final_state: ``finished``, ``stopped`` or the state of a fault.
         events: What happened, in order.
         versions: Of the programs that took part, by name.
+        cause: Why the run did not finish; when left out, what the last event says.
     """
 
     plan: Plan
@@ -58,6 +59,7 @@ class RunContext:
     final_state: str
     events: tuple[RunEvent, ...]
     versions: dict[str, str] = field(default_factory=dict)
+    cause: str = ""
 
 
 def summarize(
@@ -65,9 +67,10 @@ def summarize(
 ) -> dict[str, Any]:
     """The content of ``summary.json``; see the head of this file."""
     last = context.events[-1].text if context.events else ""
+    cause = context.cause or last
     verdict = judge(
         context.final_state,
-        last,
+        cause,
         context.simulated,
         context.rig,
         context.plan.scene,

@@ -64,7 +64,7 @@ class Verdict:
 
 def judge(
     final_state: str,
-    last_event: str,
+    cause: str,
     simulated: bool,
     rig: Rig,
     scene: Scene,
@@ -76,7 +76,7 @@ def judge(
 
     Args:
         final_state: ``finished``, ``stopped`` or any other for a fault.
-        last_event: What a run that did not finish says about it.
+        cause: Why it did not finish, if it did not.
         simulated: The drives were simulated, so that no reply may be lost.
         rig: The rig that was run.
         scene: Its scene.
@@ -101,7 +101,7 @@ def judge(
             return Verdict(FAILED, sentence, (end, *measured))
         sentence = "The run reached the goal within every limit that was measured."
         return Verdict(PASSED, sentence, (end, *measured))
-    told = last_event.rstrip(".") or f"the final state is {final_state!r}"
+    told = cause.rstrip(".") or f"the final state is {final_state!r}"
     end = Check("finished", False, f"The run ended {at}, before the goal: {told}.")
     if final_state == "stopped" and not failures:
         return Verdict(STOPPED, "The run was stopped before the goal.", (end, *measured))

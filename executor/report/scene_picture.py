@@ -127,9 +127,9 @@ def _branches(axes: Axes, eye: Eye, tree: Array) -> None:
         return
     points = eye.see(tree)[..., :2].reshape(-1, 2)
     codes = np.tile([Path.MOVETO, Path.LINETO], len(tree))
-    patch = PathPatch(
-        Path(points, codes), fill=False, edgecolor=STAND_IN["tree"], linewidth=0.7, label="tree"
-    )
+    colour = STAND_IN["tree"]
+    patch = PathPatch(Path(points, codes), fill=False, edgecolor=colour, linewidth=0.7)
+    axes.plot([], [], color=colour, linewidth=0.9, label="search tree")  # for the legend
     patch.set_zorder(50.0)
     axes.add_patch(patch)
 

@@ -290,5 +290,6 @@
   new ResizeObserver(redraw).observe(canvas);
   readColours();
   if (data.moments.length) show(now);
-  else redraw();
+  else play.disabled = slider.disabled = true;
+  redraw();
 })();

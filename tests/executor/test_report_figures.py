@@ -1,0 +1,131 @@
+"""The small calculations behind the figures: thinning, gaps, label places, solids, the eye."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from cdpr.poses import Pose
+from cdpr.shapes import (
+    Box,
+    Capsule,
+    Cylinder,
+    Obstacle,
+    Shape,
+    Sphere,
+    TriangleMesh,
+    convex_hull,
+    shape_points,
+)
+from executor.report.figure_style import spread, thinned, with_gaps
+from executor.report.scene_picture import Eye
+from executor.solids import Solid, solid_of
+
+SHAPES: dict[str, Shape] = {
+    "box": Box(np.array([0.1, 0.2, 0.3])),
+    "sphere": Sphere(0.2),
+    "cylinder": Cylinder(0.1, 0.5),
+    "capsule": Capsule(0.1, 0.5),
+    "hull": convex_hull(np.random.default_rng(4).normal(size=(20, 3))),
+}
+
+
+@given(arrays(np.float64, st.integers(1, 3000), elements=st.floats(-1e3, 1e3) | st.just(np.nan)))
+def test_a_thinned_line_keeps_its_ends_and_every_extreme(values: np.ndarray) -> None:
+    time = np.arange(len(values), dtype=np.float64)
+    x, y = thinned(time, values, 100)
+    known = values[np.isfinite(values)]
+    assert len(x) <= 104
+    assert np.all(np.diff(x) > 0)
+    np.testing.assert_array_equal(y, values[x.astype(int)])
+    if known.size:
+        assert (y.min(), y.max()) == (known.min(), known.max())
+        assert (y[0], y[-1]) == (known[0], known[-1])
+
+
+def test_a_line_is_broken_where_samples_are_missing() -> None:
+    time = np.array([0.0, 0.1, 0.2, 0.7, 0.8])
+    at, value = with_gaps(time, np.arange(5.0))
+    assert len(at) == 6
+    assert np.isnan(value[3])
+    np.testing.assert_array_equal(value[np.isfinite(value)], np.arange(5.0))
+
+
+def test_an_even_line_is_not_broken() -> None:
+    time = np.linspace(0.0, 1.0, 11)
+    at, value = with_gaps(time, time)
+    np.testing.assert_array_equal(at, time)
+    np.testing.assert_array_equal(value, time)
+
+
+@given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=12))
+def test_labels_keep_apart_and_in_order(values: list[float]) -> None:
+    places = spread(values, 0.5)
+    order = np.argsort(values, kind="stable")
+    assert np.all(np.diff(np.sort(places)) > 0.45)
+    assert np.all(np.diff(places[order]) > -1e-9) or len(set(values)) < len(values)
+
+
+def volume(solid: Solid) -> float:
+    """By the divergence theorem; right only for a closed surface that is oriented outward."""
+    a, b, c = np.moveaxis(solid.triangles(), 1, 0)
+    return float(np.sum(a * np.cross(b, c)) / 6.0)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_solid_is_closed_and_oriented_and_placed(name: str) -> None:
+    pose = Pose.from_quaternion([1.0, -2.0, 3.0], [0.5, 0.5, -0.5, 0.5])
+    solid = solid_of(Obstacle(name, SHAPES[name], pose))
+    sides = [
+        (a, b) for face in solid.faces for a, b in zip(face, (*face[1:], face[0]), strict=True)
+    ]
+    assert len(sides) == len(set(sides))
+    assert {(b, a) for a, b in sides} == set(sides)
+    assert volume(solid) > 0.0
+    local = pose.inverse().apply(solid.vertices)
+    core = shape_points(SHAPES[name])
+    grown = getattr(SHAPES[name], "radius", 0.0)
+    assert np.all(np.abs(local).max(axis=0) <= np.abs(core).max(axis=0) + grown + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "true"),
+    [
+        ("box", 8 * 0.1 * 0.2 * 0.3),
+        ("sphere", 4 / 3 * np.pi * 0.2**3),
+        ("cylinder", np.pi * 0.1**2 * 0.5),
+        ("capsule", np.pi * 0.1**2 * 0.5 + 4 / 3 * np.pi * 0.1**3),
+    ],
+)
+def test_a_solid_is_about_as_large_as_its_shape(name: str, true: float) -> None:
+    solid = solid_of(Obstacle(name, SHAPES[name], Pose.level([0.3, 0.2, 0.1])))
+    assert volume(solid) == pytest.approx(true, rel=0.06)
+    assert volume(solid) <= true * (1 + 1e-9)
+
+
+def test_only_edges_that_bend_are_drawn() -> None:
+    box = solid_of(Obstacle("box", SHAPES["box"], Pose.level([0, 0, 0])))
+    assert len(box.edges) == 12
+    cylinder = solid_of(Obstacle("round", SHAPES["cylinder"], Pose.level([0, 0, 0])))
+    heights = {round(abs(float(cylinder.vertices[i, 2])), 9) for e in cylinder.edges for i in e}
+    assert heights == {0.25}
+    assert len(cylinder.edges) == 48
+
+
+def test_an_open_mesh_shows_its_rim() -> None:
+    square = TriangleMesh(
+        np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int64),
+    )
+    assert len(solid_of(Obstacle("rim", square, Pose.level([0, 0, 0]))).edges) == 4
+
+
+def test_the_eye_sees_near_things_larger_and_the_centre_in_the_middle() -> None:
+    eye = Eye(np.array([1.0, 2.0, 3.0]), 4.0, np.eye(3))
+    np.testing.assert_allclose(eye.see(np.array([1.0, 2.0, 3.0])), [0.0, 0.0, 4.0])
+    far, near = eye.see(np.array([[2.0, 2.0, 2.0], [2.0, 2.0, 4.0]]))
+    assert near[0] > far[0]
+    assert near[2] < far[2]

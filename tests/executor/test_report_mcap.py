@@ -1,0 +1,149 @@
+"""``run.mcap`` read back with the library's own reader: every channel, count and time."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from cdpr.errors import Fault
+from executor.mcap_log import write_mcap
+from executor.mcap_schemas import CHANNELS
+from executor.run_folder import RunFolder
+from tests.executor import fake_run
+
+Messages = dict[str, list[tuple[int, dict[str, Any]]]]
+
+
+@pytest.fixture(scope="module")
+def run() -> fake_run.FakeRun:
+    return fake_run.make(rate_hz=2.0, every=20)
+
+
+@pytest.fixture(scope="module")
+def folder(run: fake_run.FakeRun, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return fake_run.write(run, tmp_path_factory.mktemp("mcap") / "run")
+
+
+@pytest.fixture(scope="module")
+def messages(folder: RunFolder) -> Messages:
+    found: Messages = defaultdict(list)
+    with folder.mcap.open("rb") as stream:
+        for _schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            found[channel.topic].append((message.log_time, json.loads(message.data)))
+    return found
+
+
+def test_no_row_is_lost(run: fake_run.FakeRun, folder: RunFolder, messages: Messages) -> None:
+    cycles, poses = len(run.cycles), run.poses
+    seen = sum(status == "ok" for status in poses.status)
+    counts = {topic: len(rows) for topic, rows in messages.items()}
+    assert counts.pop("/robot") > 100
+    assert counts == {
+        "/planned_pose": cycles,
+        "/encoder_pose": cycles,
+        "/drives": cycles,
+        "/tag_pose": seen,
+        "/tag_status": len(poses),
+        "/clearance": len(run.clearance),
+        "/events": len(run.context.events),
+        "/pictures": sum(bool(name) for name in folder.poses().picture),
+        "/scene": 1,
+    }
+
+
+def test_times_are_the_start_plus_run_time(run: fake_run.FakeRun, messages: Messages) -> None:
+    start = int(run.context.started.timestamp()) * 1_000_000_000
+    times = np.array([time - start for time, _ in messages["/drives"]]) / 1e9
+    np.testing.assert_allclose(times, run.cycles.time, atol=1e-9)
+    stamps = [m["timestamp"] for _, m in messages["/tag_pose"]]
+    told = [s["sec"] * 1_000_000_000 + s["nsec"] for s in stamps]
+    assert told == [time for time, _ in messages["/tag_pose"]]
+
+
+def test_numbers_are_those_of_the_tables(run: fake_run.FakeRun, messages: Messages) -> None:
+    _, drive = messages["/drives"][33]
+    assert drive["path_index"] == run.cycles.path_index[33]
+    assert drive["drives"][4]["set_counts"] == run.cycles.set_counts[33, 4]
+    assert drive["drives"][7]["tension_n"] == run.cycles.tensions[33, 7]
+    _, pose = messages["/encoder_pose"][33]
+    assert pose["pose"]["position"]["y"] == run.cycles.encoder[33, 1]
+    assert pose["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    _, status = messages["/tag_status"][0]
+    np.testing.assert_array_equal(
+        np.array(status["covariance"]).reshape(6, 6), run.poses.covariance[0]
+    )
+
+
+def test_a_picture_without_a_pose_says_why_and_has_nulls(
+    run: fake_run.FakeRun, messages: Messages
+) -> None:
+    lost = run.poses.status.index("no tags seen, 2 needed")
+    _, status = messages["/tag_status"][lost]
+    assert status["status"] == "no tags seen, 2 needed"
+    assert status["reprojection_px"] is None
+    assert set(status["covariance"]) == {None}
+
+
+def test_pictures_are_the_jpegs_of_the_folder(folder: RunFolder, messages: Messages) -> None:
+    name = next(name for name in folder.poses().picture if name)
+    _, picture = messages["/pictures"][0]
+    assert base64.b64decode(picture["data"]) == folder.picture(name)
+    assert picture["format"] == "jpeg"
+
+
+def test_every_channel_has_a_json_schema_and_messages_fit_it(
+    folder: RunFolder, messages: Messages
+) -> None:
+    with folder.mcap.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    names = {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
+    assert {topic: schema.name for topic, schema in names.items()} == {
+        topic: name for topic, (name, _) in CHANNELS.items()
+    }
+    for topic, schema in names.items():
+        assert schema.encoding == "jsonschema"
+        for _, message in messages[topic][:3]:
+            assert_fits(message, json.loads(schema.data), topic)
+
+
+def assert_fits(value: Any, schema: dict[str, Any], place: str) -> None:
+    kinds = {
+        "object": dict,
+        "array": list,
+        "string": str,
+        "integer": int,
+        "number": (int, float),
+        "null": type(None),
+        "boolean": bool,
+    }
+    types = schema["type"] if isinstance(schema["type"], list) else [schema["type"]]
+    assert any(isinstance(value, kinds[name]) for name in types), f"{place}: {value!r}"
+    if isinstance(value, dict):
+        assert set(value) <= set(schema["properties"]), place
+        for key, inner in value.items():
+            assert_fits(inner, schema["properties"][key], f"{place}.{key}")
+    elif isinstance(value, list):
+        for inner in value[:3]:
+            assert_fits(inner, schema["items"], f"{place}[]")
+
+
+def test_a_full_disk_leaves_no_broken_log(
+    tmp_path: Path, run: fake_run.FakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mcap.writer.Writer.add_message", full)
+    with pytest.raises(Fault, match="log cannot be written"):
+        write_mcap(folder, run.context, run.cycles, run.poses, run.clearance)
+    assert not folder.mcap.exists()

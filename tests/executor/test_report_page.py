@@ -1,0 +1,259 @@
+"""The page of a run: whole, self-contained, honest about what is not known."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import fields, replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpr.cables import cables_to
+from cdpr.errors import BadInput
+from cdpr.plan import Plan, plan_from_document, sealed
+from cdpr.rig import rig_from_document
+from cdpr.rig_file import PulleysDocument
+from cdpr.scene import scene_from_document
+from cdpr.scene_file import SceneDocument
+from executor.clearance_table import no_clearance
+from executor.cycle_table import CycleTable
+from executor.pose_table import no_poses
+from executor.report import build_report
+from executor.run_folder import RunEvent, RunFolder
+from tests.executor import fake_run
+
+SVG_LINKS = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+
+
+class Page(HTMLParser):
+    """What a page is made of."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.text = text
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.headings: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        self.open.append(f"/{tag}")
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in ("h1", "h2"):
+            self.headings.append(data)
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def run() -> fake_run.FakeRun:
+    return fake_run.make(rate_hz=2.0, every=20)
+
+
+def built(run: fake_run.FakeRun, path: Path, pictures: bool = False) -> Page:
+    folder = fake_run.write(run, path, pictures)
+    return Page(build_report(RunFolder.open(folder.path)).read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def page(run: fake_run.FakeRun, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return built(run, tmp_path_factory.mktemp("page") / "run", pictures=True)
+
+
+def test_the_verdict_comes_first_and_every_section_is_there(page: Page) -> None:
+    assert page.headings == [
+        "Run of environment_3 on gachon_8_6",
+        "PASSED",
+        "Scene and path",
+        "Clearance",
+        "Position",
+        "Pictures",
+        "Cables",
+        "Following and timing",
+        "Plan, rig and bus",
+        "Events",
+    ]
+
+
+def test_nothing_is_asked_from_outside(page: Page) -> None:
+    """A lab's machine has no network, and a report must not tell anybody that it was opened."""
+    assert set(re.findall(r"https?://[^\s\"'<)]+", page.text)) <= SVG_LINKS
+    for tag, attributes in page.tags:
+        assert tag not in {"link", "iframe", "object", "base"}
+        for name in ("src", "href", "xlink:href", "action"):
+            value = attributes.get(name) or ""
+            assert not value or value.startswith(("#", "data:image/jpeg;base64,")), (tag, value)
+    assert "@import" not in page.text
+    (policy,) = [m for m in page.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert "default-src 'none'" in (policy["content"] or "")
+
+
+def test_ids_are_unique_and_links_lead_somewhere(page: Page) -> None:
+    ids = [a["id"] for _, a in page.tags if a.get("id")]
+    assert len(ids) == len(set(ids))
+    wanted = [a.get("href") or a.get("xlink:href") or "" for _, a in page.tags]
+    wanted += [f"#{name}" for name in re.findall(r"url\(#([^)]+)\)", page.text)]
+    missing = {name for name in wanted if name.startswith("#")} - {f"#{i}" for i in ids}
+    assert not missing
+
+
+def test_every_picture_says_what_it_shows(page: Page) -> None:
+    assert len(page.all("img")) == 5
+    assert all(len(image["alt"] or "") > 10 for image in page.all("img"))
+    svgs = page.all("svg")
+    assert len(svgs) == 6
+    assert all(svg["role"] == "img" and len(svg["aria-label"] or "") > 40 for svg in svgs)
+
+
+def test_figures_take_their_colours_from_the_page(page: Page) -> None:
+    """A colour that stayed matplotlib's would be wrong in one of the two schemes."""
+    figures = "".join(re.findall(r"<svg.*?</svg>", page.text, re.DOTALL))
+    used = set(re.findall(r"var\(--([\w]+)\)", figures))
+    defined = set(re.findall(r"--([\w]+):", page.text))
+    assert used >= {"ink", "encoder", "tag", "limit", "obstacle", "platform", "cable", "tree"}
+    assert used <= defined
+    assert not re.findall(r"(?:fill|stroke): #(?!ffffff)[0-9a-f]{6}", figures)
+    dark = page.text[page.text.index("prefers-color-scheme: dark") :]
+    assert used - {"surface"} <= set(re.findall(r"--([\w]+):", dark))
+
+
+def test_the_page_is_small(page: Page) -> None:
+    assert len(page.text) < 6_000_000
+
+
+def scene_data(page: Page) -> dict[str, object]:
+    found = re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', page.text)
+    assert found
+    data = json.loads(found[1])
+    assert isinstance(data, dict)
+    return data
+
+
+def test_the_viewer_moves_the_platform_as_the_drives_did(page: Page, run: fake_run.FakeRun) -> None:
+    data = scene_data(page)
+    moments = data["moments"]
+    assert isinstance(moments, list)
+    assert moments[0]["t"] == 0.0
+    assert moments[-1]["t"] == pytest.approx(run.cycles.time[-1], abs=1e-3)
+    for moment in moments[:: len(moments) // 7]:
+        row = int(np.argmin(np.abs(run.cycles.time - moment["t"])))
+        np.testing.assert_allclose(moment["p"], run.cycles.encoder[row] * 1e3, atol=0.051)
+    assert len(data["tree"]) == 399  # type: ignore[arg-type]
+
+
+def test_texts_of_files_cannot_become_markup(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    evil = "</script><script>alert(1)</script><img src=x onerror=alert(1)>"
+    document = run.context.plan.document
+    scene = document.scene.model_dump(mode="json")
+    scene["name"] = scene["obstacles"][0]["name"] = evil
+    context = replace(
+        run.context,
+        plan=with_scene(run, SceneDocument.model_validate(scene)),
+        interface=evil,
+        final_state="latched",
+        events=(RunEvent(0.0, evil, evil),),
+        versions={evil: evil},
+    )
+    names = (evil, *run.clearance.obstacles[1:])
+    clearance = replace(run.clearance, obstacles=names, obstacle=(evil,) * len(run.clearance))
+    page = built(replace(run, context=context, clearance=clearance), tmp_path / "run")
+    assert len(page.all("script")) == 2
+    assert not page.all("img")
+    assert not [a for _, a in page.tags if "onerror" in a]
+
+
+def with_scene(run: fake_run.FakeRun, scene: SceneDocument) -> Plan:
+    document = run.context.plan.document
+    parts = {name: getattr(document, name) for name in type(document).model_fields}
+    parts = {k: v for k, v in parts.items() if k not in ("hash", "kind", "schema_version")}
+    parts |= {"scene": scene, "scene_hash": scene_from_document(scene).hash}
+    return plan_from_document(sealed(parts))
+
+
+def test_a_run_without_camera_has_no_camera_section(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    only = replace(run, poses=no_poses(), clearance=run.clearance.of("encoder"))
+    page = built(only, tmp_path / "run")
+    assert "Pictures" not in page.headings
+    assert "Clearance" in page.headings
+    assert "no camera" in page.text
+
+
+def test_a_scene_without_obstacles_says_so(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    scene = run.context.plan.document.scene.model_copy(update={"obstacles": []})
+    context = replace(run.context, plan=with_scene(run, scene))
+    empty = replace(run, context=context, poses=no_poses(), clearance=no_clearance())
+    page = built(empty, tmp_path / "run")
+    assert "The scene has no obstacles." in page.text
+    assert "Smallest clearance" not in page.text
+
+
+def test_a_run_that_ended_before_its_first_cycle_still_has_a_page(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
+    context = replace(run.context, final_state="latched", fast=False)
+    early = replace(run, context=context, cycles=none, poses=no_poses(), clearance=no_clearance())
+    page = built(early, tmp_path / "run")
+    assert page.headings[1] == "FAILED"
+    assert "Position" not in page.headings
+    assert scene_data(page)["moments"] == []
+
+
+def test_a_run_in_real_time_shows_its_lateness(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    late = np.abs(np.random.default_rng(5).normal(0.0, 1e-4, len(run.cycles)))
+    cycles = replace(run.cycles, lateness=late)
+    context = replace(run.context, fast=False, simulated=False, interface="socketcan")
+    page = built(replace(run, cycles=cycles, context=context), tmp_path / "run")
+    assert "Lateness of the cycles" in page.text
+    assert "real drives, bus socketcan" in page.text
+    assert "Simulated time" not in page.text
+
+
+def test_replies_that_never_came_leave_gaps_not_errors(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    tensions, encoder = run.cycles.tensions.copy(), run.cycles.encoder.copy()
+    tensions[:, 2] = np.nan
+    encoder[5:9] = np.nan
+    missing = run.cycles.missing.copy()
+    missing[5:9] = 8
+    cycles = replace(run.cycles, tensions=tensions, encoder=encoder, missing=missing)
+    page = built(replace(run, cycles=cycles), tmp_path / "run")
+    assert page.headings[1] == "FAILED"
+    assert "NaN" not in json.dumps(scene_data(page))
+
+
+def test_cables_over_pulleys_leave_them_where_the_model_says(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    pulleys = PulleysDocument(radius_mm=13.0, feed_directions=[[0.0, 0.0, 1.0]] * 8)
+    rig = rig_from_document(run.context.rig.document.model_copy(update={"pulleys": pulleys}))
+    page = built(replace(run, context=replace(run.context, rig=rig)), tmp_path / "run")
+    moment = scene_data(page)["moments"][0]  # type: ignore[index]
+    exits = cables_to(rig, run.cycles.encoder[0] + rig.anchors).exits
+    np.testing.assert_allclose(moment["exits"], exits * 1e3, atol=0.051)
+
+
+def test_the_report_is_made_from_the_folder_alone(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    folder = fake_run.write(run, tmp_path / "run")
+    first = build_report(folder).read_bytes()
+    moved = folder.path.rename(tmp_path / "moved and renamed")
+    (moved / "report.html").unlink()
+    assert build_report(RunFolder.open(moved)).read_bytes() == first
+
+
+def test_an_incomplete_folder_gets_no_page(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    folder = fake_run.write(run, tmp_path / "run", pictures=False)
+    (folder.path / "cycles.csv").unlink()
+    with pytest.raises(BadInput, match="no such file"):
+        build_report(folder)
+    assert not folder.report.exists()

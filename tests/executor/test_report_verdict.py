@@ -1,0 +1,222 @@
+"""The verdict: passed only when all that was measured kept its limit; each reason in numbers."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from executor.clearance_table import ClearanceTable, no_clearance
+from executor.cycle_table import CycleTable
+from executor.pose_table import no_poses
+from executor.run_folder import RunEvent
+from executor.verdict import distances, following, replies, tensions
+from tests.executor import fake_run
+
+
+@pytest.fixture(scope="module")
+def run() -> fake_run.FakeRun:
+    return fake_run.make(rate_hz=2.0, every=20)
+
+
+def summary(run: fake_run.FakeRun, **context: Any) -> dict[str, Any]:
+    return replace(run, context=replace(run.context, **context)).summary
+
+
+def rows(
+    source: str, distance_mm: float, uncertainty_mm: float, planned_mm: float
+) -> ClearanceTable:
+    one = np.array([distance_mm / 1e3])
+    planned = np.array([planned_mm / 1e3])
+    return ClearanceTable(
+        np.array([3.25]),
+        (source,),
+        one,
+        np.array([uncertainty_mm / 1e3]),
+        ("cable 3",),
+        ("box",),
+        planned,
+        ("box",),
+        one[:, None],
+        planned[:, None],
+    )
+
+
+def test_a_good_run_passes_and_says_by_how_much(run: fake_run.FakeRun) -> None:
+    made = run.summary
+    assert (made["verdict"], made["passed"]) == ("PASSED", True)
+    assert any("limit 2 mm" in reason for reason in made["reasons"])
+    assert all(any(sign.isdigit() for sign in reason) for reason in made["reasons"])
+
+
+def test_the_figures_are_those_of_the_tables(run: fake_run.FakeRun) -> None:
+    made, cycles, poses = run.summary, run.cycles, run.poses
+    off = np.linalg.norm(cycles.encoder - cycles.planned, axis=1) * 1e3
+    assert made["encoder_error_mm"]["max"] == pytest.approx(off.max(), abs=1e-6)
+    assert made["encoder_error_mm"]["rms"] == pytest.approx(np.sqrt((off**2).mean()), abs=1e-6)
+    seen = [k for k, status in enumerate(poses.status) if status == "ok"]
+    tag = np.linalg.norm(poses.position[seen] - poses.planned[seen], axis=1) * 1e3
+    assert made["tag_error_mm"] == {
+        "max": pytest.approx(tag.max(), abs=1e-6),
+        "rms": pytest.approx(np.sqrt((tag**2).mean()), abs=1e-6),
+        "frames": len(poses),
+        "frames_without_pose": len(poses) - len(seen),
+    }
+    by_camera = [k for k, s in enumerate(run.clearance.source) if s == "tag"]
+    least = min(by_camera, key=lambda k: run.clearance.distance[k])
+    assert made["clearance_mm"]["source"] == "tag"
+    assert made["clearance_mm"]["at_s"] == run.clearance.time[least]
+    assert made["clearance_mm"]["pair"][1] == run.clearance.obstacle[least]
+    assert made["tension_n"]["planned_max"] == pytest.approx(
+        cycles.planned_tensions.max(), abs=1e-4
+    )
+    assert made["started"] == "2026-03-04T05:06:07.000+00:00"
+    assert made["lateness_ms"] is None
+
+
+def test_without_camera_and_obstacles_these_figures_are_null(run: fake_run.FakeRun) -> None:
+    made = replace(run, poses=no_poses(), clearance=no_clearance()).summary
+    assert made["passed"]
+    assert made["tag_error_mm"] is None
+    assert made["clearance_mm"] is None
+
+
+def test_lateness_is_told_for_a_run_in_real_time(run: fake_run.FakeRun) -> None:
+    late = np.arange(len(run.cycles)) * 1e-6
+    slow = replace(run, cycles=replace(run.cycles, lateness=late))
+    made = summary(slow, fast=False)
+    assert made["lateness_ms"]["max"] == pytest.approx(late[-1] * 1e3, abs=1e-4)
+    assert made["lateness_ms"]["p50"] == pytest.approx(np.median(late) * 1e3, abs=1e-4)
+
+
+def test_a_stopped_run_is_not_passed_and_not_a_fault(run: fake_run.FakeRun) -> None:
+    events = (RunEvent(1.0, "stop", "The operator stopped the run."),)
+    made = summary(run, final_state="stopped", events=events)
+    assert (made["verdict"], made["passed"]) == ("STOPPED", False)
+    assert made["reasons"] == [
+        "The run ended after 42.8 s and 854 mm, before the goal: The operator stopped the run."
+    ]
+
+
+def test_a_fault_is_failed_and_names_its_cause_even_when_notes_follow(
+    run: fake_run.FakeRun,
+) -> None:
+    events = (RunEvent(1.0, "following_error", "cable 4 jammed"), RunEvent(1.1, "late", "a note"))
+    assert "a note" in summary(run, final_state="latched", events=events)["reasons"][0]
+    made = summary(run, final_state="latched", events=events, cause="cable 4 jammed")
+    assert made["verdict"] == "FAILED"
+    assert "cable 4 jammed" in made["reasons"][0]
+
+
+def test_a_stopped_run_that_broke_a_limit_is_failed(run: fake_run.FakeRun) -> None:
+    near = replace(run, clearance=rows("tag", 5.0, 1.0, 5.0))
+    assert summary(near, final_state="stopped")["verdict"] == "FAILED"
+
+
+def test_a_run_of_no_cycles_fails_with_a_whole_summary(run: fake_run.FakeRun) -> None:
+    none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
+    early = replace(run, cycles=none, poses=no_poses(), clearance=no_clearance())
+    made = summary(early, final_state="latched", fast=False)
+    assert made["verdict"] == "FAILED"
+    assert made["following_error_mm"]["max"] is None
+    assert made["travelled_mm"] is None
+
+
+@pytest.mark.parametrize(("worst_mm", "passed"), [(1.999, True), (2.0, True), (2.001, False)])
+def test_the_following_error_is_held_against_its_limit(
+    run: fake_run.FakeRun, worst_mm: float, passed: bool
+) -> None:
+    errors = np.full(len(run.cycles), np.nan)
+    errors[17] = worst_mm / 1e3
+    check = following(replace(run.cycles, following_error=errors), 0.002)
+    assert check.passed is passed
+    assert f"{worst_mm:.3f} mm" in check.text
+
+
+def test_no_drive_position_at_all_is_no_pass(run: fake_run.FakeRun) -> None:
+    unknown = replace(run.cycles, following_error=np.full(len(run.cycles), np.nan))
+    assert not following(unknown, 0.002).passed
+
+
+@pytest.mark.parametrize(("simulated", "passed"), [(True, False), (False, True)])
+def test_lost_replies_fail_simulated_drives_and_are_told_on_a_bus(
+    run: fake_run.FakeRun, simulated: bool, passed: bool
+) -> None:
+    missing = run.cycles.missing.copy()
+    missing[3] = 2
+    check = replies(replace(run.cycles, missing=missing), simulated)
+    assert check.passed is passed
+    assert check.text.startswith("2 of ")
+
+
+@pytest.mark.parametrize(
+    ("tension", "passed"), [(2.4, False), (2.6, True), (100.9, True), (101.1, False)]
+)
+def test_a_slack_or_overloaded_cable_fails_and_is_named(
+    run: fake_run.FakeRun, tension: float, passed: bool
+) -> None:
+    changed = run.cycles.tensions.copy()
+    changed[9, 4] = tension
+    (check,) = tensions(replace(run.cycles, tensions=changed), run.context.rig)
+    assert check.passed is passed
+    assert passed or f"Cable 5 {'went slack' if tension < 5 else 'pulled'}" in check.text
+
+
+def test_drives_without_torque_are_not_judged_by_it(run: fake_run.FakeRun) -> None:
+    unknown = replace(run.cycles, tensions=np.full_like(run.cycles.tensions, np.nan))
+    assert tensions(unknown, run.context.rig) == []
+    assert replace(run, cycles=unknown).summary["tension_n"]["min"] is None
+
+
+@pytest.mark.parametrize("source", ["tag", "encoder"])
+@pytest.mark.parametrize(
+    ("distance", "uncertainty", "passed"),
+    [(10.0, 0.0, True), (9.9, 0.0, False), (9.0, 1.0, True), (9.0, 0.99, False), (30, 40, True)],
+)
+def test_a_clearance_fails_only_when_too_small_beyond_its_uncertainty(
+    source: str, distance: float, uncertainty: float, passed: bool
+) -> None:
+    check = distances(rows(source, distance, uncertainty, distance), 0.010)[0]
+    assert check.passed is passed
+    assert "cable 3 to box" in check.text
+    assert "asks for 10 mm" in check.text
+
+
+@pytest.mark.parametrize(("distance", "passed"), [(39.01, True), (38.99, False), (60.0, True)])
+def test_the_camera_is_also_held_against_the_plan(distance: float, passed: bool) -> None:
+    required, planned = distances(rows("tag", distance, 1.0, 40.0), 0.010)
+    assert required.passed
+    assert planned.passed is passed
+    assert planned.name == "clearance_plan"
+
+
+def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
+    """The worst row is the one furthest beyond its own uncertainty, not the smallest distance."""
+    good, bad = rows("tag", 9.5, 1.0, 9.5), rows("tag", 9.9, 0.05, 9.9)
+    both = ClearanceTable(
+        *(
+            good.obstacles
+            if f.name == "obstacles"
+            else getattr(good, f.name) + getattr(bad, f.name)
+            if isinstance(getattr(good, f.name), tuple)
+            else np.concatenate([getattr(good, f.name), getattr(bad, f.name)])
+            for f in fields(ClearanceTable)
+        )
+    )
+    check = distances(both, 0.010)[0]
+    assert not check.passed
+    assert "9.9 ± 0.1 mm" in check.text or "9.9 ± 0.0 mm" in check.text
+
+
+def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRun) -> None:
+    count = len(run.poses)
+    blind = replace(
+        run.poses,
+        status=("no tags in the picture",) * count,
+        position=np.full((count, 3), np.nan),
+    )
+    made = replace(run, poses=blind).summary
+    assert made["verdict"] == "FAILED"
+    assert f"None of {count} pictures gave a pose: no tags in the picture." in made["reasons"]

@@ -1,0 +1,286 @@
+"""The run folder: made whole or not at all, and everything written into it comes back."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from cdpr.errors import BadInput
+from executor.clearance_table import ClearanceTable, no_clearance
+from executor.cycle_table import CycleTable, quaternions_of
+from executor.pose_table import PoseTable, no_poses
+from executor.run_folder import NEEDED, RunEvent, RunFolder
+from tests.executor import fake_run
+from tracking.pose_log import POSE_COLUMNS
+
+
+@pytest.fixture(scope="module")
+def run() -> fake_run.FakeRun:
+    return fake_run.make(rate_hz=2.0, every=20)
+
+
+def same(one: Any, other: Any) -> None:
+    """Equal tables: texts and whole numbers exactly, numbers to the digits of the file."""
+    for field in fields(one):
+        left, right = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(left, np.ndarray) and left.dtype == np.float64:
+            np.testing.assert_allclose(right, left, rtol=1e-5, atol=6e-8, err_msg=field.name)
+        elif isinstance(left, np.ndarray):
+            np.testing.assert_array_equal(right, left, err_msg=field.name)
+        else:
+            assert left == right, field.name
+
+
+def test_a_new_folder_has_a_place_for_events_and_pictures(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "a run")
+    assert folder.events() == []
+    assert (folder.path / "pictures").is_dir()
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "dead link"])
+def test_an_existing_path_is_never_written_into(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "run"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "file":
+        path.write_text("mine")
+    else:
+        path.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(BadInput, match="exists already") as caught:
+        RunFolder.create(path)
+    assert caught.value.exit_code == 2
+    assert "another folder" in caught.value.next_step
+    assert not (tmp_path / "nowhere").exists()
+    assert kind != "folder" or not list(path.iterdir())
+
+
+@pytest.mark.parametrize("parent", ["missing", "file"])
+def test_a_place_that_cannot_hold_a_folder_is_bad_input(tmp_path: Path, parent: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(BadInput, match="cannot be made"):
+        RunFolder.create(tmp_path / parent / "run")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_nothing_half_made_is_left_when_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_path: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "touch", full)
+    with pytest.raises(BadInput, match="cannot be written to"):
+        RunFolder.create(tmp_path / "run")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_folder_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="no such run folder"):
+        RunFolder.open(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_opening_names_the_file_that_is_missing(tmp_path: Path, name: str) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    for other in NEEDED:
+        (folder.path / other).touch()
+    (folder.path / name).unlink()
+    with pytest.raises(BadInput, match=name):
+        RunFolder.open(folder.path)
+
+
+def test_everything_that_is_written_comes_back(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    path = fake_run.write(run, tmp_path / "run").path
+    folder = RunFolder.open(path)
+    same(run.cycles, folder.cycles())
+    same(run.clearance, folder.clearance())
+    same(replace(run.poses, picture=folder.poses().picture), folder.poses())
+    assert folder.plan().document == run.context.plan.document
+    assert folder.rig().hash == run.context.rig.hash
+    assert folder.summary() == json.loads(json.dumps(run.summary))
+    assert tuple(folder.events()) == run.context.events
+
+
+def test_an_event_is_on_disk_as_soon_as_it_is_appended(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    first, second = RunEvent(0.5, "moving", "Los – 20 mm/s"), RunEvent(1.0, "stop", 'a "stop"\n')
+    folder.append_event(first)
+    assert RunFolder(folder.path).events() == [first]
+    folder.append_event(second)
+    assert RunFolder(folder.path).events() == [first, second]
+
+
+def test_an_event_cut_by_a_crash_is_left_out(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    folder.append_event(RunEvent(0.5, "moving", "moves"))
+    with (folder.path / "events.jsonl").open("a") as stream:
+        stream.write('{"time_s": 0.7, "co')
+    assert [event.code for event in folder.events()] == ["moving"]
+
+
+def test_a_broken_event_in_the_middle_is_told_with_its_line(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    (folder.path / "events.jsonl").write_text('{"time_s": 0.7}\n')
+    folder.append_event(RunEvent(0.5, "moving", "moves"))
+    with pytest.raises(BadInput, match="not an event") as caught:
+        folder.events()
+    assert caught.value.where.endswith("events.jsonl:1")
+
+
+def test_a_picture_comes_back_as_jpeg(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    name = folder.write_picture(7, np.full((48, 64), 99, dtype=np.uint8))
+    assert name == "pictures/frame_000007.jpg"
+    assert folder.picture(name)[:2] == b"\xff\xd8"
+    with pytest.raises(BadInput, match="picture"):
+        folder.picture("pictures/frame_000008.jpg")
+
+
+def test_a_discarded_folder_is_gone(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    folder.append_event(RunEvent(0.0, "refused", "no"))
+    folder.discard()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("cycles.csv", "", "empty"),
+        ("cycles.csv", "cycle,time_s\n0,0.0\n", "'set_1_counts'|'state'|missing"),
+        ("cycles.csv", "cycle,time_s\n0,0.0\n1\n", "line 3 has 1 values for 2 columns"),
+        ("clearance.csv", "time_s\nsoon\n", "'time_s' holds a text"),
+        ("summary.json", "{", "not valid JSON"),
+        ("summary.json", '{"schema_version": 2}', "schema_version 1"),
+        ("rig.json", "{}", "this key is missing"),
+    ],
+)
+def test_a_damaged_file_is_told_by_name(tmp_path: Path, name: str, text: str, what: str) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    (folder.path / name).write_text(text)
+    readers = {
+        "cycles.csv": folder.cycles,
+        "clearance.csv": folder.clearance,
+        "summary.json": folder.summary,
+        "rig.json": folder.rig,
+    }
+    with pytest.raises(BadInput, match=what) as caught:
+        readers[name]()
+    assert name in caught.value.where
+
+
+@given(
+    values=arrays(np.float64, (3, 2), elements=st.floats(-9.0, 9.0) | st.just(math.nan)),
+    names=st.lists(
+        st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), min_size=1),
+        min_size=2,
+        max_size=2,
+        unique=True,
+    ),
+)
+def test_clearances_of_obstacles_of_any_name_round_trip(
+    tmp_path_factory: pytest.TempPathFactory, values: np.ndarray, names: list[str]
+) -> None:
+    path = tmp_path_factory.mktemp("table") / "clearance.csv"
+    column = np.arange(3.0)
+    table = ClearanceTable(
+        column,
+        ("tag",) * 3,
+        column,
+        column,
+        ("cable 1",) * 3,
+        (names[0],) * 3,
+        column,
+        tuple(names),
+        values,
+        -values,
+    )
+    table.write_csv(path)
+    same(table, ClearanceTable.read_csv(path))
+
+
+@pytest.mark.parametrize("names", [("x", "planned_x"), ("distance", "time_s"), ('a,"b"', "c d")])
+def test_names_of_obstacles_that_look_like_columns_do_no_harm(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    one = np.array([1.0])
+    table = ClearanceTable(
+        one,
+        ("tag",),
+        one,
+        one,
+        ("b",),
+        (names[0],),
+        one,
+        names,
+        np.array([[2.0, 3.0]]),
+        np.array([[4.0, 5.0]]),
+    )
+    table.write_csv(tmp_path / "clearance.csv")
+    same(table, ClearanceTable.read_csv(tmp_path / "clearance.csv"))
+
+
+@pytest.mark.parametrize("obstacles", [(), ("a", "b")])
+def test_tables_without_rows_round_trip(tmp_path: Path, obstacles: tuple[str, ...]) -> None:
+    no_clearance(obstacles).write_csv(tmp_path / "clearance.csv")
+    no_poses().write_csv(tmp_path / "poses.csv")
+    assert ClearanceTable.read_csv(tmp_path / "clearance.csv").obstacles == obstacles
+    assert len(PoseTable.read_csv(tmp_path / "poses.csv")) == 0
+
+
+def test_poses_have_the_columns_of_cdpr_track(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    """Programs that read one file must be able to read the other."""
+    run.poses.write_csv(tmp_path / "poses.csv")
+    names = (tmp_path / "poses.csv").read_text().splitlines()[0].split(",")
+    assert [n for n in names if not n.startswith("planned_")] == list(POSE_COLUMNS)
+
+
+def test_a_plain_csv_reader_finds_the_numbers_in_the_named_units(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    run.cycles.write_csv(tmp_path / "cycles.csv")
+    with (tmp_path / "cycles.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    row, k = rows[40], 40
+    assert float(row["planned_z_mm"]) == pytest.approx(run.cycles.planned[k, 2] * 1000, abs=1e-6)
+    assert float(row["length_8_mm"]) == pytest.approx(run.cycles.lengths[k, 7] * 1000, abs=1e-6)
+    assert int(row["set_3_counts"]) == run.cycles.set_counts[k, 2]
+    assert float(row["tension_1_n"]) == pytest.approx(run.cycles.tensions[k, 0], abs=1e-4)
+    assert len(rows) == len(run.cycles)
+
+
+def test_a_table_of_unequal_lengths_cannot_be_made(run: fake_run.FakeRun) -> None:
+    with pytest.raises(ValueError, match="lateness has 3 rows"):
+        replace(run.cycles, lateness=np.zeros(3))
+    with pytest.raises(ValueError, match="distances must have shape"):
+        replace(run.clearance, distances=run.clearance.distances[:, :1])
+    with pytest.raises(ValueError, match="frame has 1 rows"):
+        replace(run.poses, frame=np.zeros(1, dtype=np.int64))
+
+
+def test_rotations_become_quaternions_whether_they_change_or_not() -> None:
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    half = math.sqrt(0.5)
+    turning = quaternions_of(np.array([np.eye(3), quarter]))
+    np.testing.assert_allclose(turning, [[1, 0, 0, 0], [half, 0, 0, half]], atol=1e-12)
+    still = quaternions_of(np.array([quarter, quarter]))
+    np.testing.assert_allclose(still, [[half, 0, 0, half]] * 2, atol=1e-12)
+    assert quaternions_of(np.empty((0, 3, 3))).shape == (0, 4)
+
+
+def test_cycles_without_rows_round_trip(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    """A fault before the first cycle still leaves a whole folder."""
+    none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
+    none.write_csv(tmp_path / "cycles.csv")
+    again = CycleTable.read_csv(tmp_path / "cycles.csv")
+    assert (len(again), again.cable_count) == (0, 8)
