@@ -43,7 +43,7 @@ def heartbeat_cycles(cycle: float) -> int:
 
 def heartbeat_timeout(cycle: float) -> float:
     """When a heartbeat is missed, [s]; more than three of its periods, ``cycle`` in [s]."""
-    return max(HEARTBEAT_TIMEOUT, 3.5 * cycle * heartbeat_cycles(cycle))
+    return max(HEARTBEAT_TIMEOUT, 3.2 * cycle * heartbeat_cycles(cycle))
 
 
 def bus_load(drives: int, cycle: float, bitrate: int) -> float:

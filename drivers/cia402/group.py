@@ -59,7 +59,8 @@ class Cia402Group:
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
-        self._set_points = [_frame(RPDO1_BASE + node) for node in self._nodes]
+        rest = make_set_point(ControlWord.QUICK_STOP, 0)
+        self._set_points = [_frame(RPDO1_BASE + node, rest) for node in self._nodes]
         self._sync = _frame(SYNC_ID, make_sync())
         alive = make_heartbeat(NmtState.OPERATIONAL)
         self._heartbeat = _frame(HEARTBEAT_BASE + MASTER_NODE, alive)
@@ -354,7 +355,7 @@ class Cia402Group:
             self._state = GroupState.CONFIGURED if faulted else GroupState.QUICK_STOP
 
 
-def _frame(can_id: int, data: bytes = b"") -> can.Message:
+def _frame(can_id: int, data: bytes) -> can.Message:
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 

@@ -1,0 +1,107 @@
+"""A master and a whole simulated rig on one bus, both in this process, for tests to drive."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import can
+import numpy as np
+import pytest
+
+from cdpr.kinematics import cable_lengths
+from cdpr.poses import Pose
+from cdpr.rig import Rig
+from cdpr.statics.working import working_tensions
+from drivers.bus import BusSettings, open_bus
+from drivers.cia402.frames import parse_set_point
+from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
+from simulation.drive import SimulatedDrive
+from simulation.rehearsal import Rehearsal
+
+
+class Bench:
+    """Master, drives and a listener that hears every control word."""
+
+    def __init__(self, rig: Rig, group: DriveGroup, rehearsal: Rehearsal, ear: can.BusABC) -> None:
+        self.rig, self.group, self.rehearsal, self._ear = rig, group, rehearsal, ear
+        self.status: CycleStatus | None = None
+        self.before_cycle: Callable[[], None] = lambda: None
+        self.reply_timeout = 0.0
+
+    @property
+    def drives(self) -> tuple[SimulatedDrive, ...]:
+        return self.rehearsal.drives
+
+    def cycle(self, targets: list[int] | None = None) -> CycleStatus:
+        """One cycle; without targets the drives stay where they were told to be."""
+        self.before_cycle()
+        self.group.send_cycle(self.group.targets.tolist() if targets is None else targets)
+        self.status = self.group.receive(self.reply_timeout)
+        return self.status
+
+    def until(self, state: GroupState, limit: int = 30) -> int:
+        """Cycles until the group is in a state."""
+        for count in range(limit):
+            if self.group.state is state:
+                return count
+            self.cycle()
+        faults = self.status.faults if self.status else ()
+        pytest.fail(f"not {state} after {limit} cycles but {self.group.state}; {faults}")
+
+    def enable(self) -> None:
+        self.group.configure()
+        self.status = self.group.read_positions()
+        self.group.command(GroupCommand.ENABLE)
+        self.until(GroupState.ENABLED)
+
+    def lifted(self, height: float) -> list[int]:
+        """Targets with the platform this much above home, [m], under its working tensions."""
+        pose = Pose.level(self.rig.home.position + np.array([0.0, 0.0, height]))
+        tensions = working_tensions(self.rig, pose).tensions
+        winch_map = self.rehearsal.plant.winch_map
+        unstrained = winch_map.unstrained(cable_lengths(self.rig, pose), tensions)
+        return [int(count) for count in np.rint(winch_map.counts(unstrained))]
+
+    def control_words(self) -> list[int]:
+        """Every control word sent since the last call."""
+        words = []
+        while (message := self._ear.recv(0)) is not None:
+            if 0x200 < message.arbitration_id <= 0x27F:
+                parsed = parse_set_point(message.data)
+                assert parsed is not None
+                words.append(parsed[0])
+        return words
+
+
+@contextmanager
+def three_on_a_bus(settings: BusSettings) -> Iterator[tuple[can.BusABC, can.BusABC, can.BusABC]]:
+    buses: list[can.BusABC] = []
+    try:
+        for _ in range(3):
+            buses.append(open_bus(settings))
+        yield buses[0], buses[1], buses[2]
+    finally:
+        for bus in buses:
+            bus.shutdown()
+
+
+def free_udp_channel() -> str:
+    """Loopback multicast that no other test run on this machine hears."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return f"239.74.163.2:{probe.getsockname()[1]}"
+
+
+class SteppedClock:
+    """The time of drives that are served by a thread: one cycle more for each cycle sent."""
+
+    def __init__(self, cycle: float) -> None:
+        self.cycle, self.now = cycle, 0.0
+
+    def tick(self) -> None:
+        self.now += self.cycle
+
+    def __call__(self) -> float:
+        return self.now

@@ -1,0 +1,108 @@
+"""Opening a bus, and how full it gets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import can
+import pytest
+
+from cdpr.errors import BadInput, HardwareMissing, Refused
+from cdpr.rig import Rig, rig_from_document
+from cdpr.rig_file import RigDocument
+from drivers import bus as bus_module
+from drivers.bus import BusSettings, open_bus
+from drivers.bus_load import bus_load, check_bus_load, cycle_bits, heartbeat_cycles
+
+
+def with_bus(rig: Rig, **changes: object) -> Rig:
+    document = rig.document.model_dump()
+    document["bus"].update(changes)
+    return rig_from_document(RigDocument.model_validate(document))
+
+
+def test_an_unknown_interface_lists_those_there_are() -> None:
+    with pytest.raises(BadInput) as caught:
+        open_bus(BusSettings("sockectan", "can0"))
+    assert "'sockectan'" in caught.value.what
+    assert "socketcan" in caught.value.next_step
+    assert "udp_multicast" in caught.value.next_step
+
+
+def test_a_missing_kernel_interface_says_how_to_bring_it_up() -> None:
+    with pytest.raises(HardwareMissing) as caught:
+        open_bus(BusSettings("socketcan", "can77", 500_000))
+    assert "can77" in caught.value.what
+    assert "ip link set can77 up" in caught.value.next_step
+    assert "bitrate 500000" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("flags", "queue", "what"),
+    [("0x40080", 128, "down"), ("0x40081", 10, "transmit queue")],
+)
+def test_a_kernel_interface_that_is_down_or_short_of_queue_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, queue: int, what: str
+) -> None:
+    folder = tmp_path / "can0"
+    folder.mkdir()
+    (folder / "flags").write_text(f"{flags}\n")
+    (folder / "tx_queue_len").write_text(f"{queue}\n")
+    monkeypatch.setattr(bus_module, "INTERFACES", tmp_path)
+    with pytest.raises(HardwareMissing) as caught:
+        open_bus(BusSettings("socketcan", "can0"))
+    assert what in caught.value.what
+    assert "txqueuelen" in caught.value.next_step
+
+
+def test_what_a_back_end_raises_becomes_hardware_missing() -> None:
+    with pytest.raises(HardwareMissing) as caught:
+        open_bus(BusSettings("slcan", "/nowhere/ttyACM7"))
+    assert caught.value.why
+    assert caught.value.next_step
+
+
+@pytest.mark.parametrize("port", ["port", "0", "65536"])
+def test_a_udp_port_that_is_none_is_refused(port: str) -> None:
+    with pytest.raises(BadInput, match="port"):
+        open_bus(BusSettings("udp_multicast", f"239.74.163.2:{port}"))
+
+
+def test_buses_of_one_virtual_channel_hear_each_other() -> None:
+    settings = BusSettings("virtual", "hear-each-other")
+    with open_bus(settings) as one, open_bus(settings) as other:
+        one.send(can.Message(arbitration_id=0x123, data=b"ab", is_extended_id=False))
+        heard = other.recv(0)
+        assert heard is not None
+        assert (heard.arbitration_id, bytes(heard.data)) == (0x123, b"ab")
+
+
+def test_bits_of_a_cycle_at_worst_stuffing() -> None:
+    """Eight set-points, eight replies, one SYNC: 2215 bits; 70 % at 316 Hz and 1 Mbit/s."""
+    assert cycle_bits(8) == 2215
+    assert cycle_bits(8) * 316 == pytest.approx(0.7e6, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rate", "bitrate", "load"),
+    [(100, 1_000_000, 0.23), (250, 1_000_000, 0.56), (500, 1_000_000, 1.12), (100, 500_000, 0.46)],
+)
+def test_the_load_is_that_of_the_cyclic_frames_and_some_heartbeats(
+    rate: int, bitrate: int, load: float
+) -> None:
+    assert bus_load(8, 1.0 / rate, bitrate) == pytest.approx(load, abs=0.03)
+    assert bus_load(8, 1.0 / rate, bitrate) > cycle_bits(8) * rate / bitrate
+
+
+def test_a_bus_that_is_too_slow_is_refused_with_the_cycle_it_can_do(rig: Rig) -> None:
+    assert check_bus_load(rig) < 0.25
+    with pytest.raises(Refused) as caught:
+        check_bus_load(with_bus(rig, cycle_ms=2.0))
+    assert caught.value.values["load"] > 1.0
+    enough = float(caught.value.next_step.split("bus.cycle_ms to ")[1].split()[0])
+    assert check_bus_load(with_bus(rig, cycle_ms=enough)) <= 0.7
+
+
+@pytest.mark.parametrize("cycle_ms", [1, 3, 4, 10, 30, 100])
+def test_heartbeats_come_several_times_within_their_time_out(cycle_ms: int) -> None:
+    assert heartbeat_cycles(cycle_ms / 1000.0) * cycle_ms <= max(30, cycle_ms)

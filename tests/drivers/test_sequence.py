@@ -1,0 +1,116 @@
+"""The group's steps: never disable voltage, all enabled or none, and it arrives."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.cia402.sequence import Goal, next_words
+from drivers.cia402.states import ControlWord, DriveState
+
+STATES = st.sampled_from(DriveState)
+READY = {
+    DriveState.SWITCHED_ON,
+    DriveState.QUICK_STOP_ACTIVE,
+    DriveState.OPERATION_ENABLED,
+}
+
+
+def after(state: DriveState, word: ControlWord) -> DriveState:
+    """What a drive of CiA 402 does with a word (605Ah = 6)."""
+    match word, state:
+        case ControlWord.QUICK_STOP, DriveState.OPERATION_ENABLED:
+            return DriveState.QUICK_STOP_ACTIVE
+        case ControlWord.QUICK_STOP, DriveState.READY_TO_SWITCH_ON | DriveState.SWITCHED_ON:
+            return DriveState.SWITCH_ON_DISABLED
+        case ControlWord.SHUTDOWN, (
+            DriveState.SWITCH_ON_DISABLED | DriveState.SWITCHED_ON | DriveState.OPERATION_ENABLED
+        ):
+            return DriveState.READY_TO_SWITCH_ON
+        case ControlWord.SWITCH_ON, (DriveState.READY_TO_SWITCH_ON | DriveState.OPERATION_ENABLED):
+            return DriveState.SWITCHED_ON
+        case ControlWord.ENABLE_OPERATION, (DriveState.SWITCHED_ON | DriveState.QUICK_STOP_ACTIVE):
+            return DriveState.OPERATION_ENABLED
+    return state
+
+
+@given(
+    goal=st.sampled_from(Goal),
+    drives=st.lists(st.tuples(STATES, st.booleans()), min_size=1, max_size=10),
+)
+def test_words_never_free_a_cable_and_enable_all_or_none(
+    goal: Goal, drives: list[tuple[DriveState, bool]]
+) -> None:
+    states = [state for state, _ in drives]
+    words = next_words(goal, states, [released for _, released in drives])
+    assert len(words) == len(states)
+    assert all(word & 0x02 for word in words)
+    if ControlWord.ENABLE_OPERATION in words:
+        assert goal in (Goal.ENABLE, Goal.POWER_OFF)
+        assert set(words) == {ControlWord.ENABLE_OPERATION}
+        assert set(states) <= READY
+    for state, word in zip(states, words, strict=True):
+        if state is DriveState.QUICK_STOP_ACTIVE:
+            # Holding drives are only told to go on holding, or to follow again with all others.
+            assert word in (ControlWord.QUICK_STOP, ControlWord.ENABLE_OPERATION)
+        if state is DriveState.OPERATION_ENABLED and word is ControlWord.SHUTDOWN:
+            pytest.fail("shutdown of a drive under torque")
+
+
+@given(
+    st.lists(
+        st.sampled_from(
+            [
+                DriveState.SWITCH_ON_DISABLED,
+                DriveState.READY_TO_SWITCH_ON,
+                DriveState.SWITCHED_ON,
+                DriveState.QUICK_STOP_ACTIVE,
+                DriveState.OPERATION_ENABLED,
+            ]
+        ),
+        min_size=1,
+        max_size=10,
+    )
+)
+def test_any_mixture_without_fault_is_enabled_and_powered_off(states: list[DriveState]) -> None:
+    def run(goal: Goal, states: list[DriveState]) -> list[DriveState]:
+        released = [False] * len(states)
+        for _ in range(8):
+            words = next_words(goal, states, released)
+            released = [
+                s is DriveState.QUICK_STOP_ACTIVE and (r or w is ControlWord.QUICK_STOP)
+                for s, r, w in zip(states, released, words, strict=True)
+            ]
+            states = [after(s, w) for s, w in zip(states, words, strict=True)]
+        return states
+
+    enabled = run(Goal.ENABLE, states)
+    assert set(enabled) == {DriveState.OPERATION_ENABLED}
+    assert set(run(Goal.STOP, enabled)) == {DriveState.QUICK_STOP_ACTIVE}
+    assert set(run(Goal.POWER_OFF, states)) == {DriveState.READY_TO_SWITCH_ON}
+
+
+@pytest.mark.parametrize("bad", [DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE])
+@pytest.mark.parametrize("goal", [Goal.ENABLE, Goal.POWER_OFF])
+def test_a_fault_of_one_stops_all(goal: Goal, bad: DriveState) -> None:
+    states = [DriveState.OPERATION_ENABLED] * 7 + [bad]
+    assert set(next_words(goal, states, [True] * 8)) == {ControlWord.QUICK_STOP}
+
+
+def test_a_drive_that_stopped_by_itself_is_first_told_to_stop() -> None:
+    """The word that it was already getting must not enable it again."""
+    states = [DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE]
+    assert next_words(Goal.ENABLE, states, [False, False])[1] is ControlWord.QUICK_STOP
+    assert next_words(Goal.ENABLE, states, [False, True])[1] is ControlWord.ENABLE_OPERATION
+
+
+def test_only_faulted_drives_get_a_reset() -> None:
+    states = [DriveState.FAULT, DriveState.SWITCH_ON_DISABLED]
+    words = next_words(Goal.RESET_FAULT, states, [False, False])
+    assert words == (ControlWord.RESET_FAULT, ControlWord.SHUTDOWN)
+
+
+def test_unknown_drives_are_told_to_stop() -> None:
+    """A drive not heard yet may be holding the platform from an earlier run."""
+    assert next_words(Goal.IDLE, [DriveState.NOT_READY], [False]) == (ControlWord.QUICK_STOP,)

@@ -1,0 +1,54 @@
+"""Status words against the table of CiA 402-2, and the safety of the control words sent."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from drivers.cia402.states import ControlWord, DriveState, state_of
+
+# Bits 6..0 as the standard prints them; x is any.
+STANDARD = {
+    "0x?0000": DriveState.NOT_READY,
+    "1x?0000": DriveState.SWITCH_ON_DISABLED,
+    "0100001": DriveState.READY_TO_SWITCH_ON,
+    "01x0001": DriveState.READY_TO_SWITCH_ON,
+    "01x0011": DriveState.SWITCHED_ON,
+    "01x0111": DriveState.OPERATION_ENABLED,
+    "00x0111": DriveState.QUICK_STOP_ACTIVE,
+    "0xx1111": DriveState.FAULT_REACTION_ACTIVE,
+    "0xx1000": DriveState.FAULT,
+}
+
+
+def standard_state(word: int) -> DriveState | None:
+    bits = f"{word & 0x7F:07b}"
+    for pattern, state in STANDARD.items():
+        if re.fullmatch(re.sub("[x?]", ".", pattern), bits):
+            return state
+    return None
+
+
+def test_every_status_word_means_what_the_standard_says() -> None:
+    for word in range(0x10000):
+        expected = standard_state(word) or DriveState.NOT_READY
+        assert state_of(word) is expected, hex(word)
+
+
+@pytest.mark.parametrize(
+    ("word", "state"),
+    [
+        (0x1237, DriveState.OPERATION_ENABLED),
+        (0x0217, DriveState.QUICK_STOP_ACTIVE),
+        (0x0231, DriveState.READY_TO_SWITCH_ON),
+        (0x0250, DriveState.SWITCH_ON_DISABLED),
+        (0x0218, DriveState.FAULT),
+    ],
+)
+def test_status_words_seen_on_drives(word: int, state: DriveState) -> None:
+    assert state_of(word) is state
+
+
+def test_no_control_word_is_disable_voltage() -> None:
+    assert all(word & 0x02 for word in ControlWord)
