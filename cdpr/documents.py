@@ -102,13 +102,14 @@ def check_version(
 def _validated(
     data: dict[str, Any], model: type[Model], places: Places
 ) -> tuple[Model | None, list[Problem]]:
+    document: Model | None = None
+    problems: list[Problem] = []
     try:
         document = model.model_validate(data)
+        found = document.findings()
     except ValidationError as error:
         problems = problems_of(error, model, places)
         found = _findings_of_sound_parts(data, model, error)
-    else:
-        problems, found = [], document.findings()
     problems += [Problem(key_path(parts), what, *place_of(parts, places)) for parts, what in found]
     return (document if not problems else None), problems
 

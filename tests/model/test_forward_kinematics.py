@@ -45,7 +45,7 @@ def test_a_guess_nearby_needs_few_steps(name: str, data: st.DataObject) -> None:
     rig = RIGS[name]
     pose = data.draw(poses_of(rig))
     turn = matrix_from_rotation_vector([0.01, -0.02, 0.015])
-    guess = Pose(pose.position + [0.004, -0.003, 0.005], turn @ pose.rotation)
+    guess = Pose(pose.position + np.array([0.004, -0.003, 0.005]), turn @ pose.rotation)
     found = forward_kinematics(rig, cable_lengths(rig, pose), guess)
     agree(found.pose, pose)
     assert found.iterations <= 8

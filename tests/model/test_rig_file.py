@@ -1,0 +1,372 @@
+"""Rig files: every kind of mistake is told with its place and in a plain sentence, all at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdpr.errors import BadInput, CdprError, InvalidFile
+from cdpr.rig import load_rig, rig_from_document
+from cdpr.rig_file import RigDocument
+from tests.model.rig_builds import CONFIGS, hall_data, paper_data, rig_of
+
+PAPER = (CONFIGS / "gachon_8_6.yaml").read_text(encoding="utf-8")
+HALL = (CONFIGS / "hall_10_6.yaml").read_text(encoding="utf-8")
+JARGON = re.compile(r"(?i)input should|valid (dictionary|list|string)|value error|type=|pydantic")
+
+
+def problems_in(text: str, tmp_path: Path) -> list[tuple[int, int, str, str]]:
+    """Line, column, key and sentence of everything that is wrong."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InvalidFile) as caught:
+        load_rig(path)
+    error = caught.value
+    assert error.exit_code == 2
+    assert not JARGON.search(str(error)), str(error)
+    for problem in error.problems:
+        assert f"{path}:{problem.line}:{problem.column}:" in str(error)
+    return [(p.line, p.column, p.key, p.what) for p in error.problems]
+
+
+def line_of(text: str, part: str) -> int:
+    return text[: text.index(part)].count("\n") + 1
+
+
+MISTAKES = {
+    entry["mistake"]: entry
+    for entry in yaml.safe_load((Path(__file__).parent / "rig_mistakes.yaml").read_text())
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_told_by_key_and_sentence(mistake: str, tmp_path: Path) -> None:
+    entry = MISTAKES[mistake]
+    assert entry["old"] in PAPER
+    text = PAPER.replace(entry["old"], entry["new"], 1)
+    # A section that is renamed away for the example is itself an unknown key.
+    told = [problem for problem in problems_in(text, tmp_path) if problem[2] != "x"]
+    assert [problem[2] for problem in told] == [entry["key"]], told
+    assert entry["sentence"] in told[0][3]
+    assert 1 <= told[0][0] <= text.count("\n") + 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("  - {node_id: 8,", "  - {node_id: -8,", "node_id: -8"),
+        ("mass_kg: 0.4", "mass_kg: zero", "mass_kg: zero"),
+        ("fx_px: 1000", "fx_px: -1", "fx_px: -1"),
+    ],
+)
+def test_line_and_column_are_those_of_the_key(old: str, new: str, key: str, tmp_path: Path) -> None:
+    text = PAPER.replace(old, new, 1)
+    line = line_of(text, key)
+    column = text.splitlines()[line - 1].index(key) + 1
+    assert [(p[0], p[1]) for p in problems_in(text, tmp_path)] == [(line, column)]
+
+
+def test_every_problem_of_a_file_is_told_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
+    """Also those between parts, as far as the parts that they compare are sound."""
+    text = PAPER
+    for old, new in (
+        ("size_mm: [130, 130, 130]", "size_mm: [130, 130]"),
+        ("mass_kg: 0.4", "mass_kg: -3"),
+        ("[0, 0, 445]", "[0, 900, 445]"),
+        ("  - [65, -65, 65]\n", ""),
+        ("stiffness_n", "stifness_n"),
+        ("min_tension_n: 5", "min_tension_n: 500"),
+        ("counts_per_rev: 131072", "counts_per_rev: 1.5"),
+        ("node_id: 2,", "node_id: 1,"),
+        ("bitrate: 1000000", "bitrate: fast"),
+        ("family: tag36h11", "family: tag36"),
+        ("id: 302", "id: 301"),
+        ("name: front", ""),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    found = problems_in(text, tmp_path)
+    assert [key for _, _, key, _ in found] == [
+        "platform.size_mm",
+        "platform.mass_kg",
+        "platform.home.position_mm",
+        "anchors_mm",
+        "cables.stiffness_n",
+        "cables.stifness_n",
+        "cables.max_tension_n",
+        "winches[0].counts_per_rev",
+        "winches[1].node_id",
+        "bus.bitrate",
+        "tags.family",
+        "tags.platform[1].id",
+        "cameras[0].name",
+    ]
+    assert [problem[:2] for problem in found] == sorted(problem[:2] for problem in found)
+
+
+def test_a_part_that_is_unsound_is_not_judged_against_others(tmp_path: Path) -> None:
+    """One mistake is one message: no home "outside" a workspace that is not a number."""
+    text = PAPER.replace("upper_mm: [250, 250, 650]", "upper_mm: [250, x, 100]")
+    text = text.replace("node_id: 1,", "node_id: x,").replace("node_id: 2,", "node_id: x,")
+    found = problems_in(text, tmp_path)
+    assert [p[2] for p in found] == [
+        "workspace.upper_mm[1]",
+        "winches[0].node_id",
+        "winches[1].node_id",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "sentence"),
+    [
+        (("    - [0, 0, -1]\n", ""), "feed_directions", "9 feed directions for 10 outlets"),
+        (("- [0, 0, -1]\n", "- [0, 0, 2]\n"), "feed_directions[6]", "its length is 2"),
+        (("  radius_mm: 40", "  radius_mm: 0"), "radius_mm", "must be more than 0 (it is 0)"),
+    ],
+)
+def test_pulleys_are_checked(
+    change: tuple[str, str], key: str, sentence: str, tmp_path: Path
+) -> None:
+    assert change[0] in HALL
+    [(_, _, told, what)] = problems_in(HALL.replace(*change, 1), tmp_path)
+    assert told == f"pulleys.{key}"
+    assert sentence in what
+
+
+def test_two_cameras_of_one_name_are_told(tmp_path: Path) -> None:
+    start = PAPER.index("  - name: front")
+    [(_, _, key, what)] = problems_in(PAPER + PAPER[start:], tmp_path)
+    assert (key, what) == ("cameras[1].name", "camera name 'front' stands twice")
+
+
+def test_five_cables_are_too_few(tmp_path: Path) -> None:
+    data = paper_data()
+    for key in ("outlets_mm", "anchors_mm", "winches"):
+        data[key] = data[key][:5]
+    [(_, _, key, what)] = problems_in(yaml.safe_dump(data), tmp_path)
+    assert key == "outlets_mm"
+    assert "5 outlets" in what
+    assert "6 or more" in what
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "sentence"),
+    [
+        ("", 1, "the file is empty"),
+        ("# only a remark\n", 1, "the file is empty"),
+        ("just words", 1, "the file must hold keys and values"),
+        ("- 1\n- 2\n", 1, "the file must hold keys and values"),
+        ("a: 1\n\tb: 2\n", 2, "a tab"),
+        ("a: [1, 2\nb: 3\n", 2, "not valid YAML"),
+        ("a: 1\n b: 2\n", 2, "not valid YAML"),
+        ("a: 'open\n", 2, "not valid YAML"),
+        ("a: \x07\n", 1, "character #x0007"),
+        ("a: 1\n--- \nb: 1\n", 2, "not valid YAML"),
+        ("a: *nowhere\n", 1, "not valid YAML"),
+        ("[" * 3000, 1, "nested too deeply"),
+    ],
+)
+def test_text_that_is_no_rig_at_all_is_told_with_its_line(
+    text: str, line: int, sentence: str, tmp_path: Path
+) -> None:
+    [(told_line, _, _, what)] = problems_in(text, tmp_path)
+    assert told_line == line
+    assert sentence in what
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: None, "no such file"),
+        (lambda path: path.mkdir(), "this is a folder"),
+        (lambda path: path.write_bytes(b"a: 1\nb: \xff\n"), "byte 0xff in line 2"),
+        (lambda path: path.write_bytes("a: 1".encode("utf-16")), "not UTF-8"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_told(
+    make: Callable[[Path], object], words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "rig.yaml"
+    make(path)
+    with pytest.raises(BadInput, match=words) as caught:
+        load_rig(path)
+    assert caught.value.where == str(path)
+    assert caught.value.next_step
+    assert "Errno" not in str(caught.value)
+
+
+def test_a_path_through_a_file_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="cannot be read"):
+        load_rig(tmp_path / "file" / "rig.yaml")
+
+
+@pytest.mark.parametrize("name", ["gachon_8_6", "hall_10_6"])
+@pytest.mark.parametrize("layout", ["\ufeff{}", "crlf"])
+def test_byte_order_marks_and_windows_line_ends_do_no_harm(
+    name: str, layout: str, tmp_path: Path
+) -> None:
+    text = (CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")
+    path = tmp_path / "rig.yaml"
+    changed = text.replace("\n", "\r\n") if layout == "crlf" else "\ufeff" + text
+    path.write_bytes(changed.encode())
+    assert load_rig(path).hash == load_rig(CONFIGS / f"{name}.yaml").hash
+
+
+def test_winches_may_share_their_values_by_alias(tmp_path: Path) -> None:
+    data = paper_data()
+    lines = [f"  - {{<<: *winch, node_id: {i}}}" for i in range(2, 9)]
+    first = yaml.safe_dump(data["winches"][0], default_flow_style=True).strip()
+    winches = "\n".join(["winches:", f"  - &winch {first}", *lines, "", ""])
+    start, end = PAPER.index("winches:"), PAPER.index("motion:")
+    path = tmp_path / "rig.yaml"
+    path.write_text(PAPER[:start] + winches + PAPER[end:], encoding="utf-8")
+    assert load_rig(path).hash == load_rig(CONFIGS / "gachon_8_6.yaml").hash
+    path.write_text(path.read_text().replace("max_speed_mm_s: 100", "max_speed_mm_s: -1"))
+    with pytest.raises(InvalidFile) as caught:
+        load_rig(path)
+    assert [p.key for p in caught.value.problems] == [
+        f"winches[{i}].max_speed_mm_s" for i in range(8)
+    ]
+
+
+def test_the_rig_is_in_si_units_and_read_only() -> None:
+    rig = load_rig(CONFIGS / "hall_10_6.yaml")
+    data = hall_data()
+    np.testing.assert_allclose(1000.0 * rig.outlets, data["outlets_mm"])
+    np.testing.assert_allclose(1000.0 * rig.anchors, data["anchors_mm"])
+    np.testing.assert_allclose(2000.0 * rig.half_size, data["platform"]["size_mm"])
+    assert rig.pulley_radius == pytest.approx(0.04)
+    assert rig.motion.speed == pytest.approx(0.1)
+    assert rig.winches[1].counts_per_metre == pytest.approx(-4096 * 8 / 0.4)
+    assert rig.winches[1].drum_to_outlet == pytest.approx(2.4)
+    corners = {tuple(np.round(corner, 6)) for corner in rig.platform_corners}
+    assert corners == {
+        (x, y, z) for x in (-0.2, 0.2) for y in (-0.15, 0.15) for z in (-0.125, 0.125)
+    }
+    for array in (
+        rig.outlets,
+        rig.anchors,
+        rig.half_size,
+        rig.feed_directions,
+        rig.platform_corners,
+    ):
+        assert not array.flags.writeable
+
+
+def shuffled(value: Any, rng: np.random.Generator) -> Any:
+    if isinstance(value, dict):
+        keys = list(value)
+        rng.shuffle(keys)
+        return {key: shuffled(value[key], rng) for key in keys}
+    return [shuffled(v, rng) for v in value] if isinstance(value, list) else value
+
+
+def with_floats(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: with_floats(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [with_floats(part) for part in value]
+    whole = {1, 301, 302, 303, 304, 305, 306, 401, 402, 403, 404}
+    return float(value) if type(value) is int and value not in whole and value > 8 else value
+
+
+def test_the_hash_is_of_the_content_not_of_its_spelling() -> None:
+    data = paper_data()
+    rig = rig_of(data)
+    assert rig_of(shuffled(data, np.random.default_rng(1))).hash == rig.hash
+    spelt = paper_data()
+    for section in ("platform", "workspace", "outlets_mm", "anchors_mm", "cables"):
+        spelt[section] = with_floats(spelt[section])
+    assert spelt != data or repr(spelt) != repr(data)
+    assert rig_of(spelt).plan_hash == rig.plan_hash
+
+
+def test_spelling_out_a_default_does_not_change_the_hash() -> None:
+    data = paper_data()
+    rig = rig_of(data)
+    del data["platform"]["centre_of_mass_mm"]
+    data["platform"]["home"]["rotation_wxyz"] = [1, 0, 0, 0]
+    assert rig_of(data).hash == rig.hash
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "in_plan"),
+    [
+        ("platform", "mass_kg", 0.41, True),
+        ("cables", "max_tension_n", 99, True),
+        ("cables", "radius_mm", 0.5, True),
+        ("workspace", "upper_mm", [250, 250, 651], True),
+        ("bus", "channel", "can0", False),
+        ("motion", "speed_mm_s", 21, False),
+    ],
+)
+def test_a_plan_rests_on_geometry_and_limits_only(
+    section: str, key: str, value: object, in_plan: bool
+) -> None:
+    """So that a plan may be run over another bus, and never on another robot."""
+    rig, data = rig_of(paper_data()), paper_data()
+    data[section][key] = value
+    changed = rig_of(data)
+    assert changed.hash != rig.hash
+    assert (changed.plan_hash != rig.plan_hash) == in_plan
+
+
+def test_a_document_whose_parts_disagree_makes_no_rig() -> None:
+    data = paper_data()
+    data["anchors_mm"].pop()
+    data["winches"][1]["node_id"] = 1
+    with pytest.raises(BadInput, match=r"7 anchors for 8 outlets.*; .*node_id 1 stands twice"):
+        rig_from_document(RigDocument.model_validate(data))
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Paths of every value, sections and lists included."""
+    parts: Any = ()
+    if isinstance(value, dict):
+        parts = value.items()
+    elif isinstance(value, list):
+        parts = enumerate(value)
+    return [path] * bool(path) + [p for key, part in parts for p in leaves(part, (*path, key))]
+
+
+ODD = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(10**30), 10**30),
+    st.floats(),
+    st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=8),
+    st.just([]),
+    st.just({}),
+    st.lists(st.floats(), max_size=4),
+    st.dictionaries(st.sampled_from(["name", "x", "position_mm"]), st.integers(), max_size=2),
+)
+
+
+@settings(max_examples=150)
+@given(path=st.sampled_from(leaves(paper_data())), value=ODD)
+def test_whatever_stands_in_a_file_makes_a_rig_or_one_of_our_errors(
+    path: tuple[Any, ...], value: Any, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """No exception of a library ever reaches the user."""
+    changed = paper_data()
+    inner = changed
+    for part in path[:-1]:
+        inner = inner[part]
+    inner[path[-1]] = value
+    file = tmp_path_factory.mktemp("odd") / "rig.yaml"
+    file.write_text(yaml.safe_dump(changed, allow_unicode=True), encoding="utf-8")
+    told = ""
+    try:
+        load_rig(file)
+    except CdprError as error:
+        told = str(error)
+    assert not JARGON.search(told), told
