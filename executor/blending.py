@@ -7,12 +7,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from cdpr.poses import Pose, interpolate
-from executor.path import Path, Segment, corner, corner_deviation, line, poses_of
+from executor.path import MIDDLE_SHARE, Path, Segment, corner, direction, line, poses_of
 
 #: A corner takes at most this share of each neighbouring line, so that corners never meet.
 LONGEST_SHARE = 0.45
 #: How often a corner that is too tight is halved before the path stops at it instead.
 HALVINGS = 5
+#: A turn of more than 105° is not rounded: its curve is so tight that a stop takes less time
+#: (measured for both ready rigs), and that of a turn straight back has no direction at all.
+SHARPEST_TURN = float(np.radians(105.0))
+#: Waypoints that change the path by less are left out, [m] and [rad].
+SAME = 1e-9
 
 IsAllowed = Callable[[Sequence[Pose]], bool]
 
@@ -28,15 +33,16 @@ def rounded(
 
     Args:
         waypoints: At least two poses, ``world_from_platform``.
-        tolerance: Largest distance of a rounded corner from the sharp one, [m]; 0 keeps all sharp.
+        tolerance: Largest distance of a rounded corner from the sharp one, rotation counted as
+            ``weight`` metres for a radian, [m]; 0 keeps all sharp.
         weight: Metres of path for a radian of rotation.
         is_allowed: Tells whether all of some dense poses keep the scene's clearances.
     """
-    points = _distinct(waypoints)
+    points = _needed(waypoints, weight)
     segments: list[Segment] = []
     begin = points[0]
     for before, at, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
-        turn = _largest_allowed(before, at, after, tolerance, weight, is_allowed)
+        turn = _largest_allowed((before, at, after), tolerance, weight, is_allowed)
         if turn is None:
             segments.append(line(begin, at, weight))
             begin = at
@@ -48,31 +54,47 @@ def rounded(
     return Path(tuple(segments))
 
 
-def _distinct(waypoints: Sequence[Pose]) -> list[Pose]:
-    """Waypoints without repeats; at least two remain."""
+def _needed(waypoints: Sequence[Pose], weight: float) -> list[Pose]:
+    """Waypoints without repeats and without those on the way between their neighbours."""
     kept = [waypoints[0]]
     for pose in waypoints[1:]:
-        if pose.distance_to(kept[-1]) > 1e-9 or pose.angle_to(kept[-1]) > 1e-9:
-            kept.append(pose)
+        if _same(pose, kept[-1]):
+            continue
+        if len(kept) > 1 and _on_the_way(kept[-2], kept[-1], pose, weight):
+            kept.pop()
+        kept.append(pose)
     return kept if len(kept) > 1 else [waypoints[0], waypoints[-1]]
 
 
+def _same(a: Pose, b: Pose) -> bool:
+    return a.distance_to(b) <= SAME and a.angle_to(b) <= SAME
+
+
+def _on_the_way(before: Pose, at: Pose, after: Pose, weight: float) -> bool:
+    """Whether the straight move from the first to the last passes through the second."""
+    legs = [line(before, at, weight).length, line(at, after, weight).length]
+    return _same(interpolate(before, after, legs[0] / sum(legs)), at)
+
+
 def _largest_allowed(
-    before: Pose,
-    at: Pose,
-    after: Pose,
-    tolerance: float,
-    weight: float,
-    is_allowed: IsAllowed,
+    turn: tuple[Pose, Pose, Pose], tolerance: float, weight: float, is_allowed: IsAllowed
 ) -> tuple[Pose, Pose, Segment] | None:
-    share = LONGEST_SHARE
-    legs = [line(at, end, weight).length for end in (before, after)]
-    reach = min(share * min(legs), _reach(before, at, after, legs, tolerance))
+    before, at, after = turn
+    lengths = [line(before, at, weight).length, line(at, after, weight).length]
+    # Both moves as they are run, from before to after: a half turn read backwards goes astray.
+    legs = [
+        direction(at, interpolate(before, at, 0.5), weight),
+        direction(at, interpolate(at, after, 0.5), weight),
+    ]
+    if -legs[0] @ legs[1] < np.cos(SHARPEST_TURN):
+        return None
+    deviation = MIDDLE_SHARE * float(np.linalg.norm(legs[0] + legs[1]))  # for a metre of leg
+    reach = min(LONGEST_SHARE * min(lengths), tolerance / max(deviation, 1e-12))
     for _ in range(HALVINGS):
         if reach <= 0.0:
             return None
-        start = interpolate(at, before, reach / legs[0])
-        end = interpolate(at, after, reach / legs[1])
+        start = interpolate(before, at, 1.0 - reach / lengths[0])
+        end = interpolate(at, after, reach / lengths[1])
         segment = corner(start, at, end, weight)
         steps = max(9, int(np.ceil(segment.length / 0.001)))
         samples = poses_of(*segment.at(np.linspace(0.0, segment.length, steps)))
@@ -80,13 +102,3 @@ def _largest_allowed(
             return start, end, segment
         reach /= 2.0
     return None
-
-
-def _reach(before: Pose, at: Pose, after: Pose, legs: list[float], tolerance: float) -> float:
-    """Length of the two legs at which the corner leaves the sharp one by the tolerance, [m]."""
-    start = interpolate(at, before, min(1.0, 1e-3 / legs[0]))
-    end = interpolate(at, after, min(1.0, 1e-3 / legs[1]))
-    deviation = corner_deviation(start, at, end)
-    if deviation < 1e-12:  # the two lines are one: any rounding is the line itself
-        return float("inf")
-    return tolerance * min(1e-3, *legs) / deviation

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-import ruckig
 
-from cdpr.errors import Fault
 from cdpr.poses import Array
 from cdpr.rig import Motion
-from executor.path import Path
+from executor.path import Path, Segment
+from executor.s_curve import SCurve, length_to_change, s_curve
+
+_BISECTIONS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,11 +21,13 @@ class TimeLaw:
     """Travelled length over time.
 
     Attributes:
-        pieces: One jerk-limited move for each segment of the path.
+        pieces: One jerk-limited motion for each segment of the path.
+        offsets: Travelled length at which each begins, [m].
         starts: Time at which each begins, and the end, shape (n + 1,), [s].
     """
 
-    pieces: tuple[ruckig.Trajectory, ...]
+    pieces: tuple[SCurve, ...]
+    offsets: tuple[float, ...]
     starts: Array
 
     @property
@@ -36,38 +40,39 @@ class TimeLaw:
         time = min(max(time, 0.0), self.duration)
         index = int(np.searchsorted(self.starts, time, "right")) - 1
         index = min(max(index, 0), len(self.pieces) - 1)
-        position, speed, acceleration = self.pieces[index].at_time(time - self.starts[index])
-        return position[0], speed[0], acceleration[0]
+        travelled, speed, acceleration = self.pieces[index].at(time - float(self.starts[index]))
+        return self.offsets[index] + travelled, speed, acceleration
 
 
 def time_law(path: Path, motion: Motion) -> TimeLaw:
-    """The fastest jerk-limited run along a path within the motion limits.
+    """A fast jerk-limited run along a path within the motion limits.
 
-    In a rounded corner the speed is held so low that v²κ stays within the acceleration limit; where
-    two straight segments meet at an angle (a corner that could not be rounded) the path stops.
+    All speeding up and slowing down is done on straight segments. A rounded corner is passed at one
+    speed, so low that what its bend makes of it stays within the limits of acceleration and jerk;
+    so the limits hold for the platform's motion in space, not only along the path. Where two
+    straight segments meet at an angle (a corner that could not be rounded) the path stops.
 
     Raises:
         Fault: No time law was found (never seen; the limits are consistent by construction).
     """
-    caps = [_speed_cap(s.curvature, motion) for s in path.segments]
+    caps = [_speed_cap(segment, motion) for segment in path.segments]
     speeds = _boundary_speeds(path, caps, motion)
-    pieces, starts = [], [0.0]
-    for index, segment in enumerate(path.segments):
-        piece = _piece(
-            (float(path.starts[index]), speeds[index]),
-            (float(path.starts[index]) + segment.length, speeds[index + 1]),
-            caps[index],
-            motion,
-        )
-        pieces.append(piece)
-        starts.append(starts[-1] + piece.duration)
-    return TimeLaw(tuple(pieces), np.array(starts))
+    pieces = tuple(
+        s_curve(segment.length, ends, cap if segment.straight else max(ends), motion)
+        for segment, cap, ends in zip(path.segments, caps, pairwise(speeds), strict=True)
+    )
+    starts = np.concatenate([[0.0], np.cumsum([piece.duration for piece in pieces])])
+    return TimeLaw(pieces, tuple(path.starts[:-1].tolist()), starts)
 
 
-def _speed_cap(curvature: float, motion: Motion) -> float:
-    if curvature == 0.0:
-        return motion.speed
-    return min(motion.speed, math.sqrt(motion.acceleration / curvature))
+def _speed_cap(segment: Segment, motion: Motion) -> float:
+    cap = motion.speed
+    bend, bend_change = segment.bends
+    if bend > 0.0:
+        cap = min(cap, math.sqrt(motion.acceleration / bend))
+    if bend_change > 0.0:
+        cap = min(cap, math.cbrt(motion.jerk / bend_change))
+    return cap
 
 
 def _boundary_speeds(path: Path, caps: list[float], motion: Motion) -> list[float]:
@@ -81,47 +86,23 @@ def _boundary_speeds(path: Path, caps: list[float], motion: Motion) -> list[floa
         speeds.append(0.0 if sharp else min(cap_left, cap_right))
     speeds.append(0.0)
     for i, segment in enumerate(segments):
-        speeds[i + 1] = _reachable(speeds[i], speeds[i + 1], segment.length, motion)
+        speeds[i + 1] = _reachable(speeds[i], speeds[i + 1], segment, motion)
     for i in reversed(range(len(segments))):
-        speeds[i] = _reachable(speeds[i + 1], speeds[i], segments[i].length, motion)
+        speeds[i] = _reachable(speeds[i + 1], speeds[i], segments[i], motion)
     return speeds
 
 
-def _reachable(known: float, wanted: float, length: float, motion: Motion) -> float:
-    """The largest speed up to ``wanted`` that can be reached from ``known`` within a length."""
-    if wanted <= known or _change_length(known, wanted, motion) <= length:
+def _reachable(known: float, wanted: float, segment: Segment, motion: Motion) -> float:
+    """The largest speed up to ``wanted`` at one end of a segment with ``known`` at the other."""
+    if not segment.straight:
+        return min(known, wanted)
+    if wanted <= known or length_to_change(known, wanted, motion) <= segment.length:
         return wanted
     low, high = known, wanted
-    for _ in range(60):
+    for _ in range(_BISECTIONS):
         middle = (low + high) / 2.0
-        if _change_length(known, middle, motion) <= length:
+        if length_to_change(known, middle, motion) <= segment.length:
             low = middle
         else:
             high = middle
     return low
-
-
-def _change_length(slow: float, fast: float, motion: Motion) -> float:
-    """Length to change speed with zero acceleration at both ends (symmetric S-curve), [m]."""
-    change = fast - slow
-    if change <= motion.acceleration**2 / motion.jerk:
-        time = 2.0 * math.sqrt(change / motion.jerk)
-    else:
-        time = change / motion.acceleration + motion.acceleration / motion.jerk
-    return (slow + fast) / 2.0 * time
-
-
-def _piece(
-    start: tuple[float, float], end: tuple[float, float], cap: float, motion: Motion
-) -> ruckig.Trajectory:
-    request = ruckig.InputParameter(1)
-    request.current_position, request.current_velocity = [start[0]], [start[1]]
-    request.target_position, request.target_velocity = [end[0]], [end[1]]
-    request.current_acceleration, request.target_acceleration = [0.0], [0.0]
-    request.max_velocity = [max(cap, start[1], end[1]) * (1.0 + 1e-9)]
-    request.max_acceleration, request.max_jerk = [motion.acceleration], [motion.jerk]
-    trajectory = ruckig.Trajectory(1)
-    result = ruckig.Ruckig(1).calculate(request, trajectory)
-    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise Fault(f"no time law for a segment of the path: ruckig says {result}")
-    return trajectory

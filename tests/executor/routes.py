@@ -1,0 +1,77 @@
+"""Random poses and routes for the tests of this folder, and distances by an independent route."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cdpr.poses import Pose
+from cdpr.rig import Motion
+
+Array = NDArray[np.float64]
+WEIGHT = 0.11
+GACHON = Motion(
+    speed=0.020,
+    acceleration=0.1,
+    jerk=1.0,
+    blend_tolerance=0.001,
+    following_error=0.002,
+    start_tolerance=0.001,
+)
+HALL = Motion(
+    speed=0.1,
+    acceleration=0.3,
+    jerk=3.0,
+    blend_tolerance=0.005,
+    following_error=0.005,
+    start_tolerance=0.003,
+)
+
+
+def at_mm(x: float, y: float, z: float, turn_deg: float = 0.0) -> Pose:
+    """A pose turned about z."""
+    turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+    return Pose(np.array([x, y, z]) / 1000.0, turn)
+
+
+def random_pose(rng: np.random.Generator, size: float, turn: float = 0.0) -> Pose:
+    """A pose in a cube of half width ``size`` [m], turned by up to ``turn`` [rad]."""
+    axis = rng.normal(size=3)
+    vector = axis / np.linalg.norm(axis) * turn * rng.random()
+    return Pose(rng.uniform(-size, size, 3), Rotation.from_rotvec(vector).as_matrix())
+
+
+def random_route(
+    seed: int, turned: bool = False, count: int | None = None, sharpest_deg: float = 130.0
+) -> list[Pose]:
+    """Two to seven waypoints, from some millimetres to some decimetres apart.
+
+    Every turn is by an even chance between 0 and ``sharpest_deg``, in any plane.
+    """
+    rng = np.random.default_rng(seed)
+    size = 10.0 ** rng.uniform(-2.5, -0.5)
+    turn = 0.5 * size if turned else 0.0  # [rad] for [m]: a part of the way, not most of it
+    poses = [random_pose(rng, size, turn)]
+    heading = rng.normal(size=3)
+    heading /= np.linalg.norm(heading)
+    for _ in range((count or rng.integers(2, 8)) - 1):
+        across = np.cross(heading, rng.normal(size=3))
+        angle = np.radians(rng.uniform(0.0, sharpest_deg))
+        heading = np.cos(angle) * heading + np.sin(angle) * across / np.linalg.norm(across)
+        position = poses[-1].position + size * rng.uniform(0.3, 1.0) * heading
+        poses.append(Pose(position, random_pose(rng, size, turn).rotation))
+    return poses
+
+
+def steps_between(positions: Array, rotations: Array, weight: float = WEIGHT) -> Array:
+    """√(|Δp|² + (ρ Δθ)²) of neighbouring rows, shape (n − 1,), [m]."""
+    moved = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    relative = np.einsum("nji,njk->nik", rotations[:-1], rotations[1:])
+    turned = Rotation.from_matrix(relative).magnitude()
+    return np.hypot(moved, weight * turned)
+
+
+def always(_poses: object) -> bool:
+    """No obstacle anywhere."""
+    return True
