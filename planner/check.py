@@ -36,7 +36,7 @@ from planner.track import Track
 SPACING = 0.005
 CLEARANCE_TOLERANCE = 0.1e-3
 """How exactly the smallest clearances are found, [m]."""
-MARGIN_TOLERANCE = 0.005
+MARGIN_TOLERANCE = 0.02
 """How exactly the smallest capacity margin is found, part of the largest tension."""
 END_TOLERANCE = 1e-6
 """How far a path may begin and end from the scene's start and goal, [m] and [rad]."""
@@ -60,9 +60,7 @@ def verify(plan: Plan) -> VerifiedPlan:
     return verified(plan, report)
 
 
-def check_path(
-    rig: Rig, scene: Scene, poses: Sequence[Pose], *, ends: bool = True
-) -> CheckReport:
+def check_path(rig: Rig, scene: Scene, poses: Sequence[Pose], *, ends: bool = True) -> CheckReport:
     """Checks a path, whether a few corners or thousands of poses of an executed curve.
 
     Args:

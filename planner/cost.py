@@ -29,6 +29,10 @@ class Cost(Protocol):
         """Cost of the straight edge from ``start`` to ``end``, shape (n,) each."""
         ...
 
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Costs of straight edges from many points, shape (k, n), to one; shape (k,)."""
+        ...
+
 
 class LengthCost:
     """The length of an edge, [m]."""
@@ -36,6 +40,11 @@ class LengthCost:
     def edge(self, start: Array, end: Array) -> float:
         """Length of the edge, [m]."""
         return float(np.linalg.norm(end - start))
+
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Lengths of the edges, shape (k,), [m]."""
+        lengths: Array = np.linalg.norm(end - starts, axis=1)
+        return lengths
 
 
 class KinematicCost:
@@ -60,14 +69,22 @@ class KinematicCost:
         return self._scaled(*self._indices(positions))
 
     def edge(self, start: Array, end: Array) -> float:
-        """Line integral of c along the edge (trapezoids between samples 10 mm apart), [m]."""
-        length = float(np.linalg.norm(end - start))
-        count = max(2, int(np.ceil(length / _SAMPLING)) + 1)
-        points = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
+        """Line integral of c along the edge, [m]."""
+        return float(self.edges(start[None, :], end)[0])
+
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Line integrals of c, shape (k,), [m]: trapezoids between samples at most 10 mm apart."""
+        if not len(starts):
+            return np.zeros(0)
+        lengths = np.linalg.norm(end - starts, axis=1)
+        count = max(2, int(np.ceil(float(lengths.max()) / _SAMPLING)) + 1)
+        shares = np.linspace(0.0, 1.0, count)[:, None, None]
+        points = (starts + shares * (end - starts)).reshape(-1, starts.shape[1])
         corners, weights = corners_and_weights(self._lattice, points)
-        values = np.sum(self._values[corners] * weights, axis=-1)
-        inner = float(values.sum()) - (float(values[0]) + float(values[-1])) / 2.0
-        return length * inner / (count - 1)
+        values = np.einsum("kc,kc->k", self._values[corners], weights).reshape(count, -1)
+        inner = values.sum(axis=0) - (values[0] + values[-1]) / 2.0
+        integrals: Array = lengths * inner / (count - 1)
+        return integrals
 
     def mean_along(self, waypoints: Array) -> float:
         """Mean of c over the length of a path, exact at samples; waypoints shape (k, 3), [m]."""

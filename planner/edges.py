@@ -88,11 +88,9 @@ class ObstacleEdges:
         moved = hull_body(np.ascontiguousarray(hulls.points(body)))
         return is_apart(moved, self._pieces[piece], needed)
 
-    def _decide_unclear(
-        self, hulls: Swept, start: Pose, end: Pose, piece: int, body: int
-    ) -> bool:
-        """The hulls are too near: that is the truth where they are exact, else a closer look."""
-        if hulls.exact or hulls.growth.max() < _FINEST:
+    def _decide_unclear(self, hulls: Swept, start: Pose, end: Pose, piece: int, body: int) -> bool:
+        """A hull is too near: that is the truth where it is exact, else a closer look is needed."""
+        if hulls.growth[body] < _FINEST:
             self._count(piece, body)
             return False
         middle = interpolate(start, end, 0.5)

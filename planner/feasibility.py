@@ -94,8 +94,6 @@ class FeasibleEdges:
         missing = np.unique(corners[np.isnan(self._margins[corners])])
         if len(missing):
             where = self._lattice.points(missing)
-            self._margins[missing] = capacity_margins(
-                self.rig, self.scene, where, self._rotation
-            )
+            self._margins[missing] = capacity_margins(self.rig, self.scene, where, self._rotation)
         interpolated: Array = np.sum(self._margins[corners] * weights, axis=-1)
         return interpolated

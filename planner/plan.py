@@ -26,7 +26,10 @@ from planner.shortcut import cheapest_through, drawn_tight, shortcut
 from planner.space import Space, TranslationSpace
 from planner.validity import Validity
 
-_SPREAD = 0.020
+_SPREAD_POINTS = 40
+_ROUNDS = 2
+_FOR_FEWER_CORNERS = 0.003
+"""Share of its cost that a finished path may lose to have fewer corners, at which a run slows."""
 
 
 def make_plan(
@@ -110,7 +113,7 @@ def _searched(
         if settings.sampler == "adaptive"
         else GoalBias(space, goal, random)
     )
-    result = RrtStar(validity, cost, sampler, settings).search(start, goal, progress)
+    result = RrtStar(validity, cost, sampler, settings, random).search(start, goal, progress)
     if result.path is None:
         raise _no_solution(scene, validity, settings, result)
     return result, result.path
@@ -142,18 +145,16 @@ def _no_solution(
     )
 
 
-def _post_processed(
-    raw: Array, validity: Validity, cost: Cost, settings: PlannerSettings
-) -> Array:
+def _post_processed(raw: Array, validity: Validity, cost: Cost, settings: PlannerSettings) -> Array:
     """Algorithm 3; in the rewiring mode the path is then drawn tight as well."""
     path = shortcut(raw, validity.edge, cost)
     if settings.mode == "paper" or len(path) == 2:
         return path
-    path = cheapest_through(path, validity.edge, cost, _SPREAD)
-    path = drawn_tight(path, validity.edge, cost)
-    path = cheapest_through(path, validity.edge, cost, _SPREAD)
-    path = drawn_tight(path, validity.edge, cost)
-    return shortcut(path, validity.edge, cost)
+    length = float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    for _ in range(_ROUNDS):
+        path = cheapest_through(path, validity.edge, cost, length / _SPREAD_POINTS)
+        path = drawn_tight(path, validity.edge, cost)
+    return shortcut(path, validity.edge, cost, _FOR_FEWER_CORNERS)
 
 
 def _planner(settings: PlannerSettings) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from cdpr.poses import Array
@@ -40,13 +41,19 @@ class RrtStar:
     """One search, fed by a sampler; the same random numbers give the same tree."""
 
     def __init__(
-        self, validity: Validity, cost: Cost, sampler: Sampler, settings: PlannerSettings
+        self,
+        validity: Validity,
+        cost: Cost,
+        sampler: Sampler,
+        settings: PlannerSettings,
+        random: Generator,
     ) -> None:
         """Holds what the search needs; `search` does it."""
         self.validity = validity
         self.cost = cost
         self.sampler = sampler
         self.settings = settings
+        self.random = random
 
     def search(self, start: Array, goal: Array, progress: Progress | None = None) -> SearchResult:
         """Grows a tree from ``start`` until ``goal`` is a node of it, and in the rewiring mode on.
@@ -64,11 +71,14 @@ class RrtStar:
             nearest_to_goal, last = 0.0, 0
         while iteration < last:
             iteration += 1
-            added = self._grow(tree)
+            wanted = self.sampler.draw(tree) if reached is None else self._near_path(tree, reached)
+            added = self._grow(tree, wanted)
             if added is not None:
                 away = float(np.linalg.norm(tree.points[added] - goal))
                 nearest_to_goal = min(nearest_to_goal, away)
-                if away <= self.settings.goal_radius and self._join_goal(tree, added, goal, reached):
+                if away <= self.settings.goal_radius and self._join_goal(
+                    tree, added, goal, reached
+                ):
                     if reached is None:
                         reached = tree.count - 1
                         last = self._last_iteration(iteration)
@@ -89,9 +99,17 @@ class RrtStar:
             return iteration
         return min(iteration + IMPROVING_ITERATIONS, self.settings.max_iterations)
 
-    def _grow(self, tree: Tree) -> int | None:
-        """One expansion (lines 4–18); the new node, or None when it failed."""
-        wanted = self.sampler.draw(tree)
+    def _near_path(self, tree: Tree, reached: int) -> Array:
+        """A point near the best path so far, where new nodes can still make it cheaper."""
+        way = tree.way_to(reached)
+        k = int(self.random.integers(len(way) - 1)) if len(way) > 1 else 0
+        on_way = way[k] + self.random.random() * (way[min(k + 1, len(way) - 1)] - way[k])
+        away = self.random.normal(0.0, self.settings.neighbour_radius, on_way.shape)
+        near: Array = np.clip(on_way + away, self.validity.space.lower, self.validity.space.upper)
+        return near
+
+    def _grow(self, tree: Tree, wanted: Array) -> int | None:
+        """One expansion (lines 5–18); the new node, or None when it failed."""
         nearest = tree.nearest(wanted)
         new = self._steer(tree.points[nearest], wanted)
         if new is None:  # drawn on a node: no fault of that node
@@ -102,7 +120,7 @@ class RrtStar:
             return None
         self.sampler.tell(nearest, True)
         neighbours = tree.within(new, self.settings.neighbour_radius)
-        costs = self._edge_costs(tree, neighbours, new)
+        costs = self.cost.edges(tree.points[neighbours], new)
         own = float(costs[int(np.flatnonzero(neighbours == nearest)[0])])
         parent, cost = self._best_parent(tree, neighbours, costs, nearest, own, new)
         node = tree.add(new, parent, cost)
@@ -121,9 +139,6 @@ class RrtStar:
             step = min(step, length)
         new: Array = near + along * (step / length)
         return new
-
-    def _edge_costs(self, tree: Tree, neighbours: NDArray[np.int64], new: Array) -> Array:
-        return np.array([self.cost.edge(tree.points[int(k)], new) for k in neighbours])
 
     def _best_parent(
         self,
@@ -144,9 +159,7 @@ class RrtStar:
                 return int(neighbours[k]), float(totals[k])
         return nearest, already
 
-    def _rewire(
-        self, tree: Tree, node: int, neighbours: NDArray[np.int64], costs: Array
-    ) -> None:
+    def _rewire(self, tree: Tree, node: int, neighbours: NDArray[np.int64], costs: Array) -> None:
         """RRT*: neighbours that are cheaper through the new node become its children."""
         through = float(tree.costs[node]) + costs
         for k in np.flatnonzero(through < tree.costs[neighbours] - 1e-12).tolist():

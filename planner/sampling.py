@@ -96,9 +96,7 @@ class AdaptiveSample:
         """SamplingBackward, Eq. 12: outside the ball about the mean of all nodes through x_c."""
         centre = tree.points.mean(axis=0)
         radius = float(np.linalg.norm(centre - failed))
-        drawn = self._random.uniform(
-            self._space.lower, self._space.upper, (_TRIES, len(centre))
-        )
+        drawn = self._random.uniform(self._space.lower, self._space.upper, (_TRIES, len(centre)))
         away = np.linalg.norm(drawn - centre, axis=1)
         outside = np.flatnonzero(away > radius)
         # A ball that leaves no room in the bounds: the farthest of the points drawn.

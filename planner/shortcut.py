@@ -18,13 +18,14 @@ IsFree = Callable[[Array, Array], bool]
 _ROUND_OFF = 1e-12
 
 
-def shortcut(path: Array, is_free: IsFree, cost: Cost) -> Array:
+def shortcut(path: Array, is_free: IsFree, cost: Cost, dearer: float = 0.0) -> Array:
     """Algorithm 3: from each kept node straight to the farthest node that can be reached.
 
     Args:
         path: Free from node to node, shape (k, n).
         is_free: Whether an edge is allowed.
         cost: Of edges.
+        dearer: Share by which a shortcut may cost more than what it replaces, to save corners.
 
     Returns:
         Some of the nodes, the first and the last among them, shape (j, n).
@@ -37,7 +38,7 @@ def shortcut(path: Array, is_free: IsFree, cost: Cost) -> Array:
             for j in range(last, i, -1)
             if j == i + 1
             or (
-                cost.edge(path[i], path[j]) <= along[j] - along[i] + _ROUND_OFF
+                cost.edge(path[i], path[j]) <= (1.0 + dearer) * (along[j] - along[i]) + _ROUND_OFF
                 and is_free(path[i], path[j])
             )
         )
@@ -61,8 +62,7 @@ def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -
     best = np.append(0.0, np.full(len(points) - 1, np.inf))
     parent = np.zeros(len(points), dtype=np.int64)
     for j in range(1, len(points)):
-        edges = np.array([cost.edge(points[i], points[j]) for i in range(j)])
-        totals = best[:j] + edges
+        totals = best[:j] + cost.edges(points[:j], points[j])
         for i in np.argsort(totals, kind="stable").tolist():
             if i == j - 1 or is_free(points[i], points[j]):
                 best[j], parent[j] = totals[i], i
@@ -103,7 +103,7 @@ def _move_corner(path: Array, k: int, step: float, is_free: IsFree, cost: Cost) 
     if size > 0.0:
         ways = np.concatenate([inward[None, :] / size, ways])
     tried = corner + step * ways
-    totals = [cost.edge(before, t) + cost.edge(t, after) for t in tried]
+    totals = cost.edges(tried, before) + cost.edges(tried, after)
     for i in np.argsort(totals, kind="stable").tolist():
         if totals[i] >= now * (1.0 - 1e-6):
             return False

@@ -25,17 +25,12 @@ class Swept:
         cables: Hull points of each cable, shape (m, 3 or 4, 3), [m].
         platform: Hull points of the platform, shape (16, 3), [m].
         growth: What each hull must be grown by, cables and then platform, shape (m + 1,), [m];
-            zeros where the hulls are exact. Cable radii are not in it.
+            zero where a hull is exact. Cable radii are not in it.
     """
 
     cables: Array
     platform: Array
     growth: Array
-
-    @property
-    def exact(self) -> bool:
-        """Whether the hulls are just what is swept."""
-        return not self.growth.any()
 
     def reach(self, directions: Array) -> Array:
         """Largest reach of each hull, not grown; shape (..., m + 1, 3) → (..., m + 1), [m]."""
