@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from threading import Event
 
 import can
 import numpy as np
@@ -127,7 +126,7 @@ class Rehearsal:
 
     def serve(
         self,
-        stop: Event,
+        stop_requested: Callable[[], bool],
         on_status: Callable[[RehearsalStatus], None] | None = None,
         *,
         status_period: float = 0.5,
@@ -136,7 +135,7 @@ class Rehearsal:
         """Answers in real time until told to stop or interrupted from the keyboard.
 
         Args:
-            stop: Set to end it.
+            stop_requested: Asked every few milliseconds; true ends it.
             on_status: Called every ``status_period`` seconds, between two frames.
             status_period: [s].
             clock: Monotonic seconds.
@@ -145,7 +144,7 @@ class Rehearsal:
             Fault: The bus failed, or the platform has no equilibrium.
         """
         try:
-            self._serve(stop, on_status, status_period, clock)
+            self._serve(stop_requested, on_status, status_period, clock)
         except KeyboardInterrupt:
             return
 
@@ -156,13 +155,13 @@ class Rehearsal:
 
     def _serve(
         self,
-        stop: Event,
+        stop_requested: Callable[[], bool],
         on_status: Callable[[RehearsalStatus], None] | None,
         status_period: float,
         clock: Callable[[], float],
     ) -> None:
         last = told = clock()
-        while not stop.is_set():
+        while not stop_requested():
             message = take(self._bus, IDLE_WAIT)
             now = clock()
             # Frames of one burst follow each other at once: only what needs the time asks for it.

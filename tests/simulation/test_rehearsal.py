@@ -1,0 +1,158 @@
+"""Drives and plant together: what the drums do is what the platform and the torques show."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from cdpr.kinematics import cable_lengths
+from cdpr.poses import Pose
+from cdpr.rig import Rig
+from cdpr.statics.working import working_tensions
+from drivers.bus import BusSettings, open_bus
+from drivers.cia402.states import DriveState
+from drivers.drive_group import DriveGroup, GroupCommand, GroupState, make_drive_group
+from simulation.rehearsal import Rehearsal, RehearsalStatus
+
+_CHANNELS = itertools.count()
+
+
+@pytest.fixture
+def channel() -> BusSettings:
+    return BusSettings("virtual", f"rehearsal-{next(_CHANNELS)}")
+
+
+def targets_for(robot: Rig, rehearsal: Rehearsal, pose: Pose) -> list[int]:
+    winch_map = rehearsal.plant.winch_map
+    tensions = working_tensions(robot, pose).tensions
+    unstrained = winch_map.unstrained(cable_lengths(robot, pose), tensions)
+    return [int(count) for count in np.rint(winch_map.counts(unstrained))]
+
+
+def enabled(robot: Rig, group: DriveGroup, rehearsal: Rehearsal) -> list[int]:
+    """Enables; returns where the drives stand."""
+    group.configure()
+    start = [int(p) for p in group.read_positions(rehearsal.pump).positions]
+    group.command(GroupCommand.ENABLE)
+    for _ in range(10):
+        group.send_cycle(start)
+        group.receive(0.0)
+    assert group.state is GroupState.ENABLED
+    return start
+
+
+def circle(robot: Rig, cycles: int) -> Iterator[Pose]:
+    """A circle of 4 mm radius through home, at most 0.25 mm a cycle."""
+    for cycle in range(cycles + 1):
+        angle = 2.0 * np.pi * cycle / cycles
+        offset = 0.004 * np.array([1.0 - np.cos(angle), np.sin(angle), 0.0])
+        yield Pose.level(robot.home.position + offset)
+
+
+@pytest.mark.parametrize("which", ["rig", "pulley_rig"])
+def test_platform_is_where_the_set_points_of_the_cycle_before_put_it(
+    request: pytest.FixtureRequest, channel: BusSettings, which: str
+) -> None:
+    robot: Rig = request.getfixturevalue(which)
+    with open_bus(channel) as master, open_bus(channel) as bus:
+        rehearsal = Rehearsal(robot, bus, robot.home)
+        group = make_drive_group(robot, master, rehearsal.pump)
+        enabled(robot, group, rehearsal)
+        before = robot.home
+        for pose in circle(robot, 100):
+            group.send_cycle(targets_for(robot, rehearsal, pose))
+            status = group.receive(0.0)
+            assert np.array_equal(status.positions, status.demands)
+            # Counts are whole: the platform is off by a fraction of a count of cable.
+            assert rehearsal.pose.distance_to(before) < 3e-5
+            rated = np.array([w.torque_constant for w in robot.winches])
+            shown = status.torques / 1000.0 * rated
+            assert shown == pytest.approx(rehearsal.tensions, abs=rated[0] / 1000.0)
+            assert rehearsal.tensions.min() > 0.5 * robot.min_tension
+            before = pose
+
+
+def test_two_rehearsals_are_the_same_to_the_last_bit(rig: Rig) -> None:
+    runs = []
+    for _ in range(2):
+        settings = BusSettings("virtual", f"rehearsal-{next(_CHANNELS)}")
+        with open_bus(settings) as master, open_bus(settings) as bus:
+            rehearsal = Rehearsal(rig, bus, rig.home)
+            group = make_drive_group(rig, master, rehearsal.pump)
+            enabled(rig, group, rehearsal)
+            for pose in circle(rig, 60):
+                group.send_cycle(targets_for(rig, rehearsal, pose))
+                group.receive(0.0)
+            runs.append(np.append(rehearsal.pose.matrix().ravel(), rehearsal.tensions))
+    assert np.array_equal(*runs)
+
+
+def test_a_start_away_from_home_is_where_the_drives_say(rig: Rig, channel: BusSettings) -> None:
+    start = Pose.level(rig.home.position + np.array([0.1, -0.05, 0.08]))
+    with open_bus(channel) as master, open_bus(channel) as bus:
+        rehearsal = Rehearsal(rig, bus, start)
+        group = make_drive_group(rig, master, rehearsal.pump)
+        group.configure()
+        read = group.read_positions().positions.tolist()
+        assert read == targets_for(rig, rehearsal, start)
+        assert rehearsal.pose.distance_to(start) < 1e-5
+
+
+def test_without_torque_the_brakes_hold_the_platform(rig: Rig, channel: BusSettings) -> None:
+    with open_bus(channel) as master, open_bus(channel) as bus:
+        rehearsal = Rehearsal(rig, bus, rig.home)
+        group = make_drive_group(rig, master, rehearsal.pump)
+        start = enabled(rig, group, rehearsal)
+        before = rehearsal.pose
+        group.command(GroupCommand.HALT_POWER)
+        for _ in range(10):
+            group.send_cycle(start)
+            status = group.receive(0.0)
+        assert group.state is GroupState.DISABLED
+        assert (status.torques == 0).all()
+        assert rehearsal.pose.distance_to(before) < 1e-9
+
+
+class ManualTime:
+    """A clock that tells the time it is given, and ends the service after some readings."""
+
+    def __init__(self, stop: threading.Event, readings: int, step: float) -> None:
+        self._stop, self._left, self._step, self._now = stop, readings, step, 0.0
+
+    def __call__(self) -> float:
+        self._left -= 1
+        if self._left <= 0:
+            self._stop.set()
+        self._now += self._step
+        return self._now
+
+
+def test_served_drives_stop_by_themselves_when_the_master_is_gone(
+    rig: Rig, channel: BusSettings
+) -> None:
+    """No frame comes any more; the time-outs run on the clock alone."""
+    stop, told = threading.Event(), list[RehearsalStatus]()
+    with open_bus(channel) as master, open_bus(channel) as bus:
+        rehearsal = Rehearsal(rig, bus, rig.home)
+        group = make_drive_group(rig, master, rehearsal.pump)
+        enabled(rig, group, rehearsal)
+        clock = ManualTime(stop, readings=20, step=0.005)
+        rehearsal.serve(stop, told.append, status_period=0.02, clock=clock)
+    assert told
+    assert told[0].states == (DriveState.OPERATION_ENABLED,) * 8
+    assert told[-1].states == (DriveState.QUICK_STOP_ACTIVE,) * 8
+    assert told[-1].pose.distance_to(rig.home) < 1e-5
+
+
+def test_serving_ends_quietly_on_an_interrupt_from_the_keyboard(
+    rig: Rig, channel: BusSettings
+) -> None:
+    def interrupted() -> float:
+        raise KeyboardInterrupt
+
+    with open_bus(channel) as bus:
+        Rehearsal(rig, bus, rig.home).serve(threading.Event(), clock=interrupted)
