@@ -41,7 +41,7 @@ class CycleRecord:
         actual: What the drives answered, [counts].
         torques: What they answered, [‰ of rated torque].
         missing: How many did not answer.
-        following_error: Largest over the cables, [m].
+        following_error: Largest over the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
     """
 
@@ -244,7 +244,9 @@ class Loop:
         return status
 
     def _following_errors(self, status: CycleStatus) -> Array:
-        """Signed, in cable length, shape (m,), [m]."""
+        """Signed, in cable length, shape (m,), [m]; NaN while the drives do not follow."""
+        if status.state is not GroupState.ENABLED:
+            return np.full(len(self._per_metre), np.nan)
         errors: Array = (status.positions - status.demands) / self._per_metre
         return errors
 

@@ -15,7 +15,7 @@ from executor.blending import IsAllowed, rounded
 from executor.path import Path
 from executor.setpoints import CheckedTable, build_table, check_table
 from executor.timing import TimeLaw, time_law
-from planner.check import VerifiedPlan
+from planner.check_report import VerifiedPlan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,8 @@ from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
 from executor.path import Path, poses_of
 from executor.timing import TimeLaw
-from planner.check import CheckReport, check_path
+from planner.check import check_path
+from planner.check_report import CheckReport
 
 INT32_MAX = 2**31 - 1
 
@@ -127,7 +128,7 @@ def check_table(rig: Rig, scene: Scene, table: SetpointTable) -> CheckedTable:
         raise _refusal(found)
     report = check_path(rig, scene, table.poses())
     if not report.passed:
-        raise _refusal([str(violation) for violation in report.violations])
+        raise _refusal([violation.sentence() for violation in report.violations])
     return CheckedTable(table, table.hash, report, WinchMap(rig))
 
 

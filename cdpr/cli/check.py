@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from planner.check_report import CheckReport, Closest
 
 
 def check(
@@ -39,9 +42,39 @@ def check(
     if as_json:
         show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
     else:
-        show_facts(f"check of {plan}", report.sentences())
+        show_facts(f"check of {plan}", sentences_of(report))
         for violation in report.violations:
-            out.print(f"[red]violated[/red] {violation}")
+            out.print(f"[red]violated[/red] {violation.sentence()}", soft_wrap=True)
         out.print("[green]passed[/green]" if report.passed else "[red]not passed[/red]")
     if not report.passed:
         raise typer.Exit(3)
+
+
+def sentences_of(report: CheckReport) -> list[tuple[str, str]]:
+    """What the check found, for people."""
+    own = report.self_clearance
+    facts = [
+        ("length", f"{report.length * 1000:.1f} mm, {report.samples} poses looked at"),
+        (
+            "self clearance",
+            _distance(own, report.proved_self_clearance, report.required_self_clearance),
+        ),
+        ("tension", f"{report.min_tension:.1f} to {report.max_tension:.1f} N"),
+        ("capacity margin", f"{report.capacity_margin:.1f} N"),
+        ("cable speed", f"at most {report.max_cable_speed * 1000:.1f} mm/s"),
+    ]
+    near = report.obstacle_clearance
+    if near is not None:
+        text = _distance(near, report.proved_obstacle_clearance, report.required_obstacle_clearance)
+        facts.insert(1, ("clearance", text))
+    return facts
+
+
+def _distance(closest: Closest, proved: float, required: float) -> str:
+    near = closest.nearest
+    x, y, z = closest.pose.position * 1000
+    return (
+        f"{near.distance * 1000:.2f} mm, {near.first} to {near.second}, with the platform at"
+        f" {x:.1f}, {y:.1f}, {z:.1f} mm; proved {proved * 1000:.2f} mm,"
+        f" asked {required * 1000:g} mm"
+    )

@@ -44,7 +44,9 @@ def demo(
     scene = load_scene(configs() / f"environment_{environment}.yaml")
     settings = PlannerSettings(seed=seed)
     with progress_bar("planning", settings.max_iterations, True) as advance:
-        document = make_plan(rig, scene, settings, progress=lambda p: advance(p.iterations))
+        document = make_plan(
+            rig, scene, settings, progress=lambda done, _most, _distance: advance(done)
+        )
     show_facts("plan", sentences_of(document)[:-1])
     with TemporaryDirectory(prefix="cdpr-demo-") as temporary:
         plan_path = Path(temporary) / "plan.json"

@@ -79,13 +79,15 @@ def plan(
 
     the_rig = load_rig(rig)
     the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
-    _check_output(output, force)
+    check_output(output, force)
     options: dict[str, Any] = {} if max_iterations is None else {"max_iterations": max_iterations}
     settings = PlannerSettings(
         sampler=planner.value, cost=cost.value, mode=mode.value, seed=seed, **options
     )
     with progress_bar("planning", settings.max_iterations, not as_json) as advance:
-        document = make_plan(the_rig, the_scene, settings, progress=lambda p: advance(p.iterations))
+        document = make_plan(
+            the_rig, the_scene, settings, progress=lambda done, _most, _distance: advance(done)
+        )
     save_plan(document, output)
     if as_json:
         show_json({"plan": str(output), **facts_of(document)})
@@ -108,8 +110,12 @@ def _changed(
     return scene.changed(start=start, goal=goal, clearance=clearance)
 
 
-def _check_output(path: Path, force: bool) -> None:
-    """Before the search: a plan that cannot be written would be lost."""
+def check_output(path: Path, force: bool) -> None:
+    """Before the work: a result that cannot be written would be lost.
+
+    Raises:
+        BadInput: The file exists, or its folder does not or is read-only.
+    """
     import os
 
     from cdpr.errors import BadInput
@@ -124,7 +130,7 @@ def _check_output(path: Path, force: bool) -> None:
         )
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise BadInput(
-            "the plan cannot be written there",
+            "the file cannot be written there",
             where=str(path),
             why="the folder does not exist or is read-only",
             next_step="choose a folder that you may write to",

@@ -141,7 +141,7 @@ def test_served_drives_stop_by_themselves_when_the_master_is_gone(
         group = make_drive_group(rig, master, rehearsal.pump)
         enabled(rig, group, rehearsal)
         clock = ManualTime(stop, readings=20, step=0.005)
-        rehearsal.serve(stop, told.append, status_period=0.02, clock=clock)
+        rehearsal.serve(stop.is_set, told.append, status_period=0.02, clock=clock)
     assert told
     assert told[0].states == (DriveState.OPERATION_ENABLED,) * 8
     assert told[-1].states == (DriveState.QUICK_STOP_ACTIVE,) * 8
@@ -155,4 +155,4 @@ def test_serving_ends_quietly_on_an_interrupt_from_the_keyboard(
         raise KeyboardInterrupt
 
     with open_bus(channel) as bus:
-        Rehearsal(rig, bus, rig.home).serve(threading.Event(), clock=interrupted)
+        Rehearsal(rig, bus, rig.home).serve(threading.Event().is_set, clock=interrupted)
