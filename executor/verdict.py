@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,13 +127,18 @@ def following(cycles: CycleTable, limit: float) -> Check:
     value = float(cycles.following_error[worst])
     passed = value <= limit
     text = (
-        f"Every cable followed its set-point within {value * 1e3:.3f} mm"
+        f"No cable was more than {_rounded_up(value):.3f} mm off its set-point"
         f" (limit {limit * 1e3:g} mm)."
         if passed
         else f"A cable was {value * 1e3:.3f} mm off its set-point at {cycles.time[worst]:.2f} s;"
         f" the limit is {limit * 1e3:g} mm."
     )
     return Check("following_error", passed, text)
+
+
+def _rounded_up(length: float) -> float:
+    """A length [m] in mm, rounded up to a micrometre and never nothing at all."""
+    return max(math.ceil(round(length * 1e6, 3)), 1) / 1e3
 
 
 def replies(cycles: CycleTable, simulated: bool) -> Check:

@@ -32,13 +32,14 @@ def clearance_figure(run: RunData) -> str:
     shown = nearest_obstacles(run.clearance, MOST_OBSTACLES)
     rows = 0 if len(shown) < 2 else -(-len(shown) // _COLUMNS)
     with settings():
-        figure = new_figure(3.4 + 1.9 * rows)
-        heights = [3.4] + [1.9] * rows
-        grid = figure.add_gridspec(1 + rows, _COLUMNS, height_ratios=heights)
+        heights = [3.2, 1.6] + [1.9] * rows
+        figure = new_figure(sum(heights))
+        grid = figure.add_gridspec(2 + rows, _COLUMNS, height_ratios=heights)
         main = figure.add_subplot(grid[0, :])
         _smallest(main, run)
+        _difference(figure.add_subplot(grid[1, :], sharex=main), run)
         for place, index in enumerate(shown if rows else []):
-            cell = grid[1 + place // _COLUMNS, place % _COLUMNS]
+            cell = grid[2 + place // _COLUMNS, place % _COLUMNS]
             _obstacle(figure.add_subplot(cell, sharex=main), run, index)
         return as_svg(figure, "clearance", _alternative(run))
 
@@ -68,11 +69,25 @@ def _smallest(axes: Axes, run: RunData) -> None:
     _planned(axes, reference.time, reference.planned_distance * 1e3)
     _required(axes, run.plan.scene.obstacle_clearance * 1e3)
     axes.set_ylabel("smallest clearance [mm]")
-    axes.set_xlabel("time [s]")
+    axes.tick_params(labelbottom=False)
     axes.set_title("Cables and platform to the nearest obstacle")
     axes.set_xlim(0.0, float(run.cycles.time[-1]))
     _from_zero(axes)
     legend_above(axes)
+
+
+def _difference(axes: Axes, run: RunData) -> None:
+    """The best measurement less the plan; zero outside the band would be a contradiction."""
+    rows = _sources(run.clearance)[0]
+    off = (rows.distance - rows.planned_distance) * 1e3
+    time, off, spread = with_gaps(rows.time, off, rows.uncertainty * 1e3)
+    colour = STAND_IN[rows.source[0]]
+    axes.fill_between(time, off - spread, off + spread, color=colour, alpha=0.22, linewidth=0)
+    axes.plot(time, off, color=colour, linewidth=1.0)
+    axes.axhline(0.0, color=STAND_IN["planned"], linestyle=(0, (4, 2)), linewidth=1.2)
+    axes.set_title(f"{_NAMES[rows.source[0]]} less planned, with its uncertainty".capitalize())
+    axes.set_ylabel("difference [mm]")
+    axes.set_xlabel("time [s]")
 
 
 def _obstacle(axes: Axes, run: RunData, index: int) -> None:

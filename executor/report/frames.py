@@ -45,7 +45,7 @@ def _clearance(run: RunData, row: int) -> str:
         float(values[k]) * 1e3
         for values in (rows.distance, rows.uncertainty, rows.planned_distance)
     )
-    return f"clearance {distance:.1f} ± {spread:.1f} mm (planned {planned:.1f} mm)"
+    return f"clearance {distance:.1f} ± {spread:.1f} mm (plan {planned:.1f})"
 
 
 def _measured(run: RunData, row: int) -> str:

@@ -80,6 +80,9 @@ def _clearance(key: dict[str, Any] | None) -> list[str]:
 
 
 def _following(key: dict[str, Any]) -> str:
+    text = known(key["max"], 3, "mm")
+    if text.startswith("0.000"):
+        text = "<\u00a00.001 mm"
     return _tile(
         "Following error", known(key["max"], 3, "mm"), f"largest; limit {key['limit']:g} mm"
     )
