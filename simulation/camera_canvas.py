@@ -196,5 +196,6 @@ def draw_triangles(canvas: Canvas, vertices: Array, brightness: Array) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.asarray(1.0 / met[3], dtype=np.float32)
             value = np.asarray(met[4] * depth, dtype=np.float32)
-        mask = (met[0] >= 0) & (met[1] >= 0) & (met[2] >= 0) & (met[3] > 0)
+        least = met[3] * np.float32(-1e-5)  # rounding must not open cracks between triangles
+        mask = (met[0] >= least) & (met[1] >= least) & (met[2] >= least) & (met[3] > 0)
         part.paint(depth, value, np.asarray(mask))

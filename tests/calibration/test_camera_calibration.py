@@ -1,0 +1,134 @@
+"""Intrinsics from a chessboard: the true ones come back from exact and from rendered pictures."""
+
+from __future__ import annotations
+
+from datetime import date
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from calibration.camera import (
+    CameraCalibration,
+    Chessboard,
+    calibrate_camera,
+    calibrate_from_corners,
+)
+from calibration.result_file import camera_result, write_result
+from cdpr.errors import BadInput
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+
+BOARD = Chessboard(9, 6, 0.025)
+SIZE = (640, 480)
+MATRIX = np.array([[600.0, 0.0, 322.0], [0.0, 603.0, 238.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([-0.12, 0.05, 0.0008, -0.0006, 0.0])
+
+
+def board_poses(count: int) -> list[Pose]:
+    rng = np.random.default_rng(4)
+    poses = []
+    for _ in range(count):
+        turn = matrix_from_rotation_vector(rng.uniform(-0.6, 0.6, 3))
+        middle = np.array([*rng.uniform(-0.06, 0.06, 2), rng.uniform(0.4, 0.6)])
+        poses.append(Pose(middle - turn @ BOARD.points().mean(axis=0), turn))
+    return poses
+
+
+def corners_at(pose: Pose) -> Array:
+    points = pose.apply(BOARD.points())
+    zero = np.zeros(3)
+    return cv2.projectPoints(points, zero, zero, MATRIX, DISTORTION)[0].reshape(-1, 2)
+
+
+def views(count: int, noise: float) -> dict[str, Array]:
+    rng = np.random.default_rng(5)
+    found = {}
+    for k, pose in enumerate(board_poses(count)):
+        corners = corners_at(pose)
+        found[f"view {k}"] = corners + noise * rng.standard_normal(corners.shape)
+    return found
+
+
+def board_picture(pose: Pose) -> np.ndarray:
+    """The board rendered by meeting its plane with every ray, 2 x 2 samples a pixel."""
+    columns = (np.arange(SIZE[0] * 2) + 0.5) / 2 - 0.5
+    rows = (np.arange(SIZE[1] * 2) + 0.5) / 2 - 0.5
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
+    flat = cv2.undistortPoints(pixels, MATRIX, DISTORTION).reshape(-1, 2)
+    rays = np.column_stack([flat, np.ones(len(flat))]) @ pose.rotation
+    origin = -pose.rotation.T @ pose.position
+    places = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
+    squares = np.floor(places).astype(int)
+    board = (squares[:, 0] >= 0) & (squares[:, 0] <= BOARD.columns)
+    board &= (squares[:, 1] >= 0) & (squares[:, 1] <= BOARD.rows)
+    black = board & (squares.sum(axis=1) % 2 == 0)
+    values = np.where(black, 30.0, 220.0).reshape(SIZE[1] * 2, SIZE[0] * 2)
+    return np.round(cv2.resize(values, SIZE, interpolation=cv2.INTER_AREA)).astype(np.uint8)
+
+
+def check_values(found: CameraCalibration, pixels: float) -> None:
+    assert np.abs(found.matrix - MATRIX).max() < pixels
+    np.testing.assert_allclose(found.distortion[:2], DISTORTION[:2], atol=0.03)
+
+
+def test_exact_corners_give_the_exact_camera() -> None:
+    found = calibrate_from_corners(views(12, 0.0), BOARD, SIZE)
+    np.testing.assert_allclose(found.matrix, MATRIX, atol=0.02)
+    np.testing.assert_allclose(found.distortion, DISTORTION, atol=2e-3)
+    assert found.error < 1e-3
+
+
+def test_noisy_corners_stay_within_the_stated_deviations() -> None:
+    found = calibrate_from_corners(views(20, 0.1), BOARD, SIZE)
+    assert 0.05 < found.error < 0.25
+    for name, value, truth in [
+        ("fx", found.matrix[0, 0], 600.0),
+        ("fy", found.matrix[1, 1], 603.0),
+        ("cx", found.matrix[0, 2], 322.0),
+        ("cy", found.matrix[1, 2], 238.0),
+    ]:
+        assert found.deviations[name] > 0.0
+        assert abs(value - truth) < 5.0 * found.deviations[name]
+
+
+def test_rendered_pictures_are_calibrated_and_useless_ones_named() -> None:
+    pictures = [(f"{k}.png", board_picture(pose)) for k, pose in enumerate(board_poses(8))]
+    pictures.append(("wall.png", np.full((SIZE[1], SIZE[0]), 128, np.uint8)))
+    found = calibrate_camera(pictures, BOARD)
+    check_values(found, pixels=4.0)
+    assert found.unused == ("wall.png",)
+    assert set(found.view_errors) == {f"{k}.png" for k in range(8)}
+    assert found.error < 0.2
+
+
+def test_too_few_pictures_are_refused() -> None:
+    wall = np.full((SIZE[1], SIZE[0]), 128, np.uint8)
+    with pytest.raises(BadInput, match="in 0 of 2 pictures"):
+        calibrate_camera([("a", wall), ("b", wall)], BOARD)
+
+
+def test_pictures_of_two_sizes_are_refused_by_name() -> None:
+    with pytest.raises(BadInput, match="64 x 48 px, the ones before 640 x 480"):
+        calibrate_camera(
+            [("a", np.zeros((480, 640), np.uint8)), ("b", np.zeros((48, 64), np.uint8))], BOARD
+        )
+
+
+def test_the_result_file_is_dated_and_has_the_keys_of_the_rig_file(tmp_path: Path) -> None:
+    found = calibrate_from_corners(views(8, 0.05), BOARD, SIZE)
+    path = tmp_path / "calibration_camera.yaml"
+    write_result(path, camera_result(found, "front", date(2026, 3, 1)))
+    read = yaml.safe_load(path.read_text())
+    assert read["date"] == "2026-03-01"
+    assert read["fx_px"] == pytest.approx(found.matrix[0, 0])
+    assert len(read["distortion"]) == 5
+    assert read["data_sha256"] == found.data_hash
+    assert read["view_errors_px"].keys() == {f"view {k}" for k in range(8)}
+
+
+def test_other_data_have_another_hash() -> None:
+    first = calibrate_from_corners(views(8, 0.0), BOARD, SIZE)
+    second = calibrate_from_corners(views(8, 0.01), BOARD, SIZE)
+    assert first.data_hash != second.data_hash

@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import pytest
+
+from cdpr.rig import Camera, Rig, load_rig
+from cdpr.scene import Scene, load_scene
+from simulation.camera import SyntheticCamera
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    return load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return load_scene(CONFIGS / "environment_1.yaml")
+
+
+@pytest.fixture(scope="session")
+def camera(rig: Rig) -> Camera:
+    return rig.cameras[0]
+
+
+@pytest.fixture(scope="session")
+def synthetic(rig: Rig, scene: Scene, camera: Camera) -> SyntheticCamera:
+    return SyntheticCamera(rig, scene, camera, seed=7)

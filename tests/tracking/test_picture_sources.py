@@ -1,0 +1,177 @@
+"""Folders, videos and cameras as sources; what cannot be used is told by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cdpr.errors import BadInput, HardwareMissing
+from cdpr.poses import Pose
+from cdpr.rig import Camera, Rig
+from drivers.cameras import Frame, ImageFolder, LiveCamera, VideoFile
+from simulation.camera import SyntheticCamera
+from tracking.measurement import NoPose, PoseMeasurement
+from tracking.pose_log import POSE_COLUMNS, pose_row, write_pose_log
+from tracking.track import NoPlatformSeen, TrackCount, track
+from tracking.tracker import Tracker
+
+TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(4)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
+    """Pictures 8 to 11, so that the order of names is not that of letters."""
+    place = tmp_path / "some pictures"
+    place.mkdir()
+    for k, pose in enumerate(TRUTH):
+        name = str(place / f"frame_{8 + k}.png")
+        cv2.imwrite(name, synthetic.render(pose, k), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return place
+
+
+def test_a_folder_is_read_in_the_order_of_its_numbers(folder: Path, camera: Camera) -> None:
+    (folder / "notes.txt").write_text("not a picture")
+    frames = list(ImageFolder(folder, camera))
+    assert [frame.name for frame in frames] == [f"frame_{8 + k}.png" for k in range(4)]
+    np.testing.assert_allclose([frame.time for frame in frames], [0.0, 0.1, 0.2, 0.3])
+
+
+def test_a_broken_file_among_good_ones_is_named_and_skipped(
+    folder: Path, rig: Rig, camera: Camera
+) -> None:
+    (folder / "frame_9.png").write_bytes(b"\x89PNG\r\n\x1a\n cut short")
+    (folder / "frame_10.png").write_bytes(b"")
+    told: list[str] = []
+    source = ImageFolder(folder, camera, on_unreadable=told.append)
+    results = list(track(source, Tracker(rig, camera)))
+    assert told == ["frame_9.png", "frame_10.png"] == source.unreadable
+    assert [r.name for r in results] == ["frame_8.png", "frame_11.png"]
+    for result, truth in zip(results, (TRUTH[0], TRUTH[3]), strict=True):
+        assert isinstance(result.observation, PoseMeasurement)
+        assert result.observation.pose.distance_to(truth) < 1e-3
+    assert results[1].observation.time == pytest.approx(0.3)  # the gap stays a gap
+
+
+def test_a_folder_of_broken_files_only_is_refused(tmp_path: Path, camera: Camera) -> None:
+    (tmp_path / "a.png").write_bytes(b"nothing")
+    with pytest.raises(BadInput, match="none of the 1 files"):
+        list(ImageFolder(tmp_path, camera))
+
+
+def test_an_empty_or_missing_folder_is_refused(tmp_path: Path, camera: Camera) -> None:
+    with pytest.raises(BadInput, match="no pictures"):
+        ImageFolder(tmp_path, camera)
+    with pytest.raises(BadInput, match="no such folder"):
+        ImageFolder(tmp_path / "nowhere", camera)
+
+
+def test_pictures_of_another_size_are_refused_by_name(tmp_path: Path, camera: Camera) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((480, 640), dtype=np.uint8))
+    with pytest.raises(BadInput, match="640 x 480 px, camera 'front' has 1280 x 720") as told:
+        list(ImageFolder(tmp_path, camera))
+    assert "small.png" in told.value.where
+
+
+def test_a_video_is_measured_picture_by_picture(
+    tmp_path: Path, rig: Rig, camera: Camera, synthetic: SyntheticCamera
+) -> None:
+    path = tmp_path / "run.avi"
+    code = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), code, 10.0, (camera.width, camera.height), isColor=False)
+    if not writer.isOpened():
+        pytest.fail("this OpenCV writes no MJPG video, so videos cannot be tested here")
+    for k, pose in enumerate(TRUTH):
+        writer.write(synthetic.render(pose, k))
+    writer.release()
+    video = VideoFile(path, camera)
+    assert len(video) == len(TRUTH)
+    count = TrackCount()
+    results = list(track(video, Tracker(rig, camera), count))
+    assert count.poses == len(TRUTH)
+    for k, (result, truth) in enumerate(zip(results, TRUTH, strict=True)):
+        assert isinstance(result.observation, PoseMeasurement)
+        assert result.observation.time == pytest.approx(0.1 * k)
+        assert result.observation.pose.distance_to(truth) < 2e-3
+
+
+def test_a_file_that_is_no_video_is_refused(tmp_path: Path, camera: Camera) -> None:
+    path = tmp_path / "notes.avi"
+    path.write_text("no video")
+    with pytest.raises(BadInput, match="no video"):
+        VideoFile(path, camera)
+    with pytest.raises(BadInput, match="no such file"):
+        VideoFile(tmp_path / "missing.avi", camera)
+
+
+def test_a_camera_that_is_not_there_is_hardware_missing(camera: Camera) -> None:
+    with pytest.raises(HardwareMissing, match="cannot be opened") as told:
+        LiveCamera("97", camera)
+    assert told.value.exit_code == 4
+    assert "camera 97" in told.value.where
+
+
+def test_pictures_without_tags_say_what_was_expected(rig: Rig, camera: Camera) -> None:
+    blank = [Frame(k * 0.1, np.full((720, 1280), 90, np.uint8), f"p{k}") for k in range(3)]
+    seen = track(blank, Tracker(rig, camera))
+    with pytest.raises(NoPlatformSeen) as told:
+        for _ in seen:
+            pass
+    message = str(told.value)
+    assert told.value.exit_code == 2
+    assert "none of 3 pictures" in message
+    assert "tag36h11 tags 301, 302, 303, 304, 305, 306" in message
+    assert "no tag of any known family" in message
+
+
+def test_pictures_with_other_tags_say_which(
+    rig: Rig, camera: Camera, scene: object, synthetic: SyntheticCamera
+) -> None:
+    others = tuple(replace(tag, id=tag.id + 200) for tag in rig.platform_tags)
+    picture = Frame(0.0, synthetic.render(TRUTH[0], 0), "first.png")
+    with pytest.raises(NoPlatformSeen, match=r"first\.png shows tag36h11 .*301"):
+        list(track([picture], Tracker(replace(rig, platform_tags=others), camera)))
+
+
+def test_a_source_without_pictures_and_one_without_an_end_come_to_an_end(
+    rig: Rig, camera: Camera
+) -> None:
+    with pytest.raises(NoPlatformSeen, match="no pictures"):
+        list(track([], Tracker(rig, camera)))
+
+    def endless() -> object:
+        while True:
+            yield Frame(0.0, np.full((720, 1280), 90, np.uint8), "again")
+
+    with pytest.raises(NoPlatformSeen, match="none of 2 pictures"):
+        list(track(endless(), Tracker(rig, camera), give_up_after=2))  # type: ignore[arg-type]
+
+
+def test_the_pose_log_has_a_row_a_picture_whether_it_gave_a_pose_or_not(
+    tmp_path: Path, rig: Rig, camera: Camera, synthetic: SyntheticCamera
+) -> None:
+    pictures = [
+        Frame(0.0, synthetic.render(TRUTH[0], 0), "a.png"),
+        Frame(0.1, np.full((720, 1280), 90, np.uint8), "b.png"),
+    ]
+    logged = list(track(pictures, Tracker(rig, camera)))
+    assert isinstance(logged[1].observation, NoPose)
+    write_pose_log(tmp_path / "poses.csv", logged)
+    lines = (tmp_path / "poses.csv").read_text().splitlines()
+    assert lines[0].split(",") == list(POSE_COLUMNS)
+    assert len(lines) == 3
+    row = dict(zip(POSE_COLUMNS, pose_row(0, logged[0]), strict=True))
+    found = logged[0].observation
+    assert isinstance(found, PoseMeasurement)
+    assert float(row["x_mm"]) == pytest.approx(found.pose.position[0] * 1e3, abs=1e-6)
+    assert float(row["std_rz_deg"]) == pytest.approx(
+        np.degrees(found.rotation_deviation[2]), abs=1e-6
+    )
+    assert float(row["cov_x_rz_mm_deg"]) == pytest.approx(
+        1e3 * np.degrees(1.0) * found.covariance[0, 5], rel=1e-4
+    )
+    assert row["tags"].split() == [str(tag) for tag in found.tags]
+    assert "to be seen" in lines[2]

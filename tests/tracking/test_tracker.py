@@ -1,0 +1,199 @@
+"""The tracker on rendered pictures: exact enough, honest, never mirrored, never silent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from cdpr.errors import BadInput
+from cdpr.poses import (
+    Array,
+    Pose,
+    interpolate,
+    matrix_from_rotation_vector,
+    rotation_vector_from_matrix,
+)
+from cdpr.rig import Camera, Rig
+from cdpr.scene import Scene
+from simulation.camera import Optics, SyntheticCamera
+from tracking.camera_check import CameraMoved
+from tracking.measurement import NoPose, PoseMeasurement
+from tracking.tracker import Tracker, TrackerSettings
+
+
+def along(points: list[list[float]], count: int) -> Iterator[Pose]:
+    """Level poses along a polyline."""
+    for a, b in pairwise(points):
+        for k in range(count):
+            yield interpolate(Pose.level(a), Pose.level(b), k / count)
+
+
+def error_of(found: PoseMeasurement, truth: Pose) -> Array:
+    turn = rotation_vector_from_matrix(found.pose.rotation @ truth.rotation.T)
+    return np.concatenate([found.pose.position - truth.position, turn])
+
+
+def test_a_path_is_measured_to_half_a_millimetre(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera
+) -> None:
+    tracker = Tracker(rig, camera)
+    way = [[0.18, 0.18, 0.3], [0.1, 0.0, 0.5], [0.0, -0.15, 0.55], [-0.18, -0.18, 0.4]]
+    errors, normalised, states = [], [], []
+    for frame, truth in enumerate(along(way, count=20)):
+        found = tracker.observe(synthetic.render(truth, frame), frame * 0.1)
+        assert isinstance(found, PoseMeasurement), found
+        error = error_of(found, truth)
+        errors.append(error)
+        normalised.append(error @ np.linalg.solve(found.covariance, error))
+        states.append(found.status)
+        assert set(found.tags) <= set(tracker.expected_tags)
+    by_pose = np.array(errors)
+    position = np.linalg.norm(by_pose[:, :3], axis=1)
+    rotation = np.degrees(np.linalg.norm(by_pose[:, 3:], axis=1))
+    assert np.sqrt(np.mean(position**2)) < 0.5e-3
+    assert np.sqrt(np.mean(rotation**2)) < 0.1
+    assert np.mean(normalised) < 8.0  # 6 would be exact; more than that is too sure of itself
+    assert np.all(position < 5e-3)
+    assert states[0] == "found"
+    assert states.count("tracked") >= len(states) - 3
+    assert tracker.camera_check is not None
+    assert tracker.camera_check.error < 0.1
+
+
+def test_turned_poses_are_found_without_a_guess_and_never_mirrored(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera
+) -> None:
+    rng, tracker = np.random.default_rng(5), Tracker(rig, camera)
+    found_count = 0
+    for frame in range(40):
+        place = rng.uniform([-0.2, -0.2, 0.2], [0.2, 0.2, 0.6])
+        truth = Pose(place, matrix_from_rotation_vector(rng.normal(size=3) * 0.15))
+        tracker.forget()
+        found = tracker.observe(synthetic.render(truth, frame), float(frame))
+        if isinstance(found, NoPose):
+            continue  # behind the obstacle
+        found_count += 1
+        error = error_of(found, truth)
+        assert np.linalg.norm(error[:3]) < 3e-3
+        assert np.linalg.norm(error[3:]) < np.radians(1.0)
+        assert np.all(np.abs(error) < 6.0 * np.sqrt(np.diag(found.covariance)))
+    assert found_count >= 35
+
+
+def test_a_sudden_jump_is_followed_by_searching_the_whole_picture(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera
+) -> None:
+    tracker = Tracker(rig, camera)
+    first, second = Pose.level([0.1, 0.1, 0.4]), Pose.level([-0.1, 0.1, 0.55])
+    tracker.observe(synthetic.render(first, 0), 0.0)
+    found = tracker.observe(synthetic.render(second, 1), 0.1)
+    assert isinstance(found, PoseMeasurement)
+    assert found.status == "found"
+    assert found.pose.distance_to(second) < 2e-3
+
+
+def test_a_platform_behind_an_obstacle_gives_a_reason_and_is_found_again(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera
+) -> None:
+    tracker = Tracker(rig, camera)
+    seen = synthetic.render(Pose.level([0.1, 0.1, 0.4]), 0)
+    covered = seen.copy()
+    covered[200:480, 420:860] = 128
+    assert isinstance(tracker.observe(seen, 0.0), PoseMeasurement)
+    lost = tracker.observe(covered, 0.1)
+    assert isinstance(lost, NoPose)
+    assert "301, 302" in lost.reason
+    again = tracker.observe(seen, 0.2)
+    assert isinstance(again, PoseMeasurement)
+    assert again.status == "found"
+
+
+def test_tags_with_broken_outlines_are_still_used(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera
+) -> None:
+    """A dark line through the white border hides a tag from the detector, not from the tracker."""
+    tracker, truth = Tracker(rig, camera), Pose.level([0.1, 0.1, 0.4])
+    picture = synthetic.render(truth, 0)
+    whole = tracker.observe(picture, 0.0)
+    assert isinstance(whole, PoseMeasurement)
+    crossed = picture.copy()
+    crossed[:, 582:585] = 30
+    found = tracker.observe(crossed, 0.1)
+    assert isinstance(found, PoseMeasurement)
+    assert set(found.tags) == set(whole.tags)
+    assert found.pose.distance_to(truth) < 2e-3
+
+
+def test_a_moved_camera_is_told_with_how_far(rig: Rig, camera: Camera, scene: Scene) -> None:
+    turn = matrix_from_rotation_vector([0.0, np.radians(0.5), 0.0])
+    place = camera.world_from_camera
+    moved = Pose(place.position + np.array([0.006, 0.0, 0.0]), turn @ place.rotation)
+    real = SyntheticCamera(rig, scene, replace(camera, world_from_camera=moved), seed=1)
+    tracker = Tracker(rig, camera)
+    with pytest.raises(CameraMoved) as told:
+        tracker.observe(real.render(Pose.level([0.0, 0.0, 0.445]), 0), 0.0)
+    assert told.value.exit_code == 1
+    assert float(told.value.values["moved_mm"]) == pytest.approx(6.0, abs=1.0)
+    assert float(told.value.values["turned_deg"]) == pytest.approx(0.5, abs=0.05)
+    assert "world_from_camera" in told.value.next_step
+
+
+def test_a_camera_moved_during_a_run_is_noticed(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera, scene: Scene
+) -> None:
+    place = camera.world_from_camera
+    turn = matrix_from_rotation_vector([0.0, np.radians(0.2), 0.0])
+    moved = replace(camera, world_from_camera=Pose(place.position, turn @ place.rotation))
+    later = SyntheticCamera(rig, scene, moved, seed=1)
+    tracker = Tracker(rig, camera, TrackerSettings(camera_check_period=2))
+    truth = Pose.level([0.0, 0.0, 0.445])
+    assert isinstance(tracker.observe(synthetic.render(truth, 0), 0.0), PoseMeasurement)
+    with pytest.raises(CameraMoved):
+        list(tracker.observe(later.render(truth, frame), frame * 0.1) for frame in range(1, 4))
+
+
+def test_a_single_tag_that_allows_two_poses_gives_none(
+    rig: Rig, camera: Camera, scene: Scene
+) -> None:
+    tracker = Tracker(rig, camera, TrackerSettings(single_tag_margin=float("inf")))
+    one = replace(rig, platform_tags=rig.platform_tags[2:3])
+    synthetic = SyntheticCamera(one, replace(scene, obstacles=()), camera, seed=2)
+    found = tracker.observe(synthetic.render(Pose.level([0.1, 0.1, 0.4]), 0), 0.0)
+    assert isinstance(found, NoPose)
+    assert "two poses" in found.reason
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.zeros((480, 640), dtype=np.uint8),
+        np.zeros((720, 1280, 3), dtype=np.uint8),
+        np.zeros((720, 1280), dtype=np.uint16),
+    ],
+)
+def test_a_picture_of_another_kind_is_refused(rig: Rig, camera: Camera, wrong: np.ndarray) -> None:
+    with pytest.raises(BadInput, match="1280 x 720"):
+        Tracker(rig, camera).observe(wrong, 0.0)
+
+
+def test_a_rig_without_tags_cannot_be_tracked(rig: Rig, camera: Camera) -> None:
+    bare = replace(rig, platform_tags=())
+    with pytest.raises(BadInput, match="no tags"):
+        Tracker(bare, camera)
+
+
+def test_strong_noise_and_blur_widen_the_covariance(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera, scene: Scene
+) -> None:
+    poor = SyntheticCamera(rig, scene, camera, seed=3, optics=Optics(noise=8.0, blur=1.2))
+    truth = Pose.level([0.1, 0.1, 0.4])
+    clear = Tracker(rig, camera).observe(synthetic.render(truth, 0), 0.0)
+    blurred = Tracker(rig, camera).observe(poor.render(truth, 0), 0.0)
+    assert isinstance(clear, PoseMeasurement)
+    assert isinstance(blurred, PoseMeasurement)
+    assert np.trace(blurred.covariance) > 1.5 * np.trace(clear.covariance)
+    assert blurred.pose.distance_to(truth) < 2e-3
