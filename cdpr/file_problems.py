@@ -89,7 +89,7 @@ def _shown(value: object) -> str:
         case bool():
             return f"it is {str(value).lower()}"
         case int() | float():
-            return f"it is {value:.12g}" if isinstance(value, float) else f"it is {str(value)[:40]}"
+            return f"it is {str(value)[:40]}"
         case str():
             return f"it is the text {value[:60]!r}"
         case Mapping():

@@ -144,7 +144,7 @@ class SceneDocument(Document):
 
 
 def _is_flat(points_mm: list[list[float]]) -> bool:
-    points = np.asarray(points_mm)
+    points = np.asarray(points_mm, dtype=np.float64)
     centred = points - points.mean(axis=0)
     size = float(np.max(np.abs(centred)))
     return size == 0.0 or int(np.linalg.matrix_rank(centred / size, tol=1e-9)) < 3

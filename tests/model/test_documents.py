@@ -1,0 +1,125 @@
+"""Content hashes and atomic writes."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdpr.documents import content_hash, write_atomic
+from cdpr.errors import BadInput
+
+json_values = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(allow_nan=False, allow_infinity=False),
+        st.text(),
+    ),
+    lambda inner: st.one_of(st.lists(inner), st.dictionaries(st.text(), inner)),
+    max_leaves=10,
+)
+
+
+@given(st.dictionaries(st.text(), json_values))
+def test_the_order_of_keys_does_not_change_a_hash(data: dict[str, Any]) -> None:
+    assert content_hash(dict(reversed(data.items()))) == content_hash(data)
+
+
+@given(json_values, json_values)
+def test_different_content_has_different_hashes(a: Any, b: Any) -> None:
+    assert (content_hash(a) == content_hash(b)) == (repr_sorted(a) == repr_sorted(b))
+
+
+def repr_sorted(value: Any) -> str:
+    """An independent canonical form: types and signs of zero count."""
+    if isinstance(value, dict):
+        inner = ",".join(f"{k!r}:{repr_sorted(value[k])}" for k in sorted(value))
+        return f"{{{inner}}}"
+    return f"[{','.join(map(repr_sorted, value))}]" if isinstance(value, list) else repr(value)
+
+
+def test_a_hash_stays_the_same_from_version_to_version() -> None:
+    """Plans on disk rest on it."""
+    text = rb'{"a":"\u00e9","b":[1,2.5,null,true]}'
+    expected = "sha256:" + hashlib.sha256(text).hexdigest()
+    assert content_hash({"b": [1, 2.5, None, True], "a": "é"}) == expected
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_what_is_no_number_has_no_hash(value: float) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        content_hash({"a": value})
+
+
+def test_a_file_is_replaced_whole_and_nothing_else_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "a folder" / "file.json"
+    path.parent.mkdir()
+    path.write_text("old")
+    write_atomic(path, "new é\n")
+    assert path.read_bytes() == "new é\n".encode()
+    assert [p.name for p in path.parent.iterdir()] == ["file.json"]
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_a_failed_write_leaves_the_old_file_and_no_other(
+    step: str, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file.json"
+    path.write_text("old")
+
+    def fail(*_: object) -> NoReturn:
+        raise OSError(number, os.strerror(number))
+
+    if step == "fsync":
+        monkeypatch.setattr(os, "fsync", fail)
+    else:
+        monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(BadInput, match="cannot be written") as caught:
+        write_atomic(path, "new")
+    assert caught.value.why == os.strerror(number)
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file.json"]
+
+
+def test_an_interrupted_write_leaves_no_temporary_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(_: int) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomic(tmp_path / "file.json", "new")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_text_that_cannot_be_encoded_leaves_no_temporary_file(tmp_path: Path) -> None:
+    with pytest.raises(UnicodeEncodeError):
+        write_atomic(tmp_path / "file.json", "\ud800")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_may_not_be_written_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Root may write everywhere, so the system's answer is played."""
+
+    def denied(**_: object) -> NoReturn:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(tempfile, "mkstemp", denied)
+    with pytest.raises(BadInput, match="cannot be written") as caught:
+        write_atomic(tmp_path / "file.json", "new")
+    assert caught.value.why == "Permission denied"
+    assert "may write to" in caught.value.next_step

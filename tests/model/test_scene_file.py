@@ -1,0 +1,243 @@
+"""Scene files: shapes, names and ends are checked, and a changed scene is checked again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdpr.errors import BadInput, InvalidFile
+from cdpr.poses import Pose
+from cdpr.scene import load_scene
+from cdpr.shapes import (
+    Box,
+    Capsule,
+    ConvexHull,
+    Cylinder,
+    Sphere,
+    TriangleMesh,
+    convex_hull,
+    shape_points,
+)
+from tests.model.rig_builds import CONFIGS, scene_data, scene_of
+
+TETRAHEDRON = [[0, 0, 0], [100, 0, 0], [0, 100, 0], [0, 0, 100]]
+FACES = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+
+
+def problems_with(obstacles: list[dict[str, Any]], tmp_path: Path) -> list[tuple[str, str]]:
+    data = scene_data()
+    data["obstacles"] = obstacles
+    path = tmp_path / "scene.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    with pytest.raises(InvalidFile) as caught:
+        load_scene(path)
+    assert all(problem.line > 0 and problem.column > 0 for problem in caught.value.problems)
+    return [(problem.key, problem.what) for problem in caught.value.problems]
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "key", "sentence"),
+    [
+        ({}, "obstacles[0]", "'o' needs exactly one shape: one of box, sphere, cylinder, capsule"),
+        (
+            {"box": {"size_mm": [1, 1, 1]}, "sphere": {"radius_mm": 1}},
+            "obstacles[0]",
+            "obstacle 'o' needs exactly one shape: it has box, sphere",
+        ),
+        ({"box": {"size_mm": [1, 0, 1]}}, "obstacles[0].box.size_mm[1]", "must be more than 0"),
+        ({"sphere": {"radius_mm": -1}}, "obstacles[0].sphere.radius_mm", "must be more than 0"),
+        ({"capsule": {"radius_mm": 1}}, "obstacles[0].capsule.length_mm", "this key is missing"),
+        ({"cone": {}, "box": {"size_mm": [1, 1, 1]}}, "obstacles[0].cone", "unknown key 'cone'"),
+        (
+            {"convex": {"points_mm": [[0, 0, 5], [9, 0, 5], [0, 9, 5], [9, 9, 5], [3, 1, 5]]}},
+            "obstacles[0].convex.points_mm",
+            "the points lie in a plane",
+        ),
+        (
+            {"convex": {"points_mm": [[7, 7, 7]] * 4}},
+            "obstacles[0].convex.points_mm",
+            "the points lie in a plane",
+        ),
+        (
+            {"convex": {"points_mm": TETRAHEDRON[:3]}},
+            "obstacles[0].convex.points_mm",
+            "needs 4 entries or more, it has 3",
+        ),
+        (
+            {"mesh": {"points_mm": TETRAHEDRON, "triangles": [*FACES, [0, 1, 4]]}},
+            "obstacles[0].mesh.triangles[4]",
+            "[0, 1, 4] names a point outside 0..3",
+        ),
+        (
+            {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1, -1]]}},
+            "obstacles[0].mesh.triangles[0]",
+            "[0, 1, -1] names a point outside 0..3",
+        ),
+        (
+            {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1, 1]]}},
+            "obstacles[0].mesh.triangles[0]",
+            "[0, 1, 1] names one point twice",
+        ),
+        (
+            {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1]]}},
+            "obstacles[0].mesh.triangles[0]",
+            "needs 3 entries, it has 2",
+        ),
+        (
+            {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1, 2.0]]}},
+            "obstacles[0].mesh.triangles[0][2]",
+            "must be a whole number (it is 2.0)",
+        ),
+    ],
+)
+def test_a_wrong_obstacle_is_told_by_key(
+    obstacle: dict[str, Any], key: str, sentence: str, tmp_path: Path
+) -> None:
+    [(told, what)] = problems_with([{"name": "o", **obstacle}], tmp_path)
+    assert told == key
+    assert sentence in what
+
+
+def test_two_obstacles_of_one_name_are_told_beside_other_problems(tmp_path: Path) -> None:
+    box = {"size_mm": [1, 1, 1]}
+    found = problems_with(
+        [{"name": "a", "box": box}, {"name": "a", "box": {"size_mm": [1]}}, {"name": "b"}],
+        tmp_path,
+    )
+    assert dict(found) == {
+        "obstacles[1].name": "obstacle name 'a' stands twice",
+        "obstacles[1].box.size_mm": "needs 3 entries, it has 1",
+        "obstacles[2]": "obstacle 'b' needs exactly one shape: one of box, sphere, cylinder, "
+        "capsule, convex, mesh",
+    }
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "sentence"),
+    [
+        ("clearance", "obstacle_mm", -1, "must be 0 or more (it is -1)"),
+        ("clearance", "self_mm", float("nan"), "must be a finite number (it is nan)"),
+        ("load", "payload_kg", -1, "must be 0 or more (it is -1)"),
+        ("start", "position_mm", [0, 0], "needs 3 entries, it has 2"),
+        ("goal", "rotation_wxyz", [1, 0, 0, 1], "must be a unit quaternion"),
+    ],
+)
+def test_a_wrong_number_in_a_section_is_told(
+    section: str, key: str, value: object, sentence: str, tmp_path: Path
+) -> None:
+    data = scene_data()
+    data.setdefault(section, {})[key] = value
+    path = tmp_path / "scene.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    with pytest.raises(InvalidFile) as caught:
+        load_scene(path)
+    [problem] = caught.value.problems
+    assert problem.key == f"{section}.{key}"
+    assert sentence in problem.what
+
+
+def test_every_shape_arrives_in_metres_and_in_its_place() -> None:
+    data = scene_data()
+    mesh = {"points_mm": TETRAHEDRON, "triangles": FACES}
+    shapes: list[tuple[str, dict[str, Any]]] = [
+        ("box", {"size_mm": [100, 200, 300]}),
+        ("sphere", {"radius_mm": 50}),
+        ("cylinder", {"radius_mm": 20, "length_mm": 90}),
+        ("capsule", {"radius_mm": 20, "length_mm": 90}),
+        ("convex", {"points_mm": [*TETRAHEDRON, [1, 1, 1]]}),
+        ("mesh", mesh),
+    ]
+    turn = [0.7071067811865476, 0, 0, 0.7071067811865476]
+    data["obstacles"] = [
+        {"name": key, key: shape, "position_mm": [1, 2, 3], "rotation_wxyz": turn}
+        for key, shape in shapes
+    ]
+    scene = scene_of(data)
+    kinds = [type(obstacle.shape) for obstacle in scene.obstacles]
+    assert kinds == [Box, Sphere, Cylinder, Capsule, ConvexHull, TriangleMesh]
+    box, ball, cylinder, capsule, hull, surface = (o.shape for o in scene.obstacles)
+    np.testing.assert_allclose(box.half_size, [0.05, 0.1, 0.15])
+    assert ball.radius == 0.05
+    assert (cylinder.radius, cylinder.length) == (0.02, 0.09)
+    assert (capsule.radius, capsule.length) == (0.02, 0.09)
+    assert len(hull.vertices) == 4  # the inner point is no vertex
+    for body in (hull, surface):
+        assert not body.vertices.flags.writeable
+        assert not body.triangles.flags.writeable
+    pose = scene.obstacles[0].pose
+    np.testing.assert_allclose(pose.apply([1.0, 0.0, 0.0]), [0.001, 1.002, 0.003], atol=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(4, 30))
+def test_a_hull_holds_its_points_and_looks_outward(seed: int, count: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    hull = convex_hull(points)
+    corners = hull.vertices[hull.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    heights = np.einsum("ij,nij->ni", normals, points[:, None, :] - corners[None, :, 0])
+    assert heights.max() < 1e-9
+    volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+    assert volume > 0.0  # counter-clockwise from outside
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [Box(np.array([1.0, 2.0, 3.0])), Sphere(2.0), Cylinder(1.0, 4.0), Capsule(1.0, 4.0)],
+    ids=lambda shape: type(shape).__name__,
+)
+def test_the_points_of_a_shape_grown_by_its_radius_hold_it(shape: Any) -> None:
+    points = shape_points(shape)
+    radius = getattr(shape, "radius", 0.0)
+    rng = np.random.default_rng(3)
+    for direction in rng.normal(size=(50, 3)):
+        u = direction / np.linalg.norm(direction)
+        flat = np.hypot(u[0], u[1])
+        reach = {
+            Box: lambda u=u: np.abs(u) @ [1.0, 2.0, 3.0],
+            Sphere: lambda: 2.0,
+            Cylinder: lambda u=u, flat=flat: flat + 2.0 * abs(u[2]),
+            Capsule: lambda u=u: 1.0 + 2.0 * abs(u[2]),
+        }[type(shape)]()
+        assert np.max(points @ u) + radius >= reach - 1e-12
+
+
+def test_a_changed_scene_keeps_the_rest_and_has_another_hash() -> None:
+    scene = scene_of(scene_data())
+    other = scene.changed(
+        start=Pose.level([0.1, 0.0, 0.3]), goal=Pose.level([0.0, 0.1, 0.3]), clearance=0.02
+    )
+    assert other.obstacle_clearance == 0.02
+    assert other.self_clearance == scene.self_clearance
+    np.testing.assert_allclose(other.start.position, [0.1, 0.0, 0.3])
+    assert [o.name for o in other.obstacles] == [o.name for o in scene.obstacles]
+    assert other.hash != scene.hash
+    assert scene.changed().hash == scene.hash
+    assert scene.changed(clearance=scene.obstacle_clearance).hash == scene.hash
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"clearance": -0.001},
+        {"clearance": float("nan")},
+        {"clearance": float("inf")},
+        {"start": Pose.level([0.0, np.nan, 0.3])},
+        {"goal": Pose.level([0.0, np.inf, 0.3])},
+    ],
+)
+def test_a_scene_cannot_be_changed_into_an_invalid_one(change: dict[str, Any]) -> None:
+    """A negative clearance would make every plan pass."""
+    with pytest.raises(BadInput):
+        scene_of(scene_data()).changed(**change)
+
+
+@pytest.mark.parametrize("name", ["environment_1", "environment_2", "environment_3", "hall_pillar"])
+def test_the_ready_scenes_load_alike_twice(name: str) -> None:
+    path = CONFIGS / f"{name}.yaml"
+    assert load_scene(path).hash == load_scene(path).hash

@@ -1,0 +1,125 @@
+"""From cable lengths to drive counts: home, directions, stretch, and the way back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdpr.kinematics import cable_lengths, structure_matrix
+from cdpr.poses import Pose
+from cdpr.rig import Rig
+from cdpr.statics.working import weight_wrench, working_tensions
+from cdpr.winches import WinchMap
+from tests.model.rig_builds import hall_data, paper_data, poses_of, rig_of
+
+
+def with_home_counts() -> Rig:
+    data = paper_data()
+    for number, winch in enumerate(data["winches"]):
+        winch["home_counts"] = 1000 * number - 3500
+        winch["direction"] = -1 if number % 2 else 1
+    return rig_of(data)
+
+
+RIGS = {"paper": with_home_counts(), "ten cables": rig_of(hall_data())}
+MAPS = {name: WinchMap(rig) for name, rig in RIGS.items()}
+each = pytest.mark.parametrize("name", RIGS)
+
+
+@each
+def test_at_home_under_working_tensions_each_drive_stands_at_its_home_counts(name: str) -> None:
+    rig, winches = RIGS[name], MAPS[name]
+    tensions = working_tensions(rig, rig.home).tensions
+    unstrained = winches.unstrained(cable_lengths(rig, rig.home), tensions)
+    expected = [w.home_counts for w in rig.winches]
+    np.testing.assert_allclose(winches.counts(unstrained), expected, atol=1e-6)
+
+
+@each
+@settings(max_examples=40)
+@given(data=st.data())
+def test_lengths_and_tensions_come_back_from_rounded_counts(name: str, data: st.DataObject) -> None:
+    """To half a count of the drive."""
+    rig, winches = RIGS[name], MAPS[name]
+    pose = data.draw(poses_of(rig, 5.0))
+    share = np.array(data.draw(st.lists(st.floats(0, 1), min_size=10, max_size=10)))
+    tensions = share[: rig.cable_count] * rig.max_tension
+    lengths = cable_lengths(rig, pose)
+    counts = np.round(winches.counts(winches.unstrained(lengths, tensions)))
+    back = winches.strained(winches.unstrained_from_counts(counts), tensions)
+    half = 0.51 * (1.0 + rig.max_tension / rig.cable_stiffness)
+    half_count = half / np.abs([w.counts_per_metre for w in rig.winches])
+    assert np.all(np.abs(back - lengths) <= half_count)
+
+
+@each
+def test_more_tension_means_less_cable_paid_out(name: str) -> None:
+    """A stretched cable of the same length has less material; `direction` gives the sign."""
+    rig, winches = RIGS[name], MAPS[name]
+    lengths = cable_lengths(rig, rig.home)
+    slack = winches.unstrained(lengths, np.full(rig.cable_count, rig.min_tension))
+    taut = winches.unstrained(lengths, np.full(rig.cable_count, rig.max_tension))
+    assert np.all(taut < slack)
+    turned = winches.counts(taut) - winches.counts(slack)
+    assert np.all(turned * np.sign([w.counts_per_metre for w in rig.winches]) < 0.0)
+
+
+@each
+def test_the_stretch_is_hookes(name: str) -> None:
+    """ΔL = t L0 / EA, over the cable behind the outlet too."""
+    rig, winches = RIGS[name], MAPS[name]
+    behind = np.array([w.drum_to_outlet for w in rig.winches])
+    unstrained = np.linspace(1.0, 3.0, rig.cable_count) + behind
+    tensions = np.linspace(rig.min_tension, rig.max_tension, rig.cable_count)
+    stretch = winches.strained(unstrained, tensions) - (unstrained - behind)
+    np.testing.assert_allclose(stretch, tensions * unstrained / rig.cable_stiffness, rtol=1e-9)
+
+
+@each
+def test_a_turn_of_the_drum_pays_out_its_circumference(name: str) -> None:
+    rig, winches = RIGS[name], MAPS[name]
+    for number, winch in enumerate(rig.document.winches):
+        one_turn = np.zeros(rig.cable_count)
+        one_turn[number] = winch.direction * winch.counts_per_rev * winch.gear_ratio
+        counts = np.array([w.home_counts for w in rig.winches]) + one_turn
+        paid = winches.unstrained_from_counts(counts) - winches.home_unstrained
+        expected = np.zeros(rig.cable_count)
+        expected[number] = winch.drum_mm_per_rev / 1000.0
+        np.testing.assert_allclose(paid, expected, atol=1e-12)
+
+
+@each
+def test_whole_trajectories_map_like_single_poses(name: str) -> None:
+    rig, winches = RIGS[name], MAPS[name]
+    lengths = cable_lengths(rig, rig.home) + np.array([[0.0], [0.1], [-0.1]])
+    tensions = np.full_like(lengths, rig.min_tension)
+    together = winches.counts(winches.unstrained(lengths, tensions))
+    for row, length, tension in zip(together, lengths, tensions, strict=True):
+        expected = winches.counts(winches.unstrained(length, tension))
+        np.testing.assert_allclose(row, expected, rtol=1e-14)
+
+
+@each
+@settings(max_examples=25)
+@given(data=st.data())
+def test_working_tensions_hold_the_weight_within_the_limits(name: str, data: st.DataObject) -> None:
+    rig = RIGS[name]
+    pose = data.draw(poses_of(rig, 0.0))
+    tensions = working_tensions(rig, pose).tensions
+    balance = structure_matrix(rig, pose) @ tensions + weight_wrench(rig, pose)
+    np.testing.assert_allclose(balance, 0.0, atol=1e-6)
+    assert np.all(tensions >= rig.min_tension - 1e-9)
+    assert np.all(tensions <= rig.max_tension + 1e-9)
+
+
+def test_the_weight_of_a_payload_off_the_middle_turns_the_platform() -> None:
+    """A payload on +x pulls down: a moment about +y, whatever the position."""
+    from cdpr.scene import Load
+
+    rig = RIGS["paper"]
+    load = Load(2.0, np.array([0.1, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+    wrench = weight_wrench(rig, Pose.level([0.1, 0.1, 0.4]), load)
+    np.testing.assert_allclose(wrench[:3], [0.0, 0.0, -(0.4 + 2.0) * 9.80665])
+    np.testing.assert_allclose(wrench[3:], [0.0, 0.1 * 2.0 * 9.80665, 0.0], atol=1e-12)
