@@ -134,7 +134,11 @@ class _Check:
                 self._violation(what, away, END_TOLERANCE, "mm", pose.position)
 
     def _check_pulleys(self) -> None:
-        """The bounds rest on exits that move at most half as fast as anchors."""
+        """Anchors four pulley radii from the swivel axis, so that exits move half as fast at most.
+
+        An anchor's motion dB moves its exit by at most 2 r dB / ρ about the axis and r dB / l along
+        the pulley, ρ its distance from the axis and l the free length, which is then over 2.8 r.
+        """
         radius = self.rig.pulley_radius
         if radius == 0.0:
             return
@@ -143,10 +147,9 @@ class _Check:
             offset = pose.apply(self.rig.anchors) - self.rig.outlets
             along = np.sum(offset * self.rig.feed_directions, axis=-1, keepdims=True)
             reach = np.linalg.norm(offset - along * self.rig.feed_directions, axis=-1)
-            near = float(min(reach.min() - 4.0 * radius, np.linalg.norm(offset, axis=-1).min()))
-            if near - 3.0 * radius < SPACING and reach.min() - SPACING < 4.0 * radius:
-                k = int(np.argmin(reach))
-                what = f"cable {k + 1} comes too near to its pulley's axis for its motion to be bounded"
+            k = int(np.argmin(reach))
+            if reach[k] - SPACING < 4.0 * radius:
+                what = f"cable {k + 1} comes too near to its pulley's axis to bound its motion"
                 self._violation(what, float(reach[k]), 4.0 * radius, "mm", pose.position)
                 return
 
@@ -172,8 +175,11 @@ class _Check:
         return closest, proof
 
     def _self_slope(self) -> float:
-        """Two points of cables whose anchors move alike part by at most the motion; exits on pulleys
-        add half of it each; turning adds the levers of anchors and, to the platform, of exits."""
+        """How fast self clearance can change, per unit of motion.
+
+        Two points of cables whose anchors move alike part by at most the motion; exits on pulleys
+        add half of it each; turning adds the levers of anchors and, to the platform, of exits.
+        """
         slope = 1.0 if self.rig.pulley_radius == 0.0 else 2.0
         if self.track.turns:
             positions = np.array([pose.position for pose in self.track.poses])

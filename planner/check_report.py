@@ -1,4 +1,4 @@
-"""What a check found: figures with pair and place, violations, and the plan that has been proved."""
+"""What a check found: figures with pair and place, violations, and the plan that passed."""
 
 from __future__ import annotations
 

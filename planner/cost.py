@@ -7,6 +7,7 @@ inverse volume of the force set, each scaled to 0..1 between its extremes over t
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -89,7 +90,7 @@ class KinematicCost:
     def mean_along(self, waypoints: Array) -> float:
         """Mean of c over the length of a path, exact at samples; waypoints shape (k, 3), [m]."""
         total, length = 0.0, 0.0
-        for start, end in zip(waypoints[:-1], waypoints[1:], strict=True):
+        for start, end in pairwise(waypoints):
             part = float(np.linalg.norm(end - start))
             count = max(2, int(np.ceil(part / _SAMPLING)) + 1)
             points = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)

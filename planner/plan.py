@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from planner.cost import Cost, KinematicCost, LengthCost
 from planner.endpoints import require_usable_ends
 from planner.rrt_star import Progress, RrtStar, SearchResult
 from planner.sampling import AdaptiveSample, GoalBias, Sampler
-from planner.settings import PlannerSettings
+from planner.settings import ATTEMPT_WITH_ROOM, CLEARANCE_RESERVE, PlannerSettings
 from planner.shortcut import cheapest_through, drawn_tight, shortcut
 from planner.space import Space, TranslationSpace
 from planner.validity import Validity
@@ -63,10 +64,9 @@ def make_plan(
     settings = settings or PlannerSettings()
     require_usable_ends(rig, scene)
     space = TranslationSpace(rig, scene.start.rotation)
-    validity = Validity(rig, scene, space)
     kinematic = KinematicCost(rig, space.rotation)
     cost: Cost = kinematic if settings.cost == "kinematic" else LengthCost()
-    result, raw = _searched(space, scene, validity, cost, settings, progress)
+    result, raw, validity = _searched(rig, scene, space, cost, settings, progress)
     path = _post_processed(raw, validity, cost, settings)
     poses = [space.pose(point) for point in path]
     report = check_path(rig, scene, poses)
@@ -99,24 +99,40 @@ def make_plan(
 
 
 def _searched(
-    space: Space,
+    rig: Rig,
     scene: Scene,
-    validity: Validity,
+    space: Space,
     cost: Cost,
     settings: PlannerSettings,
     progress: Progress | None,
-) -> tuple[SearchResult, Array]:
+) -> tuple[SearchResult, Array, Validity]:
+    """Searches, in the rewiring mode first with room for the blends that round the corners.
+
+    A blend leaves the path by up to the rig's blend tolerance, and toward the obstacle it goes
+    around; without room the executor would have to make it small, and slow down. Where no path has
+    that room, the search begins again without.
+    """
     start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
-    random = np.random.default_rng(settings.seed)
-    sampler: Sampler = (
-        AdaptiveSample(space, start, goal, random)
-        if settings.sampler == "adaptive"
-        else GoalBias(space, goal, random)
-    )
-    result = RrtStar(validity, cost, sampler, settings, random).search(start, goal, progress)
-    if result.path is None:
-        raise _no_solution(scene, validity, settings, result)
-    return result, result.path
+    attempts = [(CLEARANCE_RESERVE, settings)]
+    if settings.mode == "rewire":
+        fewer = max(1, int(ATTEMPT_WITH_ROOM * settings.max_iterations))
+        room = CLEARANCE_RESERVE + rig.motion.blend_tolerance
+        attempts.insert(0, (room, replace(settings, max_iterations=fewer)))
+    for reserve, attempt in attempts:
+        validity = Validity(rig, scene, space, reserve)
+        if not (validity.edge(start, start) and validity.edge(goal, goal)):
+            continue
+        random = np.random.default_rng(settings.seed)
+        sampler: Sampler = (
+            AdaptiveSample(space, start, goal, random)
+            if settings.sampler == "adaptive"
+            else GoalBias(space, goal, random)
+        )
+        search = RrtStar(validity, cost, sampler, attempt, random)
+        result = search.search(start, goal, progress)
+        if result.path is not None:
+            return result, result.path, validity
+    raise _no_solution(scene, validity, settings, result)
 
 
 def _no_solution(

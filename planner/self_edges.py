@@ -120,8 +120,9 @@ class SelfEdges:
         # Without the map: two points of cables that move by d at one end move apart by at most d.
         by_motion = state.pair_gaps + radii - np.linalg.norm(moved)
         i, j = self._model.pairs.T
-        room: Array = np.where(usable, np.maximum(by_map, by_motion), by_motion) - radii
-        return room - left_out[i] - left_out[j]
+        room: Array = np.where(usable, np.maximum(by_map, by_motion), by_motion)
+        room = room - radii - left_out[i] - left_out[j]
+        return room
 
     def _platform_room(self, state: _State, at: Pose, to: Pose, exits: Array) -> Array:
         """A cable's point at the arc a moves past the platform by at most a times its turn."""

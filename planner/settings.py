@@ -15,6 +15,9 @@ CLEARANCE_RESERVE = 0.05e-3
 """Added to every clearance the scene asks for, [m], so that round-off in a plan's file (1 nm) and
 between the planner's distances and those of `check` can never turn a plan into a refused one."""
 
+ATTEMPT_WITH_ROOM = 0.25
+"""Part of the iterations after which the rewiring mode no longer insists on room for the blends."""
+
 MARGIN_RESERVE = 0.002
 """Part of the largest tension by which required wrenches must lie inside the available ones."""
 

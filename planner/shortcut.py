@@ -8,6 +8,7 @@ cost more than the way it replaces, so a shortcut must not be dearer; under the 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def _move_corner(path: Array, k: int, step: float, is_free: IsFree, cost: Cost) 
 
 def _spread(path: Array, spacing: float) -> Array:
     points = [path[:1]]
-    for start, end in zip(path[:-1], path[1:], strict=True):
+    for start, end in pairwise(path):
         count = max(1, int(np.ceil(np.linalg.norm(end - start) / spacing)))
         shares = np.arange(1, count) / count
         points += [start + shares[:, None] * (end - start), end[None, :]]
@@ -123,5 +124,5 @@ def _spread(path: Array, spacing: float) -> Array:
 
 
 def _costs_along(path: Array, cost: Cost) -> Array:
-    edges = [cost.edge(a, b) for a, b in zip(path[:-1], path[1:], strict=True)]
+    edges = [cost.edge(a, b) for a, b in pairwise(path)]
     return np.append(0.0, np.cumsum(edges))

@@ -10,7 +10,7 @@ from cdpr.scene import Scene
 from planner.edges import ObstacleEdges
 from planner.feasibility import FeasibleEdges
 from planner.self_edges import SelfEdges
-from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+from planner.settings import MARGIN_RESERVE
 from planner.space import Space, inside
 
 Reason = Literal["workspace", "obstacle clearance", "self clearance", "wrench feasibility"]
@@ -24,11 +24,11 @@ class Validity:
         rejections: Number of edges refused, by reason.
     """
 
-    def __init__(self, rig: Rig, scene: Scene, space: Space) -> None:
-        """Takes the clearances of ``scene`` with the planner's reserve on top."""
+    def __init__(self, rig: Rig, scene: Scene, space: Space, reserve: float) -> None:
+        """Takes the clearances of ``scene`` with ``reserve`` [m] on top."""
         self.space = space
-        self.obstacles = ObstacleEdges(rig, scene, scene.obstacle_clearance + CLEARANCE_RESERVE)
-        self.robot = SelfEdges(rig, scene.self_clearance + CLEARANCE_RESERVE)
+        self.obstacles = ObstacleEdges(rig, scene, scene.obstacle_clearance + reserve)
+        self.robot = SelfEdges(rig, scene.self_clearance + reserve)
         rotation = scene.start.rotation
         self.wrenches = FeasibleEdges(rig, scene, rotation, MARGIN_RESERVE * rig.max_tension)
         self.checks = 0
