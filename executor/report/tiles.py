@@ -83,9 +83,7 @@ def _following(key: dict[str, Any]) -> str:
     text = known(key["max"], 3, "mm")
     if text.startswith("0.000"):
         text = "<\u00a00.001 mm"
-    return _tile(
-        "Following error", known(key["max"], 3, "mm"), f"largest; limit {key['limit']:g} mm"
-    )
+    return _tile("Following error", text, f"largest; limit {key['limit']:g} mm")
 
 
 def _camera(key: dict[str, Any] | None) -> list[str]:

@@ -257,3 +257,12 @@ def test_an_incomplete_folder_gets_no_page(tmp_path: Path, run: fake_run.FakeRun
     with pytest.raises(BadInput, match="no such file"):
         build_report(folder)
     assert not folder.report.exists()
+
+
+def test_an_error_too_small_for_its_digits_is_not_told_as_zero(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    exact = replace(run.cycles, following_error=np.full(len(run.cycles), 1e-8))
+    page = built(replace(run, cycles=exact), tmp_path / "run")
+    assert "&lt;\u00a00.001 <small>mm" in page.text
+    assert "No cable was more than 0.001\u00a0mm off" in page.text
