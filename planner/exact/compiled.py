@@ -1,0 +1,65 @@
+"""How kernels are compiled, and where the machine code is kept.
+
+Numba recompiles a cached function when its own file changes, not when a function it calls does. So
+the cache lies in a folder named after the content of all kernels: any change begins a new one. The
+folder is the user's (``NUMBA_CACHE_DIR``, else ``XDG_CACHE_HOME`` or ``~/.cache``), which lets a
+read-only installation work. Where no folder can be written, kernels live as long as the process.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import llvmlite.binding as llvm
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "fastmath": False}
+
+
+def kernel(function: Function) -> Function:
+    """Compiles a pure function when it is first called; exact IEEE arithmetic, no GIL."""
+    folder = cache_folder()
+    if folder is None:
+        return cast(Function, numba.njit(**_OPTIONS)(function))
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(folder)  # read where the decorator runs, hence put back after it
+    try:
+        return cast(Function, numba.njit(cache=True, **_OPTIONS)(function))
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+@cache
+def cache_folder() -> Path | None:
+    """The folder of these kernels' machine code; None where none can be written."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given:
+        parent = Path(given)
+    else:
+        cache_home = os.environ.get("XDG_CACHE_HOME")
+        parent = Path(cache_home) if cache_home else Path.home() / ".cache"
+        parent = parent / "cdpr" / "kernels"
+    folder = parent / _version()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:  # read-only or full: compiled code is then not kept
+        return None
+
+
+@cache
+def _version() -> str:
+    """Name of this state of the kernels on this processor."""
+    digest = hashlib.sha256(f"{numba.__version__} {llvm.get_host_cpu_name()}".encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
