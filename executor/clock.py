@@ -38,12 +38,17 @@ class RealClock:
     """Absolute deadlines on the monotonic clock.
 
     A late cycle moves all later ones: the path is delayed, cycles are never skipped or bunched.
+    Only the scheduler's small delays are caught up with, so that they do not add up.
     """
 
     simulated = False
 
     #: Of each cycle, kept free for deciding and sending, [s].
     RESERVE = 0.0005
+
+    #: A cycle that is later than this is not caught up with, [cycles]: the drives would get two
+    #: set-points closer to each other than the time in which they interpolate between them.
+    CAUGHT_UP = 0.1
 
     def __init__(self, cycle: float) -> None:
         """The first cycle begins with the first call of `next_cycle`."""
@@ -61,7 +66,7 @@ class RealClock:
             time.sleep((deadline - now) / 1e9)
             now = time.monotonic_ns()
         late = (now - deadline) / self._cycle_ns
-        self._begin_ns = deadline if late <= 1.0 else now
+        self._begin_ns = deadline if late <= self.CAUGHT_UP else now
         return late
 
     def time_left(self) -> float:

@@ -76,5 +76,7 @@ def targets_at(setpoints: NDArray[np.int32], index: float) -> tuple[int, ...]:
     share = index - row
     if share == 0.0:
         return tuple(int(v) for v in setpoints[row])
-    mixed = (1.0 - share) * setpoints[row] + share * setpoints[row + 1]
-    return tuple(int(v) for v in np.rint(mixed))
+    first, second = setpoints[row].astype(np.int64), setpoints[row + 1].astype(np.int64)
+    # Rounded always the same way: to even, a step of n counts could become n + 1.
+    mixed = np.floor(first + share * (second - first) + 0.5)
+    return tuple(int(v) for v in mixed)

@@ -65,9 +65,14 @@ class Machine:
 
     def __init__(self) -> None:
         """Starts ready."""
-        self.state = State.READY
-        self.stopped = False
-        self.faulted = False
+        self._state = State.READY
+        self._stopped = False
+        self._faulted = False
+
+    @property
+    def state(self) -> State:
+        """Where the run is; only events change it."""
+        return self._state
 
     def on(self, event: Event) -> State:
         """Takes one step.
@@ -76,21 +81,21 @@ class Machine:
             ForbiddenTransition: The event is not foreseen here; the caller must stop the rig.
         """
         if event is Event.FAULT:
-            self.faulted = True
-            self.state = State.LATCHED
-            return self.state
-        if event is Event.HELD and self.state is State.SECURING:
-            self.state = self._end()
-            return self.state
-        following = _NEXT.get((self.state, event))
+            self._faulted = True
+            self._state = State.LATCHED
+            return self._state
+        if event is Event.HELD and self._state is State.SECURING:
+            self._state = self._end()
+            return self._state
+        following = _NEXT.get((self._state, event))
         if following is None:
-            raise ForbiddenTransition(f"{event.value} in state {self.state.value}")
-        self.stopped |= event is Event.STOP
-        self.faulted |= event is Event.PATH_FAULT
-        self.state = following
+            raise ForbiddenTransition(f"{event.value} in state {self._state.value}")
+        self._stopped |= event is Event.STOP
+        self._faulted |= event is Event.PATH_FAULT
+        self._state = following
         return following
 
     def _end(self) -> State:
-        if self.faulted:
+        if self._faulted:
             return State.LATCHED
-        return State.STOPPED if self.stopped else State.FINISHED
+        return State.STOPPED if self._stopped else State.FINISHED

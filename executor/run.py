@@ -22,9 +22,10 @@ from executor.measured import clearance_table, encoder_rows
 from executor.observer import Look
 from executor.pose_table import PoseTable, no_poses
 from executor.prepare import PreparedRun
+from executor.realtime import real_time
 from executor.report import build_report
 from executor.run_folder import RunEvent, RunFolder
-from executor.run_log import RunLog
+from executor.run_log import RunLog, between
 from executor.summary import RunContext, summarize
 from executor.versions import versions
 
@@ -73,11 +74,13 @@ class Execution:
             pump: Lets drives simulated in this process work.
         """
         self.prepared = prepared
+        self._clock = clock
         self._log = RunLog(prepared.rig, prepared.checked)
         self._folder: RunFolder | None = None
         self._triggers: Trigger | None = None
         self._progress: Callable[[float], None] = lambda _share: None
         self._every = 1
+        self._due = 0.0
         self.loop = Loop(
             prepared.rig,
             prepared.checked,
@@ -112,7 +115,13 @@ class Execution:
         started = datetime.now(UTC)
         error: BaseException | None = None
         try:
-            self.loop.run()
+            if self._clock.simulated:
+                self.loop.run()
+            else:
+                with real_time() as denied:
+                    if denied:
+                        self._on_event(LoopEvent(0, "no_real_time", denied))
+                    self.loop.run()
         except Exception as broken:  # the drives were stopped; what is known is still recorded
             error = broken
             self._on_event(LoopEvent(len(self._log), "broken", f"the run broke: {broken}"))
@@ -120,14 +129,15 @@ class Execution:
 
     def _on_cycle(self, record: CycleRecord) -> None:
         self._log.add(record)
+        due, self._due = self._due, record.index
         if record.cycle % self._every:
             return
         self._progress(record.index)
         if self._triggers is not None:
+            # Now the platform is where the drives were told to be one cycle before.
             table = self.prepared.checked.table
-            row = int(record.index)
-            due = Pose(table.positions[row], table.rotations[row])
-            self._triggers(record.cycle * table.cycle, due)
+            pose = Pose(between(table.positions, due), table.rotations[round(due)])
+            self._triggers(record.cycle * table.cycle, pose)
 
     def _on_event(self, event: LoopEvent) -> None:
         if self._folder is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cdpr.kinematics import poses_near
 from cdpr.poses import Array, quaternion_from_matrix
@@ -54,10 +55,10 @@ class RunLog:
             time=np.array([r.cycle for r in records]) * planned.cycle,
             state=tuple(r.state.value for r in records),
             path_index=rows,
-            travelled=_between(planned.travelled, index),
+            travelled=between(planned.travelled, index),
             lateness=np.array([r.lateness for r in records]) * planned.cycle,
             missing=np.array([r.missing for r in records], dtype=np.int64),
-            planned=_between(planned.positions, index),
+            planned=between(planned.positions, index),
             planned_rotation=_quaternions(planned.rotations[rows]),
             encoder=encoder,
             encoder_rotation=_quaternions(turned),
@@ -65,7 +66,7 @@ class RunLog:
             set_counts=_matrix([r.targets for r in records], rig.cable_count),
             actual_counts=actual,
             lengths=lengths,
-            planned_tensions=_between(planned.tensions, index),
+            planned_tensions=between(planned.tensions, index),
             tensions=np.where(taut[:, None], tensions, np.nan),
         )
 
@@ -80,12 +81,13 @@ def _matrix(
     return np.array(rows, dtype=np.int64).reshape(len(rows), width)
 
 
-def _between(values: Array, index: Array) -> Array:
-    """Rows of a table at fractional places."""
+def between(values: Array, index: ArrayLike) -> Array:
+    """Rows of a table at one fractional place or several."""
+    index = np.asarray(index, dtype=np.float64)
     low = np.floor(index).astype(np.int64)
     high = np.minimum(low + 1, len(values) - 1)
     share = index - low
     if values.ndim > 1:
-        share = share[:, None]
+        share = share[..., None]
     mixed: Array = (1.0 - share) * values[low] + share * values[high]
     return mixed

@@ -22,6 +22,9 @@ from planner.check import check_path
 from planner.check_report import CheckReport
 
 INT32_MAX = 2**31 - 1
+_ARRAYS = ("travelled", "positions", "rotations", "lengths", "tensions", "counts")
+#: Tensions are solved to this accuracy, [N].
+TENSION_ACCURACY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,11 @@ class SetpointTable:
     tensions: Array
     counts: Array
 
+    def __post_init__(self) -> None:
+        """Copies the arrays and makes them read-only, so that what was checked is what is sent."""
+        for name in _ARRAYS:
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
     def __len__(self) -> int:
         """Number of rows."""
         return len(self.travelled)
@@ -57,9 +65,9 @@ class SetpointTable:
         rounded.setflags(write=False)
         return rounded
 
-    @cached_property
+    @property
     def hash(self) -> str:
-        """SHA-256 over the set-points and their cycle."""
+        """SHA-256 over the set-points and their cycle, computed anew every time."""
         digest = hashlib.sha256(repr(self.cycle).encode())
         digest.update(np.ascontiguousarray(self.setpoints).tobytes())
         return "sha256:" + digest.hexdigest()
@@ -105,12 +113,12 @@ def build_table(rig: Rig, scene: Scene, path: Path, law: TimeLaw, cycle: float) 
     winches = WinchMap(rig)
     return SetpointTable(
         cycle=cycle,
-        travelled=read_only(travelled),
-        positions=read_only(positions),
-        rotations=read_only(rotations),
-        lengths=read_only(lengths),
-        tensions=read_only(tensions),
-        counts=read_only(winches.counts(winches.unstrained(lengths, tensions))),
+        travelled=travelled,
+        positions=positions,
+        rotations=rotations,
+        lengths=lengths,
+        tensions=tensions,
+        counts=winches.counts(winches.unstrained(lengths, tensions)),
     )
 
 
@@ -118,12 +126,18 @@ def check_table(rig: Rig, scene: Scene, table: SetpointTable) -> CheckedTable:
     """Passes a table on, or refuses it with everything that is wrong.
 
     Raises:
-        Refused: A value is not finite or no int32; a winch is too fast; the ends are not the
-            scene's start and goal; or the executed curve fails the independent check.
+        Refused: A value is not finite or no int32; a winch is too fast; a tension is outside the
+            rig's limits; drive positions are not those of the poses; the ends are not the scene's
+            start and goal; or the executed curve fails the independent check.
     """
-    found = [*_number_violations(table), *_end_violations(scene, table)]
+    found = _number_violations(rig, table)
     if not found:
-        found += _speed_violations(rig, table)
+        found = [
+            *_end_violations(scene, table),
+            *_speed_violations(rig, table),
+            *_tension_violations(rig, table),
+            *_count_violations(rig, table),
+        ]
     if found:
         raise _refusal(found)
     report = check_path(rig, scene, table.poses())
@@ -141,10 +155,16 @@ def _refusal(found: list[str]) -> Refused:
     )
 
 
-def _number_violations(table: SetpointTable) -> list[str]:
-    if not np.isfinite(table.counts).all():
-        row = int(np.flatnonzero(~np.isfinite(table.counts).all(axis=1))[0])
-        return [f"row {row} holds a set-point that is no number"]
+def _number_violations(rig: Rig, table: SetpointTable) -> list[str]:
+    rows, cables = len(table), rig.cable_count
+    shapes = [(rows,), (rows, 3), (rows, 3, 3), *[(rows, cables)] * 3]
+    for name, shape in zip(_ARRAYS, shapes, strict=True):
+        values: Array = getattr(table, name)
+        if values.shape != shape or rows == 0:
+            return [f"{name} have the shape {values.shape}, not {shape}"]
+        if not np.isfinite(values).all():
+            row = int(np.argwhere(~np.isfinite(values))[0][0])
+            return [f"row {row} holds {name} that are no numbers"]
     if np.abs(table.counts).max() > INT32_MAX - 1:
         largest = int(np.abs(table.counts).argmax())
         row, cable = divmod(largest, table.counts.shape[1])
@@ -164,6 +184,29 @@ def _end_violations(scene: Scene, table: SetpointTable) -> list[str]:
                 f" {np.degrees(end.angle_to(pose)):.4f}° off the scene's"
             )
     return found
+
+
+def _tension_violations(rig: Rig, table: SetpointTable) -> list[str]:
+    low, high = float(table.tensions.min()), float(table.tensions.max())
+    if low >= rig.min_tension - TENSION_ACCURACY and high <= rig.max_tension + TENSION_ACCURACY:
+        return []
+    return [
+        f"planned tensions run from {low:.3f} to {high:.3f} N,"
+        f" the rig allows {rig.min_tension:g} to {rig.max_tension:g} N"
+    ]
+
+
+def _count_violations(rig: Rig, table: SetpointTable) -> list[str]:
+    """The check of the executed curve looks at poses, the drives get counts: they must agree."""
+    winches = WinchMap(rig)
+    unstrained = winches.unstrained_from_counts(table.setpoints.astype(np.float64))
+    anchors = [pose.apply(rig.anchors) for pose in table.poses()]
+    off = winches.strained(unstrained, table.tensions) - cables_to(rig, np.array(anchors)).lengths
+    row, cable = np.unravel_index(int(np.abs(off).argmax()), off.shape)
+    worst = float(abs(off[row, cable]))
+    if worst <= 1.0 / abs(rig.winches[int(cable)].counts_per_metre):
+        return []
+    return [f"row {row}: the set-point of cable {cable + 1} is {worst * 1000:.4f} mm off its pose"]
 
 
 def _speed_violations(rig: Rig, table: SetpointTable) -> list[str]:

@@ -37,10 +37,11 @@ def sim(
       --channel 239.74.163.2 --no-camera -o runs/udp --yes
     """
     from cdpr.cli.drives import IN_PROCESS
-    from cdpr.cli.output import out
+    from cdpr.cli.output import err, out
     from cdpr.cli.run import rig_on_bus
     from cdpr.errors import BadInput
     from drivers.bus import BusSettings, open_bus
+    from executor.realtime import real_time
     from executor.running import stop_requests
     from simulation.rehearsal import Rehearsal
 
@@ -62,7 +63,9 @@ def sim(
             f" {BusSettings.of(the_rig)}; platform at {x:.1f}, {y:.1f}, {z:.1f} mm; Ctrl-C ends it",
             soft_wrap=True,
         )
-        with stop_requests() as stop_requested:
+        with stop_requests() as stop_requested, real_time() as denied:
+            if denied:
+                err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
             rehearsal.serve(stop_requested)
     finally:
         bus.shutdown()

@@ -72,7 +72,10 @@ def track(
     the_scene = _scene(scene, plan)
     frames, total = _source(the_rig, the_scene, the_camera, source, plan)
     logged: list[LoggedPicture] = []
-    with stop_requests() as stopped, progress_bar("tracking", pictures or total, not as_json) as show:
+    with (
+        stop_requests() as stopped,
+        progress_bar("tracking", pictures or total, not as_json) as show,
+    ):
         patience = PATIENCE if total is None else None
         for found in tracked(
             islice(frames, pictures), Tracker(the_rig, the_camera), give_up_after=patience

@@ -32,6 +32,24 @@ class Limits:
     largest_step: tuple[int, ...]
     largest_lag: tuple[int, ...]
 
+    def __post_init__(self) -> None:
+        """Refuses limits that do not agree: a limit that is missing would deny nothing.
+
+        Raises:
+            ValueError: Not one whole number a drive everywhere, or an empty range.
+        """
+        rows = (self.lowest, self.highest, self.largest_step, self.largest_lag)
+        if not self.lowest or len({len(row) for row in rows}) > 1:
+            raise ValueError("the safety gate needs one limit of each kind for every drive")
+        if not all(_whole(row) for row in rows):
+            raise ValueError("the safety gate's limits must be whole numbers of counts")
+        ranges = zip(self.lowest, self.highest, strict=True)
+        if (
+            any(low > high for low, high in ranges)
+            or min(*self.largest_step, *self.largest_lag) < 0
+        ):
+            raise ValueError("the safety gate's limits leave nothing that is allowed")
+
 
 @dataclass(frozen=True, slots=True)
 class Request:
@@ -70,10 +88,14 @@ ALLOWED = Verdict(True)
 def examine(limits: Limits, request: Request) -> Verdict:
     """Allows or denies one cycle's set-points."""
     count = len(limits.lowest)
-    if len(request.targets) != count or len(request.actual) != count:
-        return Verdict(False, f"{len(request.targets)} targets for {count} drives")
-    if not all(type(target) is int for target in request.targets):
-        return Verdict(False, "a target is not a whole number")
+    known = {"targets": request.targets, "actual positions": request.actual}
+    if request.previous is not None:
+        known["previous targets"] = request.previous
+    for name, positions in known.items():
+        if len(positions) != count:
+            return Verdict(False, f"{len(positions)} {name} for {count} drives")
+        if not _whole(positions):
+            return Verdict(False, f"{name} that are not all whole numbers")
     if request.purpose is Purpose.HOLD:
         return _hold(limits, request)
     if request.purpose is Purpose.MOVE:
@@ -84,17 +106,17 @@ def examine(limits: Limits, request: Request) -> Verdict:
 def _hold(limits: Limits, request: Request) -> Verdict:
     if request.previous is not None and tuple(request.targets) == tuple(request.previous):
         return ALLOWED
-    if request.enabled:
+    if request.enabled is not False:
         return Verdict(False, "a hold would change the targets of drives that follow them")
     return _near_actual(limits, request)
 
 
 def _move(limits: Limits, request: Request) -> Verdict:
-    if request.latched:
+    if request.latched is not False:
         return Verdict(False, "a fault is latched")
-    if not request.armed:
+    if request.armed is not True:
         return Verdict(False, "not armed")
-    if not request.enabled:
+    if request.enabled is not True:
         return Verdict(False, "not all drives are enabled")
     if request.previous is None:
         return Verdict(False, "no targets were sent before")
@@ -112,6 +134,11 @@ def _move(limits: Limits, request: Request) -> Verdict:
                 f"drive {drive + 1}: step of {step} counts, allowed {limits.largest_step[drive]}",
             )
     return _near_actual(limits, request)
+
+
+def _whole(values: Sequence[int]) -> bool:
+    """Whole numbers only; NaN, which every comparison lets pass, is none."""
+    return all(type(value) is int for value in values)
 
 
 def _near_actual(limits: Limits, request: Request) -> Verdict:

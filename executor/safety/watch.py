@@ -89,15 +89,22 @@ class Watch:
         return cls(limits, zeros, zeros, zeros)
 
     def look(self, seen: Observation) -> tuple[Watch, tuple[Finding, ...]]:
-        """Takes in one cycle."""
+        """Takes in one cycle.
+
+        Raises:
+            ValueError: Not one entry for every drive; one that is missing would hide a fault.
+        """
         limits = self.limits
+        counts = {len(seen.following_errors), len(seen.tensions), len(seen.missing)}
+        if counts != {len(self.missing)}:
+            raise ValueError(f"the watch was shown {counts} entries for {len(self.missing)} drives")
         # "Not at least" and "not at most", so that a tension that is no number counts as wrong.
         slack = [seen.following and not t >= limits.min_tension for t in seen.tensions]
         over = [seen.following and not t <= limits.max_tension for t in seen.tensions]
         # A drive that did not answer says nothing new about its tension.
         watch = Watch(
             limits,
-            _counted(self.missing, seen.missing),
+            _counted(self.missing, seen.missing, [False] * len(seen.missing)),
             _counted(self.slack, slack, seen.missing),
             _counted(self.over, over, seen.missing),
         )
@@ -122,9 +129,8 @@ class Watch:
     def _following(self, seen: Observation) -> list[Finding]:
         found = []
         for drive, error in enumerate(seen.following_errors, start=1):
-            if (
-                seen.following and not abs(error) <= self.limits.following_error
-            ):  # also when it is no number
+            # "Not at most", so that an error that is no number counts as too large.
+            if seen.following and not abs(error) <= self.limits.following_error:
                 text = (
                     f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
                     f" allowed {self.limits.following_error * 1000:.2f} mm"
@@ -150,22 +156,19 @@ class Watch:
         return found
 
     def _lateness(self, seen: Observation) -> list[Finding]:
-        if seen.lateness > self.limits.late_periods:
-            text = f"a cycle began {seen.lateness:.1f} cycles late"
+        text = f"a cycle began {seen.lateness:.1f} cycles late"
+        if not seen.lateness <= self.limits.late_periods:  # also when it is no number
             return [Finding(Reaction.PATH_STOP, "late", text)]
         if seen.lateness > 1.0:
-            return [
-                Finding(Reaction.NOTE, "late", f"a cycle began {seen.lateness:.1f} cycles late")
-            ]
+            return [Finding(Reaction.NOTE, "late", text)]
         return []
 
 
 def _counted(
-    before: Sequence[int], now: Sequence[bool], unknown: Sequence[bool] | None = None
+    before: Sequence[int], now: Sequence[bool], unknown: Sequence[bool]
 ) -> tuple[int, ...]:
     """Counts in a row; where nothing is known the count stays."""
-    blind = unknown if unknown is not None else [False] * len(now)
     return tuple(
         count if hidden else (count + 1 if hit else 0)
-        for count, hit, hidden in zip(before, now, blind, strict=True)
+        for count, hit, hidden in zip(before, now, unknown, strict=True)
     )

@@ -1,0 +1,56 @@
+"""Real-time scheduling of this process while it moves a rig, and a plain word when it is denied."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+#: Above ordinary programs, below the kernel's own threads.
+PRIORITY = 50
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+
+@contextmanager
+def real_time() -> Iterator[str]:
+    """Runs the block with SCHED_FIFO, memory locked and garbage collection off.
+
+    Yields:
+        Nothing when all of it was granted, otherwise one sentence that says what was denied.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield _enter()
+    finally:
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, policy, parameter)
+        gc.enable()
+        gc.unfreeze()
+
+
+def _enter() -> str:
+    denied = []
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except PermissionError:
+        denied.append("real-time scheduling (allow it with `ulimit -r 50` or CAP_SYS_NICE)")
+    if not _lock_memory():
+        denied.append("locked memory (allow it with `ulimit -l unlimited` or CAP_IPC_LOCK)")
+    return f"denied: {', '.join(denied)}; cycles may be late" if denied else ""
+
+
+def _lock_memory() -> bool:
+    # A lock within a small limit would make later allocations fail instead of being slow.
+    if (
+        os.geteuid() != 0
+        and resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY
+    ):
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    return int(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE)) == 0
