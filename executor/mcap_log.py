@@ -11,30 +11,18 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from cdpr.cables import cables_to
 from cdpr.errors import Fault
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig
+from cdpr.poses import Array
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
+from executor.mcap_scene import robot_messages, scene_messages
 from executor.mcap_schemas import CHANNELS
+from executor.mcap_values import WORLD, Message, nanoseconds, pose_value, stamp_of
 from executor.pose_table import PoseTable
 from executor.run_folder import RunFolder
-from executor.solids import solid_of
 from executor.summary import RunContext
 
-WORLD = "world"
-ROBOT_RATE = 20.0
-"""How often the drawn robot is logged, [Hz]; the numbers are logged every cycle."""
 _INFO, _WARNING = 2, 3
-_LINE_STRIP, _LINE_LIST = 0, 2
-_OBSTACLE = {"r": 0.35, "g": 0.39, "b": 0.45, "a": 0.75}
-_PLATFORM = {"r": 0.0, "g": 0.45, "b": 0.70, "a": 0.9}
-_CABLE = {"r": 0.1, "g": 0.1, "b": 0.1, "a": 1.0}
-_PATH = {"r": 0.84, "g": 0.37, "b": 0.0, "a": 1.0}
-
-#: One message: topic, time since the start of the run [s], content.
-Message = tuple[str, float, dict[str, Any]]
 
 
 def write_mcap(
@@ -58,8 +46,8 @@ def write_mcap(
     """
     start = int(context.started.timestamp() * 1e6) * 1000
     messages = [
-        *_scene(context, start),
-        *_robot(context.rig, cycles, start),
+        *scene_messages(context, start),
+        *robot_messages(context.rig, cycles, start),
         *_cycles(cycles, start),
         *_tags(poses, start),
         *_clearance(clearance),
@@ -90,20 +78,11 @@ def _write(path: Path, messages: Sequence[Message], start: int) -> None:
             channels[topic] = writer.register_channel(topic, "json", number)
         counts = dict.fromkeys(CHANNELS, 0)
         for topic, time, content in messages:
-            at = start + _nanoseconds(time)
+            at = start + nanoseconds(time)
             data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
             writer.add_message(channels[topic], at, data, at, counts[topic])
             counts[topic] += 1
         writer.finish()  # type: ignore[no-untyped-call]
-
-
-def _nanoseconds(time: float) -> int:
-    return round(time * 1e9)
-
-
-def _stamp(start: int, time: float) -> dict[str, int]:
-    seconds, rest = divmod(start + _nanoseconds(time), 1_000_000_000)
-    return {"sec": seconds, "nsec": rest}
 
 
 def _rows(values: Array) -> list[list[float | None]]:
@@ -118,20 +97,6 @@ def _column(values: Array) -> list[float | None]:
     return [v if np.isfinite(v) else None for v in values.tolist()]
 
 
-def _vector(values: Sequence[float | None]) -> dict[str, float | None]:
-    return {"x": values[0], "y": values[1], "z": values[2]}
-
-
-def _pose(
-    position: Sequence[float | None], quaternion: Sequence[float | None]
-) -> dict[str, dict[str, float | None]]:
-    w, x, y, z = quaternion
-    return {"position": _vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}}
-
-
-_STILL = _pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-
-
 def _poses_of(
     topic: str, times: Array, positions: Array, quaternions: Array, start: int
 ) -> Iterator[Message]:
@@ -140,11 +105,11 @@ def _poses_of(
         times[known].tolist(), positions[known].tolist(), quaternions[known].tolist(), strict=True
     )
     for time, position, quaternion in rows:
-        stamp = _stamp(start, time)
+        stamp = stamp_of(start, time)
         yield (
             topic,
             time,
-            {"timestamp": stamp, "frame_id": WORLD, "pose": _pose(position, quaternion)},
+            {"timestamp": stamp, "frame_id": WORLD, "pose": pose_value(position, quaternion)},
         )
 
 
@@ -232,7 +197,7 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
 def _events(context: RunContext, start: int) -> Iterator[Message]:
     for event in context.events:
         content = {
-            "timestamp": _stamp(start, event.time_s),
+            "timestamp": stamp_of(start, event.time_s),
             "level": _INFO if context.final_state == "finished" else _WARNING,
             "message": event.text,
             "name": event.code,
@@ -246,72 +211,9 @@ def _pictures(folder: RunFolder, poses: PoseTable, start: int) -> Iterator[Messa
     for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
         if name:
             content = {
-                "timestamp": _stamp(start, time),
+                "timestamp": stamp_of(start, time),
                 "frame_id": "camera",
                 "data": base64.b64encode(folder.picture(name)).decode(),
                 "format": "jpeg",
             }
             yield "/pictures", time, content
-
-
-def _scene(context: RunContext, start: int) -> Iterator[Message]:
-    """Obstacles and planned path, once."""
-    entities = []
-    for obstacle in context.plan.scene.obstacles:
-        corners = [_vector(p) for p in solid_of(obstacle).triangles().reshape(-1, 3).tolist()]
-        surface = {"pose": _STILL, "points": corners, "color": _OBSTACLE}
-        entities.append(_entity(f"obstacle {obstacle.name}", start, 0.0, triangles=[surface]))
-    corners = [_vector(pose.position.tolist()) for pose in context.plan.waypoints]
-    path = _line(_LINE_STRIP, corners, 3.0, _PATH)
-    entities.append(_entity("planned path", start, 0.0, lines=[path]))
-    yield "/scene", 0.0, {"deletions": [], "entities": entities}
-
-
-def _robot(rig: Rig, cycles: CycleTable, start: int) -> Iterator[Message]:
-    """Platform and cables where the encoders place them, often enough to watch."""
-    known = np.isfinite(cycles.encoder).all(axis=1) & np.isfinite(cycles.encoder_rotation).all(
-        axis=1
-    )
-    last = -np.inf
-    for i in np.flatnonzero(known).tolist():
-        time = float(cycles.time[i])
-        if time - last < 1.0 / ROBOT_RATE - 1e-6:
-            continue
-        last = time
-        position, quaternion = cycles.encoder[i], cycles.encoder_rotation[i]
-        pose = Pose.from_quaternion(position, quaternion)
-        cables = cables_to(rig, pose.apply(rig.anchors))
-        ends = np.stack([cables.exits, cables.anchors], axis=1).reshape(-1, 3)
-        points = [_vector(point) for point in ends.tolist()]
-        cube = {
-            "pose": _pose(position.tolist(), quaternion.tolist()),
-            "size": _vector((2.0 * rig.half_size).tolist()),
-            "color": _PLATFORM,
-        }
-        lines = [_line(_LINE_LIST, points, 1.5, _CABLE)]
-        entity = _entity("robot", start, time, cubes=[cube], lines=lines)
-        yield "/robot", time, {"deletions": [], "entities": [entity]}
-
-
-def _line(
-    kind: int, points: list[dict[str, float | None]], thickness: float, color: dict[str, float]
-) -> dict[str, Any]:
-    return {
-        "type": kind,
-        "pose": _STILL,
-        "thickness": thickness,
-        "scale_invariant": True,
-        "points": points,
-        "color": color,
-    }
-
-
-def _entity(name: str, start: int, time: float, **primitives: list[Any]) -> dict[str, Any]:
-    return {
-        "timestamp": _stamp(start, time),
-        "frame_id": WORLD,
-        "id": name,
-        "lifetime": {"sec": 0, "nsec": 0},
-        "frame_locked": True,
-        **primitives,
-    }

@@ -1,0 +1,37 @@
+"""Times, vectors and poses as the messages of ``run.mcap`` write them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+#: One message: topic, time since the start of the run [s], content.
+Message = tuple[str, float, dict[str, Any]]
+WORLD = "world"
+
+
+def nanoseconds(time: float) -> int:
+    """[s] as whole nanoseconds."""
+    return round(time * 1e9)
+
+
+def stamp_of(start: int, time: float) -> dict[str, int]:
+    """The moment ``time`` [s] after ``start`` [ns since 1970]."""
+    seconds, rest = divmod(start + nanoseconds(time), 1_000_000_000)
+    return {"sec": seconds, "nsec": rest}
+
+
+def vector(values: Sequence[float | None]) -> dict[str, float | None]:
+    """Three numbers by axis."""
+    return {"x": values[0], "y": values[1], "z": values[2]}
+
+
+def pose_value(
+    position: Sequence[float | None], quaternion: Sequence[float | None]
+) -> dict[str, dict[str, float | None]]:
+    """A position [m] and a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    return {"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+
+
+STILL = pose_value((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
