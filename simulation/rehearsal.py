@@ -29,7 +29,7 @@ from simulation.plant import Plant
 TOP_SPEED_RESERVE = 1.5
 """A simulated motor turns this much faster than its winch's speed limit."""
 
-IDLE_WAIT = 0.002
+IDLE_WAIT = 0.005
 """Longest wait for a frame before time-outs of the drives are looked at, [s]."""
 
 

@@ -178,8 +178,8 @@ class Cia402Group:
 
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
+        self._stop()  # first: whatever the bus does now, no later cycle enables the drives again
         self._send_batch((ControlWord.QUICK_STOP,) * len(self._nodes))
-        self._stop()
 
     def close(self) -> None:
         """Lets go of the bus without sending anything."""
@@ -195,17 +195,17 @@ class Cia402Group:
 
     def _send_batch(self, words: tuple[ControlWord, ...]) -> None:
         """One set-point a drive, then SYNC. A frame that fails does not hold up the others."""
-        failure: Fault | None = None
+        self._words = words
+        self._note_released()
+        self._watch.begin_cycle()
         for message, word, target in zip(self._set_points, words, self._targets, strict=True):
             message.data = bytearray(make_set_point(word, target))
+        failure: Fault | None = None
+        for message in (*self._set_points, self._sync):
             try:
                 transmit(self._bus, message)
             except Fault as error:
                 failure = failure or error
-        transmit(self._bus, self._sync)
-        self._words = words
-        self._note_released()
-        self._watch.begin_cycle()
         if failure is not None:
             raise failure
 
@@ -226,12 +226,12 @@ class Cia402Group:
         deadline = time.monotonic() + timeout
         left = timeout
         while not self._watch.complete:
-            message = take(self._bus, left)
+            message = take(self._bus, max(0.0, left))
             if message is None:
                 return
             if _is_data(message):
                 self._watch.take(message.arbitration_id, message.data)
-            left = max(0.0, deadline - time.monotonic()) if timeout else 0.0
+            left = deadline - time.monotonic()
 
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.POWER_OFF)

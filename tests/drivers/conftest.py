@@ -47,7 +47,9 @@ def served_bench(request: pytest.FixtureRequest, rig: Rig) -> Iterator[Bench]:
     stop = threading.Event()
     with three_on_a_bus(BusSettings(kind, channel)) as (master, drives, ear):
         rehearsal = Rehearsal(rig, drives, rig.home)
-        server = threading.Thread(target=rehearsal.serve, args=(stop,), kwargs={"clock": clock})
+        server = threading.Thread(
+            target=rehearsal.serve, args=(stop.is_set,), kwargs={"clock": clock}
+        )
         server.start()
         try:
             bench = Bench(rig, make_drive_group(rig, master), rehearsal, ear)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import can
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cdpr.errors import HardwareMissing, Refused
+from cdpr.errors import Fault, HardwareMissing, Refused
 from drivers.cia402.objects import settings_for
 from drivers.cia402.states import DriveState
 from drivers.drive_group import GroupCommand, GroupState
@@ -275,6 +276,52 @@ def test_a_following_error_trips_the_drive_and_stops_all(bench: Bench) -> None:
     for _ in range(3):
         bench.cycle()
     assert [d.state for d in bench.drives[1:]] == [HOLDING] * 7
+
+
+def test_a_frame_that_the_bus_refuses_does_not_hold_up_the_stop(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.enable()
+    bus = bench.group._bus
+    send = bus.send
+
+    def full_for_drive_3(message: can.Message) -> None:
+        if message.arbitration_id == 0x203:
+            raise can.CanOperationError("No buffer space available")
+        send(message)
+
+    monkeypatch.setattr(bus, "send", full_for_drive_3)
+    with pytest.raises(Fault, match="No buffer space"):
+        bench.group.quick_stop_now()
+    assert bench.group.state is GroupState.QUICK_STOP
+    bench.rehearsal.pump()
+    assert [d.state for d in bench.drives] == [
+        DriveState.OPERATION_ENABLED if d.node == 3 else HOLDING for d in bench.drives
+    ]
+    monkeypatch.undo()
+    bench.cycle()
+    assert bench.drives[2].state is HOLDING
+
+
+def test_a_bus_that_fails_is_a_fault_of_ours(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No exception of python-can leaks, and it says what the drives do now."""
+
+    def down(timeout: float) -> None:
+        raise can.CanOperationError("Network is down")
+
+    bench.enable()
+    bench.group.send_cycle(bench.group.targets.tolist())
+    monkeypatch.setattr(bench.group._bus, "recv", down)
+    with pytest.raises(Fault, match="Network is down") as caught:
+        bench.group.receive(0.0)
+    assert "stop by themselves" in caught.value.next_step
+
+
+def test_another_master_on_the_bus_is_refused(bench: Bench) -> None:
+    say = bench.drives[0]._bus_send
+    bench.drives[0]._bus_send = lambda i, d: (say(0x080, b""), say(i, d))
+    with pytest.raises(Refused, match="another program sends SYNC"):
+        bench.group.configure()
 
 
 def test_replies_of_the_wrong_length_are_counted_and_not_used(bench: Bench) -> None:
