@@ -29,6 +29,7 @@ class Feed:
         self.index = 0.0
         self._last = rows - 1
         self._stopping: ruckig.InputParameter | None = None
+        self._answer = ruckig.OutputParameter(1)
         self._generator = ruckig.Ruckig(1, 1.0)  # unit of time: a cycle; of way: a row
         self._acceleration = motion.acceleration / motion.speed * cycle
         self._jerk = motion.jerk / motion.speed * cycle**2
@@ -59,7 +60,8 @@ class Feed:
         if self._stopping is None:
             self.index = min(self.index + 1.0, float(self._last))
             return self.index
-        answer = ruckig.OutputParameter(1)
+        # Ruckig keeps its plan in the answer: a new one each cycle would end the ramp at once.
+        answer = self._answer
         result = self._generator.update(self._stopping, answer)
         answer.pass_to_input(self._stopping)
         if result == ruckig.Result.Finished:
