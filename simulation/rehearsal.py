@@ -134,6 +134,10 @@ class Rehearsal:
     ) -> None:
         """Answers in real time until told to stop or interrupted from the keyboard.
 
+        As in a real drive, time is locked to SYNC: one cycle passes from one to the next, however
+        they jitter, and more only while none comes. When this process is held up, the drives' time
+        stands still: they do not blame the master for it.
+
         Args:
             stop_requested: Asked every few milliseconds; true ends it.
             on_status: Called every ``status_period`` seconds, between two frames.
@@ -161,18 +165,22 @@ class Rehearsal:
         clock: Callable[[], float],
     ) -> None:
         last = told = clock()
+        passed = 0.0  # of the drives' time since the last SYNC
         while not stop_requested():
             message = take(self._bus, IDLE_WAIT)
             now = clock()
-            # Frames of one burst follow each other at once: only what needs the time asks for it.
-            if message is None or message.arbitration_id == SYNC_ID:
-                self._advance(now - last)
-                last = now
-            if message is not None:
-                self._handle(message)
-            elif on_status is not None and now - told >= status_period:
-                told = now
-                on_status(self.status())
+            if message is None:
+                idle = min(now - last, self._cycle)
+                self._advance(idle)
+                passed, last = passed + idle, now
+                if on_status is not None and now - told >= status_period:
+                    told = now
+                    on_status(self.status())
+                continue
+            if message.arbitration_id == SYNC_ID:
+                self._advance(self._cycle - passed)
+                passed, last = 0.0, now
+            self._handle(message)
 
     def _routes(self) -> dict[int, Callable[[Frame], None]]:
         """What to do with each identifier."""
