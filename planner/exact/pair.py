@@ -1,0 +1,210 @@
+"""One body against one piece of an obstacle along a translation: in closed form where there is one.
+
+A cable with a point exit sweeps the triangle of its exit and its anchor before and after. The
+platform sweeps the hull of its two places; seen from the platform it is the obstacle that moves,
+which makes boxes parallel to it a segment against a larger box, and balls a segment, capsules a
+parallelogram, against the platform. All else is the distance of two hulls.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.exact.compiled import kernel
+from planner.exact.hulls import hulls_apart, hulls_distance
+from planner.exact.pieces import BOX, MESH, ROUND
+from planner.exact.segment_box import segment_box_squared
+from planner.exact.triangle_box import triangle_box_squared
+from planner.exact.triangle_point import triangle_point_squared
+from planner.exact.triangle_segment import triangle_segment_squared
+from planner.exact.vectors import Vector, minus, plus, row, turned
+from planner.exact.world import World
+
+Points = NDArray[np.float64]
+
+
+@kernel
+def cable_apart(world: World, piece: int, exit: Vector, b: Vector, c: Vector, needed: float) -> bool:
+    """Whether the triangle of an exit and two anchors is ``needed`` [m] from a piece's surface."""
+    kind = world.kinds[piece]
+    if kind == BOX or kind == ROUND:
+        return cable_squared(world, piece, exit, b, c) >= (needed + world.balls[piece]) ** 2
+    swept = np.empty((3, 3))
+    swept[0], swept[1], swept[2] = exit, b, c
+    return points_apart(world, piece, swept, needed)
+
+
+@kernel
+def platform_apart(world: World, piece: int, start: Vector, end: Vector, needed: float) -> bool:
+    """Whether the platform stays ``needed`` [m] from a piece's surface between two positions."""
+    if world.kinds[piece] == ROUND or world.sums[piece, 0] > 0.0:
+        return platform_squared(world, piece, start, end) >= (needed + world.balls[piece]) ** 2
+    return points_apart(world, piece, platform_points(world, start, end), needed)
+
+
+@kernel
+def cable_distance(
+    world: World, piece: int, exit: Vector, b: Vector, c: Vector, enough: float
+) -> float:
+    """Distance of the triangle to the piece's surface, [m]; 0 or less where they touch.
+
+    From ``enough`` on any value at least that is returned.
+    """
+    kind = world.kinds[piece]
+    if kind == BOX or kind == ROUND:
+        return np.sqrt(cable_squared(world, piece, exit, b, c)) - world.balls[piece]
+    swept = np.empty((3, 3))
+    swept[0], swept[1], swept[2] = exit, b, c
+    return points_distance(world, piece, swept, enough)
+
+
+@kernel
+def platform_distance(
+    world: World, piece: int, start: Vector, end: Vector, enough: float
+) -> float:
+    """Distance of the platform's way to the piece's surface, [m]; 0 or less where they touch.
+
+    From ``enough`` on any value at least that is returned.
+    """
+    if world.kinds[piece] == ROUND or world.sums[piece, 0] > 0.0:
+        return np.sqrt(platform_squared(world, piece, start, end)) - world.balls[piece]
+    return points_distance(world, piece, platform_points(world, start, end), enough)
+
+
+@kernel
+def cable_squared(world: World, piece: int, exit: Vector, b: Vector, c: Vector) -> float:
+    """Squared distance of a triangle to a box, or to the axis of a round piece, [m²]."""
+    if world.kinds[piece] == BOX:
+        frame, centre = world.frames[piece], row(world.centres, piece)
+        return triangle_box_squared(
+            turned(frame, minus(exit, centre)),
+            turned(frame, minus(b, centre)),
+            turned(frame, minus(c, centre)),
+            row(world.halves, piece),
+        )
+    first = world.first_point[piece]
+    if world.first_point[piece + 1] - first == 1:
+        return triangle_point_squared(exit, b, c, row(world.points, first))
+    ends = row(world.points, first), row(world.points, first + 1)
+    return triangle_segment_squared(exit, b, c, ends[0], ends[1])
+
+
+@kernel
+def platform_squared(world: World, piece: int, start: Vector, end: Vector) -> float:
+    """Squared distance of the platform's way to a parallel box or a round piece's axis, [m²]."""
+    if world.kinds[piece] == BOX:
+        frame, centre = world.frames[piece], row(world.centres, piece)
+        return segment_box_squared(
+            turned(frame, minus(start, centre)),
+            turned(frame, minus(end, centre)),
+            row(world.sums, piece),
+        )
+    first = world.first_point[piece]
+    last = world.first_point[piece + 1] - 1
+    half = (world.half[0], world.half[1], world.half[2])
+    a, b = _seen(world, first, start), _seen(world, first, end)
+    if first == last:
+        return segment_box_squared(a, b, half)
+    c, d = _seen(world, last, end), _seen(world, last, start)
+    return min(triangle_box_squared(a, b, c, half), triangle_box_squared(a, c, d, half))
+
+
+@kernel
+def _seen(world: World, point: int, position: Vector) -> Vector:
+    """A point of the world in the frame of the platform at a position."""
+    away, turn = minus(row(world.points, point), position), world.rotation
+    return (
+        turn[0, 0] * away[0] + turn[1, 0] * away[1] + turn[2, 0] * away[2],
+        turn[0, 1] * away[0] + turn[1, 1] * away[1] + turn[2, 1] * away[2],
+        turn[0, 2] * away[0] + turn[1, 2] * away[1] + turn[2, 2] * away[2],
+    )
+
+
+@kernel
+def platform_points(world: World, start: Vector, end: Vector) -> Points:
+    """The corners of the platform at two positions, shape (16, 3), [m]."""
+    swept = np.empty((16, 3))
+    place_corners(world, world.rotation, start, swept[:8])
+    place_corners(world, world.rotation, end, swept[8:])
+    return swept
+
+
+@kernel
+def place_corners(world: World, rotation: Points, position: Vector, corners: Points) -> None:
+    """Writes the corners of the platform at a pose into an array, shape (8, 3), [m]."""
+    for corner in range(8):
+        offset = (
+            world.half[0] if corner & 1 else -world.half[0],
+            world.half[1] if corner & 2 else -world.half[1],
+            world.half[2] if corner & 4 else -world.half[2],
+        )
+        corners[corner] = plus(position, turned(rotation, offset))
+
+
+@kernel
+def points_apart(world: World, piece: int, swept: Points, needed: float) -> bool:
+    """Whether the hull of points is ``needed`` [m] from a piece's surface."""
+    axis = _disc_axis(world, piece)
+    target = world.points[world.first_point[piece] : world.first_point[piece + 1]]
+    grown = needed + world.balls[piece]
+    if hulls_apart(swept, target, axis, world.discs[piece], grown):
+        return True
+    if world.kinds[piece] != MESH:
+        return False
+    for t in range(world.first_triangle[piece], world.first_triangle[piece + 1]):
+        triangle = world.triangles[t]
+        if not _boxed_apart(swept, triangle, needed):
+            if not hulls_apart(swept, triangle, axis, 0.0, needed):
+                return False
+    return True
+
+
+@kernel
+def points_distance(world: World, piece: int, swept: Points, enough: float) -> float:
+    """Distance of the hull of points to a piece's surface, [m]; see `cable_distance`."""
+    axis = _disc_axis(world, piece)
+    target = world.points[world.first_point[piece] : world.first_point[piece + 1]]
+    ball = world.balls[piece]
+    if world.kinds[piece] != MESH:
+        return _settled(swept, target, axis, world.discs[piece], enough + ball) - ball
+    low, _ = hulls_distance(swept, target, axis, 0.0, enough)
+    if low >= enough:
+        return low
+    least = enough
+    for t in range(world.first_triangle[piece], world.first_triangle[piece + 1]):
+        triangle = world.triangles[t]
+        if not _boxed_apart(swept, triangle, least):
+            least = min(least, _settled(swept, triangle, axis, 0.0, least))
+    return least
+
+
+@kernel
+def _settled(swept: Points, target: Points, axis: Vector, disc: float, enough: float) -> float:
+    """The distance of two hulls, or if that is at least ``enough``, something at least that."""
+    low, _ = hulls_distance(swept, target, axis, disc, enough)
+    if low >= enough:
+        return low
+    return hulls_distance(swept, target, axis, disc, np.inf)[0]
+
+
+@kernel
+def _disc_axis(world: World, piece: int) -> Vector:
+    frame = world.frames[piece]
+    return (frame[2, 0], frame[2, 1], frame[2, 2])
+
+
+@kernel
+def _boxed_apart(first: Points, second: Points, needed: float) -> bool:
+    """Whether the boxes about two sets of points, parallel to the axes, prove them apart."""
+    for axis in range(3):
+        low, high = first[0, axis], first[0, axis]
+        for i in range(1, len(first)):
+            low, high = min(low, first[i, axis]), max(high, first[i, axis])
+        other_low, other_high = second[0, axis], second[0, axis]
+        for i in range(1, len(second)):
+            other_low = min(other_low, second[i, axis])
+            other_high = max(other_high, second[i, axis])
+        if other_low - high >= needed or low - other_high >= needed:
+            return True
+    return False
