@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import can
 import numpy as np
 
-from cdpr.errors import Fault, HardwareMissing, Refused
+from cdpr.errors import HardwareMissing, Refused
 from cdpr.rig import Rig
-from drivers.bus import take, transmit
 from drivers.bus_load import check_bus_load, heartbeat_cycles
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.frames import (
-    HEARTBEAT_BASE,
-    MASTER_NODE,
-    RPDO1_BASE,
-    SYNC_ID,
-    NmtState,
-    make_heartbeat,
-    make_set_point,
-    make_sync,
-)
+from drivers.cia402.cyclic import CyclicBus
 from drivers.cia402.sequence import Goal, next_words
 from drivers.cia402.states import FAULTED, TORQUE_ON, ControlWord, DriveState
 from drivers.cia402.watch import DriveWatch
@@ -59,11 +48,7 @@ class Cia402Group:
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
-        rest = make_set_point(ControlWord.QUICK_STOP, 0)
-        self._set_points = [_frame(RPDO1_BASE + node, rest) for node in self._nodes]
-        self._sync = _frame(SYNC_ID, make_sync())
-        alive = make_heartbeat(NmtState.OPERATIONAL)
-        self._heartbeat = _frame(HEARTBEAT_BASE + MASTER_NODE, alive)
+        self._cyclic = CyclicBus(bus, self._nodes)
         self._state = GroupState.OFFLINE
         self._reset_memory()
 
@@ -136,7 +121,7 @@ class Cia402Group:
     def send_cycle(self, targets: Sequence[int]) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
-        self._discard_stale()
+        self._cyclic.discard_stale(self._watch)
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._released)
         self._demands = self._targets if self._known else list(self._watch.positions)
@@ -146,11 +131,11 @@ class Cia402Group:
             # Not under power, or held by the drives themselves: the targets follow the drives.
             # Once enabling has begun they stay, so that a sagging drive is not followed down.
             self._targets = list(self._watch.positions)
-        self._send_batch(words)
+        self._send(words)
         self._known = True
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
-            transmit(self._bus, self._heartbeat)
+            self._cyclic.send_heartbeat()
 
     def receive(self, timeout_s: float) -> CycleStatus:
         """Takes the replies of this cycle; see `DriveGroup.receive`."""
@@ -158,7 +143,7 @@ class Cia402Group:
         if self._pump is not None:
             self._pump()
             timeout_s = 0.0
-        self._take_replies(timeout_s)
+        self._cyclic.take_replies(self._watch, timeout_s)
         self._watch.end_cycle()
         self._look_for_faults()
         self._advance()
@@ -179,7 +164,7 @@ class Cia402Group:
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
         self._stop()  # first: whatever the bus does now, no later cycle enables the drives again
-        self._send_batch((ControlWord.QUICK_STOP,) * len(self._nodes))
+        self._send((ControlWord.QUICK_STOP,) * len(self._nodes))
 
     def close(self) -> None:
         """Lets go of the bus without sending anything."""
@@ -193,21 +178,12 @@ class Cia402Group:
                 next_step="call configure() first",
             )
 
-    def _send_batch(self, words: tuple[ControlWord, ...]) -> None:
-        """One set-point a drive, then SYNC. A frame that fails does not hold up the others."""
+    def _send(self, words: tuple[ControlWord, ...]) -> None:
+        """One cycle's frames; what was asked for is remembered even if the bus fails."""
         self._words = words
         self._note_released()
         self._watch.begin_cycle()
-        for message, word, target in zip(self._set_points, words, self._targets, strict=True):
-            message.data = bytearray(make_set_point(word, target))
-        failure: Fault | None = None
-        for message in (*self._set_points, self._sync):
-            try:
-                transmit(self._bus, message)
-            except Fault as error:
-                failure = failure or error
-        if failure is not None:
-            raise failure
+        self._cyclic.send_cycle(words, self._targets)
 
     def _note_released(self) -> None:
         for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):
@@ -215,23 +191,6 @@ class Cia402Group:
                 self._released[drive] = False
             elif word is ControlWord.QUICK_STOP:
                 self._released[drive] = True
-
-    def _discard_stale(self) -> None:
-        """Replies that came too late for their cycle are thrown away, never used as new ones."""
-        while (message := take(self._bus, 0.0)) is not None:
-            if _is_data(message):
-                self._watch.take(message.arbitration_id, message.data, stale=True)
-
-    def _take_replies(self, timeout: float) -> None:
-        deadline = time.monotonic() + timeout
-        left = timeout
-        while not self._watch.complete:
-            message = take(self._bus, max(0.0, left))
-            if message is None:
-                return
-            if _is_data(message):
-                self._watch.take(message.arbitration_id, message.data)
-            left = deadline - time.monotonic()
 
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.POWER_OFF)
@@ -353,14 +312,6 @@ class Cia402Group:
         if self._state is GroupState.FAULT:
             self._goal = Goal.RESET_FAULT if faulted else Goal.STOP
             self._state = GroupState.CONFIGURED if faulted else GroupState.QUICK_STOP
-
-
-def _frame(can_id: int, data: bytes) -> can.Message:
-    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
-
-
-def _is_data(message: can.Message) -> bool:
-    return not (message.is_extended_id or message.is_error_frame or message.is_remote_frame)
 
 
 def _is_off(state: DriveState) -> bool:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from cdpr.errors import Fault, HardwareMissing, Refused
 from drivers.cia402.objects import settings_for
-from drivers.cia402.states import DriveState
+from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.states import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
 from tests.drivers.drive_bench import Bench
 
@@ -62,7 +63,10 @@ class TestFromSetUpToPowerOff:
         bench.before_cycle()
         bench.group.quick_stop_now()
         bench.group.receive(5.0)  # replies of the stop's own SYNC
-        assert [d.state for d in bench.drives] == [HOLDING] * 8
+        network = SetupNetwork(bench.group._bus, None)
+        for node in range(1, 9):
+            word = network.client(node).read(0x6041, 0, "status word")
+            assert state_of(int.from_bytes(word, "little")) is HOLDING
         assert bench.group.state is GroupState.QUICK_STOP
 
 
