@@ -12,6 +12,7 @@ import select
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 
 from cdpr.errors import CdprError, Fault
@@ -51,7 +52,14 @@ class CameraProcess:
         self._process = context.Process(
             target=_serve, args=(make_observer, far_end), name="cdpr-camera", daemon=True
         )
-        self._process.start()
+        # Ctrl-C reaches every process of the terminal; when to end is this process's decision, even
+        # while the other one still loads its libraries. A blocked signal stays blocked there.
+        resource_tracker.ensure_running()  # on its own first start it would unblock the signal
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         far_end.close()
         try:
             if not self._link.poll(START_TIMEOUT):
@@ -116,9 +124,6 @@ class CameraProcess:
 
 def _serve(make_observer: MakeObserver, link: Connection) -> None:
     """The process: a picture a trigger, then all answers at once."""
-    # Ctrl-C reaches every process of the terminal; when to end is the parent's decision.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         with make_observer() as observer:
             link.send(0)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpr.errors import Refused
+from cdpr.errors import Fault, Refused
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
@@ -108,6 +108,7 @@ class Loop:
         self._armed = False
         self._cycle = 0
         self._told: set[str] = set()
+        self.cause = ""
 
     def read_actual(self) -> Array:
         """Positions of all drives before anything is enabled, shape (m,), [counts].
@@ -149,10 +150,10 @@ class Loop:
             self.machine.on(Event.ENABLE)
             while self.machine.state in _ACTIVE:
                 self._one_step()
-        except BaseException:
-            # Whatever broke: stop first, tell afterwards.
-            self._group.quick_stop_now()
+        except BaseException as error:
             self.machine.on(Event.FAULT)
+            self._stop_drives()
+            self._tell_cause("broken", f"the run broke: {error}")
             raise
         return self.machine.state
 
@@ -291,7 +292,7 @@ class Loop:
         for finding in findings:
             self._react(finding)
         if self._stop_requested() and self.machine.state in _STOPPABLE:
-            self._tell("stop", "stop requested; slowing down along the path")
+            self._tell_cause("stop", "stop requested; slowing down along the path")
             self._feed.stop()
             self.machine.on(Event.STOP)
 
@@ -301,7 +302,8 @@ class Loop:
         if finding.reaction is Reaction.NOTE:
             self._tell(finding.code, finding.text)
         elif finding.reaction is Reaction.PATH_STOP and self.machine.state in _ON_PATH:
-            self._tell(finding.code, f"{finding.text}; stopping along the path")
+            if self.machine.state is State.MOVING:
+                self._tell_cause(finding.code, f"{finding.text}; stopping along the path")
             self._feed.stop()
             self.machine.on(Event.PATH_FAULT)
         else:
@@ -309,10 +311,17 @@ class Loop:
 
     def _fault(self, code: str, text: str) -> None:
         """Quick stop for all drives at once, latched."""
-        self._group.quick_stop_now()
         self.machine.on(Event.FAULT)
-        self._tell(code, f"{text}; quick stop of all drives, fault latched")
+        self._stop_drives()
+        self._tell_cause(code, f"{text}; quick stop of all drives, fault latched")
         self._drain()
+
+    def _stop_drives(self) -> None:
+        """Sends the stop; on a dead bus the drives stop by themselves, as nothing reaches them."""
+        try:
+            self._group.quick_stop_now()
+        except Fault as error:
+            self._tell("stop_not_sent", f"{error.what}; the drives stop when they miss the master")
 
     def _drain(self) -> None:
         """A few more cycles, so that what the drives do during a quick stop is on record."""
@@ -324,6 +333,11 @@ class Loop:
             status = self._group.receive(self._clock.time_left())
             self._actual = tuple(int(p) for p in status.positions)
             self._record(status, self._following_errors(status), lateness)
+
+    def _tell_cause(self, code: str, text: str) -> None:
+        """Tells why the run does not finish; the first cause is kept."""
+        self.cause = self.cause or text
+        self._tell(code, text)
 
     def _tell(self, code: str, text: str) -> None:
         """Once for the same sentence."""

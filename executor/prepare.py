@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -65,10 +66,7 @@ def _keeps_clearance(rig: Rig, scene: Scene) -> IsAllowed:
 
     def is_allowed(poses: Sequence[Pose]) -> bool:
         reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
-        half_way = 0.5 * max(
-            a.distance_to(b) + reach * a.angle_to(b)
-            for a, b in zip(poses[:-1], poses[1:], strict=True)
-        )
+        half_way = 0.5 * max(a.distance_to(b) + reach * a.angle_to(b) for a, b in pairwise(poses))
         for pose in poses:
             near = model.smallest(pose)
             if near is not None and near.distance < scene.obstacle_clearance + half_way:

@@ -41,12 +41,14 @@ class Outcome:
 
     Attributes:
         state: Where the run ended.
+        cause: Why it did not finish, if it did not.
         log: Its cycles.
         started: When, UTC.
         error: What broke the loop itself, if anything did.
     """
 
     state: State
+    cause: str
     log: RunLog
     started: datetime
     error: BaseException | None
@@ -124,8 +126,7 @@ class Execution:
                     self.loop.run()
         except Exception as broken:  # the drives were stopped; what is known is still recorded
             error = broken
-            self._on_event(LoopEvent(len(self._log), "broken", f"the run broke: {broken}"))
-        return Outcome(self.loop.machine.state, self._log, started, error)
+        return Outcome(self.loop.machine.state, self.loop.cause, self._log, started, error)
 
     def _on_cycle(self, record: CycleRecord) -> None:
         self._log.add(record)
@@ -177,6 +178,7 @@ def conclude(
         final_state=outcome.state.value,
         events=tuple(folder.events()),
         versions=versions(),
+        cause=outcome.cause,
     )
     summary = summarize(context, cycles, poses, clearance)
     folder.write_summary(summary)

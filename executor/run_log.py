@@ -10,13 +10,7 @@ from cdpr.poses import Array, quaternion_from_matrix
 from cdpr.rig import Rig
 from executor.cycle_table import CycleTable
 from executor.loop import CycleRecord
-from executor.machine import State
 from executor.setpoints import CheckedTable
-
-#: In these states the drives' torques are the cables' tensions.
-_UNDER_TENSION = frozenset(
-    {State.APPROACHING, State.MOVING, State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED}
-)
 
 
 class RunLog:
@@ -44,7 +38,8 @@ class RunLog:
         actual = _matrix([r.actual for r in records], rig.cable_count)
         rated = np.array([w.torque_constant for w in rig.winches])
         tensions = _matrix([r.torques for r in records], rig.cable_count) / 1000.0 * rated
-        taut = np.array([r.state in _UNDER_TENSION for r in records], dtype=bool)
+        # Only drives that follow their set-points tell the cables' tensions by their torques.
+        taut = np.isfinite([r.following_error for r in records])
         stretch = np.where(taut[:, None], tensions, planned.tensions[rows])
         winches = self._checked.winches
         lengths = winches.strained(

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from cdpr.rig_file import RigDocument
     from cdpr.scene import Scene
     from cdpr.scene_file import SceneDocument
-    from executor.camera_process import CameraProcess
     from drivers.cameras import LiveCamera
+    from executor.camera_process import CameraProcess
     from executor.observer import Observer, PictureSource
     from simulation.camera import SyntheticCamera
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
+    from cdpr.scene import Load
     from drivers.drive_group import DriveGroup
 
 #: python-can's interface inside one process; with it the drives are simulated here.
@@ -32,12 +33,13 @@ class Drives:
 
 
 @contextmanager
-def open_drives(rig: Rig, simulated_start: Pose) -> Iterator[Drives]:
+def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]:
     """Opens the bus and configures the drives; closes both at the end.
 
     Args:
         rig: The robot and its bus.
         simulated_start: Where the platform stands when the drives are simulated here.
+        load: What it carries then.
 
     Raises:
         BadInput: python-can has no such interface.
@@ -57,7 +59,7 @@ def open_drives(rig: Rig, simulated_start: Pose) -> Iterator[Drives]:
 
             far_end = open_bus(settings)
             stack.callback(far_end.shutdown)
-            rehearsal = Rehearsal(rig, far_end, simulated_start)
+            rehearsal = Rehearsal(rig, far_end, simulated_start, load)
             pump, true_pose = rehearsal.pump, lambda: rehearsal.pose
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,21 +13,21 @@ if TYPE_CHECKING:
     from cdpr.scene import Scene
 
 
-class PlannerName(str, Enum):
+class PlannerName(StrEnum):
     """How samples are drawn."""
 
     adaptive = "adaptive"
     goal_bias = "goal-bias"
 
 
-class CostName(str, Enum):
+class CostName(StrEnum):
     """What makes a path good."""
 
     kinematic = "kinematic"
     length = "length"
 
 
-class ModeName(str, Enum):
+class ModeName(StrEnum):
     """How far the search goes."""
 
     rewire = "rewire"

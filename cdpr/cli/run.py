@@ -58,6 +58,7 @@ def run(
     from cdpr.cli.cameras import choose_camera
     from cdpr.cli.drives import IN_PROCESS
     from cdpr.cli.run_summary import show_prepared, show_summary
+    from cdpr.errors import StoppedByOperator
     from executor.run_folder import RunFolder
 
     the_rig = rig_on_bus(rig, interface, channel)
@@ -68,8 +69,8 @@ def run(
     prepared = prepared_run(plan, the_rig, quiet=as_json)
     if not as_json:
         show_prepared(prepared, in_process)
-    if not (in_process or yes):
-        typer.confirm("Move the platform now?", abort=True)
+    if not (in_process or yes) and not typer.confirm("Move the platform now?"):
+        raise StoppedByOperator("nothing was moved")
     summary = run_prepared(prepared, output, camera_name, fast=fast, start=start, quiet=as_json)
     show_summary(summary, output, as_json)
     raise typer.Exit(exit_code(summary))
@@ -154,6 +155,7 @@ def run_prepared(
     from cdpr.cli.cameras import open_camera
     from cdpr.cli.drives import IN_PROCESS, open_drives
     from cdpr.cli.output import spinner
+    from cdpr.errors import StoppedByOperator
     from executor.clock import RealClock, SimulatedClock
     from executor.run import Execution, conclude
     from executor.run_folder import RunFolder
@@ -168,13 +170,15 @@ def run_prepared(
             stop_requests() as stop_requested,
             announced(),
             open_camera(rig, scene, camera_name, output, pictures, fast) as camera,
-            open_drives(rig, start or scene.start) as drives,
+            open_drives(rig, start or scene.start, scene.load) as drives,
         ):
             clock = SimulatedClock() if fast else RealClock(prepared.checked.table.cycle)
             execution = Execution(
                 prepared, drives.group, clock, stop_requested=stop_requested, pump=drives.pump
             )
             execution.loop.arm()
+            if stop_requested():
+                raise StoppedByOperator("stopped before anything moved")
             moved = True
             outcome, looks = _move(execution, folder, camera, drives.true_pose, quiet)
     finally:

@@ -10,6 +10,7 @@ import typer
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
+    from cdpr.scene import Load
 
 
 def sim(
@@ -23,7 +24,7 @@ def sim(
         typer.Option("--at-mm", help="where the platform stands: x y z (default: home)"),
     ] = None,
     plan: Annotated[
-        Path | None, typer.Option(help="put the platform at the start of this plan")
+        Path | None, typer.Option(help="put the platform at the start of this plan, with its load")
     ] = None,
 ) -> None:
     """Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.
@@ -53,10 +54,10 @@ def sim(
             why="`cdpr run` simulates the drives itself on that interface",
             next_step="pass --interface udp_multicast, or socketcan with a vcan channel",
         )
-    pose = _start(the_rig, start_mm, plan)
+    pose, load = _start(the_rig, start_mm, plan)
     bus = open_bus(BusSettings.of(the_rig))
     try:
-        rehearsal = Rehearsal(the_rig, bus, pose)
+        rehearsal = Rehearsal(the_rig, bus, pose, load)
         x, y, z = pose.position * 1000.0
         out.print(
             f"{the_rig.cable_count} simulated drives of {the_rig.name} on"
@@ -72,7 +73,10 @@ def sim(
     out.print("the simulated drives are gone")
 
 
-def _start(rig: Rig, start_mm: tuple[float, float, float] | None, plan: Path | None) -> Pose:
+def _start(
+    rig: Rig, start_mm: tuple[float, float, float] | None, plan: Path | None
+) -> tuple[Pose, Load | None]:
+    """Where the platform stands, and what it carries."""
     from cdpr.document_types import millimetres
     from cdpr.errors import BadInput
     from cdpr.plan import load_plan
@@ -81,5 +85,6 @@ def _start(rig: Rig, start_mm: tuple[float, float, float] | None, plan: Path | N
     if start_mm is not None and plan is not None:
         raise BadInput("--at-mm and --plan contradict each other")
     if plan is not None:
-        return load_plan(plan).scene.start
-    return rig.home if start_mm is None else Pose.level(millimetres(list(start_mm)))
+        scene = load_plan(plan).scene
+        return scene.start, scene.load
+    return (rig.home if start_mm is None else Pose.level(millimetres(list(start_mm)))), None

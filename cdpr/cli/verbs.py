@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import typer
 
 from cdpr.cli.check import check
@@ -13,6 +16,7 @@ from cdpr.cli.run import run
 from cdpr.cli.sim import sim
 from cdpr.cli.stop import stop
 from cdpr.cli.track import track
+from cdpr.errors import StoppedByOperator
 
 VERBS = (demo, plan, check, run, stop, track, sim, report, doctor)
 
@@ -20,4 +24,17 @@ VERBS = (demo, plan, check, run, stop, track, sim, report, doctor)
 def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
-        app.command()(verb)
+        app.command()(_interruptible(verb))
+
+
+def _interruptible(verb: Callable[..., None]) -> Callable[..., None]:
+    """Ctrl-C where no run is going on is the operator's stop too, with its exit code."""
+
+    @functools.wraps(verb)
+    def guarded(*args: object, **options: object) -> None:
+        try:
+            verb(*args, **options)
+        except KeyboardInterrupt:
+            raise StoppedByOperator("interrupted") from None
+
+    return guarded

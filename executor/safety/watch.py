@@ -118,11 +118,10 @@ class Watch:
     def _replies(self, seen: Observation) -> list[Finding]:
         found = [Finding(Reaction.QUICK_STOP, "drive_fault", text) for text in seen.faults]
         for drive, count in enumerate(self.missing, start=1):
+            text = f"drive {drive} did not answer for {count} cycle{'s' if count > 1 else ''}"
             if count >= self.limits.missing_cycles:
-                text = f"drive {drive} did not answer for {count} cycles"
                 found.append(Finding(Reaction.QUICK_STOP, "drive_silent", text))
             elif count:
-                text = f"drive {drive} did not answer for {count} cycle"
                 found.append(Finding(Reaction.NOTE, "reply_lost", text))
         return found
 
