@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, Tag
+from cdpr.rig import Camera, Rig, Tag
 from cdpr.scene import Scene
 from cdpr.shapes import Obstacle
 from simulation.camera_canvas import SAMPLES, Canvas, Image32, draw_quad, draw_triangles
@@ -49,13 +49,28 @@ def draw_tag(
     world_from_tag = world_from_carrier.compose(tag.pose)
     camera_from_tag = camera_from_world.compose(world_from_tag)
     modules = modules_across(family)
-    distance = max(0.05, float(camera_from_tag.position[2]))
-    module_px = canvas.camera.matrix[0, 0] * tag.size / modules / distance
-    # Texels as large as samples: interpolation then blurs an edge over one sample, evenly.
-    texels = int(np.clip(round(module_px * SAMPLES), 2, 64))
+    across, down = _texels(canvas.camera, camera_from_tag, tag.size / modules)
     light = np.float32(shade(world_from_tag.rotation[:, 2]))
     half = tag.size * (modules + 2) / modules / 2.0
-    draw_quad(canvas, camera_from_tag, (half, half), light * tag_print(family, tag.id, texels))
+    draw_quad(
+        canvas, camera_from_tag, (half, half), light * tag_print(family, tag.id, across, down)
+    )
+
+
+def _texels(camera: Camera, camera_from_tag: Pose, module: float) -> tuple[int, int]:
+    """Texels for a module's width and height, as wide as samples where the tag is seen.
+
+    Interpolation between them then blurs an edge over one sample, and 2 x 2 samples show its place
+    without a bias that would hang on where it lies between the samples.
+    """
+    centre, rotation = camera_from_tag.position, camera_from_tag.rotation
+    depth = max(0.05, float(centre[2]))
+    focal = camera.matrix[[0, 1], [0, 1]] * SAMPLES * module / depth
+    right, up = ((rotation[:2, i] - centre[:2] / depth * rotation[2, i]) * focal for i in (0, 1))
+    area = abs(float(right[0] * up[1] - right[1] * up[0]))
+    width = area / max(1e-9, float(np.linalg.norm(up)))  # across the module's upright edges
+    height = area / max(1e-9, float(np.linalg.norm(right)))
+    return int(np.clip(round(width), 1, 64)), int(np.clip(round(height), 1, 64))
 
 
 def _placed(surface: Surface, obstacle: Obstacle) -> Surface:

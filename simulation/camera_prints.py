@@ -25,17 +25,18 @@ def modules_across(family: str) -> int:
 
 
 @lru_cache(maxsize=256)
-def tag_print(family: str, number: int, texels: int) -> Image32:
+def tag_print(family: str, number: int, across: int, down: int) -> Image32:
     """A tag with one module of white around it, upright as the AprilTag project draws it.
 
     Args:
         family: Such as ``tag36h11``.
         number: Number in the family.
-        texels: Texels along the side of a module.
+        across: Texels along the upper side of a module.
+        down: Texels along its left side.
     """
     dictionary = cv2.aruco.getPredefinedDictionary(FAMILIES[family])
     modules = modules_across(family)
     picture = cv2.aruco.generateImageMarker(dictionary, number, modules)
     upright = np.pad(picture[::-1, ::-1], 1, constant_values=255)  # OpenCV's stand on their head
     print_: Image32 = np.where(upright > 127, PAPER, INK).astype(np.float32)
-    return print_.repeat(texels, axis=0).repeat(texels, axis=1)
+    return print_.repeat(down, axis=0).repeat(across, axis=1)

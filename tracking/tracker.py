@@ -296,7 +296,7 @@ def _without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView]
     errors = bundle.edge_errors
     measured = np.array([view.seen.edges for view in views])
     usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # of two normal errors
-    off = measured & (errors > 6.0 * usual)
+    off = measured & (errors > 4.5 * usual)
     if not off.any():
         return None
     kept = []
