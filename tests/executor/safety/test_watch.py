@@ -1,0 +1,277 @@
+"""The watch: silent within the limits, loud one step beyond, and never fooled by NaN or gaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from executor.safety.watch import Finding, Observation, Reaction, Watch, WatchLimits
+
+NAN = float("nan")
+LIMITS = WatchLimits(following_error=0.002, min_tension=5.0, max_tension=100.0)
+FINE = Observation(
+    following=True,
+    following_errors=(0.0, 0.0, 0.0),
+    tensions=(20.0, 20.0, 20.0),
+    missing=(False, False, False),
+    faults=(),
+    lateness=0.0,
+)
+each_drive = pytest.mark.parametrize("drive", range(3))
+
+
+def _put(values: tuple[object, ...], drive: int, value: object) -> tuple[object, ...]:
+    return (*values[:drive], value, *values[drive + 1 :])
+
+
+def _look(*cycles: Observation) -> tuple[Finding, ...]:
+    """What is found in the last of some cycles."""
+    watch, found = Watch.fresh(LIMITS, 3), ()
+    for seen in cycles:
+        watch, found = watch.look(seen)
+    return found
+
+
+def _codes(*cycles: Observation) -> list[tuple[str, Reaction]]:
+    return [(finding.code, finding.reaction) for finding in _look(*cycles)]
+
+
+def _with(field: str, drive: int, value: object) -> Observation:
+    return replace(FINE, **{field: _put(getattr(FINE, field), drive, value)})
+
+
+def test_nothing_is_found_while_all_is_well():
+    assert _look(*[FINE] * 20) == ()
+
+
+def test_the_larger_reaction_has_the_larger_number():
+    assert [Reaction.NOTE, Reaction.PATH_STOP, Reaction.QUICK_STOP] == [0, 1, 2]
+
+
+def test_limits_have_the_values_of_the_stop_rules():
+    assert (LIMITS.slack_cycles, LIMITS.missing_cycles, LIMITS.late_periods) == (5, 2, 2.0)
+
+
+def test_one_lost_reply_is_noted_and_two_in_a_row_stop():
+    lost = _with("missing", 1, True)
+    (note,) = _look(lost)
+    assert note == Finding(Reaction.NOTE, "reply_lost", "drive 2 did not answer for 1 cycle")
+    (stop,) = _look(lost, lost)
+    assert stop == Finding(
+        Reaction.QUICK_STOP, "drive_silent", "drive 2 did not answer for 2 cycles"
+    )
+    assert _codes(lost, FINE, lost) == [("reply_lost", Reaction.NOTE)]
+    assert _codes(lost, FINE) == []
+    assert "3 cycles" in _look(lost, lost, lost)[0].text
+
+
+@each_drive
+def test_replies_are_counted_for_each_drive_alone(drive):
+    others = [d for d in range(3) if d != drive]
+    assert _codes(_with("missing", others[0], True), _with("missing", drive, True)) == [
+        ("reply_lost", Reaction.NOTE)
+    ]
+    assert f"drive {drive + 1} " in _look(_with("missing", drive, True))[0].text
+
+
+def test_a_watch_may_be_told_to_wait_longer_for_replies():
+    patient = replace(LIMITS, missing_cycles=4)
+    watch, lost = Watch.fresh(patient, 3), _with("missing", 0, True)
+    found = []
+    for _ in range(5):
+        watch, (finding,) = watch.look(lost)
+        found.append(finding)
+    assert [f.reaction for f in found] == [Reaction.NOTE] * 3 + [Reaction.QUICK_STOP] * 2
+    assert [f.text.split(" for ")[1] for f in found[:2]] == ["1 cycle", "2 cycles"]
+
+
+def test_every_fault_that_drives_report_stops_at_once():
+    seen = replace(FINE, following=False, faults=("node 3: over-current", "node 4: hot"))
+    assert _look(seen) == (
+        Finding(Reaction.QUICK_STOP, "drive_fault", "node 3: over-current"),
+        Finding(Reaction.QUICK_STOP, "drive_fault", "node 4: hot"),
+    )
+
+
+@each_drive
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_following_error_may_be_the_limit_and_not_more(drive, sign):
+    assert _look(_with("following_errors", drive, sign * 0.002)) == ()
+    (found,) = _look(_with("following_errors", drive, sign * 0.00201))
+    assert (found.reaction, found.code) == (Reaction.QUICK_STOP, "following_error")
+    assert found.text == (
+        f"cable {drive + 1} is {sign * 2.01:.2f} mm from its set-point, allowed 2.00 mm"
+    )
+
+
+def test_a_following_error_is_told_in_millimetres():
+    wide = Watch.fresh(replace(LIMITS, following_error=0.5), 3)
+    (found,) = wide.look(_with("following_errors", 0, 2.5))[1]
+    assert found.text == "cable 1 is 2500.00 mm from its set-point, allowed 500.00 mm"
+
+
+@each_drive
+@pytest.mark.parametrize("value", [NAN, float("inf"), -float("inf")])
+def test_a_following_error_that_is_no_number_stops(drive, value):
+    assert _codes(_with("following_errors", drive, value)) == [
+        ("following_error", Reaction.QUICK_STOP)
+    ]
+
+
+@each_drive
+@pytest.mark.parametrize(
+    ("tension", "code"),
+    [(4.99, "slack"), (-3.0, "slack"), (0.0, "slack"), (100.01, "over_tension")],
+)
+def test_five_cycles_of_wrong_tension_in_a_row_stop_along_the_path(drive, tension, code):
+    wrong = _with("tensions", drive, tension)
+    assert _codes(*[wrong] * 4) == []
+    assert _codes(*[wrong] * 5) == [(code, Reaction.PATH_STOP)]
+    assert _codes(*[wrong] * 6) == [(code, Reaction.PATH_STOP)]
+    assert _codes(*[wrong] * 4, FINE, *[wrong] * 4) == []
+    (found,) = _look(*[wrong] * 5)
+    assert found.text.startswith(f"cable {drive + 1} carries {tension:.1f} N, ")
+    ending = {
+        "slack": "less than 5.0 N: it may be slack",
+        "over_tension": "more than 100.0 N",
+    }
+    assert found.text.endswith(ending[code])
+
+
+@each_drive
+@pytest.mark.parametrize("tension", [5.0, 100.0])
+def test_the_limits_of_tension_themselves_are_allowed(drive, tension):
+    assert _look(*[_with("tensions", drive, tension)] * 9) == ()
+
+
+@each_drive
+def test_a_tension_that_is_no_number_is_slack_and_over_tension(drive):
+    assert _codes(*[_with("tensions", drive, NAN)] * 5) == [
+        ("slack", Reaction.PATH_STOP),
+        ("over_tension", Reaction.PATH_STOP),
+    ]
+
+
+@each_drive
+def test_wrong_tensions_of_different_cables_do_not_add_up(drive):
+    others = [d for d in range(3) if d != drive]
+    cycles = [_with("tensions", d, 0.0) for d in (drive, *others, drive, *others)]
+    assert _look(*cycles) == ()
+
+
+def test_slack_and_over_tension_are_counted_apart():
+    low, high = _with("tensions", 0, 0.0), _with("tensions", 0, 200.0)
+    assert _look(*[low, high] * 5) == ()
+
+
+def test_a_silent_drive_neither_resets_nor_adds_to_its_count_of_slack():
+    low = _with("tensions", 1, 0.0)
+    silent_low = replace(low, missing=(False, True, False))
+    silent_fine = replace(FINE, missing=(False, True, False))
+    assert [c for c, _ in _codes(*[low] * 4, silent_low)] == ["reply_lost"]
+    assert [c for c, _ in _codes(*[low] * 4, silent_fine)] == ["reply_lost"]
+    assert _codes(*[low] * 4, silent_fine, low) == [("slack", Reaction.PATH_STOP)]
+    high = _with("tensions", 1, 200.0)
+    assert _codes(*[high] * 4, silent_fine, high) == [("over_tension", Reaction.PATH_STOP)]
+
+
+@pytest.mark.parametrize("field", ["following_errors", "tensions"])
+def test_drives_that_do_not_follow_are_not_judged_by_errors_and_tensions(field):
+    seen = replace(_with(field, 0, NAN), following=False)
+    assert _look(*[seen] * 9) == ()
+    assert [c for c, _ in _codes(*[seen] * 9, replace(seen, faults=("x",)))] == ["drive_fault"]
+    lost = replace(seen, missing=(True, False, False))
+    assert _codes(lost, lost) == [("drive_silent", Reaction.QUICK_STOP)]
+
+
+def test_slack_before_the_drives_follow_does_not_count():
+    low = _with("tensions", 0, 0.0)
+    resting = replace(low, following=False)
+    assert _look(*[low] * 4, resting, *[low] * 4) == ()
+
+
+@pytest.mark.parametrize(
+    ("lateness", "reaction"),
+    [
+        (0.0, None),
+        (1.0, None),
+        (1.001, Reaction.NOTE),
+        (2.0, Reaction.NOTE),
+        (2.001, Reaction.PATH_STOP),
+        (1e9, Reaction.PATH_STOP),
+        (NAN, Reaction.PATH_STOP),
+    ],
+)
+def test_a_late_cycle_is_noted_and_a_very_late_one_stops(lateness, reaction):
+    found = _look(replace(FINE, lateness=lateness))
+    if reaction is None:
+        assert found == ()
+        return
+    assert found == (Finding(reaction, "late", f"a cycle began {lateness:.1f} cycles late"),)
+
+
+def test_a_lateness_before_its_time_is_nothing():
+    assert _look(replace(FINE, lateness=-0.5)) == ()
+
+
+def test_everything_is_told_at_once_gravest_first():
+    seen = Observation(
+        following=True,
+        following_errors=(0.0, 0.1, 0.0),
+        tensions=(20.0, 20.0, 0.0),
+        missing=(True, False, False),
+        faults=("node 1: hot",),
+        lateness=3.0,
+    )
+    low = _with("tensions", 2, 0.0)
+    assert [code for code, _ in _codes(*[low] * 4, seen)] == [
+        "drive_fault",
+        "reply_lost",
+        "following_error",
+        "slack",
+        "late",
+    ]
+
+
+@pytest.mark.parametrize("field", ["following_errors", "tensions", "missing"])
+@pytest.mark.parametrize("count", [0, 2, 4])
+def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
+    """A row that is too short would hide the last drive."""
+    values = (getattr(FINE, field) * 2)[:count]
+    with pytest.raises(ValueError, match="entries for 3 drives"):
+        Watch.fresh(LIMITS, 3).look(replace(FINE, **{field: values}))
+
+
+@given(
+    cycles=st.lists(
+        st.tuples(st.booleans(), st.sampled_from([0.0, 20.0, 200.0]), st.booleans()), max_size=30
+    )
+)
+def test_counts_are_runs_of_what_was_seen(cycles):
+    """Against counting by hand, for one drive."""
+    watch = Watch.fresh(LIMITS, 1)
+    missing = slack = over = 0
+    for following, tension, lost in cycles:
+        seen = Observation(following, (0.0,), (tension,), (lost,), (), 0.0)
+        watch, found = watch.look(seen)
+        missing = missing + 1 if lost else 0
+        if not lost:
+            slack = slack + 1 if following and tension < 5.0 else 0
+            over = over + 1 if following and tension > 100.0 else 0
+        assert (watch.missing, watch.slack, watch.over) == ((missing,), (slack,), (over,))
+        wanted = {
+            "drive_silent": missing >= 2,
+            "reply_lost": missing == 1,
+            "slack": slack >= 5,
+            "over_tension": over >= 5,
+        }
+        assert {f.code for f in found} == {code for code, due in wanted.items() if due}
+
+
+def test_looking_leaves_the_watch_before_unchanged():
+    watch = Watch.fresh(LIMITS, 3)
+    watch.look(_with("missing", 0, True))
+    assert watch == Watch.fresh(LIMITS, 3)

@@ -1,0 +1,105 @@
+"""The clock: late cycles delay the path and never bunch; small delays do not add up."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from executor import clock
+from executor.clock import RealClock, SimulatedClock
+
+CYCLE = 0.01
+CYCLE_NS = 10_000_000
+
+
+class _Time:
+    """A monotonic clock that is moved by hand; sleeping overshoots by a given time."""
+
+    def __init__(self) -> None:
+        self.now = 5_000_000_000
+        self.overshoot = 0
+        self.slept: list[int] = []
+
+    def monotonic_ns(self) -> int:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds > 0
+        self.slept.append(round(seconds * 1e9))
+        self.now += round(seconds * 1e9) + self.overshoot
+
+    def work(self, seconds: float) -> None:
+        self.now += round(seconds * 1e9)
+
+
+@pytest.fixture
+def time(monkeypatch: pytest.MonkeyPatch) -> _Time:
+    hand_moved = _Time()
+    monkeypatch.setattr(clock, "time", hand_moved)
+    return hand_moved
+
+
+def test_simulated_time_costs_nothing_and_is_never_late():
+    simulated = SimulatedClock()
+    assert simulated.simulated
+    assert (simulated.next_cycle(), simulated.time_left()) == (0.0, 0.0)
+
+
+def test_cycles_begin_on_time_whatever_the_work_takes(time):
+    real = RealClock(CYCLE)
+    assert not real.simulated
+    assert real.next_cycle() == 0.0
+    begin = time.now
+    for cycle in range(1, 6):
+        time.work(0.001 * cycle)
+        assert real.next_cycle() == 0.0
+        assert time.now == begin + cycle * CYCLE_NS
+
+
+def test_small_delays_are_told_and_do_not_add_up(time):
+    real = RealClock(CYCLE)
+    real.next_cycle()
+    begin, time.overshoot = time.now, 80_000
+    lateness = [real.next_cycle() for _ in range(100)]
+    assert lateness == pytest.approx([0.008] * 100)
+    assert time.now == begin + 100 * CYCLE_NS + 80_000
+
+
+@pytest.mark.parametrize("late_cycles", [0.11, 0.5, 0.9, 1.0, 2.5, 10.0])
+def test_after_a_late_cycle_the_next_is_a_whole_cycle_away(time, late_cycles):
+    """Two set-points closer than a cycle would make the drives run faster than planned."""
+    real = RealClock(CYCLE)
+    real.next_cycle()
+    time.work((1.0 + late_cycles) * CYCLE)
+    assert real.next_cycle() == pytest.approx(late_cycles)
+    late = time.now
+    assert real.next_cycle() == 0.0
+    assert time.now == late + CYCLE_NS
+
+
+@given(works=st.lists(st.floats(0.0, 0.05), max_size=30))
+def test_no_two_cycles_are_closer_than_nine_tenths(works):
+    time, real = _Time(), RealClock(CYCLE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(clock, "time", time)
+        begins = []
+        for work in works:
+            assert real.next_cycle() >= 0.0
+            begins.append(time.now)
+            time.work(work)
+    for before, after in pairwise(begins):
+        assert after - before >= 0.9 * CYCLE_NS - 1
+
+
+def test_time_left_ends_before_the_cycle_does(time):
+    real = RealClock(CYCLE)
+    assert real.time_left() == 0.0
+    real.next_cycle()
+    assert real.time_left() == pytest.approx(CYCLE - RealClock.RESERVE)
+    time.work(0.004)
+    assert real.time_left() == pytest.approx(0.006 - RealClock.RESERVE)
+    time.work(0.02)
+    assert real.time_left() == 0.0
