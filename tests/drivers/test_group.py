@@ -341,13 +341,51 @@ def test_replies_of_the_wrong_length_are_counted_and_not_used(bench: Bench) -> N
 
 def test_stale_replies_are_not_taken_for_new_ones(bench: Bench) -> None:
     bench.enable()
-    start = bench.group.targets
-    bench.group.send_cycle((start + 100).tolist())
-    bench.rehearsal.pump()  # replies wait in the queue; nobody takes them
+    start = bench.group.targets.tolist()
+    moved = bench.lifted(0.0001)
+    bench.cycle(moved)
+    bench.group.send_cycle(moved)
+    bench.rehearsal.pump()  # replies from the new place wait in the queue; nobody takes them
     bench.drives[3].silent = True
-    bench.group.send_cycle((start + 100).tolist())
+    bench.group.send_cycle(moved)
     status = bench.group.receive(0.0)
     assert status.missing.tolist() == [False] * 3 + [True] + [False] * 4
+    assert status.positions[3] == start[3]
+    assert status.positions[2] == moved[2]
+
+
+def test_torque_that_goes_without_a_word_stops_the_others(bench: Bench) -> None:
+    """The safe-torque-off input of one drive: no emergency, only another state."""
+    bench.enable()
+    bench.drives[6].state = DriveState.SWITCH_ON_DISABLED
+    for _ in range(2):
+        bench.cycle()
+    assert bench.status.faults == ((7, "drive 7 stopped by itself: switch on disabled"),)
+    assert [d.state for d in bench.drives].count(HOLDING) == 7
+
+
+def test_while_one_drive_is_slow_to_enable_the_others_hold_and_do_not_sag(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.group.configure()
+    start = bench.group.read_positions().positions
+    monkeypatch.setattr(bench.drives[7], "_command_enable", lambda: None)
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(10):
+        bench.cycle()
+    assert bench.drives[0].state is DriveState.OPERATION_ENABLED
+    bench.drives[0].motor.position += 50  # the load pulls it down a little, and keeps it there
+    bench.drives[0].motor.jammed = True
+    for _ in range(3):
+        bench.cycle()
+    assert bench.status.positions[0] == start[0] + 50
+    assert bench.group.targets.tolist() == start.tolist()
+    assert bench.group.state is GroupState.ENABLING
+    bench.until(GroupState.FAULT, limit=120)
+    assert bench.status.faults[0][0] == 8
+    assert "on the way to operation enabled" in bench.status.faults[0][1]
+    bench.cycle()
+    assert [d.state for d in bench.drives[:7]] == [HOLDING] * 7
 
 
 def test_the_heartbeat_comes_from_the_loop(bench: Bench) -> None:
