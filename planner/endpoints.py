@@ -20,11 +20,15 @@ def require_usable_ends(rig: Rig, scene: Scene) -> None:
         BadInput: One of them is outside the workspace box, too near to an obstacle, too near to
             itself or cannot be held; or they are turned differently.
     """
+    _require_same_orientation(scene)
     model = ClearanceModel(rig, scene)
     for name, pose in (("start", scene.start), ("goal", scene.goal)):
         _require_in_workspace(rig, name, pose)
         _require_clear(scene, model, name, pose)
         _require_holdable(rig, scene, name, pose)
+
+
+def _require_same_orientation(scene: Scene) -> None:
     angle = scene.start.angle_to(scene.goal)
     if angle > 1e-9:
         raise BadInput(

@@ -1,0 +1,48 @@
+"""Proved minima along a path: for functions whose slope is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from planner.bounds import smallest_along
+
+
+def broken_line(seed: int, slope: float):
+    """A function on 0..1 that changes by no more than the slope; and its smallest value."""
+    rng = np.random.default_rng(seed)
+    knots = np.linspace(0.0, 1.0, 30)
+    steps = rng.uniform(-slope, slope, 29) / 29.0
+    values = np.concatenate([[0.0], np.cumsum(steps)])
+    return (lambda x: np.interp(x, knots, values)), float(values.min())
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-4, 1e-2))
+def test_the_proved_value_is_below_the_truth_and_within_the_tolerance(seed, tolerance) -> None:
+    function, truth = broken_line(seed, 1.0)
+    found = smallest_along(np.linspace(0, 1, 5), function, 1.0, -np.inf, tolerance)
+    assert found.proved <= truth + 1e-12
+    assert truth <= found.value + 1e-12
+    assert found.value - found.proved <= tolerance + 1e-12
+    assert function(np.array([found.at]))[0] == pytest.approx(found.value)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-5, 1e-2))
+def test_a_limit_just_kept_is_proved_however_coarse_the_tolerance(seed, room) -> None:
+    function, truth = broken_line(seed, 1.0)
+    found = smallest_along(np.linspace(0, 1, 5), function, 1.0, truth - room, 1.0)
+    assert found.proved >= truth - room - 1e-12
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_limit_just_missed_is_never_proved(seed) -> None:
+    function, truth = broken_line(seed, 1.0)
+    found = smallest_along(np.linspace(0, 1, 5), function, 1.0, truth + 1e-5, 1e-3)
+    assert found.proved < truth + 1e-5
+
+
+def test_a_single_place_is_its_own_proof() -> None:
+    found = smallest_along(np.zeros(1), lambda x: x + 3.0, 1.0, 0.0, 1e-3)
+    assert (found.value, found.proved, found.samples) == (3.0, 3.0, 1)

@@ -1,0 +1,234 @@
+"""The check: what it proves, and everything it must catch."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cdpr.clearance import ClearanceModel
+from cdpr.errors import Refused
+from cdpr.kinematics import structure_matrix
+from cdpr.plan import plan_from_document, sealed
+from cdpr.poses import Pose, interpolate
+from cdpr.rig import rig_from_document
+from planner.check import _Check, check_path, verify
+from planner.check_report import VerifiedPlan
+from planner.feasibility import capacity_margins
+from planner.plan import make_plan
+from planner.settings import PlannerSettings
+from planner.track import Track
+
+
+@pytest.fixture(scope="module")
+def document(gachon, ready_scene):
+    return make_plan(gachon, ready_scene("environment_1"), PlannerSettings(mode="paper"))
+
+
+def edited(document, **changes):
+    fields = {name: getattr(document, name) for name in type(document).model_fields}
+    for name in ("hash", "kind", "schema_version"):
+        del fields[name]
+    return plan_from_document(sealed(fields | changes))
+
+
+def kinds(report) -> str:
+    return "; ".join(violation.what for violation in report.violations)
+
+
+def test_a_plan_is_verified_with_figures_that_dense_sampling_confirms(gachon, document) -> None:
+    plan = plan_from_document(document)
+    report = verify(plan).report
+    model = ClearanceModel(gachon, plan.scene)
+    moves = zip(plan.waypoints[:-1], plan.waypoints[1:], strict=True)
+    poses = [interpolate(a, b, t) for a, b in moves for t in np.linspace(0, 1, 60)]
+    obstacle = min(model.smallest(p).distance for p in poses)
+    own = min(model.self_clearance(p).distance for p in poses)
+    assert report.proved_obstacle_clearance <= obstacle + 1e-9
+    assert report.proved_self_clearance <= own + 1e-9
+    assert report.obstacle_clearance.nearest.distance == pytest.approx(obstacle, abs=1.5e-3)
+    assert report.self_clearance.nearest.distance == pytest.approx(own, abs=1e-3)
+    assert report.exactness <= 0.1e-3 + 1e-9
+    assert gachon.min_tension <= report.min_tension <= report.max_tension <= gachon.max_tension
+    assert 0 < report.max_cable_speed <= gachon.motion.speed
+    assert report.length == pytest.approx(document.quality.length_mm / 1000, abs=1e-6)
+
+
+def test_the_straight_line_of_the_paper_collides_in_every_environment(gachon, ready_scene) -> None:
+    for number in (1, 2, 3):
+        scene = ready_scene(f"environment_{number}")
+        report = check_path(gachon, scene, [scene.start, scene.goal])
+        assert not report.passed
+        assert "obstacle clearance too small" in kinds(report)
+        assert report.obstacle_clearance.nearest.distance < 0
+
+
+def test_an_edited_plan_through_an_obstacle_is_refused(document, ready_scene) -> None:
+    ends = [document.waypoints[0], document.waypoints[-1]]
+    with pytest.raises(Refused, match="obstacle clearance too small") as refusal:
+        verify(edited(document, waypoints=ends))
+    assert refusal.value.exit_code == 3
+
+
+def test_a_thread_thin_obstacle_between_samples_is_found(gachon, scene_with) -> None:
+    """A needle a cable sweeps over in passing: dense samples of the ends alone would miss it."""
+    start, goal = Pose.level([0, 0, 0.40]), Pose.level([0, 0, 0.4049])
+    exits = gachon.outlets[0]
+    crossed = (exits + interpolate(start, goal, 0.5).apply(gachon.anchors[0])) / 2
+    scene = scene_with(
+        {"name": "needle", "sphere": {"radius_mm": 0.2}, "position_mm": (crossed * 1e3).tolist()},
+        clearance={"obstacle_mm": 0.5},
+        start={"position_mm": [0.0, 0.0, 400.0]},
+        goal={"position_mm": [0.0, 0.0, 404.9]},
+    )
+    report = check_path(gachon, scene, [start, goal])
+    assert "obstacle clearance too small, cable 1 – needle" in kinds(report)
+    near = ClearanceModel(gachon, scene)
+    assert near.smallest(start).distance > 0.0005
+    assert near.smallest(goal).distance > 0.0005
+
+
+def test_clearance_a_hair_below_what_is_asked_is_refused_and_a_hair_above_is_proved(
+    gachon, document
+) -> None:
+    plan = plan_from_document(document)
+    smallest = check_path(gachon, plan.scene, plan.waypoints).proved_obstacle_clearance
+    above = plan.scene.changed(clearance=smallest + 0.2e-3)
+    below = plan.scene.changed(clearance=smallest - 0.02e-3)
+    assert not check_path(gachon, above, plan.waypoints).passed
+    assert check_path(gachon, below, plan.waypoints).passed
+
+
+def test_a_dense_list_of_poses_gives_the_figures_of_its_corners(gachon, document) -> None:
+    plan = plan_from_document(document)
+    coarse = check_path(gachon, plan.scene, plan.waypoints)
+    moves = zip(plan.waypoints[:-1], plan.waypoints[1:], strict=True)
+    dense = [interpolate(a, b, t) for a, b in moves for t in np.linspace(0, 1, 400)]
+    report = check_path(gachon, plan.scene, dense)
+    assert report.passed
+    assert report.length == pytest.approx(coarse.length)
+    first, second = (r.obstacle_clearance.nearest.distance for r in (coarse, report))
+    assert second == pytest.approx(first, abs=0.2e-3)
+    assert report.samples < 2000  # not one for each of the poses given
+
+
+def test_a_spike_among_dense_poses_is_not_overlooked(gachon, scene_with) -> None:
+    """One pose of a thousand that is far off still counts."""
+    ball = {"name": "ball", "sphere": {"radius_mm": 5}, "position_mm": [110, 25, 445]}
+    scene = scene_with(ball, goal={"position_mm": [0.0, 50.0, 445.0]})
+    ys = np.linspace(0.0, 0.05, 1000)
+    poses = [Pose.level([0.0, y, 0.445]) for y in ys]
+    calm = check_path(gachon, scene, poses).obstacle_clearance.nearest.distance
+    poses[500] = Pose.level([0.02, ys[500], 0.445])
+    spiked = check_path(gachon, scene, poses).obstacle_clearance.nearest.distance
+    assert spiked < calm - 0.015
+
+
+@pytest.mark.parametrize(
+    ("path", "what"),
+    [
+        ([[0, 0, 445], [0, 0, 500], [10, 0, 445]], "does not meet the scene's goal"),
+        ([[10, 0, 445], [0, 0, 445]], "does not meet the scene's start"),
+        ([[0, 0, 445], [0, 0, 660], [0, 0, 445]], "leaves the workspace box"),
+    ],
+)
+def test_paths_that_leave_the_box_or_miss_their_ends_are_refused(
+    gachon, scene_with, path, what
+) -> None:
+    poses = [Pose.level(np.array(p) / 1000) for p in path]
+    assert what in kinds(check_path(gachon, scene_with(), poses))
+
+
+def test_a_load_that_cannot_be_held_is_a_violation_not_a_crash(gachon, scene_with) -> None:
+    heavy = scene_with(load={"payload_kg": 60.0})
+    report = check_path(gachon, heavy, [heavy.start, heavy.goal])
+    assert "cannot hold" in kinds(report)
+    assert "no tensions within the limits" in kinds(report)
+    assert math.isnan(report.min_tension)
+    assert report.as_dict()["min_tension_n"] is None
+
+
+def test_disturbances_count_although_the_weight_alone_is_held(gachon, scene_with) -> None:
+    windy = scene_with(load={"force_n": [80.0, 80.0, 80.0]})
+    what = kinds(check_path(gachon, windy, [windy.start, windy.goal]))
+    assert "cannot hold" in what
+    assert "no tensions" not in what
+
+
+def test_too_little_self_clearance_is_a_violation_with_its_pair(gachon, scene_with) -> None:
+    scene = scene_with(clearance={"self_mm": 30.0})
+    report = check_path(gachon, scene, [scene.start, scene.goal])
+    assert "self clearance too small" in kinds(report)
+    assert report.self_clearance.nearest.first in kinds(report)
+
+
+def test_a_winch_too_slow_for_the_path_speed_is_a_violation(gachon, scene_with) -> None:
+    scene = scene_with(goal={"position_mm": [0.0, 0.0, 500.0]})
+    document = gachon.document
+    slow = [w.model_copy(update={"max_speed_mm_s": 5.0}) for w in document.winches]
+    rig = rig_from_document(document.model_copy(update={"winches": slow}))
+    assert "faster than its winch" in kinds(check_path(rig, scene, [scene.start, scene.goal]))
+
+
+def test_a_path_that_turns_the_platform_is_checked_too(gachon, scene_with) -> None:
+    turned = Pose(gachon.home.position, Rotation.from_euler("z", 1, degrees=True).as_matrix())
+    report = check_path(gachon, scene_with(), [gachon.home, turned, gachon.home])
+    assert report.passed
+    assert report.length == 0.0
+    far = Pose(gachon.home.position, Rotation.from_euler("z", 150, degrees=True).as_matrix())
+    assert "self clearance" in kinds(
+        check_path(gachon, scene_with(), [gachon.home, far], ends=False)
+    )
+
+
+@pytest.mark.parametrize("name", ["gachon", "hall"])
+@pytest.mark.parametrize("turn", [0.0, 0.02])
+def test_margin_and_self_clearance_change_no_faster_than_their_slopes(
+    name, turn, gachon, hall, ready_scene
+) -> None:
+    rig = {"gachon": gachon, "hall": hall}[name]
+    scene = ready_scene("environment_1" if name == "gachon" else "hall_pillar")
+    rng = np.random.default_rng(9)
+    for _ in range(25):
+        position = rng.uniform(rig.workspace_lower, rig.workspace_upper)
+        near = Pose(
+            position + rng.uniform(-0.002, 0.002, 3),
+            Rotation.from_rotvec(rng.uniform(-turn, turn, 3)).as_matrix(),
+        )
+        ends = [Pose.level(position), near]
+        check = _Check(rig, scene, Track(rig, ends))
+        motion = check.track.marks[-1]
+        margins = [capacity_margins(rig, scene, p.position[None], p.rotation)[0] for p in ends]
+        assert abs(margins[1] - margins[0]) <= check._margin_slope() * motion
+        own = [check.model.self_clearance(p).distance for p in ends]
+        assert abs(own[1] - own[0]) <= check._self_slope() * motion + 1e-12
+        obstacle = [check.model.smallest(p).distance for p in ends]
+        if min(obstacle) > 0.0:
+            assert abs(obstacle[1] - obstacle[0]) <= motion + 1e-6
+
+
+def test_reported_cable_speed_is_that_of_the_fastest_cable(gachon, scene_with) -> None:
+    scene = scene_with(goal={"position_mm": [0.0, 100.0, 445.0]})
+    report = check_path(gachon, scene, [scene.start, scene.goal])
+    rates = [
+        np.abs(structure_matrix(gachon, interpolate(scene.start, scene.goal, t))[1]).max()
+        for t in np.linspace(0, 1, 200)
+    ]
+    assert report.max_cable_speed == pytest.approx(0.020 * max(rates), rel=1e-2)
+
+
+def test_a_verified_plan_cannot_be_made_without_the_check(gachon, document) -> None:
+    plan = plan_from_document(document)
+    report = check_path(gachon, plan.scene, plan.waypoints)
+    with pytest.raises(TypeError, match=r"planner\.check\.verify"):
+        VerifiedPlan(plan, report, object())
+
+
+def test_a_report_is_plain_json(gachon, document) -> None:
+    import json
+
+    plan = plan_from_document(document)
+    text = json.dumps(check_path(gachon, plan.scene, plan.waypoints).as_dict(), allow_nan=False)
+    assert json.loads(text)["passed"] is True

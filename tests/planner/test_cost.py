@@ -1,0 +1,96 @@
+"""The kinematic cost: scaled over the workspace, integrated along edges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cdpr.kinematics import structure_matrix
+from cdpr.poses import Pose
+from cdpr.statics.dexterity import condition_number, rms_anchor_radius
+from cdpr.statics.wrench_set import force_volume
+from planner.cost import KinematicCost, LengthCost
+from planner.lattice import Lattice, corners_and_weights
+
+
+@pytest.fixture(scope="module")
+def cost(gachon) -> KinematicCost:
+    return KinematicCost(gachon, np.eye(3))
+
+
+@pytest.mark.parametrize("name", ["gachon", "hall"])
+def test_integrals_from_the_lattice_are_within_two_percent_of_exact_ones(
+    name, gachon, hall
+) -> None:
+    rig = {"gachon": gachon, "hall": hall}[name]
+    cost, rng = KinematicCost(rig, np.eye(3)), np.random.default_rng(1)
+    for _ in range(30):
+        start, end = rng.uniform(rig.workspace_lower, rig.workspace_upper, (2, 3))
+        points = start + np.linspace(0, 1, 201)[:, None] * (end - start)
+        values = cost.at(points)
+        mean = np.mean((values[1:] + values[:-1]) / 2)
+        assert cost.edge(start, end) == pytest.approx(mean * np.linalg.norm(end - start), rel=0.02)
+
+
+def test_both_indices_are_scaled_by_their_extremes_over_the_workspace(gachon, cost) -> None:
+    lattice = Lattice.over(gachon.workspace_lower, gachon.workspace_upper)
+    points = lattice.points(np.arange(0, lattice.count, 97))
+    length = rms_anchor_radius(gachon.anchors)
+    condition = np.array(
+        [condition_number(structure_matrix(gachon, Pose.level(p)), length) for p in points]
+    )
+    tension_range = gachon.max_tension - gachon.min_tension
+    volume = np.array(
+        [force_volume(structure_matrix(gachon, Pose.level(p)), tension_range) for p in points]
+    )
+    # c is affine in the condition number and in the inverse volume, with positive factors.
+    columns = np.column_stack([condition, 1 / volume, np.ones(len(points))])
+    factors, residual, *_ = np.linalg.lstsq(columns, cost.at(points), rcond=None)
+    assert residual[0] < 1e-18
+    assert factors[0] > 0
+    assert factors[1] > 0
+    everywhere = cost.at(lattice.points(np.arange(lattice.count)))
+    assert everywhere.min() >= 0
+    assert everywhere.max() <= 2
+
+
+def test_dexterity_gets_better_and_the_wrench_set_worse_toward_the_centre(gachon) -> None:
+    """Source: paper, Fig. 7 and section 5.1."""
+    length = rms_anchor_radius(gachon.anchors)
+    centre, corner = (structure_matrix(gachon, Pose.level([x, x, 0.445])) for x in (0.0, 0.2))
+    assert condition_number(centre, length) < condition_number(corner, length)
+    assert force_volume(centre, 100.0) < force_volume(corner, 100.0)
+
+
+def test_edges_are_symmetric_additive_and_the_same_in_a_batch(cost) -> None:
+    rng = np.random.default_rng(2)
+    start, end = rng.uniform([-0.2, -0.2, 0.2], [0.2, 0.2, 0.6], (2, 3))
+    middle = (start + end) / 2
+    whole = cost.edge(start, end)
+    assert cost.edge(end, start) == pytest.approx(whole)
+    assert cost.edge(start, middle) + cost.edge(middle, end) == pytest.approx(whole, rel=2e-3)
+    batch = cost.edges(np.stack([start, middle, end]), end)
+    assert batch == pytest.approx([whole, cost.edge(middle, end), 0.0], rel=2e-3, abs=1e-12)
+    assert len(cost.edges(np.zeros((0, 3)), end)) == 0
+
+
+def test_mean_cost_weighs_by_length(cost) -> None:
+    path = np.array([[0.0, 0, 0.3], [0.1, 0, 0.3], [0.1, 0.2, 0.3]])
+    parts = [cost.mean_along(path[:2]), cost.mean_along(path[1:])]
+    assert cost.mean_along(path) == pytest.approx((parts[0] + 2 * parts[1]) / 3)
+    point = path[:1]
+    assert cost.mean_along(np.concatenate([point, point])) == pytest.approx(cost.at(point)[0])
+
+
+def test_length_cost_is_the_distance() -> None:
+    assert LengthCost().edge(np.zeros(3), np.array([0.3, 0.4, 0.0])) == pytest.approx(0.5)
+
+
+def test_trilinear_weights_reproduce_a_linear_function() -> None:
+    lattice = Lattice.over(np.array([-1.0, 0.0, 2.0]), np.array([1.0, 0.5, 3.0]))
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-1, 0, 2], [1, 0.5, 3], (50, 3))
+    slope = np.array([1.0, -2.0, 0.5])
+    corners, weights = corners_and_weights(lattice, points)
+    values = lattice.points(corners.ravel()).reshape(50, 8, 3) @ slope
+    assert np.sum(values * weights, axis=1) == pytest.approx(points @ slope)

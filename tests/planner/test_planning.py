@@ -1,0 +1,208 @@
+"""Planning as a whole: ends, seeds, modes, refusals, and plans that pass their check."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cdpr.errors import BadInput, NoSolution
+from cdpr.plan import plan_from_document
+from cdpr.poses import Pose
+from planner.check import verify
+from planner.plan import make_plan
+from planner.settings import PlannerSettings
+
+QUICK = PlannerSettings(mode="paper")
+
+
+def proved(rig, scene, settings):
+    """The plan's document, after it passed its check and met its ends."""
+    document = make_plan(rig, scene, settings)
+    plan = verify(plan_from_document(document)).plan
+    assert plan.waypoints[0].distance_to(scene.start) < 1e-6
+    assert plan.waypoints[-1].distance_to(scene.goal) < 1e-6
+    assert plan.raw_path[-1].distance_to(scene.goal) < 1e-6
+    return document
+
+
+@pytest.mark.parametrize(
+    ("number", "clearance_mm", "sampler"),
+    [
+        (1, 20, "adaptive"),
+        (1, 10, "goal-bias"),
+        (2, 10, "adaptive"),
+        (3, 20, "adaptive"),
+        (3, 10, "goal-bias"),
+    ],
+)
+def test_plans_in_the_papers_way_pass_their_check(
+    gachon, ready_scene, number, clearance_mm, sampler
+) -> None:
+    scene = ready_scene(f"environment_{number}").changed(clearance=clearance_mm / 1000)
+    document = proved(gachon, scene, PlannerSettings(sampler=sampler, mode="paper", seed=1))
+    assert document.quality.obstacle_clearance.distance_mm >= clearance_mm
+    assert document.quality.length_mm <= document.quality.raw_length_mm
+
+
+@pytest.mark.parametrize(
+    ("number", "cost", "longest_mm"),
+    [(1, "length", 660), (3, "length", 860), (2, "kinematic", 950)],
+)
+def test_the_rewiring_mode_comes_near_the_shortest_paths_known(
+    gachon, ready_scene, number, cost, longest_mm
+) -> None:
+    """Source: polished shortest lengths at 10 mm are 628.5, 661.0 and 813.5 mm."""
+    document = proved(gachon, ready_scene(f"environment_{number}"), PlannerSettings(cost=cost))
+    assert 628 <= document.quality.length_mm <= longest_mm
+
+
+def test_the_kinematic_cost_makes_paths_of_lower_cost_integral(gachon, ready_scene) -> None:
+    integrals = {}
+    for cost in ("kinematic", "length"):
+        quality = proved(gachon, ready_scene("environment_1"), PlannerSettings(cost=cost)).quality
+        integrals[cost] = quality.mean_kinematic_cost * quality.length_mm
+    assert integrals["kinematic"] < 0.97 * integrals["length"]
+
+
+def test_the_same_seed_gives_the_same_plan_and_another_seed_another(gachon, ready_scene) -> None:
+    scene = ready_scene("environment_1")
+    plans = [
+        make_plan(gachon, scene, PlannerSettings(mode="paper", seed=s), clock=lambda: 0.0)
+        for s in (5, 5, 6)
+    ]
+    assert plans[0] == plans[1]
+    assert plans[0].hash == plans[1].hash
+    assert plans[0].waypoints != plans[2].waypoints
+
+
+def test_the_tree_of_a_plan_holds_its_raw_path(gachon, ready_scene) -> None:
+    document = make_plan(gachon, ready_scene("environment_2"), QUICK)
+    tree = document.tree
+    assert len(tree.positions_mm) == len(tree.parents) == document.statistics.nodes
+    assert tree.parents[0] == -1
+    nodes = np.array(tree.positions_mm)
+    for waypoint in document.raw_path:
+        away = np.linalg.norm(nodes - waypoint.position_mm, axis=1)
+        assert away.min() < 0.002
+
+
+def test_progress_is_told_with_iterations_and_distance(gachon, ready_scene) -> None:
+    told: list[tuple[int, int, float]] = []
+    make_plan(gachon, ready_scene("environment_1"), QUICK, lambda *now: told.append(now))
+    assert told
+    assert [t[0] for t in told] == sorted(t[0] for t in told)
+    assert all(0 <= distance < 0.6 for _, _, distance in told)
+
+
+@pytest.mark.parametrize("mode", ["paper", "rewire"])
+def test_a_goal_at_the_start_is_a_plan_of_no_length(gachon, scene_with, mode) -> None:
+    document = proved(gachon, scene_with(), PlannerSettings(mode=mode))
+    assert document.quality.length_mm == 0.0
+    assert len(document.waypoints) == 2
+    assert document.quality.obstacle_clearance is None
+
+
+@pytest.mark.parametrize("mode", ["paper", "rewire"])
+def test_a_free_straight_line_is_the_plan(gachon, scene_with, mode) -> None:
+    scene = scene_with(goal={"position_mm": [100.0, 50.0, 400.0]})
+    document = proved(gachon, scene, PlannerSettings(mode=mode, cost="length"))
+    assert document.quality.length_mm == pytest.approx(np.linalg.norm([100, 50, 45]), rel=1e-9)
+
+
+def test_a_turned_platform_keeps_its_orientation(gachon, scene_with) -> None:
+    turned = [float(np.cos(np.radians(0.5))), 0.0, 0.0, float(np.sin(np.radians(0.5)))]
+    scene = scene_with(
+        start={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": turned},
+        goal={"position_mm": [60.0, 0.0, 445.0], "rotation_wxyz": turned},
+    )
+    plan = plan_from_document(proved(gachon, scene, QUICK))
+    assert all(w.angle_to(scene.start) < 1e-9 for w in plan.waypoints)
+
+
+@pytest.mark.parametrize(
+    ("start_mm", "words"),
+    [
+        ([-150, 0, 300], ["start", "touches obstacle_1", "inside"]),
+        ([-40, 0, 300], ["start", "platform", "obstacle_1"]),
+        ([300, 0, 300], ["start", "50.0 mm outside the workspace", "x = 300.0 mm"]),
+        ([0, 0, 100], ["start", "50.0 mm outside the workspace", "z = 100.0 mm"]),
+    ],
+)
+def test_a_start_that_cannot_be_used_names_what_and_by_how_much(
+    gachon, ready_scene, start_mm, words
+) -> None:
+    scene = ready_scene("environment_1")
+    bad = scene.changed(start=Pose.level(np.array(start_mm) / 1000))
+    with pytest.raises(BadInput) as refusal:
+        make_plan(gachon, bad, QUICK)
+    assert refusal.value.exit_code == 2
+    assert all(word in str(refusal.value) for word in words)
+    mirrored = scene.changed(goal=Pose.level(np.array(start_mm) / 1000))
+    with pytest.raises(BadInput, match="goal"):
+        make_plan(gachon, mirrored, QUICK)
+
+
+def test_a_start_nearer_than_the_clearance_asked_for_tells_both_figures(
+    gachon, ready_scene
+) -> None:
+    scene = ready_scene("environment_1").changed(clearance=0.040)
+    with pytest.raises(BadInput, match=r"cable 7 is 32\.22 mm from obstacle_1.*40\.05 mm"):
+        make_plan(gachon, scene, QUICK)
+
+
+def test_a_load_too_heavy_for_the_cables_is_bad_input(gachon, scene_with) -> None:
+    with pytest.raises(BadInput, match="cannot hold the platform"):
+        make_plan(gachon, scene_with(load={"payload_kg": 60.0}), QUICK)
+
+
+def test_start_and_goal_turned_differently_are_bad_input(gachon, scene_with) -> None:
+    turned = [float(np.cos(0.05)), 0.0, 0.0, float(np.sin(0.05))]
+    scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": turned})
+    with pytest.raises(BadInput, match=r"turned against each other by 5\.73 deg"):
+        make_plan(gachon, scene, QUICK)
+
+
+@pytest.mark.parametrize("mode", ["paper", "rewire"])
+def test_no_path_within_the_limit_tells_the_best_distance_and_why(
+    gachon, ready_scene, mode
+) -> None:
+    settings = PlannerSettings(mode=mode, max_iterations=60)
+    with pytest.raises(NoSolution) as nothing:
+        make_plan(gachon, ready_scene("environment_3"), settings)
+    assert nothing.value.exit_code == 1
+    assert 0 < nothing.value.values["best_distance_mm"] < 520
+    assert "obstacle clearance" in str(nothing.value)
+    assert "cable" in str(nothing.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        ({"sampler": "random"}, "sampler"),
+        ({"cost": "time"}, "cost"),
+        ({"mode": "fast"}, "mode"),
+        ({"step": 0.0}, "step"),
+        ({"max_iterations": 0}, "max_iterations"),
+        ({"goal_radius": float("nan")}, "goal_radius"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_settings_that_no_search_could_use_are_refused(wrong, word) -> None:
+    with pytest.raises(BadInput, match=word):
+        PlannerSettings(**wrong)
+
+
+def test_pulleys_payload_and_disturbances_are_planned_and_checked(hall, ready_scene) -> None:
+    document = proved(hall, ready_scene("hall_pillar"), QUICK)
+    assert document.quality.obstacle_clearance.distance_mm >= 40
+    assert len(document.waypoints) > 2  # the pillar is in the way
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 2, 3])
+@pytest.mark.parametrize("clearance_mm", [10, 20])
+def test_twenty_seeds_pass_their_check(gachon, ready_scene, number, clearance_mm) -> None:
+    scene = ready_scene(f"environment_{number}").changed(clearance=clearance_mm / 1000)
+    for seed in range(20):
+        document = proved(gachon, scene, PlannerSettings(seed=seed))
+        assert document.quality.obstacle_clearance.distance_mm >= clearance_mm
