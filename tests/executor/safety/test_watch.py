@@ -122,6 +122,17 @@ def test_a_following_error_that_is_no_number_stops(drive, value):
 
 
 @each_drive
+def test_a_drive_that_did_not_answer_is_not_judged_by_its_old_position(drive):
+    """One lost reply is a note; the others are judged all the same."""
+    seen = _with("missing", drive, True)
+    old = replace(seen, following_errors=_put(FINE.following_errors, drive, NAN))
+    assert _codes(old) == [("reply_lost", Reaction.NOTE)]
+    other = (drive + 1) % 3
+    both = replace(old, following_errors=_put(old.following_errors, other, 0.1))
+    assert _codes(both)[1] == ("following_error", Reaction.QUICK_STOP)
+
+
+@each_drive
 @pytest.mark.parametrize(
     ("tension", "code"),
     [(4.99, "slack"), (-3.0, "slack"), (0.0, "slack"), (100.01, "over_tension")],
