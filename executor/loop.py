@@ -181,6 +181,8 @@ class Loop:
             if status is not None and status.state is GroupState.ENABLED:
                 # The drives hold what the group sent last; the platform may have moved since `arm`.
                 self._targets = tuple(int(target) for target in self._group.targets)
+                # While it enabled them, the group held each drive at a place of its own.
+                self._targets = tuple(int(t) for t in self._group.targets)
                 self.machine.on(Event.ENABLED)
                 self._tell("enabled", "all drives are enabled and hold")
                 return
@@ -250,11 +252,11 @@ class Loop:
         return status
 
     def _following_errors(self, status: CycleStatus) -> Array:
-        """Signed, in cable length, shape (m,), [m]; NaN while the drives do not follow."""
+        """Signed, in cable length, shape (m,), [m]; NaN while drives do not follow or answer."""
         if status.state is not GroupState.ENABLED:
             return np.full(len(self._per_metre), np.nan)
         errors: Array = (status.positions - status.demands) / self._per_metre
-        return errors
+        return np.where(status.missing, np.nan, errors)
 
     def _request(self, purpose: Purpose, targets: tuple[int, ...]) -> Request:
         return Request(
@@ -277,7 +279,7 @@ class Loop:
                 actual=self._actual,
                 torques=tuple(int(t) for t in status.torques),
                 missing=int(np.count_nonzero(status.missing)),
-                following_error=float(np.max(np.abs(errors))),
+                following_error=_largest(errors),
                 lateness=lateness,
             )
         )
@@ -356,6 +358,12 @@ _ACTIVE = frozenset(
 )
 _ON_PATH = frozenset({State.MOVING, State.STOPPING})
 _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING})
+
+
+def _largest(errors: Array) -> float:
+    """Of those that are known; NaN when none is."""
+    known = np.abs(errors[np.isfinite(errors)])
+    return float(known.max()) if known.size else float("nan")
 
 
 def _nothing(*_: object) -> None:

@@ -37,9 +37,9 @@ class TrackerSettings:
         camera_check_period: Pictures between checks of the camera.
     """
 
-    reprojection_px: float = 1.0
+    reprojection_px: float = 0.5
     view_angle: float = float(np.radians(76.0))
-    position_deviation: float = 0.01
+    position_deviation: float = 0.003
     jump: float = 0.03
     jump_angle: float = 0.25
     speed: float = 0.2

@@ -128,8 +128,10 @@ class Watch:
     def _following(self, seen: Observation) -> list[Finding]:
         found = []
         for drive, error in enumerate(seen.following_errors, start=1):
+            if not seen.following or seen.missing[drive - 1]:
+                continue
             # "Not at most", so that an error that is no number counts as too large.
-            if seen.following and not abs(error) <= self.limits.following_error:
+            if not abs(error) <= self.limits.following_error:
                 text = (
                     f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
                     f" allowed {self.limits.following_error * 1000:.2f} mm"
