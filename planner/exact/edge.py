@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.exact.compiled import kernel
+from planner.exact.fields import World, arm, outlet
 from planner.exact.moving_edge import pulley_clearance, pulley_pair_free
 from planner.exact.pair import cable_apart, cable_distance, platform_apart, platform_distance
-from planner.exact.vectors import Vector, plus, row
-from planner.exact.world import World
+from planner.exact.vectors import Vector, plus
 
 Array = NDArray[np.float64]
 
@@ -68,11 +68,11 @@ def edge_clearance(world: World, start: Array, end: Array) -> tuple[float, int, 
         obstacles; the number of the body (m for the platform); the number of the obstacle.
     """
     before, after = row_of(start), row_of(end)
-    bodies = len(world.radii)
+    bodies = len(world.bodies)
     least, body_found, owner_found = np.inf, -1, -1
-    for piece in range(len(world.kinds)):
+    for piece in range(len(world.spans)):
         for body in range(bodies):
-            radius = world.radii[body]
+            radius = world.bodies[body, 1]
             pair = piece * bodies + body
             if _room_at_planes(world, pair, body, before, after) - radius >= least:
                 continue
@@ -81,17 +81,11 @@ def edge_clearance(world: World, start: Array, end: Array) -> tuple[float, int, 
             elif world.pulley > 0.0:
                 found = pulley_clearance(world, piece, body, before, after, least + radius)
             else:
-                arm = row(world.arms, body)
-                found = cable_distance(
-                    world,
-                    piece,
-                    row(world.outlets, body),
-                    plus(before, arm),
-                    plus(after, arm),
-                    least + radius,
-                )
+                at = outlet(world, body)
+                b, c = plus(before, arm(world, body)), plus(after, arm(world, body))
+                found = cable_distance(world, piece, at, b, c, least + radius)
             if found - radius < least:
-                least, body_found, owner_found = found - radius, body, world.owners[piece]
+                least, body_found, owner_found = found - radius, body, world.spans[piece, 1]
     return least, body_found, owner_found
 
 
@@ -105,9 +99,8 @@ def row_of(point: Array) -> Vector:
 def in_workspace(world: World, position: Vector) -> bool:
     """Whether a position, and nothing that is not a number, is in the workspace box."""
     for axis in range(3):
-        if not (
-            world.lower[axis] - _AT_THE_WALL <= position[axis] <= world.upper[axis] + _AT_THE_WALL
-        ):
+        low, high = world.limits[0, axis] - _AT_THE_WALL, world.limits[1, axis] + _AT_THE_WALL
+        if not low <= position[axis] <= high:
             return False
     return True
 
@@ -115,46 +108,57 @@ def in_workspace(world: World, position: Vector) -> bool:
 @kernel
 def obstacles_free(world: World, before: Vector, after: Vector) -> bool:
     """Whether all bodies keep what they need to all obstacles between two positions."""
-    bodies = len(world.needed)
-    planes = world.planes
-    for piece in range(len(world.kinds)):
-        for body in range(bodies):
-            pair = piece * bodies + body
-            if world.pulley > 0.0 and body < bodies - 1:
-                if not pulley_pair_free(world, piece, body, before, after):
-                    return False
-                continue
-            proved = False
-            for k in range(world.first_plane[pair], world.first_plane[pair + 1]):
-                x, y, z, limit = planes[k, 0], planes[k, 1], planes[k, 2], planes[k, 3]
-                if (
-                    x * before[0] + y * before[1] + z * before[2] <= limit
-                    and x * after[0] + y * after[1] + z * after[2] <= limit
-                ):
-                    proved = True
-                    break
-            if not proved and not _pair_free(world, piece, body, before, after):
+    if world.pulley > 0.0:
+        return _free_over_pulleys(world, before, after)
+    # Taken out of the loop: reading an array of the world counts its owners.
+    planes, first_plane, bodies = world.planes, world.first_plane, len(world.bodies)
+    for pair in range(len(first_plane) - 1):
+        if _before_a_plane(planes, first_plane[pair], first_plane[pair + 1], before, after):
+            continue
+        if not _pair_free(world, pair // bodies, pair % bodies, before, after):
+            return False
+    return True
+
+
+@kernel
+def _before_a_plane(planes: Array, first: int, last: int, before: Vector, after: Vector) -> bool:
+    """Whether one of some planes proves a pair."""
+    for k in range(first, last):
+        x, y, z, limit = planes[k, 0], planes[k, 1], planes[k, 2], planes[k, 3]
+        if (
+            x * before[0] + y * before[1] + z * before[2] <= limit
+            and x * after[0] + y * after[1] + z * after[2] <= limit
+        ):
+            return True
+    return False
+
+
+@kernel
+def _free_over_pulleys(world: World, before: Vector, after: Vector) -> bool:
+    cables = len(world.cables)
+    for piece in range(len(world.spans)):
+        for body in range(cables):
+            if not pulley_pair_free(world, piece, body, before, after):
                 return False
+        if not _pair_free(world, piece, cables, before, after):
+            return False
     return True
 
 
 @kernel
 def _pair_free(world: World, piece: int, body: int, before: Vector, after: Vector) -> bool:
-    needed = world.needed[body]
-    if body == len(world.needed) - 1:
+    needed = world.bodies[body, 0]
+    if body == len(world.bodies) - 1:
         return platform_apart(world, piece, before, after, needed)
-    arm = row(world.arms, body)
-    exit = row(world.outlets, body)
-    return cable_apart(world, piece, exit, plus(before, arm), plus(after, arm), needed)
+    b, c = plus(before, arm(world, body)), plus(after, arm(world, body))
+    return cable_apart(world, piece, outlet(world, body), b, c, needed)
 
 
 @kernel
-def _room_at_planes(
-    world: World, pair: int, body: int, before: Vector, after: Vector
-) -> float:
+def _room_at_planes(world: World, pair: int, body: int, before: Vector, after: Vector) -> float:
     """A lower bound of the pair's distance, [m], the radius of the cable not taken off."""
     room = -np.inf
-    if world.pulley > 0.0 and body < len(world.needed) - 1:
+    if world.pulley > 0.0 and body < len(world.bodies) - 1:
         return room  # the planes hold for exits that stay
     for k in range(world.first_plane[pair], world.first_plane[pair + 1]):
         normal = (world.planes[k, 0], world.planes[k, 1], world.planes[k, 2])
@@ -162,7 +166,7 @@ def _room_at_planes(
             normal[0] * before[0] + normal[1] * before[1] + normal[2] * before[2],
             normal[0] * after[0] + normal[1] * after[1] + normal[2] * after[2],
         )
-        by_anchor = world.planes[k, 3] + world.needed[body] - reach
+        by_anchor = world.planes[k, 3] + world.bodies[body, 0] - reach
         by_exit = world.planes[k, 4] - world.planes[k, 5]
         room = max(room, min(by_anchor, by_exit))
     return room

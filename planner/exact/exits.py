@@ -7,21 +7,21 @@ import math
 import numpy as np
 
 from planner.exact.compiled import kernel
-from planner.exact.vectors import Vector, along, dot, minus, norm, row
-from planner.exact.world import World
+from planner.exact.fields import World, feed, outlet
+from planner.exact.vectors import Vector, along, dot, minus, norm
 
 
 @kernel
 def exit_point(world: World, cable: int, anchor: Vector) -> Vector:
     """The exit of a cable to an anchor in the world, [m]; not numbers where it cannot run."""
-    outlet = row(world.outlets, cable)
+    origin = outlet(world, cable)
     radius = world.pulley
     if radius == 0.0:
-        return outlet
-    feed = row(world.feeds, cable)
-    offset = minus(anchor, outlet)
-    rise = dot(offset, feed)
-    radial = along(offset, feed, -rise)
+        return origin
+    axis = feed(world, cable)
+    offset = minus(anchor, origin)
+    rise = dot(offset, axis)
+    radial = along(offset, axis, -rise)
     reach = norm(radial)
     outward = reach - radius
     distance = math.sqrt(outward * outward + rise * rise)
@@ -29,7 +29,7 @@ def exit_point(world: World, cable: int, anchor: Vector) -> Vector:
         return (np.nan, np.nan, np.nan)
     angle = math.atan2(rise, outward) + math.acos(radius / distance)
     out = radius * (1.0 + math.cos(angle)) / reach
-    return along(along(outlet, radial, out), feed, radius * math.sin(angle))
+    return along(along(origin, radial, out), axis, radius * math.sin(angle))
 
 
 @kernel
@@ -50,9 +50,9 @@ def exit_travel(world: World, cable: int, start: Vector, end: Vector, travel: fl
     radius = world.pulley
     if radius == 0.0:
         return 0.0
-    outlet, feed = row(world.outlets, cable), row(world.feeds, cable)
-    first, last = minus(start, outlet), minus(end, outlet)
-    reach = min(_radial(first, feed), _radial(last, feed)) - travel / 2.0
+    origin, axis = outlet(world, cable), feed(world, cable)
+    first, last = minus(start, origin), minus(end, origin)
+    reach = min(_radial(first, axis), _radial(last, axis)) - travel / 2.0
     from_centre = min(norm(first), norm(last)) - radius - travel / 2.0
     if not (reach > 0.0 and from_centre > radius):
         return np.inf
@@ -61,5 +61,5 @@ def exit_travel(world: World, cable: int, start: Vector, end: Vector, travel: fl
 
 
 @kernel
-def _radial(offset: Vector, feed: Vector) -> float:
-    return norm(along(offset, feed, -dot(offset, feed)))
+def _radial(offset: Vector, axis: Vector) -> float:
+    return norm(along(offset, axis, -dot(offset, axis)))

@@ -222,10 +222,15 @@ def _foot_on_face(a: Vector, b: Vector, c: Vector) -> tuple[bool, Vector]:
     u = _volume(normal, b, c) / squared
     v = _volume(normal, c, a) / squared
     w = _volume(normal, a, b) / squared
-    if u < 0.0 or v < 0.0 or w < 0.0:
+    whole = u + v + w
+    if u < 0.0 or v < 0.0 or w < 0.0 or whole == 0.0:
         return False, a
-    height = dot(normal, a) / squared
-    return True, (height * normal[0], height * normal[1], height * normal[2])
+    # Mixed from the corners: a point of the triangle however thin it is.
+    return True, (
+        (u * a[0] + v * b[0] + w * c[0]) / whole,
+        (u * a[1] + v * b[1] + w * c[1]) / whole,
+        (u * a[2] + v * b[2] + w * c[2]) / whole,
+    )
 
 
 @kernel
@@ -263,7 +268,7 @@ def hulls_definition(first: Points, second: Points) -> float:
 
     # Weights u, v ≥ 0, each set summing to 1, with the smallest ‖uᵀ first − vᵀ second‖: the two
     # sums are rows of a least-squares problem, weighted so heavily that they hold to round-off.
-    scale = 1e6 * max(1.0, float(np.abs(first).max()), float(np.abs(second).max()))
+    scale = 1e4 * max(1.0, float(np.abs(first).max()), float(np.abs(second).max()))
     count = len(first)
     matrix = np.zeros((5, count + len(second)))
     matrix[:3, :count], matrix[:3, count:] = first.T, -second.T

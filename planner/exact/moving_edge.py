@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from planner.exact.compiled import kernel
 from planner.exact.exits import exit_point, exit_travel
+from planner.exact.fields import World, anchor, half_size
 from planner.exact.pair import place_corners, points_apart, points_distance
 from planner.exact.vectors import Vector, along, cross, dot, minus, norm, plus, row, turned
-from planner.exact.world import World
 
 Array = NDArray[np.float64]
 
@@ -30,9 +30,7 @@ _DEEPEST = 64
 
 
 @kernel
-def turning_edge_free(
-    world: World, start: Array, end: Array, rotation: Array, turn: Array
-) -> bool:
+def turning_edge_free(world: World, start: Array, end: Array, rotation: Array, turn: Array) -> bool:
     """Whether the platform may go straight from ``start`` to ``end`` while it turns steadily.
 
     It stays in the workspace box, and platform and cables keep the clearance to every obstacle.
@@ -47,13 +45,13 @@ def turning_edge_free(
     """
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
     for axis in range(3):
-        low, high = world.lower[axis] - 1e-9, world.upper[axis] + 1e-9
+        low, high = world.limits[0, axis] - 1e-9, world.limits[1, axis] + 1e-9
         if not (low <= before[axis] <= high and low <= after[axis] <= high):
             return False
     if not (math.isfinite(turn[0]) and math.isfinite(turn[1]) and math.isfinite(turn[2])):
         return False
-    for piece in range(len(world.kinds)):
-        for body in range(len(world.needed)):
+    for piece in range(len(world.spans)):
+        for body in range(len(world.bodies)):
             if not pair_free(world, piece, body, before, after, rotation, turn):
                 return False
     return True
@@ -62,7 +60,7 @@ def turning_edge_free(
 @kernel
 def pulley_pair_free(world: World, piece: int, body: int, before: Vector, after: Vector) -> bool:
     """Whether a cable over a pulley keeps what it needs to a piece under translation."""
-    return pair_free(world, piece, body, before, after, world.rotation, np.zeros(3))
+    return pair_free(world, piece, body, before, after, world.platform[:3], np.zeros(3))
 
 
 @kernel
@@ -76,7 +74,7 @@ def pair_free(
     turn: Array,
 ) -> bool:
     """Whether one body keeps what it needs to one piece; arguments as of `turning_edge_free`."""
-    way, needed = minus(after, before), world.needed[body]
+    way, needed = minus(after, before), world.bodies[body, 0]
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     lows, highs = np.empty(_DEEPEST), np.empty(_DEEPEST)
     lows[0], highs[0] = 0.0, 1.0
@@ -120,20 +118,20 @@ def pulley_clearance(
     while waiting > 0:
         waiting -= 1
         low, high = lows[waiting], highs[waiting]
-        swept = _swept(world, body, before, way, world.rotation, turn, low, high)
+        swept = _swept(world, body, before, way, world.platform[:3], turn, low, high)
         bound = _bound(world, body, swept, (high - low) * norm(way), 0.0)
         if bound < np.inf:
             room = points_distance(world, piece, swept, least + bound) - bound
             if room >= least:
                 continue
-            if bound < _FINEST or room <= 0.0 and bound < 1e-6:
+            if bound < _FINEST or (room <= 0.0 and bound < 1e-6):
                 open_least = min(open_least, room)
                 least = min(least, room)
                 continue
         if waiting + 2 > _DEEPEST:
             return -np.inf
         middle = (low + high) / 2.0
-        still = _swept(world, body, before, way, world.rotation, turn, middle, middle)
+        still = _swept(world, body, before, way, world.platform[:3], turn, middle, middle)
         least = min(least, points_distance(world, piece, still, least))
         lows[waiting], highs[waiting] = middle, high
         lows[waiting + 1], highs[waiting + 1] = low, middle
@@ -153,13 +151,13 @@ def _swept(
     high: float,
 ) -> Array:
     """Points of a body at two shares of the edge: exit, anchor, exit, anchor; or 16 corners."""
-    if body == len(world.needed) - 1:
+    if body == len(world.bodies) - 1:
         swept = np.empty((16, 3))
         place_corners(world, turned_by(rotation, turn, low), along(before, way, low), swept[:8])
         place_corners(world, turned_by(rotation, turn, high), along(before, way, high), swept[8:])
         return swept
     swept = np.empty((4, 3))
-    arm = row(world.anchors, body)
+    arm = anchor(world, body)
     for i, share in enumerate((low, high)):
         at = plus(along(before, way, share), turned(turned_by(rotation, turn, share), arm))
         swept[2 * i], swept[2 * i + 1] = exit_point(world, body, at), at
@@ -169,10 +167,10 @@ def _swept(
 @kernel
 def _bound(world: World, body: int, swept: Array, travel: float, angle: float) -> float:
     """How far the body leaves the hull of its swept points, [m]."""
-    if body == len(world.needed) - 1:
-        arm = math.sqrt(world.half[0] ** 2 + world.half[1] ** 2 + world.half[2] ** 2)
+    if body == len(world.bodies) - 1:
+        arm = norm(half_size(world))
         return arm * angle * angle / 8.0
-    arm = norm(row(world.anchors, body))
+    arm = norm(anchor(world, body))
     bend = arm * angle * angle / 8.0
     if world.pulley == 0.0:
         return bend
@@ -183,7 +181,7 @@ def _bound(world: World, body: int, swept: Array, travel: float, angle: float) -
 @kernel
 def _plane_between(world: World, piece: int, body: int, swept: Array, needed: float) -> bool:
     """Whether one of the pair's planes has all swept points before it, by what is needed."""
-    pair = piece * len(world.needed) + body
+    pair = piece * len(world.bodies) + body
     for k in range(world.first_plane[pair], world.first_plane[pair + 1]):
         limit = world.planes[k, 4] - needed
         normal = (world.planes[k, 0], world.planes[k, 1], world.planes[k, 2])

@@ -8,10 +8,23 @@ parallelogram, against the platform. All else is the distance of two hulls.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from planner.exact.compiled import kernel
+from planner.exact.fields import (
+    World,
+    ball,
+    box_half,
+    box_sum,
+    centre,
+    disc,
+    disc_axis,
+    half_size,
+    in_frame,
+)
 from planner.exact.hulls import hulls_apart, hulls_distance
 from planner.exact.pieces import BOX, MESH, ROUND
 from planner.exact.segment_box import segment_box_squared
@@ -19,17 +32,18 @@ from planner.exact.triangle_box import triangle_box_squared
 from planner.exact.triangle_point import triangle_point_squared
 from planner.exact.triangle_segment import triangle_segment_squared
 from planner.exact.vectors import Vector, minus, plus, row, turned
-from planner.exact.world import World
 
 Points = NDArray[np.float64]
 
 
 @kernel
-def cable_apart(world: World, piece: int, exit: Vector, b: Vector, c: Vector, needed: float) -> bool:
+def cable_apart(
+    world: World, piece: int, exit: Vector, b: Vector, c: Vector, needed: float
+) -> bool:
     """Whether the triangle of an exit and two anchors is ``needed`` [m] from a piece's surface."""
-    kind = world.kinds[piece]
-    if kind == BOX or kind == ROUND:
-        return cable_squared(world, piece, exit, b, c) >= (needed + world.balls[piece]) ** 2
+    kind = world.spans[piece, 0]
+    if kind in (BOX, ROUND):
+        return cable_squared(world, piece, exit, b, c) >= (needed + ball(world, piece)) ** 2
     swept = np.empty((3, 3))
     swept[0], swept[1], swept[2] = exit, b, c
     return points_apart(world, piece, swept, needed)
@@ -38,8 +52,8 @@ def cable_apart(world: World, piece: int, exit: Vector, b: Vector, c: Vector, ne
 @kernel
 def platform_apart(world: World, piece: int, start: Vector, end: Vector, needed: float) -> bool:
     """Whether the platform stays ``needed`` [m] from a piece's surface between two positions."""
-    if world.kinds[piece] == ROUND or world.sums[piece, 0] > 0.0:
-        return platform_squared(world, piece, start, end) >= (needed + world.balls[piece]) ** 2
+    if world.spans[piece, 0] == ROUND or world.pieces[piece, 15] > 0.0:
+        return platform_squared(world, piece, start, end) >= (needed + ball(world, piece)) ** 2
     return points_apart(world, piece, platform_points(world, start, end), needed)
 
 
@@ -51,40 +65,38 @@ def cable_distance(
 
     From ``enough`` on any value at least that is returned.
     """
-    kind = world.kinds[piece]
-    if kind == BOX or kind == ROUND:
-        return np.sqrt(cable_squared(world, piece, exit, b, c)) - world.balls[piece]
+    kind = world.spans[piece, 0]
+    if kind in (BOX, ROUND):
+        return math.sqrt(cable_squared(world, piece, exit, b, c)) - ball(world, piece)
     swept = np.empty((3, 3))
     swept[0], swept[1], swept[2] = exit, b, c
     return points_distance(world, piece, swept, enough)
 
 
 @kernel
-def platform_distance(
-    world: World, piece: int, start: Vector, end: Vector, enough: float
-) -> float:
+def platform_distance(world: World, piece: int, start: Vector, end: Vector, enough: float) -> float:
     """Distance of the platform's way to the piece's surface, [m]; 0 or less where they touch.
 
     From ``enough`` on any value at least that is returned.
     """
-    if world.kinds[piece] == ROUND or world.sums[piece, 0] > 0.0:
-        return np.sqrt(platform_squared(world, piece, start, end)) - world.balls[piece]
+    if world.spans[piece, 0] == ROUND or world.pieces[piece, 15] > 0.0:
+        return math.sqrt(platform_squared(world, piece, start, end)) - ball(world, piece)
     return points_distance(world, piece, platform_points(world, start, end), enough)
 
 
 @kernel
 def cable_squared(world: World, piece: int, exit: Vector, b: Vector, c: Vector) -> float:
     """Squared distance of a triangle to a box, or to the axis of a round piece, [m²]."""
-    if world.kinds[piece] == BOX:
-        frame, centre = world.frames[piece], row(world.centres, piece)
+    if world.spans[piece, 0] == BOX:
+        origin = centre(world, piece)
         return triangle_box_squared(
-            turned(frame, minus(exit, centre)),
-            turned(frame, minus(b, centre)),
-            turned(frame, minus(c, centre)),
-            row(world.halves, piece),
+            in_frame(world, piece, minus(exit, origin)),
+            in_frame(world, piece, minus(b, origin)),
+            in_frame(world, piece, minus(c, origin)),
+            box_half(world, piece),
         )
-    first = world.first_point[piece]
-    if world.first_point[piece + 1] - first == 1:
+    first = world.spans[piece, 2]
+    if world.spans[piece, 3] - first == 1:
         return triangle_point_squared(exit, b, c, row(world.points, first))
     ends = row(world.points, first), row(world.points, first + 1)
     return triangle_segment_squared(exit, b, c, ends[0], ends[1])
@@ -93,16 +105,16 @@ def cable_squared(world: World, piece: int, exit: Vector, b: Vector, c: Vector) 
 @kernel
 def platform_squared(world: World, piece: int, start: Vector, end: Vector) -> float:
     """Squared distance of the platform's way to a parallel box or a round piece's axis, [m²]."""
-    if world.kinds[piece] == BOX:
-        frame, centre = world.frames[piece], row(world.centres, piece)
+    if world.spans[piece, 0] == BOX:
+        origin = centre(world, piece)
         return segment_box_squared(
-            turned(frame, minus(start, centre)),
-            turned(frame, minus(end, centre)),
-            row(world.sums, piece),
+            in_frame(world, piece, minus(start, origin)),
+            in_frame(world, piece, minus(end, origin)),
+            box_sum(world, piece),
         )
-    first = world.first_point[piece]
-    last = world.first_point[piece + 1] - 1
-    half = (world.half[0], world.half[1], world.half[2])
+    first = world.spans[piece, 2]
+    last = world.spans[piece, 3] - 1
+    half = half_size(world)
     a, b = _seen(world, first, start), _seen(world, first, end)
     if first == last:
         return segment_box_squared(a, b, half)
@@ -113,7 +125,7 @@ def platform_squared(world: World, piece: int, start: Vector, end: Vector) -> fl
 @kernel
 def _seen(world: World, point: int, position: Vector) -> Vector:
     """A point of the world in the frame of the platform at a position."""
-    away, turn = minus(row(world.points, point), position), world.rotation
+    away, turn = minus(row(world.points, point), position), world.platform
     return (
         turn[0, 0] * away[0] + turn[1, 0] * away[1] + turn[2, 0] * away[2],
         turn[0, 1] * away[0] + turn[1, 1] * away[1] + turn[2, 1] * away[2],
@@ -125,19 +137,20 @@ def _seen(world: World, point: int, position: Vector) -> Vector:
 def platform_points(world: World, start: Vector, end: Vector) -> Points:
     """The corners of the platform at two positions, shape (16, 3), [m]."""
     swept = np.empty((16, 3))
-    place_corners(world, world.rotation, start, swept[:8])
-    place_corners(world, world.rotation, end, swept[8:])
+    place_corners(world, world.platform[:3], start, swept[:8])
+    place_corners(world, world.platform[:3], end, swept[8:])
     return swept
 
 
 @kernel
 def place_corners(world: World, rotation: Points, position: Vector, corners: Points) -> None:
     """Writes the corners of the platform at a pose into an array, shape (8, 3), [m]."""
+    half = half_size(world)
     for corner in range(8):
         offset = (
-            world.half[0] if corner & 1 else -world.half[0],
-            world.half[1] if corner & 2 else -world.half[1],
-            world.half[2] if corner & 4 else -world.half[2],
+            half[0] if corner & 1 else -half[0],
+            half[1] if corner & 2 else -half[1],
+            half[2] if corner & 4 else -half[2],
         )
         corners[corner] = plus(position, turned(rotation, offset))
 
@@ -145,34 +158,35 @@ def place_corners(world: World, rotation: Points, position: Vector, corners: Poi
 @kernel
 def points_apart(world: World, piece: int, swept: Points, needed: float) -> bool:
     """Whether the hull of points is ``needed`` [m] from a piece's surface."""
-    axis = _disc_axis(world, piece)
-    target = world.points[world.first_point[piece] : world.first_point[piece + 1]]
-    grown = needed + world.balls[piece]
-    if hulls_apart(swept, target, axis, world.discs[piece], grown):
+    axis = disc_axis(world, piece)
+    target = world.points[world.spans[piece, 2] : world.spans[piece, 3]]
+    grown = needed + ball(world, piece)
+    if hulls_apart(swept, target, axis, disc(world, piece), grown):
         return True
-    if world.kinds[piece] != MESH:
+    if world.spans[piece, 0] != MESH:
         return False
-    for t in range(world.first_triangle[piece], world.first_triangle[piece + 1]):
+    for t in range(world.spans[piece, 4], world.spans[piece, 5]):
         triangle = world.triangles[t]
-        if not _boxed_apart(swept, triangle, needed):
-            if not hulls_apart(swept, triangle, axis, 0.0, needed):
-                return False
+        if _boxed_apart(swept, triangle, needed):
+            continue
+        if not hulls_apart(swept, triangle, axis, 0.0, needed):
+            return False
     return True
 
 
 @kernel
 def points_distance(world: World, piece: int, swept: Points, enough: float) -> float:
     """Distance of the hull of points to a piece's surface, [m]; see `cable_distance`."""
-    axis = _disc_axis(world, piece)
-    target = world.points[world.first_point[piece] : world.first_point[piece + 1]]
-    ball = world.balls[piece]
-    if world.kinds[piece] != MESH:
-        return _settled(swept, target, axis, world.discs[piece], enough + ball) - ball
+    axis = disc_axis(world, piece)
+    target = world.points[world.spans[piece, 2] : world.spans[piece, 3]]
+    grown = ball(world, piece)
+    if world.spans[piece, 0] != MESH:
+        return _settled(swept, target, axis, disc(world, piece), enough + grown) - grown
     low, _ = hulls_distance(swept, target, axis, 0.0, enough)
     if low >= enough:
         return low
     least = enough
-    for t in range(world.first_triangle[piece], world.first_triangle[piece + 1]):
+    for t in range(world.spans[piece, 4], world.spans[piece, 5]):
         triangle = world.triangles[t]
         if not _boxed_apart(swept, triangle, least):
             least = min(least, _settled(swept, triangle, axis, 0.0, least))
@@ -186,12 +200,6 @@ def _settled(swept: Points, target: Points, axis: Vector, disc: float, enough: f
     if low >= enough:
         return low
     return hulls_distance(swept, target, axis, disc, np.inf)[0]
-
-
-@kernel
-def _disc_axis(world: World, piece: int) -> Vector:
-    frame = world.frames[piece]
-    return (frame[2, 0], frame[2, 1], frame[2, 2])
 
 
 @kernel

@@ -1,9 +1,9 @@
 """Obstacles as the pieces that the compiled checks know, chosen by shape alone.
 
-A box, ball, capsule, cylinder or hull is one piece. A mesh that encloses a convex volume is the hull
-of its vertices; any other mesh is a guard, its hull, which is looked into, triangle by triangle,
-only where the guard is too near. (As everywhere in this program a mesh is its surface; for the
-convex ones the volume inside is forbidden too.)
+A box, ball, capsule, cylinder or hull is one piece. A mesh that encloses a convex volume is the
+hull of its vertices; any other mesh is a guard, its hull, which is looked into, triangle by
+triangle, only where the guard is too near. (As everywhere in this program a mesh is its surface;
+for the convex ones the volume inside is forbidden too.)
 """
 
 from __future__ import annotations

@@ -128,5 +128,5 @@ def _touching_all_round(piece: Piece, eye: Array, needed: float) -> Array:
         normals = np.cos(middle)[:, None] * sight + np.sin(middle)[:, None] * sideways
         behind = piece.least(normals) - needed - normals @ eye >= 0.0
         low, high = np.where(behind, middle, low), np.where(behind, high, middle)
-    normals = np.cos(low)[:, None] * sight + np.sin(low)[:, None] * sideways
-    return normals
+    touching: Array = np.cos(low)[:, None] * sight + np.sin(low)[:, None] * sideways
+    return touching

@@ -1,22 +1,19 @@
 """Rig and scene as plain arrays that compiled functions read.
 
-Bodies are the m cables and then the platform; pair ``piece * (m + 1) + body`` is one body with one
-piece of an obstacle. For translation every pair has planes in the space of positions: an edge whose
-ends p both have ``normal · p ≤ limit`` for one of the planes keeps the needed distance.
+Every pair of a body and a piece has planes in the space of positions: a translation whose ends p
+both have ``normal · p ≤ limit`` for one of the planes keeps the needed distance.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
 from cdpr.cables import cables_at
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 from cdpr.scene import Scene
+from planner.exact.fields import Integers, World
 from planner.exact.pieces import BOX, Piece, pieces_of
 from planner.exact.shadow_planes import best_first, cable_normals, platform_normals
 
@@ -27,68 +24,6 @@ round-off of the sums that are compared with it."""
 _LATTICE = 9
 _PARALLEL = 1e-13
 """Sine of the angle at which axes count as parallel; what it moves is below `ROUND_OFF`."""
-
-Integers = NDArray[np.int64]
-
-
-class World(NamedTuple):
-    """One rig at one orientation in one scene.
-
-    Attributes:
-        lower: Of the workspace box, shape (3,), [m].
-        upper: Likewise.
-        outlets: Shape (m, 3), [m].
-        feeds: Feed directions of the pulleys, shape (m, 3).
-        pulley: Radius of the pulleys, [m]; 0 for point exits.
-        anchors: Platform frame, shape (m, 3), [m].
-        arms: The same turned into the world's axes, shape (m, 3), [m].
-        rotation: ``world_from_platform`` for translation, shape (3, 3).
-        half: Of the platform box, shape (3,), [m].
-        radii: Radius of each body, shape (m + 1,), [m]; 0 for the platform.
-        needed: What each body needs to any obstacle, its radius included, shape (m + 1,), [m].
-        kinds: Kind of each piece, shape (k,); see `planner.exact.pieces`.
-        owners: Number of each piece's obstacle in the scene, shape (k,).
-        frames: ``shape_from_world`` rotation of each piece, shape (k, 3, 3).
-        centres: Origin of each piece, shape (k, 3), [m].
-        halves: Half extents of each box, shape (k, 3), [m].
-        sums: Half extents of each box grown by the platform, shape (k, 3), [m], where the axes of
-            the two are parallel; else and for other kinds zeros.
-        balls: Radius by which each piece is grown, shape (k,), [m].
-        discs: Radius of the disc of each piece, shape (k,), [m].
-        points: Points of all pieces, world frame, shape (n, 3), [m].
-        first_point: Where each piece's points begin, shape (k + 1,).
-        triangles: Triangles of all meshes, world frame, shape (t, 3, 3), [m].
-        first_triangle: Where each piece's triangles begin, shape (k + 1,).
-        planes: Of all pairs, shape (l, 6): unit normal, limit, reach of the ungrown piece along
-            the normal, reach of the exit (minus infinity for the platform).
-        first_plane: Where each pair's planes begin, shape (k (m + 1) + 1,).
-    """
-
-    lower: Array
-    upper: Array
-    outlets: Array
-    feeds: Array
-    pulley: float
-    anchors: Array
-    arms: Array
-    rotation: Array
-    half: Array
-    radii: Array
-    needed: Array
-    kinds: Integers
-    owners: Integers
-    frames: Array
-    centres: Array
-    halves: Array
-    sums: Array
-    balls: Array
-    discs: Array
-    points: Array
-    first_point: Integers
-    triangles: Array
-    first_triangle: Integers
-    planes: Array
-    first_plane: Integers
 
 
 def build_world(rig: Rig, scene: Scene, rotation: Array, clearance: float) -> World:
@@ -112,33 +47,39 @@ def build_world(rig: Rig, scene: Scene, rotation: Array, clearance: float) -> Wo
     radii = np.append(np.full(rig.cable_count, rig.cable_radius), 0.0)
     needed = radii + clearance + ROUND_OFF * _extent(rig, pieces)
     planes, first_plane = _planes(rig, pieces, rotation, needed)
+    arms = rig.anchors @ rotation.T
     return World(
-        lower=np.array(rig.workspace_lower),
-        upper=np.array(rig.workspace_upper),
-        outlets=np.array(rig.outlets),
-        feeds=np.array(rig.feed_directions),
+        limits=np.stack([rig.workspace_lower, rig.workspace_upper]),
+        platform=np.concatenate([rotation, rig.half_size[None, :]]),
         pulley=float(rig.pulley_radius),
-        anchors=np.array(rig.anchors),
-        arms=np.ascontiguousarray(rig.anchors @ rotation.T),
-        rotation=np.array(rotation, dtype=np.float64),
-        half=np.array(rig.half_size),
-        radii=radii,
-        needed=needed,
-        kinds=np.array([p.kind for p in pieces], dtype=np.int64),
-        owners=np.array([p.owner for p in pieces], dtype=np.int64),
-        frames=_stacked([p.pose.rotation.T for p in pieces], (3, 3)),
-        centres=_stacked([p.pose.position for p in pieces], (3,)),
-        halves=_stacked([p.half for p in pieces], (3,)),
-        sums=_stacked([_sum_of_boxes(rig, p, rotation) for p in pieces], (3,)),
-        balls=np.array([p.radius for p in pieces], dtype=np.float64),
-        discs=np.array([p.disc for p in pieces], dtype=np.float64),
+        cables=np.concatenate([rig.outlets, rig.feed_directions, rig.anchors, arms], axis=1),
+        bodies=np.column_stack([needed, radii]),
+        pieces=np.concatenate(
+            [np.zeros((0, 20)), *(_piece_row(rig, p, rotation) for p in pieces)], axis=0
+        ),
+        spans=_spans(pieces),
         points=np.concatenate([np.zeros((0, 3)), *(p.points for p in pieces)]),
-        first_point=_starts([len(p.points) for p in pieces]),
         triangles=np.concatenate([np.zeros((0, 3, 3)), *(p.triangles for p in pieces)]),
-        first_triangle=_starts([len(p.triangles) for p in pieces]),
         planes=planes,
         first_plane=first_plane,
     )
+
+
+def _piece_row(rig: Rig, piece: Piece, rotation: Array) -> Array:
+    grown = _sum_of_boxes(rig, piece, rotation)
+    frame = piece.pose.rotation.T.ravel()
+    sizes = np.array([piece.radius, piece.disc])
+    return np.concatenate([frame, piece.pose.position, piece.half, grown, sizes])[None, :]
+
+
+def _spans(pieces: tuple[Piece, ...]) -> Integers:
+    points = _starts([len(p.points) for p in pieces])
+    triangles = _starts([len(p.triangles) for p in pieces])
+    rows = [
+        [p.kind, p.owner, points[k], points[k + 1], triangles[k], triangles[k + 1]]
+        for k, p in enumerate(pieces)
+    ]
+    return np.array(rows, dtype=np.int64).reshape(-1, 6)
 
 
 def _planes(
@@ -187,7 +128,7 @@ def _pair_planes(
 
 
 def _sum_of_boxes(rig: Rig, piece: Piece, rotation: Array) -> Array:
-    """Half extents of the box grown by the platform, shape (3,), [m]; zeros where that is no box."""
+    """Half extents of a box grown by the platform, [m]; zeros where that is no box."""
     turn = np.abs(piece.pose.rotation.T @ rotation)
     parallel = np.all(np.minimum(turn, np.abs(1.0 - turn)) <= _PARALLEL)
     if piece.kind != BOX or not parallel:
@@ -206,7 +147,3 @@ def _extent(rig: Rig, pieces: tuple[Piece, ...]) -> float:
 
 def _starts(counts: list[int]) -> Integers:
     return np.concatenate([[0], np.cumsum(np.array(counts, dtype=np.int64))]).astype(np.int64)
-
-
-def _stacked(arrays: list[Array], shape: tuple[int, ...]) -> Array:
-    return np.ascontiguousarray(np.array(arrays, dtype=np.float64).reshape(-1, *shape))
