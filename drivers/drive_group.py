@@ -82,6 +82,7 @@ class CycleStatus:
         faults: Node and text of every fault since the last reset, oldest first.
         state: State of the group.
         holding: Every drive holds under torque (enabled or in quick stop).
+        stopped: Every drive told in this cycle that it follows no set-points.
         rejected: Replies thrown away since `configure` because their length was wrong.
     """
 
@@ -93,6 +94,7 @@ class CycleStatus:
     faults: tuple[tuple[int, str], ...]
     state: GroupState
     holding: bool
+    stopped: bool
     rejected: int
 
 

@@ -15,7 +15,13 @@ import numpy as np
 from cdpr.errors import Fault, Refused
 from cdpr.poses import Array
 from cdpr.rig import Rig
-from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
+from drivers.drive_group import (
+    Capabilities,
+    CycleStatus,
+    DriveGroup,
+    GroupCommand,
+    GroupState,
+)
 from executor.clock import Clock
 from executor.feed import Feed, targets_at
 from executor.machine import Event, Machine, State
@@ -110,7 +116,8 @@ class Loop:
         self._actual: tuple[int, ...] = ()
         self._armed = False
         self._cycle = 0
-        self._told: set[str] = set()
+        self._noted: set[str] = set()
+        self._listener_error = ""
         self.cause = ""
 
     def read_actual(self) -> Array:
@@ -124,11 +131,12 @@ class Loop:
         return np.array(self._actual, dtype=np.float64)
 
     def arm(self) -> None:
-        """Confirms that the table is the checked one and that the platform stands at its start.
+        """Confirms the drives' abilities, the table, and that the platform stands at its start.
 
         Raises:
-            Refused: It is not, or the drives are too far from the first set-point.
+            Refused: One of it is not so; nothing was enabled.
         """
+        _require_capabilities(self._group.capabilities, self._cycle_time)
         table = self._checked.table
         if table.hash != self._checked.hash:
             raise Refused("the set-point table is not the one that was checked", where="arming")
@@ -148,15 +156,21 @@ class Loop:
         self._armed = True
 
     def run(self) -> State:
-        """Runs to the end; returns the last state. The drives hold by themselves afterwards."""
+        """Runs to the end; returns the last state, and `cause` says why it is not FINISHED.
+
+        Raises:
+            Refused: It was not armed.
+        """
+        if not self._armed:
+            raise Refused("the run was not armed", where="executor")
         try:
             self.machine.on(Event.ENABLE)
             while self.machine.state in _ACTIVE:
                 self._one_step()
-        except BaseException as error:
-            self.machine.on(Event.FAULT)
-            self._stop_drives()
-            self._tell_cause("broken", f"the run broke: {error}")
+        except Exception as error:
+            self._fault("broken", f"the loop broke: {error}")
+        except BaseException:
+            self._fault("broken", "the program was ended")
             raise
         return self.machine.state
 
@@ -179,8 +193,6 @@ class Loop:
             if self.machine.state is not State.ENABLING:
                 return
             if status is not None and status.state is GroupState.ENABLED:
-                # The drives hold what the group sent last; the platform may have moved since `arm`.
-                self._targets = tuple(int(target) for target in self._group.targets)
                 # While it enabled them, the group held each drive at a place of its own.
                 self._targets = tuple(int(t) for t in self._group.targets)
                 self.machine.on(Event.ENABLED)
@@ -211,8 +223,9 @@ class Loop:
         self._send(Purpose.MOVE, targets_at(self._checked.table.setpoints, self._feed.advance()))
 
     def _secure(self) -> None:
-        """Settles, then lets the drives hold by themselves."""
-        for _ in range(SETTLING):
+        """Settles, then lets the drives hold by themselves, and waits until they say so."""
+        was_enabled = self._group.state is GroupState.ENABLED
+        for _ in range(SETTLING if was_enabled else 0):
             self._send(Purpose.HOLD, self._targets or self._actual)
             if self.machine.state is not State.SECURING:
                 return
@@ -221,9 +234,9 @@ class Loop:
             status = self._send(Purpose.HOLD, self._targets or self._actual)
             if self.machine.state is not State.SECURING:
                 return
-            if status is not None and status.state is not GroupState.ENABLED:
+            if status is not None and status.stopped and (status.holding or not was_enabled):
                 self.machine.on(Event.HELD)
-                self._tell("held", "at rest; the drives hold by themselves under torque")
+                self._tell("held", _HELD if status.holding else _NEVER_ENABLED)
                 return
         self._fault("hold_timeout", f"the drives did not go over to hold in {PATIENCE} cycles")
 
@@ -241,6 +254,12 @@ class Loop:
         if not verdict.allowed:
             self._fault("gate_denied", f"the safety gate denied a set-point: {verdict.reason}")
             return None
+        status, errors = self._exchange(targets, lateness)
+        self._judge(status, errors, lateness)
+        return status
+
+    def _exchange(self, targets: tuple[int, ...], lateness: float) -> tuple[CycleStatus, Array]:
+        """Sends what the gate allowed, receives and records."""
         self._group.send_cycle(targets)
         self._targets = targets
         self._pump()
@@ -248,8 +267,7 @@ class Loop:
         self._actual = tuple(int(p) for p in status.positions)
         errors = self._following_errors(status)
         self._record(status, errors, lateness)
-        self._judge(status, errors, lateness)
-        return status
+        return status, errors
 
     def _following_errors(self, status: CycleStatus) -> Array:
         """Signed, in cable length, shape (m,), [m]; NaN while drives do not follow or answer."""
@@ -270,20 +288,26 @@ class Loop:
         )
 
     def _record(self, status: CycleStatus, errors: Array, lateness: float) -> None:
-        self._on_cycle(
-            CycleRecord(
-                cycle=self._cycle,
-                state=self.machine.state,
-                index=self._feed.index,
-                targets=self._targets or (),
-                actual=self._actual,
-                torques=tuple(int(t) for t in status.torques),
-                missing=int(np.count_nonzero(status.missing)),
-                following_error=_largest(errors),
-                lateness=lateness,
-            )
+        record = CycleRecord(
+            cycle=self._cycle,
+            state=self.machine.state,
+            index=self._feed.index,
+            targets=self._targets or (),
+            actual=self._actual,
+            torques=tuple(int(t) for t in status.torques),
+            missing=int(np.count_nonzero(status.missing)),
+            following_error=_largest(errors),
+            lateness=lateness,
         )
         self._cycle += 1
+        self._told_outside(lambda: self._on_cycle(record))
+
+    def _told_outside(self, tell: Callable[[], None]) -> None:
+        """A listener that fails does not break the loop; it leads to a stop along the path."""
+        try:
+            tell()
+        except Exception as error:
+            self._listener_error = self._listener_error or f"what records the run failed: {error}"
 
     def _judge(self, status: CycleStatus, errors: Array, lateness: float) -> None:
         """Lets the watch look at the cycle and reacts; then looks for the operator's stop."""
@@ -296,9 +320,11 @@ class Loop:
             lateness=lateness,
         )
         self._watch, findings = self._watch.look(seen)
+        if self._listener_error:
+            findings = (*findings, Finding(Reaction.PATH_STOP, "recorder", self._listener_error))
         for finding in findings:
             self._react(finding)
-        if self._stop_requested() and self.machine.state in _STOPPABLE:
+        if self.machine.state in _STOPPABLE and self._stop_requested():
             self._tell_cause("stop", "stop requested; slowing down along the path")
             self._feed.stop()
             self.machine.on(Event.STOP)
@@ -307,7 +333,9 @@ class Loop:
         if self.machine.state is State.LATCHED:
             return
         if finding.reaction is Reaction.NOTE:
-            self._tell(finding.code, finding.text)
+            if finding.code not in self._noted:
+                self._noted.add(finding.code)
+                self._tell(finding.code, finding.text)
         elif finding.reaction is Reaction.PATH_STOP and self.machine.state in _ON_PATH:
             if self.machine.state is State.MOVING:
                 self._tell_cause(finding.code, f"{finding.text}; stopping along the path")
@@ -332,14 +360,14 @@ class Loop:
 
     def _drain(self) -> None:
         """A few more cycles, so that what the drives do during a quick stop is on record."""
-        for _ in range(SETTLING):
-            lateness = self._clock.next_cycle()
-            self._group.send_cycle(self._actual)
-            self._targets = self._actual
-            self._pump()
-            status = self._group.receive(self._clock.time_left())
-            self._actual = tuple(int(p) for p in status.positions)
-            self._record(status, self._following_errors(status), lateness)
+        try:
+            for _ in range(SETTLING):
+                lateness = self._clock.next_cycle()
+                targets = self._targets or self._actual
+                if examine(self._limits, self._request(Purpose.HOLD, targets)).allowed:
+                    self._exchange(targets, lateness)
+        except Exception as error:  # the drives have been told to stop; nothing more is owed
+            self._tell("bus_lost", f"{error}; the drives stop when they miss the master")
 
     def _tell_cause(self, code: str, text: str) -> None:
         """Tells why the run does not finish; the first cause is kept."""
@@ -347,10 +375,8 @@ class Loop:
         self._tell(code, text)
 
     def _tell(self, code: str, text: str) -> None:
-        """Once for the same sentence."""
-        if text not in self._told:
-            self._told.add(text)
-            self._on_event(LoopEvent(self._cycle, code, text))
+        event = LoopEvent(self._cycle, code, text)
+        self._told_outside(lambda: self._on_event(event))
 
 
 _ACTIVE = frozenset(
@@ -364,6 +390,34 @@ def _largest(errors: Array) -> float:
     """Of those that are known; NaN when none is."""
     known = np.abs(errors[np.isfinite(errors)])
     return float(known.max()) if known.size else float("nan")
+
+
+_HELD = "at rest; the drives hold by themselves under torque"
+_NEVER_ENABLED = "stopped before all drives were enabled; none of them follows set-points"
+
+
+def _require_capabilities(drives: Capabilities, cycle: float) -> None:
+    """Drives must start, stop and hold together without the master, or have brakes.
+
+    Raises:
+        Refused: They do not, or the cycle is faster than they were tested with.
+    """
+    missing = []
+    if not drives.sync:
+        missing.append("take their set-points at one SYNC")
+    if not (drives.holds_on_comm_loss or drives.has_brake):
+        missing.append("hold when the master is lost")
+    if not (drives.holds_on_quick_stop or drives.has_brake):
+        missing.append("hold after a quick stop")
+    if cycle * drives.max_hz < 1.0 - 1e-9:
+        missing.append(f"keep up with a cycle of {cycle * 1000:g} ms")
+    if missing:
+        raise Refused(
+            f"these drives do not {', nor '.join(missing)}",
+            where="arming",
+            why="a cable robot whose drives do not stop together and hold drops its platform",
+            next_step="use drives that do, or winches with brakes; nothing was enabled",
+        )
 
 
 def _nothing(*_: object) -> None:
@@ -382,7 +436,8 @@ def _gate_limits(rig: Rig, checked: CheckedTable) -> Limits:
     speeds = np.array([w.max_speed for w in rig.winches])
     rows = checked.table.setpoints.astype(np.int64)
     step = np.floor(per_metre * speeds * checked.table.cycle).astype(int) + 1
-    lag = np.floor(per_metre * rig.motion.following_error).astype(int)
+    # The actual position is of one cycle before, and the drives follow one cycle behind.
+    lag = np.floor(per_metre * rig.motion.following_error).astype(int) + 2 * step
     return Limits(
         lowest=tuple((rows.min(axis=0) - margin).tolist()),
         highest=tuple((rows.max(axis=0) + margin).tolist()),

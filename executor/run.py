@@ -44,14 +44,12 @@ class Outcome:
         cause: Why it did not finish, if it did not.
         log: Its cycles.
         started: When, UTC.
-        error: What broke the loop itself, if anything did.
     """
 
     state: State
     cause: str
     log: RunLog
     started: datetime
-    error: BaseException | None
 
 
 class Execution:
@@ -115,18 +113,14 @@ class Execution:
         self._every = max(1, round(1.0 / (camera_rate * cycle)))
         self._progress = progress or self._progress
         started = datetime.now(UTC)
-        error: BaseException | None = None
-        try:
-            if self._clock.simulated:
+        if self._clock.simulated:
+            self.loop.run()
+        else:
+            with real_time() as denied:
+                if denied:
+                    self._on_event(LoopEvent(0, "no_real_time", denied))
                 self.loop.run()
-            else:
-                with real_time() as denied:
-                    if denied:
-                        self._on_event(LoopEvent(0, "no_real_time", denied))
-                    self.loop.run()
-        except Exception as broken:  # the drives were stopped; what is known is still recorded
-            error = broken
-        return Outcome(self.loop.machine.state, self.loop.cause, self._log, started, error)
+        return Outcome(self.loop.machine.state, self.loop.cause, self._log, started)
 
     def _on_cycle(self, record: CycleRecord) -> None:
         self._log.add(record)

@@ -257,6 +257,7 @@ class Cia402Group:
                 s in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
                 for s in watch.states
             ),
+            stopped=DriveState.OPERATION_ENABLED not in watch.states and not missing.any(),
             rejected=watch.rejected,
         )
 
