@@ -1,9 +1,10 @@
 """How kernels are compiled, and where the machine code is kept.
 
 Numba recompiles a cached function when its own file changes, not when a function it calls does. So
-the cache lies in a folder named after the content of all kernels: any change begins a new one. The
-folder is the user's (``NUMBA_CACHE_DIR``, else ``XDG_CACHE_HOME`` or ``~/.cache``), which lets a
-read-only installation work. Where no folder can be written, kernels live as long as the process.
+the cache lies in a folder named after the content of all kernels here and beside the function: any
+change begins a new one. The folder is the user's (``NUMBA_CACHE_DIR``, else ``XDG_CACHE_HOME`` or
+``~/.cache``), which lets a read-only installation work. Where no folder can be written, kernels
+live as long as the process.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "fastmath": F
 
 def kernel(function: Function) -> Function:
     """Compiles a pure function when it is first called; exact IEEE arithmetic, no GIL."""
-    folder = cache_folder()
+    folder = cache_folder(Path(function.__code__.co_filename).parent)
     if folder is None:
         return cast(Function, numba.njit(**_OPTIONS)(function))
     config: Any = numba.config
@@ -39,8 +40,8 @@ def kernel(function: Function) -> Function:
 
 
 @cache
-def cache_folder() -> Path | None:
-    """The folder of these kernels' machine code; None where none can be written."""
+def cache_folder(sources: Path) -> Path | None:
+    """The folder of the machine code of kernels in ``sources``; None where none can be written."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         parent = Path(given)
@@ -48,7 +49,7 @@ def cache_folder() -> Path | None:
         cache_home = os.environ.get("XDG_CACHE_HOME")
         parent = Path(cache_home) if cache_home else Path.home() / ".cache"
         parent = parent / "cdpr" / "kernels"
-    folder = parent / _version()
+    folder = parent / _version(sources)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -58,9 +59,10 @@ def cache_folder() -> Path | None:
 
 
 @cache
-def _version() -> str:
-    """Name of this state of the kernels on this processor."""
+def _version(sources: Path) -> str:
+    """Name of this state of the kernels in ``sources``, and of those here, on this processor."""
     digest = hashlib.sha256(f"{numba.__version__} {platform.machine()}".encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    here = Path(__file__).parent
+    for source in sorted({*here.glob("*.py"), *sources.glob("*.py")}):
         digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
