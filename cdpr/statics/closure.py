@@ -2,7 +2,8 @@
 
 They can exactly when the structure matrix has full rank and tensions that are all positive balance
 each other. When they cannot, there is a wrench against which no cable can pull; one quadratic
-program gives either proof.
+program gives either proof. For maps of many poses, `closure_margin` gives the same answer as a
+number, without a proof.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cdpr.errors import BadInput, Fault
-from cdpr.statics.arguments import WRENCH_SIZE, checked_structure_matrix
-from cdpr.statics.wrench_facets import RANK_TOLERANCE
+from cdpr.statics.arguments import WRENCH_SIZE, blocks, checked_structure_matrix
+from cdpr.statics.wrench_facets import RANK_TOLERANCE, WrenchFacets, wrench_facets
+from cdpr.statics.wrench_set import subsets
 
 SMALLEST_TENSION = 1e-9
 """Part of the largest self-balancing tension that the smallest must exceed to be positive."""
@@ -74,6 +76,50 @@ def wrench_closure(structure_matrix: ArrayLike) -> WrenchClosure:
         return _result(matrix, closed=True, proof=tensions / tensions.max())
     blocked = -left @ (right[:WRENCH_SIZE] @ gains / singular_values)
     return _result(matrix, closed=False, proof=blocked / np.linalg.norm(blocked))
+
+
+def closure_margin(
+    structure_matrix: ArrayLike, characteristic_length: float
+) -> NDArray[np.float64]:
+    """Return how far poses are from gaining or losing wrench closure.
+
+    A direction that five cables (or more) cannot act along decides: the others must pull along it
+    both ways. The margin is the pull of one newton the weaker way, in the worst such direction.
+
+    Args:
+        structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
+        characteristic_length: [m], divides the moments.
+
+    Returns:
+        shape (...), [-]: positive exactly where closed; minus infinity where the structure matrix
+        has no full rank.
+
+    Raises:
+        BadInput: The shape is another one, a value is not finite, or the length is not positive.
+
+    Source: Gouttefarde & Gosselin, "Analysis of the wrench-closure workspace of planar parallel
+        cable-driven mechanisms", 2006 (the same condition for planar robots).
+    """
+    matrix = checked_structure_matrix(structure_matrix)
+    batch, shape = matrix.shape[:-2], matrix.shape[-2:]
+    matrices = matrix.reshape(-1, *shape)
+    margins = np.zeros(len(matrices))
+    for block in blocks(len(matrices)):
+        facets = wrench_facets(matrices[block], 0.0, 1.0, characteristic_length)
+        margins[block] = _weaker_pulls(facets)
+    return margins.reshape(batch)
+
+
+def _weaker_pulls(facets: WrenchFacets) -> NDArray[np.float64]:
+    cable_count = facets.cable_gains.shape[-1]
+    if cable_count < WRENCH_SIZE:
+        return np.full(facets.full_rank.shape, -np.inf)
+    # The gains of the other cables are zero by construction, and round-off in fact.
+    acting = subsets(cable_count, cable_count - WRENCH_SIZE + 1)
+    gains = np.take_along_axis(facets.cable_gains, acting[np.newaxis], axis=-1)
+    weaker = np.minimum(gains.max(axis=-1), -gains.min(axis=-1))
+    weaker[np.isinf(facets.upper)] = np.inf
+    return np.asarray(np.where(facets.full_rank, weaker.min(axis=-1), -np.inf))
 
 
 def _most_even(null_basis: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from cdpr.errors import BadInput
-from cdpr.statics.closure import wrench_closure
-from tests.statics.robots import flat_matrix, paper_matrix, random_matrix
+from cdpr.statics.closure import closure_margin, wrench_closure
+from tests.statics.robots import PAPER_LENGTH, flat_matrix, paper_matrix, random_matrix
 
 
 def largest_smallest_tension(matrix):
@@ -91,6 +91,39 @@ def test_a_cable_that_must_be_slack_opens_the_closure():
     answer = wrench_closure(with_one_lifting)
     assert not answer.closed
     assert answer.residual < 1e-12
+
+
+@settings(max_examples=150)
+@given(seed=st.integers(0, 2**32 - 1), cables=st.sampled_from([6, 7, 8, 10, 12]))
+def test_the_margin_is_positive_exactly_where_the_quadratic_program_closes(seed, cables):
+    matrix = random_matrix(seed, cables)
+    margin = float(closure_margin(matrix, 0.2))
+    if abs(margin) > 1e-9:
+        assert wrench_closure(matrix).closed == (margin > 0.0)
+
+
+def test_margins_of_many_poses_are_those_of_each():
+    matrices = np.array([random_matrix(seed, 8) for seed in range(300)]).reshape(20, 15, 6, 8)
+    margins = closure_margin(matrices, 0.2)
+    assert margins.shape == (20, 15)
+    assert margins[7, 4] == pytest.approx(float(closure_margin(matrices[7, 4], 0.2)), abs=1e-12)
+    assert (margins > 0.0).any()
+    assert (margins < 0.0).any()
+
+
+def test_the_margin_crosses_zero_without_a_jump():
+    """A surface drawn through zero is then where closure ends, not somewhere in a cell."""
+    line = np.linspace([0.0, 0.0, 0.445], [0.9, 0.3, 0.445], 4001)
+    margins = closure_margin(np.array([paper_matrix(tuple(p)) for p in line]), PAPER_LENGTH)
+    lost = int(np.argmax(margins <= 0.0))
+    assert 0 < lost < len(line)
+    assert margins[lost - 1] - margins[lost] < 2e-3
+    assert margins[lost] < 0.0
+
+
+def test_without_full_rank_the_margin_is_minus_infinity():
+    assert closure_margin(flat_matrix(), 0.2) == -np.inf
+    assert closure_margin(paper_matrix()[:, :5], 0.2) == -np.inf
 
 
 def test_several_poses_at_once_are_refused():
