@@ -6,11 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.exact.compiled import kernel
-from planner.exact.triangle_point import (
-    face_point_squared,
-    segment_point_squared,
-    triangle_point_definition,
-)
+from planner.exact.segment_pair import segment_pair_squared
+from planner.exact.triangle_point import face_point_squared, triangle_point_definition
 from planner.exact.vectors import Vector, along, cross, dot, minus
 
 
@@ -34,24 +31,6 @@ def triangle_segment_squared(a: Vector, b: Vector, c: Vector, start: Vector, end
         ),
         min(face_point_squared(a, b, c, start), face_point_squared(a, b, c, end)),
     )
-
-
-@kernel
-def segment_pair_squared(p: Vector, q: Vector, r: Vector, s: Vector) -> float:
-    """Squared distance of the segments p q and r s, [m²]."""
-    first, second, gap = minus(q, p), minus(s, r), minus(p, r)
-    aa, bb, ab = dot(first, first), dot(second, second), dot(first, second)
-    ag, bg = dot(first, gap), dot(second, gap)
-    least = min(
-        min(segment_point_squared(r, s, p), segment_point_squared(r, s, q)),
-        min(segment_point_squared(p, q, r), segment_point_squared(p, q, s)),
-    )
-    determinant = aa * bb - ab * ab
-    if determinant > 0.0:
-        share = (ab * bg - bb * ag) / determinant
-        if 0.0 < share < 1.0:
-            least = min(least, segment_point_squared(r, s, along(p, first, share)))
-    return least
 
 
 def triangle_segment_definition(

@@ -129,7 +129,9 @@ def test_many_edges_and_points_are_answered_as_one_by_one() -> None:
     scene = load_scene(CONFIGS / "environment_2.yaml")
     world = build_world(GACHON, scene, np.eye(3), 0.01)
     rng = np.random.default_rng(8)
-    starts, ends = map(np.array, zip(*(random_edge(rng, GACHON, 0.2) for _ in range(50))))
+    starts, ends = map(
+        np.array, zip(*(random_edge(rng, GACHON, 0.2) for _ in range(50)), strict=True)
+    )
     one_by_one = [edge_free(world, a, b) for a, b in zip(starts, ends, strict=True)]
     assert edges_free(world, starts, ends).tolist() == one_by_one
     assert edges_free(world, ends, starts).tolist() == one_by_one

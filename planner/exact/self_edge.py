@@ -1,0 +1,201 @@
+"""Self clearance of a rig: proved once over the workspace box, then only what is left, by edge."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.errors import BadInput
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from cdpr.self_clearance import SelfModel
+from planner.exact.compiled import kernel
+from planner.exact.fields import World
+from planner.exact.moving_edge import turned_by
+from planner.exact.self_region import (
+    PROVED,
+    REFUTED,
+    Robot,
+    pair_over_region,
+    platform_over_region,
+)
+from planner.exact.vectors import Vector, along, minus
+from planner.exact.world import ROUND_OFF
+
+_MOST_BOXES = 2048
+_MOST_PIECES = 4096
+_DEEPEST = 64
+_FINEST = 1e-9
+
+
+def build_robot(rig: Rig, world: World, clearance: float) -> Robot:
+    """What is to be compared on a rig, proved over its workspace as far as that goes.
+
+    Args:
+        rig: The robot.
+        world: Made from it for one orientation; its obstacles are not used.
+        clearance: Smallest allowed distance between cables and of cables to the platform, [m].
+
+    Raises:
+        BadInput: The clearance is negative or not finite.
+    """
+    if not 0.0 <= clearance < np.inf:
+        raise BadInput(
+            f"the self clearance must be 0 mm or more (it is {clearance * 1000.0:g} mm)",
+            where="exact edge checks",
+        )
+    model = SelfModel(rig)
+    guard = ROUND_OFF * float(max(np.abs(rig.outlets).max(), np.abs(world.limits).max()))
+    robot = Robot(
+        pairs=np.array(model.pairs),
+        stubs=np.column_stack([_stubs(rig.anchors, model), _stubs(rig.outlets, model)]),
+        stub=float(model.stub),
+        pair_needed=clearance + 2.0 * rig.cable_radius + guard,
+        platform_needed=clearance + rig.cable_radius + guard,
+        open_pairs=np.arange(len(model.pairs)),
+        open_cables=np.arange(rig.cable_count),
+    )
+    open_pairs = [k for k in robot.open_pairs if not box_proved(world, robot, int(k), False)]
+    open_cables = [k for k in robot.open_cables if not box_proved(world, robot, int(k), True)]
+    return robot._replace(
+        open_pairs=np.array(open_pairs, dtype=np.int64),
+        open_cables=np.array(open_cables, dtype=np.int64),
+    )
+
+
+def _stubs(ends: Array, model: SelfModel) -> Array:
+    """Lengths left out where two cables share an end, shape (q,); as in `cdpr.self_clearance`."""
+    apart = np.linalg.norm(ends[model.pairs[:, 0]] - ends[model.pairs[:, 1]], axis=-1)
+    stubs: Array = np.where(apart < model.stub, model.stub, 0.0)
+    return stubs
+
+
+@kernel
+def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool:
+    """Whether the cables keep the self clearance under a translation.
+
+    What is proved over the whole workspace is not looked at, so both ends must lie in it.
+
+    Args:
+        world: Where; gives the orientation.
+        robot: What is needed.
+        start: World frame, shape (3,), [m].
+        end: Likewise.
+    """
+    still = np.zeros(3)
+    before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
+    rotation = world.platform[:3]
+    for pair in robot.open_pairs:
+        if not _clear(world, robot, pair, False, before, after, rotation, still):
+            return False
+    for cable in robot.open_cables:
+        if not _clear(world, robot, cable, True, before, after, rotation, still):
+            return False
+    return True
+
+
+@kernel
+def self_turning_edge_free(
+    world: World, robot: Robot, start: Array, end: Array, rotation: Array, turn: Array
+) -> bool:
+    """Whether the cables keep the self clearance while the platform is moved and turned.
+
+    Args:
+        world: Where; its own orientation is not used.
+        robot: What is needed.
+        start: World frame, shape (3,), [m].
+        end: Likewise.
+        rotation: ``world_from_platform`` at the start, shape (3, 3).
+        turn: Rotation vector from start to end, platform frame, shape (3,), [rad].
+    """
+    before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
+    for pair in range(len(robot.pairs)):
+        if not _clear(world, robot, pair, False, before, after, rotation, turn):
+            return False
+    for cable in range(len(world.cables)):
+        if not _clear(world, robot, cable, True, before, after, rotation, turn):
+            return False
+    return True
+
+
+@kernel
+def _clear(
+    world: World,
+    robot: Robot,
+    which: int,
+    to_platform: bool,
+    before: Vector,
+    after: Vector,
+    rotation: Array,
+    turn: Array,
+) -> bool:
+    """One pair, or one cable to the platform, along an edge that is halved until decided."""
+    way = minus(after, before)
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    size = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2) + angle
+    lows, highs, ends = np.empty(_DEEPEST), np.empty(_DEEPEST), np.empty((2, 3))
+    lows[0], highs[0] = 0.0, 1.0
+    waiting, tried = 1, 0
+    while waiting > 0:
+        waiting -= 1
+        low, high, tried = lows[waiting], highs[waiting], tried + 1
+        middle = (low + high) / 2.0
+        ends[0], ends[1] = along(before, way, low), along(before, way, high)
+        at, there = along(before, way, middle), turned_by(rotation, turn, middle)
+        off = angle * (high - low) / 2.0
+        if to_platform:
+            found = platform_over_region(world, robot, which, there, ends, at, off)
+        else:
+            found = pair_over_region(world, robot, which, there, ends, at, off)
+        if found == PROVED:
+            continue
+        if found == REFUTED or tried >= _MOST_PIECES or waiting + 2 > _DEEPEST:
+            return False
+        if size * (high - low) < _FINEST:
+            return False
+        lows[waiting], highs[waiting] = middle, high
+        lows[waiting + 1], highs[waiting + 1] = low, middle
+        waiting += 2
+    return True
+
+
+@kernel
+def box_proved(world: World, robot: Robot, which: int, to_platform: bool) -> bool:
+    """Whether one pair, or one cable to the platform, is proved over the whole workspace box."""
+    boxes, corners = np.empty((_DEEPEST, 6)), np.empty((8, 3))
+    boxes[0, :3], boxes[0, 3:] = world.limits[0], world.limits[1]
+    waiting, tried = 1, 0
+    rotation = world.platform[:3]
+    while waiting > 0:
+        waiting -= 1
+        tried += 1
+        box = boxes[waiting].copy()
+        for corner in range(8):
+            for axis in range(3):
+                corners[corner, axis] = box[axis + 3 * ((corner >> axis) & 1)]
+        at = ((box[0] + box[3]) / 2.0, (box[1] + box[4]) / 2.0, (box[2] + box[5]) / 2.0)
+        if to_platform:
+            found = platform_over_region(world, robot, which, rotation, corners, at, 0.0)
+        else:
+            found = pair_over_region(world, robot, which, rotation, corners, at, 0.0)
+        if found == PROVED:
+            continue
+        if found == REFUTED or tried >= _MOST_BOXES or waiting + 2 > _DEEPEST:
+            return False
+        longest = 0
+        for axis in range(1, 3):
+            if box[axis + 3] - box[axis] > box[longest + 3] - box[longest]:
+                longest = axis
+        boxes[waiting], boxes[waiting + 1] = box, box
+        boxes[waiting, longest + 3], boxes[waiting + 1, longest] = at[longest], at[longest]
+        waiting += 2
+    return True
+
+
+@kernel
+def self_edges_free(world: World, robot: Robot, starts: Array, ends: Array) -> NDArray[np.bool_]:
+    """`self_edge_free` for many edges, shape (k, 3) each, [m]; shape (k,)."""
+    free = np.empty(len(starts), dtype=np.bool_)
+    for i in range(len(starts)):
+        free[i] = self_edge_free(world, robot, starts[i], ends[i])
+    return free
