@@ -113,12 +113,17 @@ def test_margins_of_many_poses_are_those_of_each():
 
 def test_the_margin_crosses_zero_without_a_jump():
     """A surface drawn through zero is then where closure ends, not somewhere in a cell."""
-    line = np.linspace([0.0, 0.0, 0.445], [0.9, 0.3, 0.445], 4001)
-    margins = closure_margin(np.array([paper_matrix(tuple(p)) for p in line]), PAPER_LENGTH)
-    lost = int(np.argmax(margins <= 0.0))
-    assert 0 < lost < len(line)
-    assert margins[lost - 1] - margins[lost] < 2e-3
-    assert margins[lost] < 0.0
+    start, end = np.array([0.0, 0.0, 0.445]), np.array([0.9, 0.3, 0.445])
+    closed, lost = 0.0, 1.0
+    while lost - closed > 1e-12:
+        share = (closed + lost) / 2.0
+        at = start + share * (end - start)
+        inside = closure_margin(paper_matrix(tuple(at)), PAPER_LENGTH) > 0.0
+        closed, lost = (share, lost) if inside else (closed, share)
+    sides = np.array([paper_matrix(tuple(start + s * (end - start))) for s in (closed, lost)])
+    before, after = closure_margin(sides, PAPER_LENGTH)
+    assert 0.0 < before < 1e-9
+    assert -1e-9 < after <= 0.0
 
 
 def test_without_full_rank_the_margin_is_minus_infinity():
