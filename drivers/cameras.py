@@ -64,7 +64,9 @@ class ImageFolder:
         found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS]
         if not found:
             raise BadInput(
-                f"the folder has no pictures ({', '.join(PICTURE_ENDINGS)})", where=str(folder)
+                "the folder has no pictures",
+                where=str(folder),
+                next_step=f"name a folder with files that end in {', '.join(PICTURE_ENDINGS)}",
             )
         self.files = tuple(sorted(found, key=lambda path: _natural(path.name)))
         self.unreadable: list[str] = []
@@ -116,7 +118,11 @@ class VideoFile:
         self._path, self._camera = path, camera
         capture = _opened(str(path))
         if not capture.isOpened():
-            raise BadInput("the file is no video that can be read", where=str(path))
+            raise BadInput(
+                "the file is no video that can be read",
+                where=str(path),
+                next_step="convert it, for example with ffmpeg to MJPEG or H.264",
+            )
         self._count = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
         capture.release()
 

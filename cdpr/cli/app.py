@@ -7,6 +7,8 @@ import os
 import sys
 import tempfile
 import traceback
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
@@ -19,10 +21,15 @@ EPILOG = (
 )
 
 
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        print(f"cdpr {version('cdpr')}")
+        raise typer.Exit
+
+
 def build_app() -> typer.Typer:
     """The whole command line."""
     app = typer.Typer(
-        help="Plan, prove, run and measure paths of cable-driven parallel robots.",
         epilog=EPILOG,
         no_args_is_help=True,
         add_completion=True,
@@ -30,8 +37,20 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
+    app.callback()(_options)
     add_verbs(app)
     return app
+
+
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_tell_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    """Plan, prove, run and measure paths of cable-driven parallel robots."""
 
 
 def main() -> None:

@@ -38,7 +38,9 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
     """
     if without:
         if wanted is not None:
-            raise BadInput("--camera and --no-camera contradict each other")
+            raise BadInput(
+                "--camera and --no-camera contradict each other", next_step="leave one of them out"
+            )
         return None
     if not rig.cameras or not rig.platform_tags:
         raise BadInput(

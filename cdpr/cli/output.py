@@ -22,7 +22,12 @@ def show_json(document: Any) -> None:
 
 
 def show_facts(title: str, facts: list[tuple[str, str]]) -> None:
-    """A result for people: names on the left, values on the right."""
+    """A result for people: names on the left, values on the right; a line each in a file."""
+    if not out.is_terminal:
+        width = max(len(name) for name, _ in facts)
+        lines = [f"  {name:<{width}}  {value}" for name, value in facts]
+        typer.echo("\n".join([title, *lines]))
+        return
     table = Table(title=title, show_header=False, box=None, title_justify="left", padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
@@ -33,14 +38,16 @@ def show_facts(title: str, facts: list[tuple[str, str]]) -> None:
 
 @contextmanager
 def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr; the value given to the callback is how far it is."""
+    """A bar on stderr where somebody looks; the value given to the callback is how far it is."""
     columns = (
         TextColumn("[progress.description]{task.description}"),
         BarColumn(),
         TextColumn("{task.completed:.0f}/{task.total:.0f}" if total else "{task.completed:.0f}"),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=err, transient=True, disable=not shown) as bar:
+    with Progress(
+        *columns, console=err, transient=True, disable=not (shown and err.is_terminal)
+    ) as bar:
         task = bar.add_task(text, total=total)
         yield lambda value: bar.update(task, completed=value)
 

@@ -58,7 +58,6 @@ def run(
     from cdpr.cli.cameras import choose_camera
     from cdpr.cli.drives import IN_PROCESS
     from cdpr.cli.run_summary import show_prepared, show_summary
-    from cdpr.errors import StoppedByOperator
     from executor.run_folder import RunFolder
 
     the_rig = rig_on_bus(rig, interface, channel)
@@ -69,11 +68,37 @@ def run(
     prepared = prepared_run(plan, the_rig, quiet=as_json)
     if not as_json:
         show_prepared(prepared, in_process)
-    if not (in_process or yes) and not typer.confirm("Move the platform now?"):
-        raise StoppedByOperator("nothing was moved")
+    if not (in_process or yes):
+        _ask_operator()
     summary = run_prepared(prepared, output, camera_name, fast=fast, start=start, quiet=as_json)
     show_summary(summary, output, as_json)
     raise typer.Exit(exit_code(summary))
+
+
+def _ask_operator() -> None:
+    """A real bus moves only after a yes; silence is none.
+
+    Raises:
+        StoppedByOperator: The answer was no.
+        BadInput: There is nobody to ask.
+    """
+    import sys
+
+    from cdpr.errors import BadInput, StoppedByOperator
+
+    print("Move the platform now? [y/N] ", end="", file=sys.stderr, flush=True)
+    answer = sys.stdin.readline()
+    if not answer:
+        print(file=sys.stderr)
+        raise BadInput(
+            "nobody answered whether the platform may move",
+            where="standard input",
+            next_step="run it in a terminal, or pass --yes; nothing was moved",
+        )
+    if answer.strip().lower() not in ("y", "yes"):
+        raise StoppedByOperator(
+            "nothing was moved", next_step="run it again when the platform may move"
+        )
 
 
 def rig_on_bus(path: Path, interface: str | None, channel: str | None) -> Rig:

@@ -41,7 +41,7 @@ def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
         show_json({"run": str(folder), **summary})
         return
     colour = COLOURS[summary["verdict"]]
-    out.print(f"[bold {colour}]{summary['verdict']}[/] {summary['sentence']}")
+    out.print(f"[bold {colour}]{summary['verdict']}[/] {summary['sentence']}", soft_wrap=True)
     for reason in summary["reasons"]:
-        out.print(f"  {reason}")
+        out.print(f"  {reason}", soft_wrap=True)
     out.print(f"report: {folder / 'report.html'}", soft_wrap=True)

@@ -83,7 +83,9 @@ def _start(
     from cdpr.poses import Pose
 
     if start_mm is not None and plan is not None:
-        raise BadInput("--at-mm and --plan contradict each other")
+        raise BadInput(
+            "--at-mm and --plan contradict each other", next_step="leave one of them out"
+        )
     if plan is not None:
         scene = load_plan(plan).scene
         return scene.start, scene.load

@@ -1,0 +1,90 @@
+"""Plans made by hand, so that tests of what comes after need no search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from cdpr.document_types import PoseDocument, millimetres
+from cdpr.plan import save_plan, sealed
+from cdpr.plan_file import PlanDocument
+from cdpr.poses import Pose
+from cdpr.rig import Rig, load_rig
+from cdpr.scene import Scene, scene_from_document
+from cdpr.scene_file import SceneDocument
+from planner.check import check_path
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+RIG = CONFIGS / "gachon_8_6.yaml"
+HALL = CONFIGS / "hall_10_6.yaml"
+START_MM, GOAL_MM = (0.0, 0.0, 445.0), (0.0, 30.0, 495.0)
+
+
+def free_scene(start_mm: Sequence[float], goal_mm: Sequence[float]) -> Scene:
+    """A room with one far block, so that there is a clearance to measure."""
+    data = {
+        "schema_version": 1,
+        "name": "far block",
+        "clearance": {"obstacle_mm": 10, "self_mm": 5},
+        "start": {"position_mm": list(start_mm)},
+        "goal": {"position_mm": list(goal_mm)},
+        "obstacles": [
+            {
+                "name": "block",
+                "box": {"size_mm": [80.0, 80.0, 100.0]},
+                "position_mm": [-150.0, 0.0, 50.0],
+            }
+        ],
+    }
+    return scene_from_document(SceneDocument.model_validate(data))
+
+
+def straight_plan(rig: Rig, scene: Scene, corners_mm: Sequence[Sequence[float]]) -> PlanDocument:
+    """A sealed plan along straight lines; whether it is a good one is for the check to say."""
+    waypoints = [PoseDocument(position_mm=list(map(float, corner))) for corner in corners_mm]
+    report = check_path(rig, scene, [Pose.level(millimetres(list(c))) for c in corners_mm])
+    near, own = report.obstacle_clearance, report.self_clearance
+    length = report.length * 1000.0
+    return sealed(
+        {
+            "rig_hash": rig.plan_hash,
+            "scene_hash": scene.hash,
+            "rig": rig.document,
+            "scene": scene.document,
+            "planner": {
+                "name": "adaptive",
+                "cost": "length",
+                "mode": "paper",
+                "seed": 0,
+                "step_mm": 40.0,
+                "neighbour_radius_mm": 80.0,
+                "goal_radius_mm": 50.0,
+                "max_iterations": 1,
+            },
+            "waypoints": waypoints,
+            "raw_path": waypoints,
+            "tree": {"positions_mm": [list(map(float, corners_mm[0]))], "parents": [-1]},
+            "statistics": {
+                "nodes": 1,
+                "iterations": 0,
+                "edge_checks": 1,
+                "planning_time_s": 0.0,
+            },
+            "quality": {
+                "length_mm": length,
+                "raw_length_mm": length,
+                "mean_kinematic_cost": 0.5,
+                "min_tension_n": report.min_tension,
+                "max_tension_n": report.max_tension,
+                "obstacle_clearance": near.as_dict() if near else None,
+                "self_clearance": own.as_dict(),
+            },
+        }
+    )
+
+
+def write_short_plan(path: Path, rig_file: Path = RIG) -> Path:
+    """A straight path of 58 mm of the paper's rig, about 3 s long."""
+    scene = free_scene(START_MM, GOAL_MM)
+    save_plan(straight_plan(load_rig(rig_file), scene, [START_MM, GOAL_MM]), path)
+    return path

@@ -1,0 +1,76 @@
+"""Calls the real command line in this process: `main` with arguments, as the console script."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+from cdpr.cli import main
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a call left: its exit code and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def said(self) -> str:
+        """Everything it said, without line breaks, so that no wrapping hides a sentence."""
+        return " ".join((self.out + " " + self.err).split())
+
+
+def call(*arguments: str | Path, answers: str = "") -> Answer:
+    """Runs ``cdpr ARGUMENTS``; ``answers`` is what its standard input holds."""
+    out, err = io.StringIO(), io.StringIO()
+    argv = ["cdpr", *map(str, arguments)]
+    with (
+        mock.patch.object(sys, "argv", argv),
+        mock.patch.object(sys, "stdin", io.StringIO(answers)),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+        else:
+            code = 0
+    assert code is None or isinstance(code, int)
+    return Answer(code or 0, out.getvalue(), err.getvalue())
+
+
+def content(folder: Path) -> dict[str, bytes | None]:
+    """Every path below a folder with its bytes; None for a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+@contextmanager
+def nothing_written(folder: Path) -> Iterator[None]:
+    """Whatever happens inside leaves the folder as it was."""
+    before = content(folder)
+    yield
+    after = content(folder)
+    assert after.keys() == before.keys()
+    assert after == before
+
+
+def one_message(answer: Answer, code: int, *parts: str) -> None:
+    """The answer is one clear error: exit code, a message with a next step, and nothing else."""
+    assert answer.code == code, answer
+    assert "Traceback" not in answer.said
+    assert "defect of cdpr" not in answer.said
+    assert answer.err.count("error: ") == 1, answer.err
+    assert "\n  next: " in answer.err, answer.err
+    for part in parts:
+        assert part in answer.said, f"{part!r} not in {answer.said!r}"

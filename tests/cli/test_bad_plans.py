@@ -1,0 +1,104 @@
+"""Plan files that cannot be used, for `cdpr check` and `cdpr run` alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cdpr.plan import save_plan
+from cdpr.rig import load_rig
+from cdpr.scene import load_scene
+from tests.cli.plans import CONFIGS, HALL, RIG, straight_plan
+from tests.cli.program import Answer, call, nothing_written, one_message
+
+
+def use(verb: str, plan: Path, folder: Path, rig: Path = RIG) -> Answer:
+    """`cdpr check` or `cdpr run` of a plan, which must leave the folder as it is."""
+    rest = ["-o", folder / "run", "--fast", "--no-camera"] if verb == "run" else []
+    with nothing_written(folder):
+        return call(verb, plan, "--rig", rig, *rest)
+
+
+@pytest.fixture(params=["check", "run"])
+def verb(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_a_plan_with_nan_is_not_read(short_plan: Path, tmp_path: Path, verb: str) -> None:
+    plan = tmp_path / "plan.json"
+    plan.write_text(short_plan.read_text().replace("445.0", "NaN", 1))
+    one_message(use(verb, plan, tmp_path), 2, f"{plan}: the plan holds NaN", "cdpr plan")
+
+
+def test_an_edited_plan_is_not_used(short_plan: Path, tmp_path: Path, verb: str) -> None:
+    data = json.loads(short_plan.read_text())
+    data["waypoints"][1]["position_mm"][2] += 1.0
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(data))
+    one_message(use(verb, plan, tmp_path), 2, str(plan), "hash does not match", "edited")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "part"),
+    [
+        ("missing", None, "no such file"),
+        ("empty", "", "the file is empty"),
+        ("cut off", '{"kind": "cdpr-plan", "waypoi', "cut off or edited"),
+        ("something else", '{"kind": "shopping list"}', "this is not a plan file"),
+        ("a list", "[]", "this is not a plan file"),
+        ("a later version", '{"kind": "cdpr-plan", "schema_version": 7}', "schema version 7"),
+        ("incomplete", '{"kind": "cdpr-plan", "schema_version": 1}', "waypoints"),
+    ],
+)
+def test_a_file_that_is_no_plan_is_told_so(
+    tmp_path: Path, verb: str, name: str, text: str | None, part: str
+) -> None:
+    plan = tmp_path / f"{name}.json"
+    if text is not None:
+        plan.write_text(text)
+    one_message(use(verb, plan, tmp_path), 2, str(plan), part)
+
+
+def test_a_plan_of_another_rig_names_what_differs(
+    short_plan: Path, tmp_path: Path, verb: str
+) -> None:
+    answer = use(verb, short_plan, tmp_path, HALL)
+    one_message(answer, 2, str(short_plan), "made for the rig 'gachon_8_6'", "outlets_mm")
+
+
+def test_a_plan_of_the_rig_before_it_was_changed_names_the_part(
+    short_plan: Path, tmp_path: Path, verb: str
+) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG.read_text().replace("mass_kg: 0.4", "mass_kg: 0.5"))
+    answer = use(verb, short_plan, tmp_path, rig)
+    one_message(answer, 2, "as it is now", "differ: platform")
+
+
+def colliding_plan(path: Path) -> Path:
+    """A plan whose file is whole, straight through the obstacle of environment 1."""
+    scene = load_scene(CONFIGS / "environment_1.yaml")
+    corners = [(180.0, 180.0, 300.0), (-180.0, -180.0, 400.0)]
+    save_plan(straight_plan(load_rig(RIG), scene, corners), path)
+    return path
+
+
+def test_a_whole_plan_that_collides_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    plan = colliding_plan(tmp_path / "plan.json")
+    answer = use("run", plan, tmp_path)
+    one_message(answer, 3, "the plan fails its check", "obstacle_1", "limit 10 mm")
+
+
+def test_check_tells_every_violation_with_its_place_and_exits_3(tmp_path: Path) -> None:
+    plan = colliding_plan(tmp_path / "plan.json")
+    answer = use("check", plan, tmp_path)
+    assert answer.code == 3
+    assert "violated" in answer.out
+    assert "obstacle_1" in answer.out
+    assert "not passed" in answer.out
+    told = call("check", plan, "--json")
+    assert told.code == 3
+    assert json.loads(told.out)["passed"] is False
+    assert json.loads(told.out)["violations"]

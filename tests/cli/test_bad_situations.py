@@ -1,0 +1,349 @@
+"""Files are good, but the world is not: places, drives, cameras and folders that cannot be used."""
+
+from __future__ import annotations
+
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drivers.cia402 import sdo
+from simulation.rehearsal import Rehearsal
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import Answer, call, nothing_written, one_message
+
+SCENE = CONFIGS / "environment_1.yaml"
+ROOT = Path(__file__).parents[2]
+#: Drops CAP_DAC_OVERRIDE, with which root writes into read-only folders, and becomes the command.
+WITHOUT_PRIVILEGE = """
+import ctypes, os, sys
+PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
+ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
+def refused(folder: Path, code: int, *parts: str, **options: object) -> Answer:
+    """A run with these options ends with one message; no run folder is left."""
+    arguments: list[str] = []
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        arguments += [option] if value is True else [option, *str(value).split()]
+    with nothing_written(folder):
+        answer = call("run", folder / "plan.json", "-o", folder / "run", *arguments)
+    one_message(answer, code, *parts)
+    return answer
+
+
+@pytest.fixture
+def folder(tmp_path: Path, short_plan: Path) -> Path:
+    """A folder with the plan in it."""
+    shutil.copy(short_plan, tmp_path / "plan.json")
+    return tmp_path
+
+
+# Where the platform should go.
+
+
+@pytest.mark.parametrize(
+    ("option", "place", "parts"),
+    [
+        ("--start-mm", "-150 0 300", ["start", "obstacle_1", "mm"]),
+        ("--goal-mm", "-150 -100 300", ["goal", "obstacle_1", "mm"]),
+        ("--goal-mm", "0 0 900", ["goal", "workspace", "650"]),
+        ("--start-mm", "0 0 100", ["start", "workspace", "150"]),
+    ],
+)
+def test_a_start_or_goal_that_cannot_be_used_is_told_with_what_and_how_much(
+    tmp_path: Path, option: str, place: str, parts: list[str]
+) -> None:
+    with nothing_written(tmp_path):
+        answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", option, *place.split())
+    one_message(answer, 2, *parts)
+
+
+def test_a_goal_that_is_not_reached_tells_how_near_the_search_came(tmp_path: Path) -> None:
+    hard = CONFIGS / "environment_3.yaml"
+    with nothing_written(tmp_path):
+        answer = call("plan", RIG, hard, "-o", tmp_path / "plan.json", "--max-iterations", "5")
+    one_message(answer, 1, "5", "mm", "goal")
+
+
+# Where results should go.
+
+
+def test_an_existing_plan_is_not_replaced_unless_it_is_asked_for(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.json"
+    plan.write_text("mine")
+    with nothing_written(tmp_path):
+        answer = call("plan", RIG, SCENE, "-o", plan)
+    one_message(answer, 2, str(plan), "exists already", "--force")
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_an_existing_run_folder_is_not_touched(folder: Path, kind: str) -> None:
+    run = folder / "run"
+    if kind == "folder":
+        run.mkdir()
+        (run / "mine.txt").write_text("mine")
+    else:
+        run.write_text("mine")
+    refused(folder, 2, str(run), "exists already", rig=RIG, fast=True, no_camera=True)
+
+
+def test_a_demo_does_not_write_into_an_existing_folder(tmp_path: Path) -> None:
+    with nothing_written(tmp_path):
+        one_message(call("demo", "-o", tmp_path), 2, "exists already")
+
+
+@pytest.mark.parametrize("verb", ["plan", "run", "demo", "track"])
+def test_a_result_in_a_folder_that_is_not_there_is_told_before_the_work(
+    folder: Path, verb: str
+) -> None:
+    place = folder / "no such folder" / "result"
+    rest = {
+        "plan": [RIG, SCENE],
+        "run": [folder / "plan.json", "--rig", RIG, "--fast", "--no-camera"],
+        "demo": [],
+        "track": [RIG, "synthetic", "--plan", folder / "plan.json"],
+    }[verb]
+    with nothing_written(folder):
+        one_message(call(verb, *rest, "-o", place), 2, str(place))
+
+
+@pytest.fixture
+def read_only(short_plan: Path) -> Iterator[Path]:
+    """A folder that its user may read and not write, with a plan in it; removed afterwards."""
+    place = Path(tempfile.mkdtemp(dir="/tmp", prefix="read only "))
+    shutil.copy(short_plan, place / "plan.json")
+    (place / "plan.json").chmod(0o644)
+    place.chmod(stat.S_IRUSR | stat.S_IXUSR | stat.S_IROTH | stat.S_IXOTH)
+    yield place
+    place.chmod(0o700)
+    shutil.rmtree(place)
+
+
+@pytest.mark.parametrize("verb", ["plan", "run", "demo"])
+def test_a_read_only_folder_is_told_before_the_work(read_only: Path, verb: str) -> None:
+    """In a process of its own, without the right of root to write anywhere."""
+    rest = {
+        "plan": [RIG, SCENE, "-o", "new.json"],
+        "run": ["plan.json", "--rig", RIG, "-o", "run", "--fast", "--no-camera"],
+        "demo": [],
+    }[verb]
+    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cdpr.cli import main; main()"
+    command = [sys.executable, "-B", "-c", program, verb, *map(str, rest)]
+    with nothing_written(read_only):
+        done = subprocess.run(
+            [sys.executable, "-c", WITHOUT_PRIVILEGE, *command],
+            cwd=read_only,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    one_message(Answer(done.returncode, done.stdout, done.stderr), 2, "you may write to")
+
+
+# The bus and the drives.
+
+
+def test_an_unknown_bus_lists_those_that_are_known(folder: Path) -> None:
+    rig = folder / "rig.yaml"
+    rig.write_text(RIG.read_text().replace("interface: virtual", "interface: udp_multicats"))
+    parts = ["bus.interface", "udp_multicats", "udp_multicast", "socketcan"]
+    refused(folder, 2, *parts, rig=rig, no_camera=True, yes=True)
+    one_message(call("sim", rig), 2, *parts)
+    doctor = call("doctor", rig)
+    assert doctor.code == 4
+    assert "udp_multicats" in doctor.said
+
+
+def test_a_kernel_bus_that_is_not_there_names_the_command_that_brings_it_up(folder: Path) -> None:
+    refused(
+        folder,
+        4,
+        "ip link",
+        rig=RIG,
+        interface="socketcan",
+        channel="can77",
+        no_camera=True,
+        yes=True,
+    )
+
+
+def test_a_platform_that_stands_elsewhere_is_not_moved(folder: Path) -> None:
+    refused(
+        folder,
+        3,
+        "not at the start of the plan",
+        "allowed 1.0 mm",
+        "nothing was enabled",
+        rig=RIG,
+        fast=True,
+        no_camera=True,
+        simulated_start_mm="0 0 455",
+    )
+
+
+def test_a_drive_that_does_not_answer_is_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    switch_on = Rehearsal.__init__
+
+    def with_a_dead_drive(rehearsal: Rehearsal, *arguments: object) -> None:
+        switch_on(rehearsal, *arguments)  # type: ignore[arg-type]
+        rehearsal.drives[4].silent = True
+
+    monkeypatch.setattr(Rehearsal, "__init__", with_a_dead_drive)
+    refused(folder, 4, "drive 5", "answer", "check power", rig=RIG, fast=True, no_camera=True)
+
+
+def test_a_bus_without_drives_is_told_before_anything_is_enabled(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sdo, "RESPONSE_TIMEOUT", 0.01)
+    refused(
+        folder,
+        4,
+        "drives 1, 2, 3, 4, 5, 6, 7, 8 do not answer",
+        "cdpr sim",
+        rig=RIG,
+        interface="udp_multicast",
+        channel="239.74.163.9:43991",
+        no_camera=True,
+        yes=True,
+    )
+
+
+@pytest.mark.parametrize("answers", ["", "n\n", "\n"])
+def test_a_real_bus_moves_only_after_a_yes(folder: Path, answers: str) -> None:
+    bus = ["--interface", "udp_multicast", "--channel", "239.74.163.9:43992"]
+    with nothing_written(folder):
+        answer = call(
+            *("run", folder / "plan.json", "--rig", RIG, "-o", folder / "run", "--no-camera"),
+            *bus,
+            answers=answers,
+        )
+    code, part = (2, "--yes") if not answers else (130, "nothing was moved")
+    assert answer.code == code, answer
+    assert part in answer.said
+
+
+# The camera.
+
+
+def test_a_camera_that_is_not_there_is_told_before_anything_moves(folder: Path) -> None:
+    refused(folder, 4, "camera 77", "/dev/video", rig=RIG, fast=True, camera=77)
+
+
+def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
+    rig = folder / "rig.yaml"
+    rig.write_text(RIG.read_text().split("\ntags:\n")[0] + "\n")
+    refused(folder, 2, "no camera or no tags", "--no-camera", rig=rig, fast=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        ({"camera": "0", "no_camera": True}, ["--camera", "--no-camera"]),
+        ({"fast": True, "interface": "udp_multicast", "no_camera": True}, ["--fast", "virtual"]),
+        ({"interface": "udp_multicast"}, ["no camera was named"]),
+        ({"interface": "udp_multicast", "camera": "synthetic"}, ["synthetic"]),
+        (
+            {"interface": "udp_multicast", "no_camera": True, "simulated_start_mm": "0 0 445"},
+            ["--simulated-start-mm"],
+        ),
+    ],
+)
+def test_wishes_that_contradict_each_other_are_told(
+    folder: Path, options: dict[str, object], parts: list[str]
+) -> None:
+    refused(folder, 2, *parts, rig=RIG, **options)
+
+
+@pytest.mark.parametrize(
+    ("source", "code", "part"),
+    [
+        ("no such thing", 2, "neither a folder of pictures"),
+        ("77", 4, "camera 77"),
+        ("empty", 2, "empty"),
+        ("text.mp4", 2, "text.mp4"),
+        ("synthetic", 2, "--plan"),
+    ],
+)
+def test_a_source_that_shows_nothing_leaves_no_pose_log(
+    tmp_path: Path, source: str, code: int, part: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.mp4").write_text("no video")
+    place = source if source.isdigit() or source == "synthetic" else tmp_path / source
+    with nothing_written(tmp_path):
+        answer = call("track", RIG, place, "-o", tmp_path / "poses.csv")
+    one_message(answer, code, part)
+
+
+def test_a_camera_that_the_rig_does_not_have_lists_those_it_has(tmp_path: Path) -> None:
+    answer = call("track", RIG, tmp_path, "-o", tmp_path / "poses.csv", "--camera", "back")
+    one_message(answer, 2, "no camera 'back'", "front")
+
+
+# Runs that were, and options.
+
+
+def test_a_report_needs_a_whole_run_folder(tmp_path: Path, finished_run: Path) -> None:
+    one_message(call("report", tmp_path / "nowhere"), 2, "no such run folder")
+    broken = tmp_path / "broken"
+    shutil.copytree(finished_run, broken)
+    (broken / "cycles.csv").unlink()
+    with nothing_written(tmp_path):
+        answer = call("report", broken)
+    one_message(answer, 2, "cycles.csv missing")
+
+
+@pytest.mark.parametrize("name", ["cycles.csv", "clearance.csv", "poses.csv", "summary.json"])
+def test_a_damaged_run_folder_is_told_by_file(
+    tmp_path: Path, finished_run: Path, name: str
+) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(finished_run, broken)
+    (broken / "report.html").unlink()
+    (broken / name).write_text('"nonsense')
+    with nothing_written(tmp_path):
+        answer = call("report", broken)
+    one_message(answer, 2, name)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["dance"],
+        ["plan", RIG],
+        ["plan", RIG, SCENE, "-o", "x.json", "--seed", "-1"],
+        ["plan", RIG, SCENE, "-o", "x.json", "--seed", "one"],
+        ["plan", RIG, SCENE, "-o", "x.json", "--planner", "adaptiv"],
+        ["plan", RIG, SCENE, "-o", "x.json", "--clearance-mm", "nan"],
+        ["plan", RIG, SCENE, "-o", "x.json", "--clearance-mm", "inf"],
+        ["plan", RIG, SCENE, "-o", "x.json", "--goal-mm", "0", "0", "nan"],
+        ["run", "plan.json"],
+        ["demo", "--environment", "4"],
+        ["check"],
+    ],
+    ids=lambda arguments: " ".join(str(a) for a in arguments if not isinstance(a, Path)),
+)
+def test_a_wrong_option_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str | Path]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with nothing_written(tmp_path):
+        answer = call(*arguments)
+    assert answer.code == 2, answer
+    assert answer.err
+    assert answer.out == ""
+    assert "Traceback" not in answer.said
+    assert "defect" not in answer.said

@@ -1,0 +1,195 @@
+"""How the program talks: help with examples, JSON for programs, plain text where nobody looks."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pty
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from cdpr.cli.verbs import VERBS
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import Answer, call
+
+ROOT = Path(__file__).parents[2]
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+NAMES = [verb.__name__ for verb in VERBS]
+
+
+def no_number(name: str) -> NoReturn:
+    raise AssertionError(f"{name} is no JSON")
+
+
+def document(answer: Answer) -> Any:
+    """Standard output as strict JSON."""
+    return json.loads(answer.out, parse_constant=no_number)
+
+
+@pytest.mark.parametrize("verb", NAMES)
+def test_help_of_every_verb_has_an_example(verb: str) -> None:
+    answer = call(verb, "--help")
+    assert answer.code == 0
+    assert "Example" in answer.out
+    assert f"cdpr {verb}" in answer.out.split("Example", 1)[1]
+    assert "\x1b" not in answer.out
+    assert answer.err == ""
+
+
+def test_help_lists_every_verb_and_the_exit_codes() -> None:
+    answer = call("--help")
+    assert answer.code == 0
+    assert all(f" {verb} " in answer.out for verb in NAMES)
+    assert "3 refused by a safety check" in answer.said
+
+
+def test_nothing_asked_shows_the_help() -> None:
+    answer = call()
+    assert answer.code == 2
+    assert " demo " in answer.said
+
+
+def test_version_is_told() -> None:
+    answer = call("--version")
+    assert answer.code == 0
+    assert re.fullmatch(r"cdpr \d+\.\d+\.\d+\S*\n", answer.out)
+
+
+def test_json_of_plan_and_check(tmp_path: Path) -> None:
+    """In a room without obstacles the obstacle clearance is unknown: null, never NaN."""
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "schema_version: 1\nname: empty\nclearance: {obstacle_mm: 10, self_mm: 5}\n"
+        "start: {position_mm: [0, 0, 445]}\ngoal: {position_mm: [0, 0, 505]}\nobstacles: []\n"
+    )
+    plan = tmp_path / "plan.json"
+    planned = call("plan", RIG, scene, "-o", plan, "--json")
+    assert (planned.code, planned.err) == (0, "")
+    assert document(planned)["quality"]["length_mm"] == pytest.approx(60.0)
+    assert document(planned)["plan"] == str(plan)
+    checked = call("check", plan, "--json", "--rig", RIG)
+    assert (checked.code, checked.err) == (0, "")
+    assert document(checked)["passed"] is True
+    assert document(checked)["hash"] == document(planned)["hash"]
+
+
+def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
+    summary = document(call("report", finished_run, "--json"))
+    assert summary == json.loads((finished_run / "summary.json").read_text())
+    assert all(
+        set(one) == {"name", "good", "text", "fix"} for one in document(call("doctor", "--json"))
+    )
+    assert document(call("stop", "--json")) == {"stopped_processes": []}
+
+
+def test_json_of_track(tmp_path: Path, short_plan: Path) -> None:
+    poses = tmp_path / "poses.csv"
+    answer = call(
+        *("track", RIG, "synthetic", "--plan", short_plan, "-o", poses, "--pictures", "2", "--json")
+    )
+    assert answer.code == 0, answer
+    facts = document(answer)
+    assert (facts["pictures"], facts["poses"]) == (2, 2)
+    assert len(poses.read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["check", "no such plan.json"], 2),
+        (["report", "no such folder"], 2),
+        (["track", RIG, "no such source", "-o", "poses.csv"], 2),
+        (["plan", RIG, CONFIGS / "gachon_8_6.yaml", "-o", "plan.json"], 2),
+    ],
+)
+def test_an_error_is_json_too_when_json_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str | Path], code: int
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = call(*arguments, "--json")
+    told = document(answer)
+    assert answer.code == code
+    assert told["exit_code"] == code
+    assert told["what"]
+    assert told["next_step"]
+    assert "error: " in answer.err
+
+
+def test_nothing_but_the_result_is_on_standard_output_and_no_escape_codes_where_nobody_looks(
+    short_plan: Path, finished_run: Path
+) -> None:
+    for arguments in (["check", short_plan], ["report", finished_run], ["doctor"], ["stop"]):
+        answer = call(*arguments)
+        assert answer.code == 0
+        assert "\x1b" not in answer.out + answer.err
+        assert answer.err.strip() == ""
+
+
+def test_no_sentence_is_broken_where_a_program_reads_it(
+    finished_run: Path, tmp_path: Path, short_plan: Path
+) -> None:
+    run = tmp_path / "a run whose folder has quite a long name so that its line must be long"
+    answer = call("run", short_plan, "--rig", RIG, "-o", run, "--fast", "--no-camera")
+    assert answer.code == 0
+    lines = answer.out.splitlines()
+    assert f"report: {run / 'report.html'}" in lines
+    summary = json.loads((run / "summary.json").read_text())
+    assert [line.strip() for line in lines if line.startswith("  The ")] == [
+        reason for reason in summary["reasons"] if reason.startswith("The ")
+    ]
+    assert answer.err == "", "no progress where nobody looks"
+
+
+def in_terminal(*arguments: str | Path, **variables: str) -> str:
+    """What the program writes when its standard output is a terminal."""
+    main_end, far_end = pty.openpty()
+    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cdpr.cli import main; main()"
+    environment = {"PATH": os.environ["PATH"], "TERM": "xterm-256color", **variables}
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        stdout=far_end,
+        stderr=far_end,
+        stdin=subprocess.DEVNULL,
+        env=environment,
+    )
+    os.close(far_end)
+    text = b""
+    while True:
+        try:
+            piece = os.read(main_end, 4096)
+        except OSError:  # Linux says EIO when the last one closed the far end
+            break
+        if not piece:
+            break
+        text += piece
+    os.close(main_end)
+    assert process.wait(timeout=60) == 0
+    return text.decode()
+
+
+def test_no_color_is_heeded_in_a_terminal() -> None:
+    assert COLOUR.search(in_terminal("doctor"))
+    coloured = re.compile(r"\x1b\[(?:[0-9;]*;)?(?:3[0-8]|4[0-8]|9[0-7])(?:;[0-9;]*)?m")
+    assert coloured.search(in_terminal("doctor"))
+    assert not coloured.search(in_terminal("doctor", NO_COLOR="1"))
+    assert not coloured.search(in_terminal("--help", NO_COLOR="1"))
+
+
+def test_numbers_that_are_not_known_are_null(finished_run: Path) -> None:
+    def numbers(value: Any) -> list[float]:
+        if isinstance(value, dict):
+            return [n for part in value.values() for n in numbers(part)]
+        if isinstance(value, list):
+            return [n for part in value for n in numbers(part)]
+        return [value] if isinstance(value, float) else []
+
+    summary = document(call("report", finished_run, "--json"))
+    assert all(math.isfinite(number) for number in numbers(summary))
+    assert summary["tag_error_mm"] is None
+    assert summary["lateness_ms"] is None
