@@ -64,7 +64,7 @@ def test_a_mistake_is_told_by_key_and_sentence(mistake: str, tmp_path: Path) -> 
     [
         ("  - {node_id: 8,", "  - {node_id: -8,", "node_id: -8"),
         ("mass_kg: 0.4", "mass_kg: zero", "mass_kg: zero"),
-        ("fx_px: 1000", "fx_px: -1", "fx_px: -1"),
+        ("fx_px: 900", "fx_px: -1", "fx_px: -1"),
     ],
 )
 def test_line_and_column_are_those_of_the_key(old: str, new: str, key: str, tmp_path: Path) -> None:
