@@ -54,16 +54,20 @@ class KinematicCost:
     The extremes for the scaling, and the values that the search interpolates between, are those on
     a lattice over the workspace box. It is computed anew for every plan: on both ready rigs that
     takes less time than reading it from a file would save.
+
+    Attributes:
+        lattice: Points over the workspace box.
+        values: The cost c at them, shape (lattice.count,).
     """
 
     def __init__(self, rig: Rig, rotation: Array) -> None:
         """Computes the lattice for ``rotation``, ``world_from_platform``, shape (3, 3)."""
         self.rig = rig
         self._rotation = rotation
-        self._lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
-        condition, inverse = self._indices(self._lattice.points(np.arange(self._lattice.count)))
+        self.lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
+        condition, inverse = self._indices(self.lattice.points(np.arange(self.lattice.count)))
         self._extremes = [(float(v.min()), float(v.max())) for v in (condition, inverse)]
-        self._values = self._scaled(condition, inverse)
+        self.values = self._scaled(condition, inverse)
 
     def at(self, positions: Array) -> Array:
         """The cost c of poses, exact; positions shape (k, 3), [m]; shape (k,)."""
@@ -81,8 +85,8 @@ class KinematicCost:
         count = max(2, int(np.ceil(float(lengths.max()) / _SAMPLING)) + 1)
         shares = np.linspace(0.0, 1.0, count)[:, None, None]
         points = (starts + shares * (end - starts)).reshape(-1, starts.shape[1])
-        corners, weights = corners_and_weights(self._lattice, points)
-        values = np.einsum("kc,kc->k", self._values[corners], weights).reshape(count, -1)
+        corners, weights = corners_and_weights(self.lattice, points)
+        values = np.einsum("kc,kc->k", self.values[corners], weights).reshape(count, -1)
         inner = values.sum(axis=0) - (values[0] + values[-1]) / 2.0
         integrals: Array = lengths * inner / (count - 1)
         return integrals

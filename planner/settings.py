@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cdpr.errors import BadInput
+from planner.paper.readings import Readings
 
 SamplerName = Literal["adaptive", "goal-bias"]
 CostName = Literal["kinematic", "length"]
@@ -39,6 +40,7 @@ class PlannerSettings:
         neighbour_radius: r_c, [m].
         goal_radius: r_g, from which the goal itself is tried, [m].
         max_iterations: After which the search gives up.
+        readings: Of the text where it is open.
     """
 
     sampler: SamplerName = "adaptive"
@@ -49,6 +51,7 @@ class PlannerSettings:
     neighbour_radius: float = 0.080
     goal_radius: float = 0.050
     max_iterations: int = 20000
+    readings: Readings = Readings()
 
     def __post_init__(self) -> None:
         """Refuses what no search could use.

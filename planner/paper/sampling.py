@@ -1,0 +1,164 @@
+"""Where the tree is asked to grow next: adaptive sampling, and the goal bias it is compared with.
+
+Points have any number n of coordinates and are written into an array that the caller owns.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from planner.exact.compiled import kernel
+from planner.paper.tree import Tree, squared_distance
+
+Array = NDArray[np.float64]
+
+_TRIES = 100
+
+
+@kernel
+def goal_bias(random: Generator, goal: Array, lower: Array, upper: Array, point: Array) -> None:
+    """The goal with probability 0.5, else a point of the whole space (paper, section 5.2)."""
+    if random.random() < 0.5:
+        point[:] = goal
+    else:
+        _in_bounds(random, lower, upper, point)
+
+
+@kernel
+def forward(
+    random: Generator,
+    start: Array,
+    goal: Array,
+    focus: Array,
+    lower: Array,
+    upper: Array,
+    by_volume: bool,
+    point: Array,
+) -> None:
+    """SamplingForward, Eqs. 10 and 11; a point outside the bounds is clipped to them.
+
+    The cone's tip is the goal, its axis points to the start; ``focus``, shape (n,), is x_c.
+    """
+    n = len(point)
+    radius, axis_length, cosine = 0.0, 0.0, 0.0
+    for k in range(n):
+        to_focus, to_start = focus[k] - goal[k], start[k] - goal[k]
+        radius += to_focus * to_focus
+        axis_length += to_start * to_start
+        cosine += to_focus * to_start
+    radius, axis_length = math.sqrt(radius), math.sqrt(axis_length)
+    product = radius * axis_length
+    opening = math.acos(min(1.0, max(-1.0, cosine / product))) if product > 0.0 else 0.0
+    if by_volume:
+        radius *= random.random() ** (1.0 / n)
+        direction_in_volume(random, opening, point)
+    else:
+        radius *= random.random()
+        direction_by_angles(random, opening, point)
+    _turn_first_axis(start, goal, axis_length, point)
+    for k in range(n):
+        point[k] = min(max(goal[k] + radius * point[k], lower[k]), upper[k])
+
+
+@kernel
+def backward(
+    random: Generator, tree: Tree, focus: Array, lower: Array, upper: Array, point: Array
+) -> None:
+    """SamplingBackward, Eq. 12: outside the ball about the mean of all nodes through x_c.
+
+    Where that ball leaves no room in the bounds, the farthest of 100 points from its middle.
+    """
+    centre = tree.total / tree.size[0]
+    tried = np.empty((1, len(point)))
+    radius, farthest = 0.0, -1.0
+    for k in range(len(point)):
+        radius += (focus[k] - centre[k]) ** 2
+    for _ in range(_TRIES):
+        _in_bounds(random, lower, upper, tried[0])
+        away = squared_distance(tried, 0, centre)
+        if away > farthest:
+            farthest = away
+            point[:] = tried[0]
+        if away > radius:
+            return
+
+
+@kernel
+def near_way(
+    random: Generator, tree: Tree, way: Array, spread: float, lower: Array, upper: Array
+) -> Array:
+    """A point near a path, shape (k, n), k ≥ 2, where new nodes can still make it cheaper."""
+    k = random.integers(0, len(way) - 1)
+    share = random.random()
+    point = way[k] + share * (way[k + 1] - way[k])
+    for axis in range(len(point)):
+        off = point[axis] + random.normal(0.0, spread)
+        point[axis] = min(max(off, lower[axis]), upper[axis])
+    return point  # type: ignore[no-any-return]
+
+
+@kernel
+def direction_by_angles(random: Generator, opening: float, point: Array) -> None:
+    """A unit vector about the first axis with its angles uniform in their ranges (Eq. 10).
+
+    The last line of Eq. 10 must end in a sine, or the vector has no unit length.
+    """
+    n, sines = len(point), 1.0
+    for k in range(n - 1):
+        if k == 0:
+            angle = random.uniform(-opening, opening)
+        elif k == n - 2:
+            angle = random.uniform(0.0, 2.0 * math.pi)
+        else:
+            angle = random.uniform(0.0, math.pi)
+        point[k] = sines * math.cos(angle)
+        sines *= math.sin(angle)
+    point[n - 1] = sines
+
+
+@kernel
+def direction_in_volume(random: Generator, opening: float, point: Array) -> None:
+    """A unit vector about the first axis, uniform on the part of the sphere that a cone cuts."""
+    n = len(point)
+    widest = math.sin(min(opening, math.pi / 2.0))
+    angle = 0.0
+    while opening > 0.0:
+        angle = random.uniform(0.0, opening)
+        if random.random() <= (math.sin(angle) / widest) ** (n - 2):
+            break
+    size = 0.0
+    while size == 0.0:
+        for k in range(1, n):
+            point[k] = random.normal(0.0, 1.0)
+            size += point[k] * point[k]
+    scale = math.sin(angle) / math.sqrt(size)
+    for k in range(1, n):
+        point[k] *= scale
+    point[0] = math.cos(angle)
+
+
+@kernel
+def _turn_first_axis(start: Array, goal: Array, length: float, point: Array) -> None:
+    """Turns the first axis to the direction from goal to start, by a Householder reflection."""
+    if length == 0.0:
+        return
+    mirror = (start - goal) / length
+    mirror[0] -= 1.0
+    size, along = 0.0, 0.0
+    for k in range(len(point)):
+        size += mirror[k] * mirror[k]
+        along += mirror[k] * point[k]
+    if size < 1e-24:
+        return
+    for k in range(len(point)):
+        point[k] -= 2.0 * along / size * mirror[k]
+
+
+@kernel
+def _in_bounds(random: Generator, lower: Array, upper: Array, point: Array) -> None:
+    for k in range(len(point)):
+        point[k] = random.uniform(lower[k], upper[k])
