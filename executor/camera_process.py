@@ -76,12 +76,15 @@ class CameraProcess:
             time: Since the start of the run, [s].
             planned: Where the platform should be.
             true_pose: Where the simulated platform is; None with a real camera.
+
+        Raises:
+            CdprError: The process is gone, for the reason told.
         """
         ready = self._may_wait or select.select([], [self._link.fileno()], [], 0.0)[1]
         if not ready:
             self.dropped += 1
             return
-        self._link.send(Trigger(self.triggered, time, planned, true_pose))
+        self._send(Trigger(self.triggered, time, planned, true_pose))
         self.triggered += 1
 
     def finish(self, progress: Callable[[float], None]) -> list[Look]:
@@ -91,7 +94,7 @@ class CameraProcess:
             CdprError: The process failed, for the reason told.
         """
         try:
-            self._link.send(None)
+            self._send(None)
             while True:
                 answer = self._receive()
                 if isinstance(answer, list):
@@ -111,6 +114,13 @@ class CameraProcess:
             self._process.terminate()
             self._process.join()
         self._process.close()
+
+    def _send(self, item: Trigger | None) -> None:
+        try:
+            self._link.send(item)
+        except OSError:  # the process is gone; why, it may have told before
+            while True:
+                self._receive()
 
     def _receive(self) -> list[Look] | int:
         try:

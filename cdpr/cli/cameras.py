@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from cdpr.scene_file import SceneDocument
     from drivers.cameras import LiveCamera
     from executor.camera_process import CameraProcess
-    from executor.observer import Observer, PictureSource
+    from executor.observer import Look, Observer, PictureSource
     from simulation.camera import SyntheticCamera
 
 SYNTHETIC = "synthetic"
@@ -121,6 +121,16 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
     from drivers.cameras import LiveCamera
 
     return LivePictures(LiveCamera(name, camera))
+
+
+def unseen(frame: int, time: float, planned: Pose, reason: str) -> Look:
+    """What is known of a picture that was asked for and never measured."""
+    import numpy as np
+
+    from executor.observer import Look
+
+    nothing = np.full((6, 6), np.nan)
+    return Look(frame, time, reason, None, nothing, (), float("nan"), planned, "", None)
 
 
 class RenderedPictures:

@@ -231,21 +231,31 @@ def _move(
     true_pose: Any,
     quiet: bool,
 ) -> tuple[Outcome, list[Look]]:
+    from cdpr.cli.cameras import unseen
     from cdpr.cli.output import progress_bar
+    from cdpr.errors import CdprError
+    from executor.run_folder import RunEvent
 
     rows = len(execution.prepared.checked.table)
     if camera is None:
         with progress_bar("moving", rows, not quiet) as advance:
             return execution.run(folder, progress=advance), []
 
+    asked: list[tuple[float, Pose]] = []
+
     def trigger(time: float, planned: Pose) -> None:
+        asked.append((time, planned))
         camera.trigger(time, planned, true_pose() if true_pose else None)
 
     rate = execution.prepared.rig.cameras[0].rate
     with progress_bar("moving", rows, not quiet) as advance:
         outcome = execution.run(folder, trigger=trigger, camera_rate=rate, progress=advance)
     with progress_bar("measuring pictures", camera.triggered, not quiet) as advance:
-        return outcome, camera.finish(advance)
+        try:
+            return outcome, camera.finish(advance)
+        except CdprError as error:  # the motion is over; without pictures the run is still a record
+            folder.append_event(RunEvent(asked[-1][0] if asked else 0.0, "camera", error.what))
+            return outcome, [unseen(k, *what, error.what) for k, what in enumerate(asked)]
 
 
 def exit_code(summary: dict[str, Any]) -> int:

@@ -16,9 +16,10 @@ from cdpr.cli.run import run
 from cdpr.cli.sim import sim
 from cdpr.cli.stop import stop
 from cdpr.cli.track import track
+from cdpr.cli.workspace import workspace
 from cdpr.errors import StoppedByOperator
 
-VERBS = (demo, plan, check, run, stop, track, sim, report, doctor)
+VERBS = (demo, plan, check, run, stop, track, sim, report, workspace, doctor)
 
 
 def add_verbs(app: typer.Typer) -> None:

@@ -1,0 +1,279 @@
+"""`cdpr workspace`: maps of what a rig can do where."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from cdpr.poses import Array
+    from cdpr.rig import Rig
+    from planner.workspace.computing import Maps
+    from planner.workspace.grid import Grid
+    from planner.workspace.maps import Question
+
+CELLS_OF_A_SLICE = 50
+CELLS_OF_THE_FRAME = 40
+POINTS_FOR_ONE_PROCESS = 20000
+"""Fewer are done before other processes have started."""
+
+Triple = tuple[float, float, float]
+
+
+def workspace(
+    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder to write", metavar="DIR")],
+    scene: Annotated[
+        Path | None, typer.Option(help="scene file: obstacles, clearances, load", metavar="SCENE")
+    ] = None,
+    slices: Annotated[
+        list[str] | None,
+        typer.Option("--slice", help="plane to map, mm, such as z=445; several are possible"),
+    ] = None,
+    volume: Annotated[
+        bool | None,
+        typer.Option("--volume/--no-volume", help="map the whole box too (default: no --slice)"),
+    ] = None,
+    step_mm: Annotated[
+        float | None, typer.Option(help="distance of points; else a fiftieth of the longest side")
+    ] = None,
+    lower_mm: Annotated[
+        Triple | None, typer.Option(help="corner of the region instead of the workspace's: x y z")
+    ] = None,
+    upper_mm: Annotated[Triple | None, typer.Option(help="its opposite corner: x y z")] = None,
+    rotation_wxyz: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(help="orientation of the platform; else the scene's start, else home"),
+    ] = None,
+    length_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--characteristic-length-mm",
+            help="divides moments in the condition number; else the anchors' mean radius",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="processes; else one a core", metavar="N")
+    ] = None,
+    dask: Annotated[
+        str | None, typer.Option(help="do the work on this Dask cluster", metavar="ADDRESS")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace the maps in the folder")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
+) -> None:
+    """Map where the robot can be and how well it can work there.
+
+    Wrench closure, wrench feasibility with its margin, dexterity, volume of forces, clearances:
+    as pictures (PNG, SVG), tables (CSV, NPZ) and a page, index.html.
+
+    [dim]Examples:[/dim]
+
+      cdpr workspace configs/gachon_8_6.yaml -o maps
+
+      cdpr workspace configs/gachon_8_6.yaml --scene configs/environment_1.yaml
+      --slice z=445 --slice x=0 --step-mm 5 -o maps
+    """
+    from cdpr.cli.output import progress_bar, show_facts, show_json, spinner
+    from cdpr.rig import load_rig
+    from cdpr.scene import load_scene
+    from planner.workspace.computing import compute
+    from planner.workspace.costs import Extremes
+    from planner.workspace.folder import write_maps
+    from planner.workspace.maps import Question
+
+    the_rig = load_rig(rig)
+    the_scene = None if scene is None else load_scene(scene)
+    length = None if length_mm is None else length_mm / 1000.0
+    question = Question.about(the_rig, the_scene, _rotation(rotation_wxyz), length)
+    grids = _grids(the_rig, slices or [], volume, step_mm, lower_mm, upper_mm)
+    _make_folder(output, force)
+    with spinner("preparing (compiles exact distances when run for the first time)", not as_json):
+        extremes = Extremes.over_workspace(question)
+        _warm_up(question)
+    total = sum(grid.count for grid in grids)
+    made: list[Maps] = []
+    with (
+        _pool(total, workers or os.cpu_count() or 1, dask) as pool,
+        progress_bar("mapping", total, not as_json) as advance,
+    ):
+        done = Count(advance)
+        for grid in grids:
+            made.append(compute(question, extremes, grid, pool=pool, progress=done.more))
+    with spinner("drawing", not as_json):
+        where = f" in {the_scene.name}" if the_scene else ""
+        title = f"Workspace of {the_rig.name}{where}"
+        summary = write_maps(output, made, title, _lead(question))
+    if as_json:
+        show_json({"folder": str(output), "maps": summary})
+    else:
+        show_facts(f"maps of {the_rig.name} in {output}", _sentences(summary, output))
+
+
+class Count:
+    """Adds up points for a progress bar."""
+
+    def __init__(self, advance: Any) -> None:
+        """Reports sums to ``advance``."""
+        self._advance = advance
+        self._done = 0
+
+    def more(self, points: int) -> None:
+        """Counts newly done points."""
+        self._done += points
+        self._advance(self._done)
+
+
+def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array | None:
+    if rotation_wxyz is None:
+        return None
+    import numpy as np
+
+    from cdpr.errors import BadInput
+    from cdpr.poses import matrix_from_quaternion
+
+    norm = float(np.linalg.norm(rotation_wxyz))
+    if not 1e-6 < norm < np.inf:
+        raise BadInput("the rotation is not a quaternion w x y z of a length above 0")
+    return matrix_from_quaternion(np.array(rotation_wxyz) / norm)
+
+
+def _grids(
+    rig: Rig,
+    slices: list[str],
+    volume: bool | None,
+    step_mm: float | None,
+    lower_mm: Triple | None,
+    upper_mm: Triple | None,
+) -> list[Grid]:
+    """The slices, and with the volume the frame around it and the region itself."""
+    import numpy as np
+
+    from cdpr.document_types import millimetres
+    from planner.workspace import grid
+
+    lower = rig.workspace_lower if lower_mm is None else millimetres(list(lower_mm))
+    upper = rig.workspace_upper if upper_mm is None else millimetres(list(upper_mm))
+    step = float(np.max(upper - lower)) / CELLS_OF_A_SLICE
+    if step_mm is not None:
+        step = step_mm / 1000.0
+    wanted = [grid.parsed_slice(text) for text in slices]
+    if not wanted:
+        wanted = [(2, float(np.clip(rig.home.position[2], lower[2], upper[2])))]
+    grids = [grid.slice_through(axis, value, lower, upper, step) for axis, value in wanted]
+    if volume or (volume is None and not slices):
+        around = grid.frame_box(rig)
+        coarse = float(np.max(around[1] - around[0])) / CELLS_OF_THE_FRAME
+        grids.append(grid.volume("frame", *around, coarse))
+        grids.append(grid.volume("workspace", lower, upper, step))
+    return grids
+
+
+def _make_folder(folder: Path, force: bool) -> None:
+    """Before the work: a result that cannot be written would be lost.
+
+    Raises:
+        BadInput: The folder holds something and ``force`` is not set, or cannot be made.
+    """
+    from cdpr.errors import BadInput
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        taken = any(folder.iterdir())
+    except OSError as error:
+        raise BadInput(
+            "the folder cannot be made", where=str(folder), why=str(error.strerror)
+        ) from error
+    if taken and not force:
+        raise BadInput(
+            "the folder is not empty",
+            where=str(folder),
+            next_step="choose another name, or pass --force to write into it",
+        )
+    if not os.access(folder, os.W_OK):
+        raise BadInput("the folder is read-only", where=str(folder))
+
+
+def _warm_up(question: Question) -> None:
+    """Compiles what is needed once, before several processes would do so."""
+    from planner.workspace.maps import values_at
+
+    values_at(question, question.rig.home.position[None, :])
+
+
+@contextmanager
+def _pool(points: int, workers: int, dask: str | None) -> Iterator[Executor | None]:
+    """What does the work: a Dask cluster, processes of this computer, or nobody else."""
+    if dask is not None:
+        with _dask_client(dask) as client:
+            yield client.get_executor()
+        return
+    if workers == 1 or points <= POINTS_FOR_ONE_PROCESS:
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_leave_interrupts)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _leave_interrupts() -> None:
+    """Ctrl-C is for the process that was started; it stops the others itself."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _dask_client(address: str) -> Any:
+    from cdpr.errors import BadInput
+
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise BadInput(
+            "Dask is not installed", next_step="pip install 'cdpr[dask]', or leave --dask out"
+        ) from error
+    try:
+        return Client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise BadInput(
+            "no Dask scheduler answers there",
+            where=address,
+            why=str(error) or type(error).__name__,
+            next_step="start one (dask scheduler), or leave --dask out",
+        ) from error
+
+
+def _lead(question: Question) -> str:
+    rig = question.rig
+    turned = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform turned"
+    return (
+        f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
+        f" {question.length * 1e3:.1f} mm in the condition number{turned}."
+    )
+
+
+def _sentences(summary: dict[str, Any], folder: Path) -> list[tuple[str, str]]:
+    facts = []
+    for name, found in summary.items():
+        share = found["share"]
+        margin = found["range"]["capacity_margin_n"]
+        text = (
+            f"{found['points']} points; wrench closure {share['closed'] * 100:.1f} %,"
+            f" feasible {share['feasible'] * 100:.1f} %, allowed {share['allowed'] * 100:.1f} %"
+        )
+        if margin is not None:
+            text += f"; capacity margin {margin[0]:.1f} to {margin[1]:.1f} N"
+        facts.append((name.replace("_", " "), text))
+    facts.append(("next", f"open {folder / 'index.html'}"))
+    return facts

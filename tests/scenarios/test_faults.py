@@ -1,0 +1,347 @@
+"""Faults while a run goes on: latched, announced, drives held, everything on record, FAILED."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from cdpr.errors import Fault
+from drivers.cia402.states import DriveState
+from executor import run as run_module
+from executor.clock import SimulatedClock
+from executor.machine import State
+from executor.prepare import PreparedRun
+from executor.run import conclude
+from executor.run_folder import NEEDED, RunEvent, RunFolder
+from executor.setpoints import SetpointTable
+from tests.cli.plans import RIG
+from tests.cli.program import call
+from tests.scenarios.stage import Stage, at, staged
+
+CRUISING = 150
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault: what happens, in which cycle, and how it must be told.
+
+    Attributes:
+        happens: Called at the beginning of the cycle.
+        code: Of the event.
+        words: In the cause.
+        cycle: In which it happens.
+        within: Cycles from there until the drives are told to stop.
+        lost: Drives that cannot hold by quick stop: they are gone or in fault themselves.
+    """
+
+    happens: Callable[[Stage], object]
+    code: str
+    words: tuple[str, ...]
+    cycle: int = CRUISING
+    within: int = 4
+    lost: tuple[int, ...] = ()
+
+
+def silence(drive: int) -> Callable[[Stage], object]:
+    return lambda stage: setattr(stage.drives[drive], "silent", True)
+
+
+def jam(stage: Stage) -> None:
+    stage.drives[1].motor.jammed = True
+
+
+def slip(stage: Stage) -> None:
+    """3 mm of cable run off the drum, which then sticks."""
+    per_metre = stage.prepared.rig.winches[1].counts_per_metre
+    stage.drives[1].motor.position += 0.003 * per_metre
+    stage.drives[1].motor.jammed = True
+
+
+def tear(stage: Stage) -> None:
+    """The cable's motor feels nothing any more."""
+    stage.rehearsal._per_newton[5] = 0.0
+
+
+def overload(stage: Stage) -> None:
+    stage.rehearsal._per_newton[5] *= 6.0
+
+
+def late(stage: Stage) -> None:
+    stage.lateness = 3.0
+
+
+def jump_in_table(stage: Stage) -> None:
+    """As if memory had been written to after the check."""
+    table: SetpointTable = stage.prepared.checked.table
+    jumped = table.setpoints.copy()
+    jumped[CRUISING + 5 :, 3] += 4000
+    table.__dict__["setpoints"] = jumped
+
+
+def unplug(stage: Stage) -> None:
+    """The executor's adapter takes no frame any more."""
+
+    def send(*_: object, **__: object) -> None:
+        raise can.CanOperationError("no buffer space available")
+
+    stage.group._bus.send = send  # type: ignore[attr-defined]
+
+
+CASES = {
+    "a drive falls silent": Case(
+        silence(3), "drive_silent", ("drive 4 did not answer",), lost=(3,)
+    ),
+    "a drive reports an emergency": Case(
+        lambda stage: stage.drives[2].fail(0x2310), "drive_fault", ("drive 3",), lost=(2,)
+    ),
+    "a drive starts anew": Case(
+        lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
+    ),
+    # In a rig this stiff a winch that stands still lets its cable go slack long before 2 mm.
+    "a winch jams": Case(jam, "slack", ("cable 2", "slack"), within=60, lost=(1,)),
+    "a winch slips": Case(slip, "following_error", ("cable 2", "allowed 2.00 mm"), lost=(1,)),
+    "a cable tears": Case(tear, "slack", ("cable 6 carries 0.0 N", "slack"), within=60),
+    "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "100.0 N"), within=60),
+    "the loop is late": Case(late, "late", ("3.0 cycles late",), within=40),
+    "the table was changed": Case(jump_in_table, "gate_denied", ("drive 4", "step"), within=30),
+    "a drive is silent while enabling": Case(
+        silence(6), "drive_silent", ("drive 7 did not answer",), cycle=1, lost=(6,)
+    ),
+    "a drive fails while enabling": Case(
+        lambda stage: stage.drives[6].fail(0x3210), "drive_fault", ("drive 7",), cycle=2, lost=(6,)
+    ),
+    "a drive falls silent at the goal": Case(
+        silence(0), "drive_silent", ("drive 1 did not answer",), cycle=320, lost=(0,)
+    ),
+}
+
+
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report is made in one of these scenarios only: it takes longer than the run."""
+    monkeypatch.setattr(run_module, "build_report", lambda folder: folder.report)
+
+
+@pytest.fixture
+def table_restored(prepared: PreparedRun) -> Iterator[None]:
+    kept = prepared.checked.table.setpoints
+    yield
+    prepared.checked.table.__dict__["setpoints"] = kept
+
+
+def concluded(stage: Stage, outcome: Any) -> dict[str, Any]:
+    """The summary of a run that was written as the program writes it."""
+    stage.folder.write_plan(stage.prepared.plan.plan.document)
+    stage.folder.write_rig(stage.prepared.rig.document)
+    return conclude(
+        stage.prepared, outcome, stage.folder, [], interface="virtual", simulated=True, fast=True
+    )
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.usefixtures("no_pictures", "table_restored")
+def test_a_fault_is_latched_told_held_and_recorded(
+    prepared: PreparedRun, tmp_path: Path, name: str
+) -> None:
+    case = CASES[name]
+    with staged(prepared, tmp_path / "run", at(case.cycle, case.happens)) as stage:
+        outcome = stage.run()
+        assert outcome.state is State.LATCHED
+        assert all(word in outcome.cause for word in case.words), outcome.cause
+        events = stage.events()
+        told = [event for event in events if event.code == case.code]
+        assert told, events
+        since = told[-1].time_s / prepared.checked.table.cycle - case.cycle
+        assert 0 <= since <= case.within
+        held = [d.state for i, d in enumerate(stage.drives) if i not in case.lost]
+        if case.cycle < 10:  # nothing was enabled: the brakes hold
+            assert DriveState.OPERATION_ENABLED not in held
+        else:
+            assert set(held) == {DriveState.QUICK_STOP_ACTIVE}
+        summary = concluded(stage, outcome)
+    assert summary["verdict"] == "FAILED"
+    assert not summary["passed"]
+    assert summary["final_state"] == "latched"
+    assert any(all(word in reason for word in case.words) for reason in summary["reasons"])
+    assert [event["code"] for event in summary["events"]] == [event.code for event in events]
+    folder = RunFolder.open(stage.folder.path)
+    assert all((folder.path / file).is_file() for file in NEEDED)
+    assert folder.mcap.is_file()
+    assert len(folder.cycles()) == summary["cycles"] == len(outcome.log)
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_bus_that_fails_leaves_the_drives_stopping_by_themselves(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", at(CRUISING, unplug)) as stage:
+        outcome = stage.run()
+        assert outcome.state is State.LATCHED
+        assert "no buffer space" in outcome.cause
+        assert "stop_not_sent" in [event.code for event in stage.events()]
+        stage.rehearsal.advance(0.1)
+        assert {drive.state for drive in stage.drives} == {DriveState.QUICK_STOP_ACTIVE}
+        summary = concluded(stage, outcome)
+    assert summary["verdict"] == "FAILED"
+    assert any("no buffer space" in reason for reason in summary["reasons"])
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.parametrize("callback", ["progress", "trigger"])
+def test_an_error_in_a_callback_stops_the_drives_and_is_on_record(
+    prepared: PreparedRun, tmp_path: Path, callback: str
+) -> None:
+    def broken(*_: object) -> None:
+        if stage.cycle >= CRUISING:
+            raise ZeroDivisionError("a defect in a callback")
+
+    with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
+        outcome = stage.execution().run(stage.folder, **{callback: broken})  # type: ignore[arg-type]
+        assert outcome.state is State.LATCHED
+        assert "recorder" in [event.code for event in stage.events()]
+        stage.rehearsal.pump()
+        assert {drive.state for drive in stage.drives} == {DriveState.QUICK_STOP_ACTIVE}
+        summary = concluded(stage, outcome)
+    assert summary["verdict"] == "FAILED"
+    assert any("a defect in a callback" in reason for reason in summary["reasons"])
+
+
+def test_a_full_disk_stops_the_drives(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An event that cannot be written is a fault; the drives are stopped before it is told."""
+
+    def full(_folder: RunFolder, _event: RunEvent) -> None:
+        raise Fault("the run folder cannot be written to", why="No space left on device")
+
+    with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
+        monkeypatch.setattr(RunFolder, "append_event", full)
+        outcome = stage.run()
+        assert outcome.state is State.LATCHED
+        stage.rehearsal.pump()
+        assert DriveState.OPERATION_ENABLED not in {drive.state for drive in stage.drives}
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_the_first_of_several_causes_is_the_one_that_is_told(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    def both(stage: Stage) -> None:
+        if stage.cycle == CRUISING:
+            late(stage)
+        elif stage.cycle == CRUISING + 5:
+            stage.drives[3].silent = True
+
+    with staged(prepared, tmp_path / "run", both) as stage:
+        outcome = stage.run()
+        codes = [event.code for event in stage.events()]
+    assert outcome.state is State.LATCHED
+    assert "late" in outcome.cause
+    assert codes.index("late") < codes.index("drive_silent")
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_stop_wish_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path) -> None:
+    def both(stage: Stage) -> None:
+        if stage.cycle == CRUISING:
+            stage.stop = True
+        elif stage.cycle == CRUISING + 5:
+            stage.drives[3].silent = True
+
+    with staged(prepared, tmp_path / "run", both) as stage:
+        outcome = stage.run()
+        summary = concluded(stage, outcome)
+    assert outcome.state is State.LATCHED
+    assert summary["verdict"] == "FAILED"
+    assert any("drive 4 did not answer" in event["text"] for event in summary["events"])
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_after_a_fault_no_target_moves_a_drive(prepared: PreparedRun, tmp_path: Path) -> None:
+    with staged(prepared, tmp_path / "run", at(CRUISING, silence(3))) as stage:
+        outcome = stage.run()
+        table = outcome.log.table()
+        stopped = int(np.flatnonzero(np.array(table.state) == State.LATCHED.value)[0])
+        positions = table.actual_counts[stopped:]
+        per_metre = np.abs([w.counts_per_metre for w in prepared.rig.winches])
+        moved = np.abs(positions - positions[0]) / per_metre
+        assert moved.max() < 0.002, "no more than the ramp of the quick stop"
+        assert np.abs(np.diff(positions[-3:], axis=0)).max() == 0, "at rest at the end"
+
+
+def die(kind: str) -> Callable[[], None]:
+    def kill() -> None:
+        (child,) = multiprocessing.active_children()
+        child.kill() if kind == "killed" else child.terminate()
+
+    return kill
+
+
+@pytest.mark.parametrize(
+    "cycle",
+    [
+        pytest.param(CRUISING, id="while moving"),
+        pytest.param(100_000, id="after the motion", marks=pytest.mark.slow),
+    ],
+)
+def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cycle: int
+) -> None:
+    """Through the real program with its real camera process, killed as the system would."""
+    from executor.camera_process import CameraProcess
+
+    cycles = 0
+    finish = CameraProcess.finish
+
+    def next_cycle(_clock: SimulatedClock) -> float:
+        nonlocal cycles
+        cycles += 1
+        if cycles == cycle:
+            die("killed")()
+        return 0.0
+
+    def finish_or_die(process: CameraProcess, progress: Callable[[float], None]) -> Any:
+        if cycles < cycle:
+            die("killed")()
+        return finish(process, progress)
+
+    monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
+    monkeypatch.setattr(CameraProcess, "finish", finish_or_die)
+    run = tmp_path / "run"
+    answer = call("run", short_plan, "--rig", RIG, "-o", run, "--fast")
+    assert answer.code == 1, answer
+    assert "FAILED" in answer.out
+    assert "the camera's process ended" in answer.said
+    folder = RunFolder.open(run)
+    summary = folder.summary()
+    assert summary["verdict"] == "FAILED"
+    assert any("the camera's process ended" in reason for reason in summary["reasons"])
+    assert summary["final_state"] == ("latched" if cycle == CRUISING else "finished")
+    assert folder.report.is_file()
+
+
+def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
+    short_plan: Path, tmp_path: Path
+) -> None:
+    """The motion is good; that it was measured is not true, and is not claimed."""
+    text = RIG.read_text()
+    looks = "[0.2052217375521776, -0.4121263851345742, -0.7946433272763131, 0.3956992083985057]"
+    assert looks in text
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(text.replace(looks, "[1, 0, 0, 0]"))
+    run = tmp_path / "run"
+    answer = call("run", short_plan, "--rig", rig, "-o", run, "--fast")
+    assert answer.code == 1, answer
+    assert "FAILED" in answer.out
+    assert "pictures gave a pose: " in answer.said
+    summary = RunFolder.open(run).summary()
+    assert summary["final_state"] == "finished"
+    assert summary["clearance_mm"]["source"] == "encoder"
+    assert summary["tag_error_mm"]["frames_without_pose"] == summary["tag_error_mm"]["frames"] > 30
