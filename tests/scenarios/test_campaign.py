@@ -1,0 +1,42 @@
+"""A slice of the campaign: every environment plans, proves, runs and is measured as asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.campaign import PlanResult, RunResult, campaign, failures, table
+
+GOOD_PLAN = PlanResult(1, 10.0, 0, "", True, 10.5, 0.0, 700.0, 3.0, 1.0)
+GOOD_RUN = RunResult(1, 10.0, 0, True, "PASSED", 0.01, 0.1, -0.05, 9.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", [1, 2, 3])
+def test_a_seed_of_an_environment_holds_all_that_is_asked(environment: int) -> None:
+    results = campaign([environment], [3], [10.0, 20.0], 1, 1, lambda _result: None)
+    assert failures(results) == []
+    assert len(results) == 4
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        replace(GOOD_PLAN, problem="no path within 5000 samples"),
+        replace(GOOD_PLAN, passed=False),
+        replace(GOOD_PLAN, clearance_proved_mm=9.99),
+        replace(GOOD_PLAN, goal_error_m=2e-6),
+        replace(GOOD_RUN, verdict="FAILED"),
+        replace(GOOD_RUN, following_mm=0.11),
+        replace(GOOD_RUN, following_mm=float("nan")),
+        replace(GOOD_RUN, tag_rms_mm=1.01),
+        replace(GOOD_RUN, tag_rms_mm=float("nan")),
+        replace(GOOD_RUN, beyond_mm=0.001),
+        replace(GOOD_RUN, beyond_mm=float("nan")),
+    ],
+)
+def test_the_campaign_notices_each_thing_that_does_not_hold(bad: PlanResult | RunResult) -> None:
+    assert failures([GOOD_PLAN, GOOD_RUN]) == []
+    assert len(failures([GOOD_PLAN, bad])) == 1
+    assert "| 1 | 10 |" in table([GOOD_PLAN, bad])
