@@ -1,0 +1,158 @@
+"""The capacity margin at a pose; its definition is `cdpr.statics.feasibility.capacity_margin`.
+
+Every facet of the set of available wrenches belongs to m - 5 cables: the gains of its normal are
+zero on all others, and on these they are the vector orthogonal to their rows of the null space.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from cdpr.statics.dexterity import rms_anchor_radius
+from planner.exact.compiled import kernel
+from planner.exact.fields import World
+from planner.exact.structure import factored, structure_columns
+from planner.exact.vectors import Vector
+from planner.feasibility import external_wrenches
+
+Integers = NDArray[np.int64]
+
+_DEPENDENT = 1e-12
+
+
+class Load(NamedTuple):
+    """What the cables must hold, and what they can; moments divided by `length`.
+
+    Attributes:
+        low: Smallest tension, [N].
+        high: Largest tension, [N].
+        length: Characteristic length, [m].
+        wrench: That the cables must give in the middle, shape (6,), [N].
+        spread: Half widths of the box of wrenches about it, shape (6,), [N].
+        facets: Cables of each facet, shape (k, m - 5).
+    """
+
+    low: float
+    high: float
+    length: float
+    wrench: Array
+    spread: Array
+    facets: Integers
+
+
+def build_load(rig: Rig, scene: Scene, rotation: Array) -> Load:
+    """What the cables of a rig must hold in a scene at one orientation, shape (3, 3)."""
+    length = float(rms_anchor_radius(rig.anchors))
+    units = np.repeat([1.0, length], 3)
+    box = external_wrenches(rig, scene, rotation)
+    facets = list(combinations(range(rig.cable_count), rig.cable_count - 5))
+    return Load(
+        low=float(rig.min_tension),
+        high=float(rig.max_tension),
+        length=length,
+        wrench=-box.centre / units,
+        spread=box.half_widths / units,
+        facets=np.array(facets, dtype=np.int64),
+    )
+
+
+@kernel
+def margin_at(world: World, load: Load, rotation: Array, position: Vector) -> float:
+    """The capacity margin, [N]; minus infinity where cables do not act in every direction."""
+    count = len(world.cables)
+    columns, inverse = np.empty((count, 6)), np.empty((count, 6))
+    null_space = np.empty((count, count - 6))
+    structure_columns(world, rotation, position, load.length, columns)
+    if factored(columns, inverse, null_space) == 0.0:
+        return -np.inf
+    return margin_of(load, inverse, null_space)
+
+
+@kernel
+def margins(world: World, load: Load, positions: Array) -> Array:
+    """`margin_at` for many positions, shape (k, 3), [m], at the world's orientation."""
+    found = np.empty(len(positions))
+    for i in range(len(positions)):
+        at = (positions[i, 0], positions[i, 1], positions[i, 2])
+        found[i] = margin_at(world, load, world.platform[:3], at)
+    return found
+
+
+@kernel
+def margin_of(load: Load, inverse: Array, null_space: Array) -> float:
+    """The capacity margin, [N], from the factors of the structure matrix."""
+    size = load.facets.shape[1]
+    middle, half = (load.high + load.low) / 2.0, (load.high - load.low) / 2.0
+    gains, rows = np.empty(size), np.empty((max(size - 1, 1), size))
+    least = np.inf
+    for facet in range(len(load.facets)):
+        cables = load.facets[facet]
+        for i in range(size):
+            for j in range(size - 1):
+                rows[j, i] = null_space[cables[i], j]
+        orthogonal_vector(rows, size, gains)
+        total, reach, turned, squared, along, spread = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(size):
+            total += gains[i] * gains[i]
+            reach += abs(gains[i]) * half
+            turned += gains[i] * middle
+        if not total > _DEPENDENT * _DEPENDENT:
+            continue
+        for k in range(6):
+            normal = 0.0
+            for i in range(size):
+                normal += gains[i] * inverse[cables[i], k]
+            squared += normal * normal
+            along += normal * load.wrench[k]
+            spread += abs(normal) * load.spread[k]
+        least = min(least, (reach - spread - abs(along - turned)) / math.sqrt(squared))
+    return least
+
+
+@kernel
+def orthogonal_vector(rows: Array, size: int, found: Array) -> None:
+    """The generalised cross product: orthogonal to size - 1 rows, as long as their volume.
+
+    Args:
+        rows: Shape (size - 1, size) or more; destroyed.
+        size: Number of components.
+        found: Written to, shape (size,); zeros where the rows are dependent.
+    """
+    if size == 3:
+        found[0] = rows[0, 1] * rows[1, 2] - rows[0, 2] * rows[1, 1]
+        found[1] = rows[0, 2] * rows[1, 0] - rows[0, 0] * rows[1, 2]
+        found[2] = rows[0, 0] * rows[1, 1] - rows[0, 1] * rows[1, 0]
+        return
+    order, volume = np.arange(size), 1.0
+    for k in range(size - 1):
+        best, at_row, at_column = 0.0, k, k
+        for i in range(k, size - 1):
+            for j in range(k, size):
+                if abs(rows[i, order[j]]) > best:
+                    best, at_row, at_column = abs(rows[i, order[j]]), i, j
+        if best == 0.0:
+            found[:] = 0.0
+            return
+        order[k], order[at_column] = order[at_column], order[k]
+        for j in range(size):
+            rows[k, j], rows[at_row, j] = rows[at_row, j], rows[k, j]
+        pivot = rows[k, order[k]]
+        volume *= pivot
+        for i in range(k + 1, size - 1):
+            factor = rows[i, order[k]] / pivot
+            for j in range(k, size):
+                rows[i, order[j]] -= factor * rows[k, order[j]]
+    found[order[size - 1]] = volume
+    for k in range(size - 2, -1, -1):
+        value = 0.0
+        for j in range(k + 1, size):
+            value += rows[k, order[j]] * found[order[j]]
+        found[order[k]] = -value / rows[k, order[k]]
