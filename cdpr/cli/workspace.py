@@ -81,11 +81,11 @@ def workspace(
       --slice z=445 --slice x=0 --step-mm 5 -o maps
     """
     from cdpr.cli.output import progress_bar, show_facts, show_json, spinner
+    from cdpr.cli.workspace_files import write_maps
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
     from planner.workspace.computing import compute
     from planner.workspace.costs import Extremes
-    from planner.workspace.folder import write_maps
     from planner.workspace.maps import Question
 
     the_rig = load_rig(rig)
@@ -235,16 +235,18 @@ def _leave_interrupts() -> None:
 
 
 def _dask_client(address: str) -> Any:
+    from importlib import import_module
+
     from cdpr.errors import BadInput
 
     try:
-        from distributed import Client
+        client = import_module("distributed").Client
     except ImportError as error:
         raise BadInput(
             "Dask is not installed", next_step="pip install 'cdpr[dask]', or leave --dask out"
         ) from error
     try:
-        return Client(address, timeout="10s")
+        return client(address, timeout="10s")
     except (OSError, ValueError) as error:
         raise BadInput(
             "no Dask scheduler answers there",

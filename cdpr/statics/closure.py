@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cdpr.errors import BadInput, Fault
 from cdpr.statics.arguments import WRENCH_SIZE, blocks, checked_structure_matrix
-from cdpr.statics.wrench_facets import RANK_TOLERANCE, WrenchFacets, wrench_facets
+from cdpr.statics.wrench_facets import RANK_TOLERANCE, WrenchFacets, facet_gains, wrench_facets
 from cdpr.statics.wrench_set import subsets
 
 SMALLEST_TENSION = 1e-9
@@ -83,16 +83,18 @@ def closure_margin(
 ) -> NDArray[np.float64]:
     """Return how far poses are from gaining or losing wrench closure.
 
-    A direction that five cables (or more) cannot act along decides: the others must pull along it
-    both ways. The margin is the pull of one newton the weaker way, in the worst such direction.
+    Every direction that five independent cables cannot act along is a test: the others must pull
+    along it both ways.
 
     Args:
         structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
         characteristic_length: [m], divides the moments.
 
     Returns:
-        shape (...), [-]: positive exactly where closed; minus infinity where the structure matrix
-        has no full rank.
+        shape (...), [-]. Positive exactly where closed: every wrench of this size can be balanced
+        with tensions from 0 to 1. Otherwise zero or negative: the self-balancing tensions, of unit
+        length, miss the same sign by this much. It crosses zero without a jump, and is minus
+        infinity where the structure matrix has no full rank.
 
     Raises:
         BadInput: The shape is another one, a value is not finite, or the length is not positive.
@@ -106,20 +108,35 @@ def closure_margin(
     margins = np.zeros(len(matrices))
     for block in blocks(len(matrices)):
         facets = wrench_facets(matrices[block], 0.0, 1.0, characteristic_length)
-        margins[block] = _weaker_pulls(facets)
+        margins[block] = _closure_margins(matrices[block], facets)
     return margins.reshape(batch)
 
 
-def _weaker_pulls(facets: WrenchFacets) -> NDArray[np.float64]:
-    cable_count = facets.cable_gains.shape[-1]
-    if cable_count < WRENCH_SIZE:
-        return np.full(facets.full_rank.shape, -np.inf)
-    # The gains of the other cables are zero by construction, and round-off in fact.
-    acting = subsets(cable_count, cable_count - WRENCH_SIZE + 1)
-    gains = np.take_along_axis(facets.cable_gains, acting[np.newaxis], axis=-1)
-    weaker = np.minimum(gains.max(axis=-1), -gains.min(axis=-1))
-    weaker[np.isinf(facets.upper)] = np.inf
-    return np.asarray(np.where(facets.full_rank, weaker.min(axis=-1), -np.inf))
+def _closure_margins(matrices: NDArray[np.float64], facets: WrenchFacets) -> NDArray[np.float64]:
+    freedom = matrices.shape[-1] - WRENCH_SIZE
+    margins = np.full(len(matrices), -np.inf)
+    if freedom < 0:
+        return margins
+    usable = np.isfinite(facets.upper)
+    one_way = usable & (_weaker_way(facets.cable_gains, freedom) <= 0.0)
+    closed = facets.full_rank & ~one_way.any(axis=-1)
+    room = np.minimum(facets.upper, -facets.lower).min(axis=-1)
+    margins[closed] = room[closed]
+    opened = facets.full_rank & ~closed
+    null_space = np.linalg.svd(matrices[opened])[2][..., WRENCH_SIZE:, :]
+    missed = np.where(one_way[opened], _weaker_way(facet_gains(null_space), freedom), 0.0)
+    margins[opened] = np.minimum(missed.min(axis=-1), 0.0)
+    return margins
+
+
+def _weaker_way(gains: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
+    """Return the largest pull the weaker way along each facet's normal, negative if there is none.
+
+    Only cables that do not span the facet count: the gains of the others are round-off.
+    """
+    acting = subsets(gains.shape[-1], freedom + 1)
+    pulls = np.take_along_axis(gains, acting[np.newaxis], axis=-1)
+    return np.asarray(np.minimum(pulls.max(axis=-1), -pulls.min(axis=-1)))
 
 
 def _most_even(null_basis: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

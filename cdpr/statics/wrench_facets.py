@@ -95,7 +95,7 @@ def _normals(
     full_rank = smallest > RANK_TOLERANCE * largest
     inverse = 1.0 / np.where(full_rank[..., np.newaxis], singular_values, 1.0)
     row_space, null_space = right[..., :WRENCH_SIZE, :], right[..., WRENCH_SIZE:, :]
-    gains = _gains_of_facets(null_space)
+    gains = facet_gains(null_space)
     normals = gains @ np.swapaxes(row_space, -1, -2) * inverse[..., np.newaxis, :]
     normals = normals @ np.swapaxes(left, -1, -2)
     usable = np.einsum("...i,...i", gains, gains) > DEPENDENT_COLUMNS**2
@@ -105,8 +105,15 @@ def _normals(
     return normals * scale[..., np.newaxis], usable, full_rank
 
 
-def _gains_of_facets(null_space: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``Jᵀc`` of every facet normal c, shape (..., k, m), not of unit length."""
+def facet_gains(null_space: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``Jᵀc`` of every facet normal c; its length fades where columns become dependent.
+
+    Args:
+        null_space: Orthonormal rows that span the null space of J, shape (..., d, m).
+
+    Returns:
+        shape (..., k, m), in the order of ``subsets(m, d + 1)``, whose cables have the gains.
+    """
     freedom, cable_count = null_space.shape[-2:]
     chosen = subsets(cable_count, freedom + 1)
     products = generalised_cross(np.moveaxis(null_space[..., chosen], -3, -2))

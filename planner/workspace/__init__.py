@@ -1,0 +1,1 @@
+"""Maps of what a rig can do where: in slices and volumes, as numbers and as pictures."""

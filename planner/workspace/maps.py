@@ -1,0 +1,190 @@
+"""What can be mapped, and its values at many positions at once.
+
+A pose at which a cable cannot run (its anchor at its outlet or inside its pulley) has no values:
+they are not numbers there, in every map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.cables import Cables, NoCable, cables_to
+from cdpr.kinematics import structure_matrix_of
+from cdpr.poses import Array, Pose
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from cdpr.self_clearance import SelfModel
+from cdpr.statics.arguments import checked_length
+from cdpr.statics.closure import closure_margin
+from cdpr.statics.dexterity import condition_number, rms_anchor_radius
+from cdpr.statics.feasibility import WrenchBox, capacity_margin
+from cdpr.statics.working import weight_wrench
+from cdpr.statics.wrench_set import force_volume
+
+Values = dict[str, Array]
+OBSTACLE_CLEARANCE = "obstacle_clearance"
+"""Name of the exact distance to the nearest obstacle, [m]."""
+_POSES_AT_ONCE = 512
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Question:
+    """For what the maps are.
+
+    Attributes:
+        rig: The robot.
+        scene: Its obstacles, clearances and load; without one only the robot's own weight acts.
+        rotation: Orientation of the platform, ``world_from_platform``, shape (3, 3).
+        length: Divides the moments in the condition number, [m].
+        quantities: Names of what is mapped, from `OF_THE_ROBOT` and `OBSTACLE_CLEARANCE`.
+    """
+
+    rig: Rig
+    scene: Scene | None
+    rotation: Array
+    length: float
+    quantities: tuple[str, ...]
+
+    @classmethod
+    def about(
+        cls,
+        rig: Rig,
+        scene: Scene | None = None,
+        rotation: Array | None = None,
+        length: float | None = None,
+    ) -> Question:
+        """All that can be said of a rig, or of a rig in a scene.
+
+        Args:
+            rig: The robot.
+            scene: Where it is.
+            rotation: Shape (3, 3); that of the scene's start, else of home, when left out.
+            length: [m]; the root mean square radius of the anchors when left out.
+
+        Raises:
+            BadInput: The length is not positive.
+        """
+        if rotation is None:
+            rotation = (scene.start if scene else rig.home).rotation
+        names = list(OF_THE_ROBOT)
+        if scene is not None and scene.obstacles:
+            names.append(OBSTACLE_CLEARANCE)
+        used = rms_anchor_radius(rig.anchors) if length is None else checked_length(length)
+        return cls(rig, scene, rotation, used, tuple(names))
+
+
+def values_at(question: Question, positions: Array) -> Values:
+    """The values of every quantity asked for.
+
+    Args:
+        question: Of what.
+        positions: World frame, shape (k, 3), [m].
+
+    Returns:
+        Shape (k,) each, SI, by name; not a number where a cable cannot run.
+    """
+    anchors = question.rig.anchors @ question.rotation.T + positions[:, None, :]
+    runs = _cables_run(question.rig, anchors)
+    values = {name: np.full(len(positions), np.nan) for name in question.quantities}
+    numbers = np.flatnonzero(runs)
+    for start in range(0, len(numbers), _POSES_AT_ONCE):
+        chosen = numbers[start : start + _POSES_AT_ONCE]
+        robot = _Robots(question, positions[chosen], cables_to(question.rig, anchors[chosen]))
+        for name in values.keys() - {OBSTACLE_CLEARANCE}:
+            values[name][chosen] = OF_THE_ROBOT[name](robot)
+    if OBSTACLE_CLEARANCE in values:
+        values[OBSTACLE_CLEARANCE][numbers] = _obstacle_clearances(question, positions[numbers])
+    return values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Robots:
+    """The robot at many poses."""
+
+    question: Question
+    positions: Array
+    cables: Cables
+
+    @property
+    def matrices(self) -> Array:
+        return structure_matrix_of(self.cables, self.positions)
+
+
+def _cables_run(rig: Rig, anchors: Array) -> NDArray[np.bool_]:
+    """At which poses all cables can run; anchors shape (k, m, 3), [m]; shape (k,)."""
+    try:
+        cables_to(rig, anchors)
+    except NoCable:
+        if len(anchors) == 1:
+            return np.array([False])
+        half = len(anchors) // 2
+        return np.concatenate([_cables_run(rig, part) for part in (anchors[:half], anchors[half:])])
+    return np.ones(len(anchors), dtype=np.bool_)
+
+
+def _closure(robots: _Robots) -> Array:
+    return closure_margin(robots.matrices, rms_anchor_radius(robots.question.rig.anchors))
+
+
+def _capacity(robots: _Robots) -> Array:
+    rig = robots.question.rig
+    return capacity_margin(
+        robots.matrices,
+        rig.min_tension,
+        rig.max_tension,
+        _external(robots.question),
+        rms_anchor_radius(rig.anchors),
+    )
+
+
+def _external(question: Question) -> WrenchBox:
+    """Weight, and the box of disturbances of the scene."""
+    rig, load = question.rig, question.scene.load if question.scene else None
+    weight = weight_wrench(rig, Pose(rig.home.position, question.rotation), load)
+    if load is None:
+        return WrenchBox.of_one(weight)
+    return WrenchBox(weight, np.concatenate([load.force, load.moment]))
+
+
+def _condition(robots: _Robots) -> Array:
+    return condition_number(robots.matrices, robots.question.length)
+
+
+def _volume(robots: _Robots) -> Array:
+    rig = robots.question.rig
+    return force_volume(robots.matrices, rig.max_tension - rig.min_tension)
+
+
+def _own_clearance(robots: _Robots) -> Array:
+    question = robots.question
+    model = SelfModel(question.rig)
+    pairs = model.cable_pairs(robots.cables).distances.min(axis=-1, initial=np.inf)
+    platform = model.to_platform(robots.cables, robots.positions, question.rotation).distances
+    return np.asarray(np.minimum(pairs, platform.min(axis=-1)))
+
+
+def _obstacle_clearances(question: Question, positions: Array) -> Array:
+    """Exact distances to the nearest obstacle, [m]; 0 or less where something touches."""
+    from planner.exact.edge import edge_clearance
+    from planner.exact.world import build_world
+
+    if question.scene is None:
+        return np.full(len(positions), np.inf)
+    clearance = question.scene.obstacle_clearance
+    world = build_world(question.rig, question.scene, question.rotation, clearance)
+    return np.array([edge_clearance(world, at, at)[0] for at in positions])
+
+
+OF_THE_ROBOT: Mapping[str, Callable[[_Robots], Array]] = {
+    "closure_margin": _closure,
+    "capacity_margin": _capacity,
+    "condition_number": _condition,
+    "force_volume": _volume,
+    "self_clearance": _own_clearance,
+}
+"""Name → what computes it. ``closure_margin`` [-] (`cdpr.statics.closure.closure_margin`),
+``capacity_margin`` [N], ``condition_number`` [-], ``force_volume`` [N³], ``self_clearance`` [m]."""

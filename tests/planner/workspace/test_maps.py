@@ -1,0 +1,161 @@
+"""Maps against the same quantities pose by pose, and against the paper's values."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cdpr.clearance import ClearanceModel
+from cdpr.kinematics import structure_matrix
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from cdpr.statics.closure import wrench_closure
+from planner.cost import KinematicCost
+from planner.feasibility import capacity_margins
+from planner.workspace import computing
+from planner.workspace.computing import compute
+from planner.workspace.costs import Extremes
+from planner.workspace.grid import slice_through, volume
+from planner.workspace.maps import Question, values_at
+
+LEVEL = np.eye(3)
+
+
+@pytest.fixture(scope="module")
+def extremes(gachon):
+    return Extremes.over_workspace(Question.about(gachon))
+
+
+@pytest.fixture(scope="module")
+def reference_slice(gachon):
+    """The slice of the paper's Fig. 7 that reference values are known for, 20 mm apart."""
+    millimetres = Question.about(gachon, length=0.001)
+    corners = np.array([-0.2, -0.2, 0.3]), np.array([0.2, 0.2, 0.6])
+    grid = slice_through(2, 0.445, *corners, 0.02)
+    return compute(millimetres, Extremes.over_workspace(millimetres), grid)
+
+
+def test_the_reference_slice_has_the_reference_volumes(gachon, reference_slice):
+    """Known for tensions from 0 to 100 N; the volume goes with the third power of the range."""
+    scale = (100.0 / (gachon.max_tension - gachon.min_tension)) ** 3
+    volumes = reference_slice.values["force_volume"] * scale
+    assert volumes.min() == pytest.approx(2.6451e7, abs=5e2)
+    assert volumes.max() == pytest.approx(2.9108e7, abs=5e2)
+
+
+def test_the_reference_slice_has_the_reference_dexterity(reference_slice):
+    inverse = 1.0 / reference_slice.values["condition_number"]
+    assert inverse.min() == pytest.approx(0.00188, abs=5e-6)
+    assert inverse.max() == pytest.approx(0.00732, abs=5e-6)
+
+
+def test_toward_the_centre_dexterity_cost_falls_and_wrench_cost_rises(reference_slice):
+    x, y, _ = reference_slice.grid.axes
+    radius = np.hypot(*np.meshgrid(x, y, indexing="ij"))
+    rings = [radius <= 0.05, (radius > 0.1) & (radius <= 0.15), radius > 0.2]
+    dexterity, wrench = (
+        [reference_slice.values[name][..., 0][ring].mean() for ring in rings]
+        for name in ("dexterity_cost", "wrench_cost")
+    )
+    assert dexterity == sorted(dexterity)
+    assert wrench == sorted(wrench, reverse=True)
+
+
+def test_the_paper_s_workspace_box_is_closed_and_feasible(gachon, extremes):
+    question = Question.about(gachon)
+    grid = volume("box", gachon.workspace_lower, gachon.workspace_upper, 0.1)
+    maps = compute(question, extremes, grid)
+    assert maps.closed.all()
+    assert maps.feasible.all()
+    assert (maps.verdict == 0).all()
+
+
+def test_the_costs_are_the_planner_s(gachon, extremes):
+    question = Question.about(gachon)
+    grid = volume("box", gachon.workspace_lower, gachon.workspace_upper, 0.15)
+    maps = compute(question, extremes, grid)
+    expected = KinematicCost(gachon, LEVEL).at(grid.points(0, grid.count))
+    assert maps.values["cost"].ravel() == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("rotation_vector", [(0.0, 0.0, 0.0), (0.1, -0.05, 0.2)])
+def test_every_value_is_that_of_its_pose(hall, ready_scene, rotation_vector):
+    """Pulleys, ten cables, payload, a disturbance and round obstacles, level and turned."""
+    scene = ready_scene("hall_pillar")
+    rotation = matrix_from_rotation_vector(np.array(rotation_vector))
+    random = np.random.default_rng(3)
+    positions = random.uniform(hall.workspace_lower, hall.workspace_upper, (12, 3))
+    values = values_at(Question.about(hall, scene, rotation), positions)
+    assert values["capacity_margin"] == pytest.approx(
+        capacity_margins(hall, scene, positions, rotation), abs=1e-9
+    )
+    model = ClearanceModel(hall, scene)
+    for k, position in enumerate(positions):
+        pose = Pose(position, rotation)
+        closed = wrench_closure(structure_matrix(hall, pose)).closed
+        assert closed == (values["closure_margin"][k] > 0.0)
+        near, own = model.smallest(pose).distance, model.self_clearance(pose).distance
+        assert values["self_clearance"][k] == pytest.approx(own, abs=1e-9)
+        assert max(values["obstacle_clearance"][k], 0.0) == pytest.approx(max(near, 0.0), abs=3e-7)
+
+
+def test_a_pose_without_a_cable_is_unknown_and_forbidden(hall):
+    in_a_pulley = hall.outlets[2] + np.array([0.03, 0.0, 0.0]) - hall.anchors[2]
+    question = Question.about(hall)
+    positions = np.stack([hall.home.position, in_a_pulley, hall.home.position])
+    values = values_at(question, positions)
+    assert np.isnan([values[name][1] for name in values]).all()
+    assert np.isfinite([values[name][[0, 2]] for name in values]).all()
+    grid = volume("at", in_a_pulley, in_a_pulley + 1e-6, 1.0)
+    maps = compute(question, Extremes((1.0, 2.0), (1.0, 2.0)), grid)
+    assert (maps.verdict != 0).all()
+    assert not maps.collision_free.any()
+
+
+def test_the_scene_s_clearances_decide_what_is_free(gachon, extremes, ready_scene):
+    scene = ready_scene("environment_1")
+    question = Question.about(gachon, scene)
+    corners = np.stack([scene.start.position, [-0.15, 0.0, 0.3], scene.goal.position])
+    for position, verdict in zip(corners, (0, 4, 0), strict=True):
+        grid = volume("at", position, position + 1e-6, 1.0)
+        maps = compute(question, extremes, grid)
+        assert maps.verdict[0, 0, 0] == verdict
+        assert maps.collision_free[0, 0, 0] == (verdict == 0)
+    tight = replace(question, scene=scene.changed(clearance=0.5))
+    assert compute(tight, extremes, grid).verdict[0, 0, 0] == 4
+
+
+def test_other_workers_and_parts_change_no_value(gachon, extremes, monkeypatch):
+    question = Question.about(gachon)
+    grid = volume("box", gachon.workspace_lower, gachon.workspace_upper, 0.08)
+    alone = compute(question, extremes, grid)
+    monkeypatch.setattr(computing, "POINTS_IN_A_PART", 37)
+    done = []
+    with ThreadPoolExecutor(2) as pool:
+        shared = compute(question, extremes, grid, pool=pool, progress=done.append)
+    assert sum(done) == grid.count
+    assert len(done) > 5
+    for name, values in alone.values.items():
+        assert shared.values[name] == pytest.approx(values, rel=1e-9, abs=1e-12)
+
+
+def test_work_that_nobody_waits_for_is_cancelled(gachon, extremes, monkeypatch):
+    """Ctrl-C ends after the parts under way, not after all of them."""
+    monkeypatch.setattr(computing, "POINTS_IN_A_PART", 8)
+    question = Question.about(gachon)
+    grid = volume("box", gachon.workspace_lower, gachon.workspace_upper, 0.02)
+    evaluated = []
+    monkeypatch.setattr(
+        computing,
+        "_part",
+        lambda *a: evaluated.append(a[2]) or values_at(a[0], a[1].points(*a[2:])),
+    )
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with ThreadPoolExecutor(1) as pool, pytest.raises(KeyboardInterrupt):
+        compute(question, extremes, grid, pool=pool, progress=interrupt)
+    assert len(evaluated) < grid.count / 8 / 2

@@ -1,0 +1,91 @@
+"""`cdpr workspace`: the files it leaves, and what it refuses before any work."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cdpr.cli.app import build_app
+from cdpr.errors import BadInput
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+RIG = str(CONFIGS / "gachon_8_6.yaml")
+
+
+def run(*arguments: str):
+    return CliRunner().invoke(build_app(), ["workspace", *arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    where = tmp_path_factory.mktemp("maps") / "slices"
+    result = run(
+        RIG, "-o", str(where), "--slice", "z=445", "--slice", "x=-50", "--step-mm", "50", "--json"
+    )
+    assert result.exit_code == 0, result.output
+    (where / "printed.json").write_text(result.stdout)
+    return where
+
+
+def test_a_slice_leaves_pictures_tables_and_a_page(folder):
+    made = {p.name for p in folder.iterdir()}
+    for name in ("slice_z_445", "slice_x_minus_50"):
+        assert {f"{name}{e}" for e in (".png", ".svg", ".csv", ".npz", "_costs.png")} <= made
+    assert {"index.html", "summary.json"} <= made
+
+
+def test_the_page_shows_files_that_are_there_and_asks_nothing_of_the_network(folder):
+    page = (folder / "index.html").read_text()
+    named = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert len(named) == 8
+    assert all((folder / name).is_file() for name in named)
+    assert "://" not in page
+
+
+def test_table_and_arrays_hold_the_same_numbers(folder):
+    arrays = np.load(folder / "slice_z_445.npz")
+    with (folder / "slice_z_445.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 11 * 11
+    for name in ("condition_number", "capacity_margin_n", "self_clearance_mm"):
+        column = np.array([float(row[name]) for row in rows])
+        assert column == pytest.approx(arrays[name].ravel(), rel=1e-8)
+    assert {row["z_mm"] for row in rows} == {"445"}
+    assert {row["allowed"] for row in rows} == {"1"}
+
+
+def test_the_summary_is_what_is_printed(folder):
+    printed = json.loads((folder / "printed.json").read_text())
+    assert printed["maps"] == json.loads((folder / "summary.json").read_text())
+    assert printed["maps"]["slice_z_445"]["share"]["closed"] == 1.0
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    result = run(RIG, "-o", str(tmp_path), "--slice", "z=445")
+    assert isinstance(result.exception, BadInput)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["--slice", "z=9000"],
+        ["--slice", "up"],
+        ["--step-mm", "-3"],
+        ["--rotation-wxyz", "0", "0", "0", "0"],
+        ["--characteristic-length-mm", "0"],
+        ["--lower-mm", "0", "0", "900"],
+    ],
+)
+def test_wrong_wishes_are_bad_input_and_make_no_folder(tmp_path, wrong):
+    where = tmp_path / "maps"
+    result = run(RIG, "-o", str(where), *wrong)
+    assert isinstance(result.exception, BadInput)
+    assert not where.exists()
