@@ -193,3 +193,26 @@ def test_numbers_that_are_not_known_are_null(finished_run: Path) -> None:
     assert all(math.isfinite(number) for number in numbers(summary))
     assert summary["tag_error_mm"] is None
     assert summary["lateness_ms"] is None
+
+
+def test_every_verb_and_option_is_documented() -> None:
+    """Except of `workspace`, whose page is its help."""
+    page = (ROOT / "docs" / "command-line.md").read_text()
+    for verb in NAMES:
+        section = page.split(f"\n## {verb}\n")[1].split("\n## ")[0]
+        assert f"cdpr {verb}" in section
+        table = call(verb, "--help").out.split("╭", 1)[1]
+        options = set(re.findall(r"--[a-z][a-z-]+", table)) - {"--help"}
+        if verb != "workspace":
+            assert not {option for option in options if f"`{option}" not in section}, verb
+
+
+def test_every_example_of_the_help_names_options_that_exist() -> None:
+    for verb in NAMES:
+        text = call(verb, "--help").out
+        examples, tables = text.split("Example", 1)[1].split("╭", 1)
+        for line in re.split(r"\n\s*\n", examples):
+            named = re.match(r"\s*cdpr (\w+)", line)
+            if named is not None:
+                known = tables if named[1] == verb else call(named[1], "--help").out
+                assert all(option in known for option in re.findall(r"--[a-z][a-z-]+", line))

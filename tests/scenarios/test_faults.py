@@ -117,6 +117,20 @@ CASES = {
     "a drive fails while enabling": Case(
         lambda stage: stage.drives[6].fail(0x3210), "drive_fault", ("drive 7",), cycle=2, lost=(6,)
     ),
+    "a drive is never enabled": Case(
+        lambda stage: setattr(stage.drives[4], "_command_enable", lambda: None),
+        "drive_fault",
+        ("drive 5 stays in switched on",),
+        cycle=0,
+        within=110,
+    ),
+    "a drive does not go over to hold": Case(
+        lambda stage: setattr(stage.drives[4], "_command_quick_stop", lambda: None),
+        "hold_timeout",
+        ("did not go over to hold",),
+        within=600,
+        lost=(4,),
+    ),
     "a drive falls silent at the goal": Case(
         silence(0), "drive_silent", ("drive 1 did not answer",), cycle=320, lost=(0,)
     ),
