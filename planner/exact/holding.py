@@ -28,7 +28,7 @@ from planner.exact.exits import exit_point
 from planner.exact.fields import World, anchor, feed, outlet
 from planner.exact.self_region import OPEN, PROVED, REFUTED
 from planner.exact.structure import factored, structure_columns
-from planner.exact.vectors import Vector, along, dot, minus, norm, plus, turned
+from planner.exact.vectors import Vector, along, dot, minus, norm, plus, row, turned
 
 Array = NDArray[np.float64]
 
@@ -140,7 +140,9 @@ def line_held(
     Returns:
         `PROVED`, `REFUTED` or `OPEN`.
     """
-    if tensions_prove(world, load, reserve, middle, off, radius, True):
+    spans = np.empty((1, 3))
+    spans[0] = off
+    if tensions_prove(world, load, reserve, middle, spans, radius):
         return PROVED
     margin = margin_at(world, load, world.platform[:3], middle)
     if not margin >= reserve:
@@ -160,9 +162,8 @@ def tensions_prove(
     load: Load,
     reserve: float,
     middle: Vector,
-    off: Vector,
+    spans: Array,
     radius: float,
-    is_line: bool,
 ) -> bool:
     """Whether tensions that follow the displacement prove a region; see the module's text.
 
@@ -171,9 +172,8 @@ def tensions_prove(
         load: What must be held.
         reserve: Smallest margin wanted, [N].
         middle: Of the region, [m].
-        off: From the middle to the end of a line, or the half extents of a box, [m].
+        spans: The region is the middle and shares from -1 to 1 of each row, shape (k, 3), [m].
         radius: No point of the region is farther from its middle, [m].
-        is_line: Whether the region is the line from ``middle - off`` to ``middle + off``.
     """
     count = len(world.cables)
     columns, inverse = np.empty((count, 6)), np.empty((count, 6))
@@ -184,9 +184,7 @@ def tensions_prove(
     changes, weights = np.empty(count), np.empty(count)
     if not _changes(world, load, middle, radius, changes, weights):
         return False
-    return _tensions_hold(
-        world, load, reserve, middle, off, is_line, columns, inverse, changes, weights
-    )
+    return _tensions_hold(world, load, reserve, spans, columns, inverse, changes, weights, middle)
 
 
 @kernel
@@ -222,13 +220,12 @@ def _tensions_hold(
     world: World,
     load: Load,
     reserve: float,
-    middle: Vector,
-    off: Vector,
-    is_line: bool,
+    spans: Array,
     columns: Array,
     inverse: Array,
     changes: Array,
     weights: Array,
+    middle: Vector,
 ) -> bool:
     count = len(columns)
     tensions = _inner_tensions(load, columns, inverse)
@@ -239,14 +236,13 @@ def _tensions_hold(
     squared, norm_squared = 0.0, 0.0
     for i in range(count):
         travel, spread, row_squared = 0.0, 0.0, 0.0
-        for k in range(3):
-            part = slopes[i, k] * off[k]
-            travel += part if is_line else abs(part)
+        for k in range(len(spans)):
+            travel += abs(dot(row(slopes, i), row(spans, k)))
         for k in range(6):
             spread += abs(inverse[i, k]) * load.spread[k]
             row_squared += inverse[i, k] * inverse[i, k]
         norm_squared += row_squared
-        follows[i] = abs(travel) + spread + reserve * math.sqrt(row_squared)
+        follows[i] = travel + spread + reserve * math.sqrt(row_squared)
         if world.pulley == 0.0:
             bend = abs(tensions[i]) * changes[i] * changes[i] / math.sqrt(3.0)
             residual += weights[i] * (bend + follows[i] * changes[i])
@@ -335,8 +331,8 @@ def _slopes(
     for i in range(len(columns)):
         for k in range(3):
             value = 0.0
-            for row in range(6):
-                value -= inverse[i, row] * change[row, k]
+            for j in range(6):
+                value -= inverse[i, j] * change[j, k]
             slopes[i, k] = value
 
 
@@ -367,14 +363,16 @@ def _in_proved_cells(world: World, holding: Holding, start: Array, end: Array) -
 def _box_held(world: World, load: Load, reserve: float, whole: Array) -> bool:
     """Whether a box, lower and upper corner in shape (6,), is proved by halving it."""
     boxes, halvings = np.empty((_MOST_HALVINGS + 2, 6)), np.zeros(_MOST_HALVINGS + 2, np.int64)
-    boxes[0] = whole
+    boxes[0], spans = whole, np.zeros((3, 3))
     waiting = 1
     while waiting > 0:
         waiting -= 1
         box, halved = boxes[waiting].copy(), halvings[waiting]
         off = ((box[3] - box[0]) / 2.0, (box[4] - box[1]) / 2.0, (box[5] - box[2]) / 2.0)
         at = (box[0] + off[0], box[1] + off[1], box[2] + off[2])
-        if tensions_prove(world, load, reserve, at, off, norm(off), False):
+        for axis in range(3):
+            spans[axis, axis] = off[axis]
+        if tensions_prove(world, load, reserve, at, spans, norm(off)):
             continue
         if halved == _MOST_HALVINGS:
             return False

@@ -55,8 +55,10 @@ def build_robot(rig: Rig, world: World, clearance: float) -> Robot:
         open_pairs=np.arange(len(model.pairs)),
         open_cables=np.arange(rig.cable_count),
     )
-    open_pairs = [k for k in robot.open_pairs if not box_proved(world, robot, int(k), False)]
-    open_cables = [k for k in robot.open_cables if not box_proved(world, robot, int(k), True)]
+    count = len(model.pairs)
+    open_pairs = [k for k in range(count) if not box_proved(world, robot, k)]
+    cables = range(rig.cable_count)
+    open_cables = [k for k in cables if not box_proved(world, robot, count + k)]
     return robot._replace(
         open_pairs=np.array(open_pairs, dtype=np.int64),
         open_cables=np.array(open_cables, dtype=np.int64),
@@ -86,10 +88,10 @@ def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
     rotation = world.platform[:3]
     for pair in robot.open_pairs:
-        if not _clear(world, robot, pair, False, before, after, rotation, still):
+        if not _clear(world, robot, pair, before, after, rotation, still):
             return False
     for cable in robot.open_cables:
-        if not _clear(world, robot, cable, True, before, after, rotation, still):
+        if not _clear(world, robot, len(robot.pairs) + cable, before, after, rotation, still):
             return False
     return True
 
@@ -110,10 +112,10 @@ def self_turning_edge_free(
     """
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
     for pair in range(len(robot.pairs)):
-        if not _clear(world, robot, pair, False, before, after, rotation, turn):
+        if not _clear(world, robot, pair, before, after, rotation, turn):
             return False
     for cable in range(len(world.cables)):
-        if not _clear(world, robot, cable, True, before, after, rotation, turn):
+        if not _clear(world, robot, len(robot.pairs) + cable, before, after, rotation, turn):
             return False
     return True
 
@@ -123,13 +125,12 @@ def _clear(
     world: World,
     robot: Robot,
     which: int,
-    to_platform: bool,
     before: Vector,
     after: Vector,
     rotation: Array,
     turn: Array,
 ) -> bool:
-    """One pair, or one cable to the platform, along an edge that is halved until decided."""
+    """One comparison along an edge that is halved until decided; ``which`` as in `_compared`."""
     way = minus(after, before)
     angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     size = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2) + angle
@@ -143,10 +144,7 @@ def _clear(
         ends[0], ends[1] = along(before, way, low), along(before, way, high)
         at, there = along(before, way, middle), turned_by(rotation, turn, middle)
         off = angle * (high - low) / 2.0
-        if to_platform:
-            found = platform_over_region(world, robot, which, there, ends, at, off)
-        else:
-            found = pair_over_region(world, robot, which, there, ends, at, off)
+        found = _compared(world, robot, which, there, ends, at, off)
         if found == PROVED:
             continue
         if found == REFUTED or tried >= _MOST_PIECES or waiting + 2 > _DEEPEST:
@@ -160,8 +158,25 @@ def _clear(
 
 
 @kernel
-def box_proved(world: World, robot: Robot, which: int, to_platform: bool) -> bool:
-    """Whether one pair, or one cable to the platform, is proved over the whole workspace box."""
+def _compared(
+    world: World,
+    robot: Robot,
+    which: int,
+    rotation: Array,
+    corners: Array,
+    middle: Vector,
+    angle: float,
+) -> int:
+    """Comparison ``which`` over a region: the pairs in turn, then each cable with the platform."""
+    pairs = len(robot.pairs)
+    if which < pairs:
+        return pair_over_region(world, robot, which, rotation, corners, middle, angle)
+    return platform_over_region(world, robot, which - pairs, rotation, corners, middle, angle)
+
+
+@kernel
+def box_proved(world: World, robot: Robot, which: int) -> bool:
+    """Whether one comparison is proved over the workspace box; ``which`` as in `_compared`."""
     boxes, corners = np.empty((_DEEPEST, 6)), np.empty((8, 3))
     boxes[0, :3], boxes[0, 3:] = world.limits[0], world.limits[1]
     waiting, tried = 1, 0
@@ -174,10 +189,7 @@ def box_proved(world: World, robot: Robot, which: int, to_platform: bool) -> boo
             for axis in range(3):
                 corners[corner, axis] = box[axis + 3 * ((corner >> axis) & 1)]
         at = ((box[0] + box[3]) / 2.0, (box[1] + box[4]) / 2.0, (box[2] + box[5]) / 2.0)
-        if to_platform:
-            found = platform_over_region(world, robot, which, rotation, corners, at, 0.0)
-        else:
-            found = pair_over_region(world, robot, which, rotation, corners, at, 0.0)
+        found = _compared(world, robot, which, rotation, corners, at, 0.0)
         if found == PROVED:
             continue
         if found == REFUTED or tried >= _MOST_BOXES or waiting + 2 > _DEEPEST:

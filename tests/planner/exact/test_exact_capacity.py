@@ -130,7 +130,7 @@ def test_a_box_proved_by_tensions_keeps_the_reserve_all_over(rig: Rig, scene: Sc
         margin = float(capacity_margins(rig, scene, middle[None, :], np.eye(3))[0])
         reserve = rng.uniform(0.0, 0.4 * margin)
         radius = float(np.linalg.norm(half))
-        args = (tuple(middle.tolist()), tuple(half.tolist()), radius, False)
+        args = (tuple(middle.tolist()), np.diag(half), radius)
         if tensions_prove(world, load, reserve, *args):
             proved += 1
             corners = middle + rng.uniform(-1.0, 1.0, (200, 3)).round(0) * half
