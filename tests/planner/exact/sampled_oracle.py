@@ -142,6 +142,8 @@ def _place(pose: Pose):
 def _thread(start: Array, end: Array):
     way = end - start
     length = float(np.linalg.norm(way))
-    turn, _ = Rotation.align_vectors(way[None, :] / length, np.array([[0.0, 0.0, 1.0]]))
-    middle = Pose((start + end) / 2.0, turn.as_matrix())
+    axis = way / length
+    right = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    right /= np.linalg.norm(right)
+    middle = Pose((start + end) / 2.0, np.column_stack([right, np.cross(axis, right), axis]))
     return coal.Capsule(1e-9, length), _place(middle)
