@@ -184,7 +184,7 @@ def transmit(bus: can.BusABC, message: can.Message) -> None:
     """
     try:
         bus.send(message)
-    except can.CanError as error:
+    except Exception as error:  # back ends raise errors of their own libraries
         raise _failed(bus, "did not take a frame", error) from error
 
 
@@ -196,13 +196,13 @@ def take(bus: can.BusABC, timeout: float) -> can.Message | None:
     """
     try:
         return bus.recv(timeout)
-    except can.CanError as error:
+    except Exception as error:  # back ends raise errors of their own libraries
         raise _failed(bus, "cannot be read", error) from error
 
 
-def _failed(bus: can.BusABC, what: str, error: can.CanError) -> Fault:
+def _failed(bus: can.BusABC, what: str, error: Exception) -> Fault:
     return Fault(
-        f"the bus {what}: {error}",
+        f"the bus {what}: {str(error) or type(error).__name__}",
         where=f"bus {bus.channel_info}",
         why="the interface went down, the controller went bus-off, or its queue is full",
         next_step="the drives stop by themselves; check cable and termination, then start again",

@@ -125,11 +125,8 @@ class DriveGroup(Protocol):
         """
         ...
 
-    def read_positions(self, pump: Pump | None = None) -> CycleStatus:
+    def read_positions(self) -> CycleStatus:
         """Sends SYNC until every drive has told its position; changes no drive's state.
-
-        Args:
-            pump: As for `make_drive_group`; not needed when it was given there.
 
         Raises:
             HardwareMissing: A drive does not answer; with its node.

@@ -7,35 +7,28 @@ with the fault latched if there was one.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from cdpr.errors import Fault, Refused
+from cdpr.errors import Refused
 from cdpr.poses import Array
-from cdpr.rig import Rig
-from drivers.drive_group import (
-    Capabilities,
-    CycleStatus,
-    DriveGroup,
-    GroupCommand,
-    GroupState,
-)
+from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
+from executor.arming import require_at_start, require_capabilities, require_unchanged
 from executor.clock import Clock
 from executor.feed import Feed, targets_at
 from executor.machine import Event, Machine, State
-from executor.safety.gate import Limits, Purpose, Request, examine
-from executor.safety.watch import Finding, Observation, Reaction, Watch, WatchLimits
+from executor.safety.gate import Purpose, Request, examine
+from executor.safety.limits import gate_limits, watch_limits
+from executor.safety.watch import Finding, Observation, Reaction, Watch
 from executor.setpoints import CheckedTable
 
 #: Cycles within which the drives must be enabled, or must hold after a stop.
 PATIENCE = 300
 #: Cycles of holding still before and after the motion.
 SETTLING = 10
-#: A cable is slack below this share of the least planned tension. Plans run at the least tension
-#: itself (in 6 % of the paper rig's box), and a whole count is worth 1.7 N there: not yet slack.
-SLACK_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,80 +72,54 @@ class Loop:
 
     def __init__(
         self,
-        rig: Rig,
         checked: CheckedTable,
         group: DriveGroup,
         clock: Clock,
         *,
         stop_requested: Callable[[], bool],
-        pump: Callable[[], None] | None = None,
         on_cycle: Callable[[CycleRecord], None] | None = None,
         on_event: Callable[[LoopEvent], None] | None = None,
     ) -> None:
         """Prepares a run; nothing is sent yet.
 
         Args:
-            rig: The robot.
-            checked: The checked set-points.
+            checked: The checked set-points, with the rig they are for.
             group: Configured drives.
             clock: Real or simulated.
             stop_requested: Asked every cycle; true begins a stop along the path.
-            pump: Lets drives simulated in this process work, once a cycle.
             on_cycle: Called after every cycle; it must not take long.
             on_event: Called for every event.
         """
         self.machine = Machine()
+        rig = checked.rig
         self._rig, self._checked, self._group, self._clock = rig, checked, group, clock
         self._stop_requested = stop_requested
-        self._pump = pump or _nothing
         self._on_cycle = on_cycle or _nothing
         self._on_event = on_event or _nothing
         self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
         self._rated = np.array([w.torque_constant for w in rig.winches])
-        self._limits = _gate_limits(rig, checked)
-        self._watch = Watch.fresh(_watch_limits(rig), rig.cable_count)
+        self._limits = gate_limits(rig, checked.table.setpoints, checked.table.cycle)
+        self._watch = Watch.fresh(watch_limits(rig), rig.cable_count)
         self._feed = Feed(len(checked.table), checked.table.cycle, rig.motion)
         self._targets: tuple[int, ...] | None = None
         self._actual: tuple[int, ...] = ()
         self._armed = False
         self._cycle = 0
-        self._noted: set[str] = set()
+        self._told: set[tuple[str, int]] = set()
         self._listener_error = ""
         self.cause = ""
-
-    def read_actual(self) -> Array:
-        """Positions of all drives before anything is enabled, shape (m,), [counts].
-
-        Raises:
-            HardwareMissing: A drive does not answer (from the drive group).
-        """
-        status = self._group.read_positions(self._pump)
-        self._actual = tuple(int(p) for p in status.positions)
-        return np.array(self._actual, dtype=np.float64)
 
     def arm(self) -> None:
         """Confirms the drives' abilities, the table, and that the platform stands at its start.
 
         Raises:
             Refused: One of it is not so; nothing was enabled.
+            HardwareMissing: A drive does not answer.
         """
-        _require_capabilities(self._group.capabilities, self._cycle_time)
-        table = self._checked.table
-        if table.hash != self._checked.hash:
-            raise Refused("the set-point table is not the one that was checked", where="arming")
-        off = (self.read_actual() - table.setpoints[0]) / self._per_metre
-        worst = int(np.abs(off).argmax())
-        if abs(off[worst]) > self._rig.motion.start_tolerance:
-            raise Refused(
-                f"the platform is not at the start of the plan: cable {worst + 1} is"
-                f" {abs(off[worst]) * 1000:.1f} mm off, allowed"
-                f" {self._rig.motion.start_tolerance * 1000:.1f} mm",
-                where="arming",
-                why="the rig stands elsewhere, or its drives were not referenced at home",
-                next_step="move the platform to the plan's start (plan a path from where it is"
-                " with `cdpr plan --start-mm`), or reference the drives; nothing was enabled",
-                values={"off_mm": float(abs(off[worst]) * 1000), "cable": float(worst + 1)},
-            )
+        require_capabilities(self._group.capabilities, self._cycle_time)
+        require_unchanged(self._checked)
+        self._actual = tuple(int(p) for p in self._group.read_positions().positions)
+        require_at_start(self._checked, np.array(self._actual, dtype=np.float64))
         self._armed = True
 
     def run(self) -> State:
@@ -168,7 +135,8 @@ class Loop:
             while self.machine.state in _ACTIVE:
                 self._one_step()
         except Exception as error:
-            self._fault("broken", f"the loop broke: {error}")
+            self._fault("broken", f"the loop broke: {type(error).__name__}: {error}")
+            self._tell("traceback", traceback.format_exc())
         except BaseException:
             self._fault("broken", "the program was ended")
             raise
@@ -193,12 +161,21 @@ class Loop:
             if self.machine.state is not State.ENABLING:
                 return
             if status is not None and status.state is GroupState.ENABLED:
-                # While it enabled them, the group held each drive at a place of its own.
-                self._targets = tuple(int(t) for t in self._group.targets)
-                self.machine.on(Event.ENABLED)
-                self._tell("enabled", "all drives are enabled and hold")
+                self._take_over()
                 return
         self._fault("enable_timeout", f"the drives were not enabled within {PATIENCE} cycles")
+
+    def _take_over(self) -> None:
+        """Goes on from where the group held each drive while it enabled them."""
+        held = tuple(int(target) for target in self._group.targets)
+        first = Request(Purpose.HOLD, held, None, self._actual, self._armed, False, False)
+        verdict = examine(self._limits, first)
+        if not verdict.allowed:
+            self._fault("gate_denied", f"the drives hold elsewhere: {verdict.reason}")
+            return
+        self._targets = held
+        self.machine.on(Event.ENABLED)
+        self._tell("enabled", "all drives are enabled and hold")
 
     def _approach(self) -> None:
         """From where the drives stand to the first row, smoothly; at most the start tolerance."""
@@ -262,7 +239,6 @@ class Loop:
         """Sends what the gate allowed, receives and records."""
         self._group.send_cycle(targets)
         self._targets = targets
-        self._pump()
         status = self._group.receive(self._clock.time_left())
         self._actual = tuple(int(p) for p in status.positions)
         errors = self._following_errors(status)
@@ -317,31 +293,33 @@ class Loop:
             tensions=(np.asarray(status.torques) / 1000.0 * self._rated).tolist(),
             missing=[bool(m) for m in status.missing],
             faults=[f"node {node}: {text}" for node, text in status.faults],
-            lateness=lateness,
+            # At rest nothing is late any more.
+            lateness=0.0 if self.machine.state is State.SECURING else lateness,
         )
         self._watch, findings = self._watch.look(seen)
         if self._listener_error:
             findings = (*findings, Finding(Reaction.PATH_STOP, "recorder", self._listener_error))
         for finding in findings:
-            self._react(finding)
+            self._tell_once(finding)
+        if findings and self.machine.state is not State.LATCHED:
+            self._react(max(findings, key=lambda finding: finding.reaction))
         if self.machine.state in _STOPPABLE and self._stop_requested():
             self._tell_cause("stop", "stop requested; slowing down along the path")
             self._feed.stop()
             self.machine.on(Event.STOP)
 
+    def _tell_once(self, finding: Finding) -> None:
+        """What is wrong in every cycle is told in the first."""
+        if (finding.code, finding.drive) not in self._told:
+            self._told.add((finding.code, finding.drive))
+            self._tell(finding.code, finding.text)
+
     def _react(self, finding: Finding) -> None:
-        if self.machine.state is State.LATCHED:
-            return
-        if finding.reaction is Reaction.NOTE:
-            if finding.code not in self._noted:
-                self._noted.add(finding.code)
-                self._tell(finding.code, finding.text)
-        elif finding.reaction is Reaction.PATH_STOP and self.machine.state in _ON_PATH:
-            if self.machine.state is State.MOVING:
-                self._tell_cause(finding.code, f"{finding.text}; stopping along the path")
+        if finding.reaction is Reaction.PATH_STOP and self.machine.state in _WITHOUT_QUICK_STOP:
+            self.cause = self.cause or f"{finding.text}; stopped along the path"
             self._feed.stop()
             self.machine.on(Event.PATH_FAULT)
-        else:
+        elif finding.reaction is not Reaction.NOTE:
             self._fault(finding.code, finding.text)
 
     def _fault(self, code: str, text: str) -> None:
@@ -355,8 +333,8 @@ class Loop:
         """Sends the stop; on a dead bus the drives stop by themselves, as nothing reaches them."""
         try:
             self._group.quick_stop_now()
-        except Fault as error:
-            self._tell("stop_not_sent", f"{error.what}; the drives stop when they miss the master")
+        except Exception as error:
+            self._tell("stop_not_sent", f"{error}; the drives stop when they miss the master")
 
     def _drain(self) -> None:
         """A few more cycles, so that what the drives do during a quick stop is on record."""
@@ -382,7 +360,8 @@ class Loop:
 _ACTIVE = frozenset(
     {State.ENABLING, State.APPROACHING, State.MOVING, State.STOPPING, State.SECURING}
 )
-_ON_PATH = frozenset({State.MOVING, State.STOPPING})
+#: Where the drives move along the path together, or are at rest already.
+_WITHOUT_QUICK_STOP = frozenset({State.MOVING, State.STOPPING, State.SECURING})
 _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING})
 
 
@@ -396,30 +375,6 @@ _HELD = "at rest; the drives hold by themselves under torque"
 _NEVER_ENABLED = "stopped before all drives were enabled; none of them follows set-points"
 
 
-def _require_capabilities(drives: Capabilities, cycle: float) -> None:
-    """Drives must start, stop and hold together without the master, or have brakes.
-
-    Raises:
-        Refused: They do not, or the cycle is faster than they were tested with.
-    """
-    missing = []
-    if not drives.sync:
-        missing.append("take their set-points at one SYNC")
-    if not (drives.holds_on_comm_loss or drives.has_brake):
-        missing.append("hold when the master is lost")
-    if not (drives.holds_on_quick_stop or drives.has_brake):
-        missing.append("hold after a quick stop")
-    if cycle * drives.max_hz < 1.0 - 1e-9:
-        missing.append(f"keep up with a cycle of {cycle * 1000:g} ms")
-    if missing:
-        raise Refused(
-            f"these drives do not {', nor '.join(missing)}",
-            where="arming",
-            why="a cable robot whose drives do not stop together and hold drops its platform",
-            next_step="use drives that do, or winches with brakes; nothing was enabled",
-        )
-
-
 def _nothing(*_: object) -> None:
     """Does nothing."""
 
@@ -427,28 +382,3 @@ def _nothing(*_: object) -> None:
 def _smooth(share: float) -> float:
     """0 to 1 with zero speed and acceleration at both ends."""
     return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-
-
-def _gate_limits(rig: Rig, checked: CheckedTable) -> Limits:
-    """The table's own range with the start tolerance, the winches' speed, the following error."""
-    per_metre = np.abs([w.counts_per_metre for w in rig.winches])
-    margin = np.ceil(per_metre * rig.motion.start_tolerance).astype(int)
-    speeds = np.array([w.max_speed for w in rig.winches])
-    rows = checked.table.setpoints.astype(np.int64)
-    step = np.floor(per_metre * speeds * checked.table.cycle).astype(int) + 1
-    # The actual position is of one cycle before, and the drives follow one cycle behind.
-    lag = np.floor(per_metre * rig.motion.following_error).astype(int) + 2 * step
-    return Limits(
-        lowest=tuple((rows.min(axis=0) - margin).tolist()),
-        highest=tuple((rows.max(axis=0) + margin).tolist()),
-        largest_step=tuple(step.tolist()),
-        largest_lag=tuple(lag.tolist()),
-    )
-
-
-def _watch_limits(rig: Rig) -> WatchLimits:
-    return WatchLimits(
-        following_error=rig.motion.following_error,
-        min_tension=SLACK_SHARE * rig.min_tension,
-        max_tension=rig.max_tension,
-    )

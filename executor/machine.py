@@ -25,7 +25,7 @@ class State(Enum):
     STOPPED = "stopped"
     """Stopped by the operator on the path, held by the drives."""
     LATCHED = "latched"
-    """Stopped by a fault; only an operator's command leads out."""
+    """Stopped by a fault; this run is over, and another begins only with a new command."""
 
 
 class Event(Enum):
@@ -57,6 +57,7 @@ _NEXT = {
     (State.STOPPING, Event.STOP): State.STOPPING,
     (State.STOPPING, Event.PATH_FAULT): State.STOPPING,
     (State.STOPPING, Event.AT_REST): State.SECURING,
+    (State.SECURING, Event.PATH_FAULT): State.SECURING,
 }
 
 

@@ -62,7 +62,6 @@ class Execution:
         clock: Clock,
         *,
         stop_requested: Callable[[], bool],
-        pump: Callable[[], None] | None = None,
     ) -> None:
         """Prepares the loop; nothing is sent.
 
@@ -71,7 +70,6 @@ class Execution:
             group: Configured drives.
             clock: Real or simulated.
             stop_requested: Asked every cycle.
-            pump: Lets drives simulated in this process work.
         """
         self.prepared = prepared
         self._clock = clock
@@ -82,12 +80,10 @@ class Execution:
         self._every = 1
         self._due = 0.0
         self.loop = Loop(
-            prepared.rig,
             prepared.checked,
             group,
             clock,
             stop_requested=stop_requested,
-            pump=pump,
             on_cycle=self._on_cycle,
             on_event=self._on_event,
         )

@@ -77,21 +77,32 @@ class SetpointTable:
         return poses_of(self.positions, self.rotations)
 
 
+_PROOF = object()
+
+
 @dataclass(frozen=True, eq=False)
 class CheckedTable:
-    """A table that `check_table` passed for its rig and scene; the loop takes nothing else.
+    """A table that `check_table` passed; nothing else makes one, and the loop takes nothing else.
 
     Attributes:
         table: The set-points.
+        rig: The rig they were checked for.
         hash: Its hash when it was checked.
         report: The independent check of the executed curve.
         winches: The map between cable lengths and counts that made it.
     """
 
     table: SetpointTable
+    rig: Rig
     hash: str
     report: CheckReport
     winches: WinchMap
+    proof: object
+
+    def __post_init__(self) -> None:
+        """Refuses to exist without the check."""
+        if self.proof is not _PROOF:
+            raise TypeError("a CheckedTable comes only from executor.setpoints.check_table")
 
 
 def build_table(rig: Rig, scene: Scene, path: Path, law: TimeLaw, cycle: float) -> SetpointTable:
@@ -142,20 +153,28 @@ def check_table(rig: Rig, scene: Scene, table: SetpointTable) -> CheckedTable:
         raise _refusal(found)
     report = check_path(rig, scene, table.poses())
     if not report.passed:
-        raise _refusal([violation.sentence() for violation in report.violations])
-    return CheckedTable(table, table.hash, report, WinchMap(rig))
+        raise _refusal(
+            [violation.sentence() for violation in report.violations],
+            "plan again, with a larger clearance where that is what is missing",
+        )
+    return CheckedTable(table, rig, table.hash, report, WinchMap(rig), _PROOF)
 
 
-def _refusal(found: list[str]) -> Refused:
+def _refusal(
+    found: list[str], next_step: str = "correct the rig file, or plan again for it"
+) -> Refused:
     return Refused(
         "; ".join(found),
         where="set-point table",
         why="the executed curve is not what the plan and the rig file allow",
-        next_step="plan again with a larger clearance, or correct the rig file; nothing was armed",
+        next_step=f"{next_step}; nothing was armed",
     )
 
 
 def _number_violations(rig: Rig, table: SetpointTable) -> list[str]:
+    cycle = rig.document.bus.cycle_ms / 1000.0
+    if not abs(table.cycle - cycle) <= 1e-9:
+        return [f"the table is for a cycle of {table.cycle} s, the bus has {cycle} s"]
     rows, cables = len(table), rig.cable_count
     shapes = [(rows,), (rows, 3), (rows, 3, 3), *[(rows, cables)] * 3]
     for name, shape in zip(_ARRAYS, shapes, strict=True):
@@ -216,7 +235,7 @@ def _speed_violations(rig: Rig, table: SetpointTable) -> list[str]:
     rounding = 1.0 / per_metre / table.cycle  # a set-point is off by at most half a count
     for cable, winch in enumerate(rig.winches):
         fastest = float(speeds[:, cable].max(initial=0.0))
-        if fastest > winch.max_speed + rounding[cable]:
+        if not fastest <= winch.max_speed + rounding[cable]:
             found.append(
                 f"cable {cable + 1} would run at {fastest * 1000:.1f} mm/s,"
                 f" its winch allows {winch.max_speed * 1000:.1f} mm/s"

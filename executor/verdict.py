@@ -12,12 +12,9 @@ from cdpr.scene import Scene
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
 from executor.pose_table import PoseTable
+from executor.safety.limits import tension_limits
 
 PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
-#: A tension this share of the smallest allowed one counts as slack; torque readings are coarse.
-SLACK_SHARE = 0.5
-#: A tension this much above the largest allowed one counts as too high.
-OVERLOAD_SHARE = 1.01
 #: What the rounding of the tables may cost, [m].
 ROUNDING = 2e-9
 
@@ -159,11 +156,12 @@ def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
         return []
     low, high = float(np.nanmin(cycles.tensions)), float(np.nanmax(cycles.tensions))
     limits = f"limits {rig.min_tension:g} and {rig.max_tension:g} N"
-    if low < SLACK_SHARE * rig.min_tension:
+    slack, overload = tension_limits(rig)
+    if low < slack:
         at, cable = _where(cycles.tensions, low)
         text = f"Cable {cable} went slack: {low:.2f} N at {cycles.time[at]:.2f} s ({limits})."
         return [Check("tension", False, text)]
-    if high > OVERLOAD_SHARE * rig.max_tension:
+    if high > overload:
         at, cable = _where(cycles.tensions, high)
         text = f"Cable {cable} pulled {high:.2f} N at {cycles.time[at]:.2f} s ({limits})."
         return [Check("tension", False, text)]

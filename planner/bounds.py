@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cdpr.errors import Fault
 from cdpr.poses import Array
 
 SHORTEST = 1e-6
@@ -50,8 +51,11 @@ def smallest_along(
         slope: Largest change of the value per unit of path.
         required: The limit: where every sample keeps it, the proof is to keep it too.
         tolerance: Wanted of ``value - proved``.
+
+    Raises:
+        Fault: A value is no number.
     """
-    values = evaluate(places)
+    values = _known(evaluate(places))
     best = int(np.argmin(values))
     smallest, at, samples = float(values[best]), float(places[best]), len(places)
     low, high = places[:-1], places[1:]
@@ -71,7 +75,7 @@ def smallest_along(
         if not len(low):
             break
         middle = (low + high) / 2.0
-        values = evaluate(middle)
+        values = _known(evaluate(middle))
         samples += len(middle)
         best = int(np.argmin(values))
         if values[best] < smallest:
@@ -80,3 +84,10 @@ def smallest_along(
         low_values = np.concatenate([low_values, values])
         high_values = np.concatenate([values, high_values])
     return Smallest(smallest, at, min(proved, smallest), samples)
+
+
+def _known(values: Array) -> Array:
+    """Values as they are; one that is no number would prove whatever stands beside it."""
+    if np.isnan(values).any():
+        raise Fault("a value along the path is no number, so nothing can be proved")
+    return values

@@ -42,13 +42,17 @@ END_TOLERANCE = 1e-6
 """How far a path may begin and end from the scene's start and goal, [m] and [rad]."""
 
 
-def verify(plan: Plan) -> VerifiedPlan:
-    """Proves a plan for the rig and the scene it carries.
+def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
+    """Proves a plan for a rig and the scene it carries.
+
+    Args:
+        plan: The plan.
+        rig: The rig as it is now, when its winches or motion may differ from the plan's own.
 
     Raises:
         Refused: With every violation, what by how much and where.
     """
-    report = check_path(plan.rig, plan.scene, plan.waypoints)
+    report = check_path(rig or plan.rig, plan.scene, plan.waypoints)
     if not report.passed:
         listed = "; ".join(v.sentence() for v in report.violations)
         raise Refused(
@@ -118,7 +122,7 @@ class _Check:
             self.rig.workspace_lower - positions, positions - self.rig.workspace_upper
         ).max(axis=1)
         worst = int(np.argmax(outside))
-        if outside[worst] > END_TOLERANCE:
+        if not outside[worst] <= END_TOLERANCE:
             what = "the path leaves the workspace box"
             self._violation(what, float(outside[worst]), 0.0, "mm", positions[worst])
 
@@ -128,10 +132,12 @@ class _Check:
             ("start", poses[0], scene.start),
             ("goal", poses[-1], scene.goal),
         ):
-            away = max(pose.distance_to(wanted), pose.angle_to(wanted))
-            if away > END_TOLERANCE:
-                what = f"the path does not meet the scene's {name}"
+            what = f"the path does not meet the scene's {name}"
+            away, turned = pose.distance_to(wanted), pose.angle_to(wanted)
+            if not away <= END_TOLERANCE:
                 self._violation(what, away, END_TOLERANCE, "mm", pose.position)
+            if not turned <= END_TOLERANCE:
+                self._violation(what, turned, END_TOLERANCE, "°", pose.position)
 
     def _check_pulleys(self) -> None:
         """Anchors four pulley radii from the swivel axis, so that exits move half as fast at most.
@@ -148,9 +154,10 @@ class _Check:
             along = np.sum(offset * self.rig.feed_directions, axis=-1, keepdims=True)
             reach = np.linalg.norm(offset - along * self.rig.feed_directions, axis=-1)
             k = int(np.argmin(reach))
-            if reach[k] - SPACING < 4.0 * radius:
+            nearest = float(reach[k]) - SPACING  # between two places it may come nearer
+            if not nearest >= 4.0 * radius:
                 what = f"cable {k + 1} comes too near to its pulley's axis to bound its motion"
-                self._violation(what, float(reach[k]), 4.0 * radius, "mm", pose.position)
+                self._violation(what, nearest, 4.0 * radius, "mm", pose.position)
                 return
 
     def _obstacle_clearance(self) -> tuple[Closest | None, Smallest | None]:
@@ -202,10 +209,10 @@ class _Check:
         self, name: str, closest: Closest, proof: Smallest, required: float
     ) -> None:
         pair = f"{closest.nearest.first} – {closest.nearest.second}"
-        if proof.value < required:
+        if not proof.value >= required:
             what = f"{name} too small, {pair}"
             self._violation(what, proof.value, required, "mm", closest.pose.position)
-        elif proof.proved < required:
+        elif not proof.proved >= required:
             what = f"{name} not proved between samples, {pair}"
             self._violation(what, proof.proved, required, "mm", closest.pose.position)
 
@@ -225,7 +232,7 @@ class _Check:
 
         tolerance = MARGIN_TOLERANCE * self.rig.max_tension
         found = smallest_along(self.places, evaluate, self._margin_slope(), 0.0, tolerance)
-        if found.proved < 0.0:
+        if not found.proved >= 0.0:
             what = "the cables cannot hold every load asked for: capacity margin"
             place = self._pose(found.at).position
             self._violation(what, min(found.value, found.proved), 0.0, "N", place)
@@ -274,16 +281,15 @@ class _Check:
 
     def _cable_speed(self) -> float:
         """The largest speed of a cable at the rig's path speed, [m/s]."""
-        directions = self.track.directions(self.places)
+        twists = self.rig.motion.speed * self.track.twists(self.places, self.length_unit)
         limits = np.array([winch.max_speed for winch in self.rig.winches])
         largest = 0.0
-        for place, direction in zip(self.places.tolist(), directions, strict=True):
+        for place, twist in zip(self.places.tolist(), twists, strict=True):
             pose = self._pose(place)
-            twist = np.concatenate([self.rig.motion.speed * direction, np.zeros(3)])
             speeds = np.abs(structure_matrix(self.rig, pose).T @ twist)
             largest = max(largest, float(speeds.max()))
             over = int(np.argmax(speeds - limits))
-            if speeds[over] > limits[over]:
+            if not speeds[over] <= limits[over]:
                 what = f"cable {over + 1} would have to run faster than its winch"
                 self._violation(what, speeds[over], limits[over], "mm/s", pose.position)
                 break

@@ -10,7 +10,7 @@ from cdpr.clearance import Nearest
 from cdpr.plan import Plan
 from cdpr.poses import Array, Pose
 
-_SCALE = {"mm": 1000.0, "mm/s": 1000.0, "N": 1.0}
+_SCALE = {"mm": 1000.0, "mm/s": 1000.0, "N": 1.0, "°": 180.0 / math.pi}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class Violation:
         what: What it is, without figures.
         measured: SI.
         limit: SI.
-        unit: In which people are told: "mm", "mm/s" or "N".
+        unit: In which people are told: "mm", "mm/s", "°" or "N".
         position: Of the platform there, shape (3,), [m].
     """
 

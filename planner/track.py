@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cdpr.errors import BadInput
-from cdpr.poses import Array, Pose, interpolate
+from cdpr.poses import Array, Pose, interpolate, rotation_vector_from_matrix
 from cdpr.rig import Rig
 
 
@@ -73,12 +73,27 @@ class Track:
         share = (place - self.marks[k]) / (self.marks[k + 1] - self.marks[k])
         return interpolate(start, end, float(share))
 
-    def directions(self, places: Array) -> Array:
-        """Unit vectors of the origin's motion at places, shape (k, 3); zero where it stands."""
+    def twists(self, places: Array, turn_radius: float) -> Array:
+        """Motion at places per unit of path as it is executed, shape (k, 6); zero at rest.
+
+        Args:
+            places: Shape (k,), [m].
+            turn_radius: Metres of executed path for a radian of turning.
+
+        Returns:
+            Velocity of the origin [-] and angular velocity [rad/m], world axes.
+        """
         if len(self.poses) == 1:
-            return np.zeros((len(places), 3))
+            return np.zeros((len(places), 6))
         k = np.clip(np.searchsorted(self.marks, places, side="right") - 1, 0, len(self.poses) - 2)
-        ways = self._positions[k + 1] - self._positions[k]
-        lengths = np.linalg.norm(ways, axis=1, keepdims=True)
-        directions: Array = ways / np.where(lengths > 0.0, lengths, 1.0)
-        return directions
+        moves = np.array([self._move(int(i), turn_radius) for i in np.unique(k)])
+        return np.asarray(moves[np.searchsorted(np.unique(k), k)])
+
+    def _move(self, k: int, turn_radius: float) -> Array:
+        """The twist of the straight move from pose k to the next, per unit of executed path."""
+        start, end = self.poses[k], self.poses[k + 1]
+        turn = start.rotation @ rotation_vector_from_matrix(start.rotation.T @ end.rotation)
+        twist = np.concatenate([end.position - start.position, turn])
+        way = float(np.hypot(np.linalg.norm(twist[:3]), turn_radius * np.linalg.norm(turn)))
+        moved: Array = twist / way if way > 0.0 else np.zeros(6)
+        return moved

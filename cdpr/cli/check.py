@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 def check(
     plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
     rig: Annotated[
-        Path | None, typer.Option(help="also demand that the plan is for this rig file")
+        Path | None,
+        typer.Option(help="check for this rig file as it is now"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
@@ -35,10 +36,10 @@ def check(
     from planner.check import check_path
 
     the_plan = load_plan(plan)
-    if rig is not None:
-        require_same_rig(the_plan, load_rig(rig), plan)
+    the_rig = the_plan.rig if rig is None else load_rig(rig)
+    require_same_rig(the_plan, the_rig, plan)
     with spinner("checking", not as_json):
-        report = check_path(the_plan.rig, the_plan.scene, the_plan.waypoints)
+        report = check_path(the_rig, the_plan.scene, the_plan.waypoints)
     if as_json:
         show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
     else:

@@ -23,12 +23,10 @@ class Drives:
 
     Attributes:
         group: All of them.
-        pump: Lets simulated drives work; None on a real bus.
         true_pose: Where the simulated platform is; None on a real bus.
     """
 
     group: DriveGroup
-    pump: Callable[[], None] | None
     true_pose: Callable[[], Pose] | None
 
 
@@ -64,4 +62,4 @@ def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)
         group.configure()
-        yield Drives(group, pump, true_pose)
+        yield Drives(group, true_pose)

@@ -153,7 +153,7 @@ def prepared_run(plan: Path, rig: Rig, *, quiet: bool) -> PreparedRun:
     the_plan = load_plan(plan)
     require_same_rig(the_plan, rig, plan)
     with spinner("checking the plan and its set-points", not quiet):
-        return prepare(verify(the_plan), rig)
+        return prepare(verify(the_plan, rig), rig)
 
 
 def run_prepared(
@@ -198,9 +198,7 @@ def run_prepared(
             open_drives(rig, start or scene.start, scene.load) as drives,
         ):
             clock = SimulatedClock() if fast else RealClock(prepared.checked.table.cycle)
-            execution = Execution(
-                prepared, drives.group, clock, stop_requested=stop_requested, pump=drives.pump
-            )
+            execution = Execution(prepared, drives.group, clock, stop_requested=stop_requested)
             execution.loop.arm()
             if stop_requested():
                 raise StoppedByOperator("stopped before anything moved")

@@ -23,7 +23,7 @@ from drivers.cia402.objects import (
     settings_for,
 )
 from drivers.cia402.sdo import SetupNetwork
-from drivers.cia402.states import DriveState, state_of
+from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 
 
@@ -96,7 +96,16 @@ def _expect(network: SetupNetwork, node: int, expectations: Sequence[Expectation
 def _check_idle(network: SetupNetwork, node: int) -> None:
     """A drive that is enabled belongs to somebody; one that holds in quick stop may be taken."""
     data = network.client(node).read(0x6041, 0, "status word")
-    if state_of(int.from_bytes(data, "little")) is DriveState.OPERATION_ENABLED:
+    state = state_of(int.from_bytes(data, "little"))
+    if state in FAULTED:
+        raise Refused(
+            f"drive {node} is in fault",
+            where=f"drive {node}, object 6041h:00 status word",
+            why="it stopped itself; its own display or tool tells the cause",
+            next_step="remove the cause and clear the fault at the drive, then start again",
+            values={"node": node},
+        )
+    if state is DriveState.OPERATION_ENABLED:
         raise Refused(
             f"drive {node} is enabled already",
             where=f"drive {node}, object 6041h:00 status word",

@@ -99,12 +99,10 @@ class Cia402Group:
         configure_drives(self._rig, self._bus, self._pump)
         self._state = GroupState.CONFIGURED
 
-    def read_positions(self, pump: Pump | None = None) -> CycleStatus:
+    def read_positions(self) -> CycleStatus:
         """Sends SYNC until every drive has told its position; see `DriveGroup.read_positions`."""
         for _ in range(FIRST_READING_ATTEMPTS):
             self.send_cycle(self._watch.positions)
-            if pump is not None:
-                pump()
             status = self.receive(FIRST_READING_TIMEOUT)
             if not status.missing.any():
                 return status

@@ -8,7 +8,7 @@ from enum import IntEnum
 
 
 class Reaction(IntEnum):
-    """What a finding asks for; the larger one wins."""
+    """What a finding asks for; of several the larger one is done."""
 
     NOTE = 0
     PATH_STOP = 1
@@ -23,11 +23,13 @@ class Finding:
         reaction: What must happen.
         code: Stable name.
         text: What, where, measured value and limit.
+        drive: Which drive it is about, counted from 1; 0 for all.
     """
 
     reaction: Reaction
     code: str
     text: str
+    drive: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +118,16 @@ class Watch:
         )
 
     def _replies(self, seen: Observation) -> list[Finding]:
-        found = [Finding(Reaction.QUICK_STOP, "drive_fault", text) for text in seen.faults]
+        found = [
+            Finding(Reaction.QUICK_STOP, "drive_fault", text, number)
+            for number, text in enumerate(seen.faults, start=1)
+        ]
         for drive, count in enumerate(self.missing, start=1):
             text = f"drive {drive} did not answer for {count} cycle{'s' if count > 1 else ''}"
             if count >= self.limits.missing_cycles:
-                found.append(Finding(Reaction.QUICK_STOP, "drive_silent", text))
+                found.append(Finding(Reaction.QUICK_STOP, "drive_silent", text, drive))
             elif count:
-                found.append(Finding(Reaction.NOTE, "reply_lost", text))
+                found.append(Finding(Reaction.NOTE, "reply_lost", text, drive))
         return found
 
     def _following(self, seen: Observation) -> list[Finding]:
@@ -136,24 +141,19 @@ class Watch:
                     f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
                     f" allowed {self.limits.following_error * 1000:.2f} mm"
                 )
-                found.append(Finding(Reaction.QUICK_STOP, "following_error", text))
+                found.append(Finding(Reaction.QUICK_STOP, "following_error", text, drive))
         return found
 
     def _tensions(self, seen: Observation) -> list[Finding]:
         found = []
         for drive, tension in enumerate(seen.tensions):
+            text = f"cable {drive + 1} carries {tension:.1f} N,"
             if self.slack[drive] >= self.limits.slack_cycles:
-                text = (
-                    f"cable {drive + 1} carries {tension:.1f} N,"
-                    f" less than {self.limits.min_tension:.1f} N: it may be slack"
-                )
-                found.append(Finding(Reaction.PATH_STOP, "slack", text))
+                slack = f"{text} less than {self.limits.min_tension:.1f} N: it may be slack"
+                found.append(Finding(Reaction.PATH_STOP, "slack", slack, drive + 1))
             if self.over[drive] >= self.limits.slack_cycles:
-                text = (
-                    f"cable {drive + 1} carries {tension:.1f} N,"
-                    f" more than {self.limits.max_tension:.1f} N"
-                )
-                found.append(Finding(Reaction.PATH_STOP, "over_tension", text))
+                over = f"{text} more than {self.limits.max_tension:.1f} N"
+                found.append(Finding(Reaction.PATH_STOP, "over_tension", over, drive + 1))
         return found
 
     def _lateness(self, seen: Observation) -> list[Finding]:

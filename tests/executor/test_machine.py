@@ -35,6 +35,7 @@ FORESEEN = {
     (State.STOPPING, Event.STOP): State.STOPPING,
     (State.STOPPING, Event.PATH_FAULT): State.STOPPING,
     (State.STOPPING, Event.AT_REST): State.SECURING,
+    (State.SECURING, Event.PATH_FAULT): State.SECURING,
     (State.SECURING, Event.HELD): State.FINISHED,
     **{(state, Event.FAULT): State.LATCHED for state in State},
 }

@@ -152,7 +152,7 @@ def test_lost_replies_fail_simulated_drives_and_are_told_on_a_bus(
 
 
 @pytest.mark.parametrize(
-    ("tension", "passed"), [(2.4, False), (2.6, True), (100.9, True), (101.1, False)]
+    ("tension", "passed"), [(2.4, False), (2.6, True), (101.9, True), (102.1, False)]
 )
 def test_a_slack_or_overloaded_cable_fails_and_is_named(
     run: fake_run.FakeRun, tension: float, passed: bool

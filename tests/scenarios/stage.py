@@ -73,7 +73,6 @@ class Stage:
             self.group,
             self,
             stop_requested=lambda: self.stop,
-            pump=self.rehearsal.pump,
         )
         execution.loop.arm()
         return execution

@@ -36,7 +36,7 @@ def targets_for(robot: Rig, rehearsal: Rehearsal, pose: Pose) -> list[int]:
 def enabled(robot: Rig, group: DriveGroup, rehearsal: Rehearsal) -> list[int]:
     """Enables; returns where the drives stand."""
     group.configure()
-    start = [int(p) for p in group.read_positions(rehearsal.pump).positions]
+    start = [int(p) for p in group.read_positions().positions]
     group.command(GroupCommand.ENABLE)
     for _ in range(10):
         group.send_cycle(start)

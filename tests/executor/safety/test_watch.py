@@ -58,10 +58,10 @@ def test_limits_have_the_values_of_the_stop_rules():
 def test_one_lost_reply_is_noted_and_two_in_a_row_stop():
     lost = _with("missing", 1, True)
     (note,) = _look(lost)
-    assert note == Finding(Reaction.NOTE, "reply_lost", "drive 2 did not answer for 1 cycle")
+    assert note == Finding(Reaction.NOTE, "reply_lost", "drive 2 did not answer for 1 cycle", 2)
     (stop,) = _look(lost, lost)
     assert stop == Finding(
-        Reaction.QUICK_STOP, "drive_silent", "drive 2 did not answer for 2 cycles"
+        Reaction.QUICK_STOP, "drive_silent", "drive 2 did not answer for 2 cycles", 2
     )
     assert _codes(lost, FINE, lost) == [("reply_lost", Reaction.NOTE)]
     assert _codes(lost, FINE) == []
@@ -91,8 +91,8 @@ def test_a_watch_may_be_told_to_wait_longer_for_replies():
 def test_every_fault_that_drives_report_stops_at_once():
     seen = replace(FINE, following=False, faults=("node 3: over-current", "node 4: hot"))
     assert _look(seen) == (
-        Finding(Reaction.QUICK_STOP, "drive_fault", "node 3: over-current"),
-        Finding(Reaction.QUICK_STOP, "drive_fault", "node 4: hot"),
+        Finding(Reaction.QUICK_STOP, "drive_fault", "node 3: over-current", 1),
+        Finding(Reaction.QUICK_STOP, "drive_fault", "node 4: hot", 2),
     )
 
 

@@ -1,0 +1,70 @@
+"""What must hold before drives are enabled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpr.errors import Refused
+from cdpr.poses import Array
+from drivers.drive_group import Capabilities
+from executor.setpoints import CheckedTable
+
+
+def require_capabilities(drives: Capabilities, cycle: float) -> None:
+    """Drives must start, stop and hold together without the master, or have brakes.
+
+    Raises:
+        Refused: They do not, or the cycle is faster than they were tested with.
+    """
+    missing = []
+    if not drives.sync:
+        missing.append("take their set-points at one SYNC")
+    if not (drives.holds_on_comm_loss or drives.has_brake):
+        missing.append("hold when the master is lost")
+    if not (drives.holds_on_quick_stop or drives.has_brake):
+        missing.append("hold after a quick stop")
+    if not cycle * drives.max_hz >= 1.0 - 1e-9:
+        missing.append(f"keep up with a cycle of {cycle * 1000:g} ms")
+    if missing:
+        raise Refused(
+            f"these drives do not {', nor '.join(missing)}",
+            where="arming",
+            why="a cable robot whose drives do not stop together and hold drops its platform",
+            next_step="use drives that do, or winches with brakes; nothing was enabled",
+        )
+
+
+def require_unchanged(checked: CheckedTable) -> None:
+    """The table is still the one that was checked.
+
+    Raises:
+        Refused: It is not.
+    """
+    if checked.table.hash != checked.hash:
+        raise Refused("the set-point table is not the one that was checked", where="arming")
+
+
+def require_at_start(checked: CheckedTable, actual: Array) -> None:
+    """The drives stand where the table begins.
+
+    Args:
+        checked: The table.
+        actual: Positions of the drives, shape (m,), [counts].
+
+    Raises:
+        Refused: One is farther from its first set-point than the rig's start tolerance.
+    """
+    rig = checked.rig
+    per_metre = np.array([w.counts_per_metre for w in rig.winches])
+    off = np.abs((actual - checked.table.setpoints[0]) / per_metre)
+    worst = int(off.argmax())
+    if not off[worst] <= rig.motion.start_tolerance:
+        raise Refused(
+            f"the platform is not at the start of the plan: cable {worst + 1} is"
+            f" {off[worst] * 1000:.1f} mm off, allowed {rig.motion.start_tolerance * 1000:.1f} mm",
+            where="arming",
+            why="the rig stands elsewhere, or its drives were not referenced at home",
+            next_step="move the platform to the plan's start (plan a path from where it is"
+            " with `cdpr plan --start-mm`), or reference the drives; nothing was enabled",
+            values={"off_mm": float(off[worst] * 1000), "cable": float(worst + 1)},
+        )

@@ -1,0 +1,52 @@
+"""The limits that gate, watch and verdict judge by, from the rig and the checked table."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.rig import Rig
+from executor.safety.gate import Limits
+from executor.safety.watch import WatchLimits
+
+#: A cable is slack below this share of the least planned tension. Plans run at the least tension
+#: itself (in 6 % of the paper rig's box), and a whole count is worth 1.7 N there: not yet slack.
+SLACK_SHARE = 0.5
+#: Above this share of the largest planned tension a cable is overloaded; torque is read in ‰.
+OVERLOAD_SHARE = 1.02
+
+
+def tension_limits(rig: Rig) -> tuple[float, float]:
+    """Below the first a cable is slack, above the second overloaded, [N]."""
+    return SLACK_SHARE * rig.min_tension, OVERLOAD_SHARE * rig.max_tension
+
+
+def watch_limits(rig: Rig) -> WatchLimits:
+    """When the watch speaks up."""
+    low, high = tension_limits(rig)
+    return WatchLimits(
+        following_error=rig.motion.following_error, min_tension=low, max_tension=high
+    )
+
+
+def gate_limits(rig: Rig, setpoints: NDArray[np.int32], cycle: float) -> Limits:
+    """The table's own range with the start tolerance, the winches' speed, the following error.
+
+    Args:
+        rig: The robot.
+        setpoints: The checked table, shape (n, m), [counts].
+        cycle: [s].
+    """
+    per_metre = np.abs([w.counts_per_metre for w in rig.winches])
+    margin = np.ceil(per_metre * rig.motion.start_tolerance).astype(int)
+    speeds = np.array([w.max_speed for w in rig.winches])
+    rows = setpoints.astype(np.int64)
+    step = np.floor(per_metre * speeds * cycle).astype(int) + 1
+    # The actual position is of one cycle before, and the drives follow one cycle behind.
+    lag = np.floor(per_metre * rig.motion.following_error).astype(int) + 2 * step
+    return Limits(
+        lowest=tuple((rows.min(axis=0) - margin).tolist()),
+        highest=tuple((rows.max(axis=0) + margin).tolist()),
+        largest_step=tuple(step.tolist()),
+        largest_lag=tuple(lag.tolist()),
+    )
