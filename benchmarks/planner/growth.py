@@ -1,0 +1,179 @@
+"""How the cost of an exact edge check grows with the number of obstacles and of cables.
+
+    python benchmarks/planner/growth.py -o results
+
+Random edges of 40 mm in random scenes: boxes of 20 to 60 mm, placed where they leave room; robots
+with 6 to 16 cables around the same platform. Written as a table and a plot; the slope is that of
+the curve's last half between logarithms (1 is linear growth). Processor time of this process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from pictures import growth_figure
+from rich.progress import track
+
+from cdpr.poses import Array, read_only
+from cdpr.rig import Rig, load_rig
+from cdpr.scene import Scene, load_scene, scene_from_document
+from cdpr.scene_file import SceneDocument
+from planner.exact.edge import edges_free
+from planner.exact.world import build_world
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+OBSTACLES = (1, 2, 5, 10, 20, 50, 100)
+CABLES = (6, 7, 8, 10, 12, 14, 16)
+EDGES = 20000
+EDGE = 0.040
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Processor time in one world, [µs]."""
+
+    size: int
+    share_free: float
+    free_edge_us: float
+    any_edge_us: float
+    world_us: float
+
+
+def main() -> None:
+    """Measures, prints and writes."""
+    wishes = _wishes()
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml")
+    base = load_scene(CONFIGS / "environment_3.yaml")
+    random = np.random.default_rng(wishes.seed)
+    show = sys.stderr.isatty()
+    by_obstacles = [
+        cost(rig, crowded(base, rig, n, random), random, n, wishes.repeats)
+        for n in track(OBSTACLES, "obstacles", disable=not show)
+    ]
+    by_cables = [
+        cost(with_cables(rig, m, random), base, random, m, wishes.repeats)
+        for m in track(CABLES, "cables", disable=not show)
+    ]
+    tables = {"obstacles": by_obstacles, "cables": by_cables}
+    for name, costs in tables.items():
+        print(f"{name}: free edge, any edge, world [µs]; share free")
+        for c in costs:
+            print(f"  {c.size:4d}  {c.free_edge_us:8.3f}  {c.any_edge_us:8.3f}"
+                  f"  {c.world_us:10.0f}  {c.share_free:6.2f}")  # fmt: skip
+        for what in ("free_edge_us", "any_edge_us", "world_us"):
+            print(f"  slope of {what}: {slope(costs, what):.2f}")
+    if wishes.output:
+        write(wishes.output, tables)
+
+
+def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats: int) -> Cost:
+    """Measures one world, the best of some repetitions."""
+    begin = time.process_time()
+    world = build_world(rig, scene, rig.home.rotation, scene.obstacle_clearance)
+    built = time.process_time() - begin
+    starts = random.uniform(rig.workspace_lower, rig.workspace_upper, (EDGES, 3))
+    ways = random.normal(size=(EDGES, 3))
+    ends = starts + EDGE * ways / np.linalg.norm(ways, axis=1)[:, None]
+    ends = np.clip(ends, rig.workspace_lower, rig.workspace_upper)
+    free = edges_free(world, starts, ends)
+    some = np.flatnonzero(free)
+    chosen = np.resize(some, EDGES) if len(some) else np.zeros(0, dtype=np.int64)
+    free_edge = _time(world, starts[chosen], ends[chosen], repeats)
+    return Cost(
+        size, float(free.mean()), free_edge, _time(world, starts, ends, repeats), built * 1e6
+    )
+
+
+def _time(world: object, starts: Array, ends: Array, repeats: int) -> float:
+    """Processor time of one edge, [µs]."""
+    spent = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        edges_free(world, starts, ends)
+        spent.append(time.process_time() - begin)
+    return min(spent) / len(starts) * 1e6 if len(starts) else float("nan")
+
+
+def crowded(base: Scene, rig: Rig, count: int, random: np.random.Generator) -> Scene:
+    """The base scene with other obstacles: small boxes at the sides, where cables hardly pass."""
+    obstacles = []
+    for number in range(count):
+        angle = random.uniform(0.0, 2.0 * np.pi)
+        x, y = 430.0 * np.cos(angle), 430.0 * np.sin(angle)
+        size = random.uniform(20.0, 60.0, 3)
+        obstacles.append(
+            {
+                "name": f"box {number + 1}",
+                "box": {"size_mm": size.tolist()},
+                "position_mm": [x, y, random.uniform(size[2] / 2.0, 120.0)],
+            }
+        )
+    document = base.document.model_dump(mode="json", exclude_none=True) | {"obstacles": obstacles}
+    return scene_from_document(SceneDocument.model_validate(document))
+
+
+def with_cables(rig: Rig, count: int, random: np.random.Generator) -> Rig:
+    """A rig with other cables: outlets near the corners of the frame, anchors on the platform."""
+    numbers = np.arange(count) % rig.cable_count
+    moved = random.uniform(-0.05, 0.05, (count, 3)) * (np.arange(count) >= rig.cable_count)[:, None]
+    anchors = np.clip(rig.anchors[numbers] + moved, -rig.half_size, rig.half_size)
+    return replace(
+        rig,
+        outlets=read_only(rig.outlets[numbers] + moved),
+        anchors=read_only(anchors),
+        feed_directions=read_only(rig.feed_directions[numbers]),
+    )
+
+
+def slope(costs: Sequence[Cost], what: str) -> float:
+    """Growth between the middle and the largest size: 1 is linear, 2 is quadratic."""
+    middle, last = costs[len(costs) // 2], costs[-1]
+    values = [getattr(c, what) for c in (middle, last)]
+    return float(np.log(values[1] / values[0]) / np.log(last.size / middle.size))
+
+
+def write(folder: Path, tables: dict[str, list[Cost]]) -> None:
+    """Tables and plot as files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, costs in tables.items():
+        with (folder / f"growth_{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([name, "share_free", "free_edge_us", "any_edge_us", "world_us"])
+            writer.writerows([c.size, c.share_free, c.free_edge_us, c.any_edge_us, c.world_us]
+                             for c in costs)  # fmt: skip
+    labels = {
+        "free edge": "free_edge_us",
+        "any edge": "any_edge_us",
+        "making the world": "world_us",
+    }
+    panels = [
+        (
+            f"exact edges, more {name}",
+            f"number of {name}",
+            {text: [(c.size, getattr(c, key)) for c in costs if np.isfinite(getattr(c, key))]
+             for text, key in labels.items()},
+        )
+        for name, costs in tables.items()
+    ]  # fmt: skip
+    figure = growth_figure(panels)
+    for ending in ("png", "svg"):
+        figure.savefig(folder / f"growth.{ending}", dpi=150)
+
+
+def _wishes() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--repeats", type=int, default=5, help="of each measurement; best counts")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("-o", "--output", type=Path, help="folder for table and plot")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
