@@ -13,11 +13,13 @@ GOOD_RUN = RunResult(1, 10.0, 0, True, "PASSED", 0.01, 0.1, -0.05, 9.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", [1, 2, 3])
-def test_a_seed_of_an_environment_holds_all_that_is_asked(environment: int) -> None:
-    results = campaign([environment], [3], [10.0, 20.0], 1, 1, lambda _result: None)
+@pytest.mark.parametrize(("environment", "camera_runs"), [(1, 0), (2, 0), (3, 1)])
+def test_a_seed_of_an_environment_holds_all_that_is_asked(
+    environment: int, camera_runs: int
+) -> None:
+    results = campaign([environment], [3], [10.0, 20.0], 1, camera_runs, lambda _result: None)
     assert failures(results) == []
-    assert len(results) == 4
+    assert len(results) == 3 + camera_runs
 
 
 @pytest.mark.parametrize(
