@@ -1,0 +1,107 @@
+"""The checks together: which reason is given, and that nothing is compiled before it is called."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from cdpr.rig import load_rig
+from cdpr.scene import load_scene
+from planner.exact import compilation, compiled
+from planner.exact.checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
+
+ROOT = Path(__file__).parents[3]
+GACHON = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
+SCENE = load_scene(ROOT / "configs" / "environment_1.yaml")
+HOME = GACHON.home.position
+
+
+def checks(**changes: float) -> ExactChecks:
+    limits = {"obstacle_clearance": 0.01, "self_clearance": 0.005, "margin_reserve": 0.2}
+    return ExactChecks(GACHON, SCENE, np.eye(3), **(limits | changes))
+
+
+def test_every_reason_is_told() -> None:
+    aside = HOME + np.array([0.1, 0.0, 0.0])
+    assert checks().problem(HOME, aside) == FREE
+    assert checks().problem(HOME, HOME + np.array([0.0, 0.0, 1.0])) == WORKSPACE
+    assert checks().problem(SCENE.start.position, SCENE.goal.position) == OBSTACLE
+    assert checks(self_clearance=0.05).problem(HOME, aside) == SELF
+    assert checks(margin_reserve=50.0).problem(HOME, aside) == WRENCH
+
+
+def test_many_edges_and_frozen_arrays_are_taken_as_one_by_one() -> None:
+    made = checks()
+    starts = np.stack([SCENE.start.position, HOME])
+    ends = np.stack([SCENE.goal.position, HOME])
+    found = made.problems(starts, ends).tolist()
+    assert found == [made.problem(a, b) for a, b in zip(starts, ends, strict=True)]
+    distance, body, obstacle = made.clearance(SCENE.start.position, SCENE.start.position)
+    assert (round(distance, 4), body, obstacle) == (0.0322, 6, 0)
+
+
+def test_turning_edges_tell_their_reason_too() -> None:
+    made = checks()
+    turned = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
+    assert made.turning_problem(Pose.level(HOME), turned) == FREE
+    assert made.turning_problem(SCENE.start, Pose(SCENE.goal.position, turned.rotation)) == OBSTACLE
+    assert made.turning_problem(Pose.level(HOME), Pose.level([0.0, 0.0, 2.0])) == WORKSPACE
+    assert checks(self_clearance=0.05).turning_problem(Pose.level(HOME), turned) == SELF
+
+
+def test_importing_the_checks_compiles_nothing() -> None:
+    script = (
+        "import sys; import planner.exact; assert 'numba' not in sys.modules\n"
+        "from planner.exact import checks, edge, self_edge, holding, moving_edge\n"
+        "kernels = [v for m in (checks, edge, self_edge, holding, moving_edge)"
+        " for v in vars(m).values() if hasattr(v, 'signatures')]\n"
+        "assert len(kernels) > 20\n"
+        "assert not any(k.signatures for k in kernels)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, timeout=120)
+
+
+def test_the_cache_is_the_given_folder_and_none_where_nothing_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernels = Path(compiled.__file__).parent
+    find = compiled.cache_folder.__wrapped__
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
+    folder = find(kernels)
+    assert folder is not None
+    assert folder.parent == tmp_path / "given"
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert find(kernels) == tmp_path / "cdpr" / "kernels" / folder.name
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert find(kernels) is None
+
+
+def test_kernels_without_a_cache_still_run_and_are_never_said_to_be_compiled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(compiled, "cache_folder", lambda sources: None)
+    monkeypatch.setattr(compilation, "cache_folder", lambda sources: None)
+
+    def twice(value: float) -> float:
+        return 2.0 * value
+
+    assert compiled.kernel(twice)(1.5) == 3.0
+    assert not compilation.is_compiled()
+
+
+def test_compiling_all_leaves_its_mark_and_tells_each_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compilation, "cache_folder", lambda sources: tmp_path)
+    assert not compilation.is_compiled()
+    steps: list[str] = []
+    compilation.compile_all(GACHON, SCENE, steps.append)
+    assert compilation.is_compiled()
+    assert len(steps) == 4
