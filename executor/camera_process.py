@@ -1,19 +1,18 @@
 """The camera's own process, so that pictures never delay the loop.
 
-The loop triggers; the process takes (or renders) a picture, measures the pose and answers once at
-the end. Triggers are small and go through a pipe; when the process is too far behind, a trigger is
-dropped and counted instead of making the loop wait.
+The loop triggers; the process takes (or renders) a picture, measures the pose, says so, and gives
+all its answers at the end. In real time a trigger that comes too early is dropped and counted.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import select
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from time import monotonic
 
 from cdpr.errors import CdprError, Fault
 from cdpr.poses import Pose
@@ -38,15 +37,17 @@ class CameraProcess:
 
         Args:
             make_observer: Called in the process; picklable.
-            may_wait: In simulated time a trigger waits for its place; in real time it is dropped.
+            may_wait: In simulated time triggers queue up. In real time one is dropped while the
+                picture before is still being measured, so that none is older than it says.
 
         Raises:
             CdprError: The camera cannot be used, for the reason told.
         """
         self.dropped = 0
+        self.triggered = 0
+        self._measured = 0
         self._may_wait = may_wait
         self._closed = False
-        self.triggered = 0
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
         self._process = context.Process(
@@ -69,22 +70,24 @@ class CameraProcess:
             self.close()
             raise
 
-    def trigger(self, time: float, planned: Pose, true_pose: Pose | None) -> None:
+    def trigger(self, time: float, true_pose: Pose | None) -> None:
         """Asks for a picture now.
 
         Args:
             time: Since the start of the run, [s].
-            planned: Where the platform should be.
             true_pose: Where the simulated platform is; None with a real camera.
 
         Raises:
             CdprError: The process is gone, for the reason told.
         """
-        ready = self._may_wait or select.select([], [self._link.fileno()], [], 0.0)[1]
-        if not ready:
+        while self._link.poll():
+            answer = self._receive()
+            if isinstance(answer, int):
+                self._measured = answer
+        if not self._may_wait and self._measured < self.triggered:
             self.dropped += 1
             return
-        self._send(Trigger(self.triggered, time, planned, true_pose))
+        self._send(Trigger(self.triggered, time, monotonic(), true_pose))
         self.triggered += 1
 
     def finish(self, progress: Callable[[float], None]) -> list[Look]:
@@ -140,8 +143,7 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
             looks = []
             while (trigger := link.recv()) is not None:
                 looks.append(observer.look(trigger))
-                if len(looks) % 10 == 0:
-                    _tell_progress(link, len(looks))
+                link.send(len(looks))
             link.send(looks)
     except EOFError:
         return  # the parent is gone
@@ -149,9 +151,3 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
         link.send(_Failure(error))
     except Exception as error:
         link.send(_Failure(f"the camera's process failed: {type(error).__name__}: {error}"))
-
-
-def _tell_progress(link: Connection, done: int) -> None:
-    """Only when the pipe has room: during the run nobody reads progress."""
-    if select.select([], [link.fileno()], [], 0.0)[1]:
-        link.send(done)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Protocol
 
@@ -14,10 +14,9 @@ from cdpr.clearance import ClearanceModel
 from cdpr.poses import Array, Pose
 from cdpr.rig import Camera, Rig
 from cdpr.scene import Scene
-from executor.measured import ClearanceRow
 from executor.pose_table import OK
 from executor.run_folder import RunFolder
-from tracking.measured_clearance import clearance_of
+from tracking.measured_clearance import MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 
@@ -29,13 +28,13 @@ class Trigger:
     Attributes:
         frame: Its number.
         time: Since the start of the run, [s].
-        planned: Where the platform should be.
+        asked: When, monotonic, [s].
         true_pose: Where the simulated platform is; None with a real camera.
     """
 
     frame: int
     time: float
-    planned: Pose
+    asked: float
     true_pose: Pose | None
 
 
@@ -45,13 +44,12 @@ class Look:
 
     Attributes:
         frame: Its number.
-        time: Since the start of the run, [s].
+        time: Of the picture, since the start of the run, [s].
         status: ``ok``, or why there is no pose.
         pose: ``world_from_platform`` as measured, or None.
         covariance: Of position and rotation vector, world axes, shape (6, 6), [m, rad].
         tags: Numbers of the tags used.
         reprojection: RMS of the corners, [px].
-        planned: Where the platform should have been.
         picture: Name of the kept picture in the run folder, or nothing.
         clearance: Distances at the measured pose, or None.
     """
@@ -63,16 +61,21 @@ class Look:
     covariance: Array
     tags: tuple[int, ...]
     reprojection: float
-    planned: Pose
     picture: str
-    clearance: ClearanceRow | None
+    clearance: MeasuredClearance | None
+
+
+def unseen(frame: int, time: float, reason: str) -> Look:
+    """What is known of a picture that gave no pose, or was asked for and never taken."""
+    unknown = np.full((6, 6), np.nan)
+    return Look(frame, time, reason, None, unknown, (), float("nan"), "", None)
 
 
 class PictureSource(Protocol):
     """A camera, real or rendered, that gives a picture when asked."""
 
-    def picture(self, true_pose: Pose | None, frame: int) -> NDArray[np.uint8]:
-        """A grey picture, now."""
+    def picture(self, trigger: Trigger) -> tuple[NDArray[np.uint8], float]:
+        """A grey picture, and how much later than asked for it was taken, [s]."""
         ...
 
     def close(self) -> None:
@@ -119,44 +122,25 @@ class Observer:
 
     def look(self, trigger: Trigger) -> Look:
         """Takes a picture and measures the platform in it."""
-        image = self._source.picture(trigger.true_pose, trigger.frame)
+        image, delay = self._source.picture(trigger)
+        time = trigger.time + delay
         kept = ""
         if trigger.frame % self._keep_every == 0:
             kept = self._folder.write_picture(trigger.frame, image)
-        found = self._tracker.observe(image, trigger.time)
+        found = self._tracker.observe(image, time)
         if not isinstance(found, PoseMeasurement):
-            nothing = np.full((6, 6), np.nan)
-            return Look(
-                trigger.frame,
-                trigger.time,
-                found.reason,
-                None,
-                nothing,
-                (),
-                float("nan"),
-                trigger.planned,
-                kept,
-                None,
-            )
+            return replace(unseen(trigger.frame, time, found.reason), picture=kept)
         return Look(
             trigger.frame,
-            trigger.time,
+            time,
             OK,
             found.pose,
             found.covariance,
             found.tags,
             found.reprojection,
-            trigger.planned,
             kept,
-            self._clearance_row(trigger, found),
+            clearance_of(self._clearance, found),
         )
-
-    def _clearance_row(self, trigger: Trigger, found: PoseMeasurement) -> ClearanceRow | None:
-        measured = clearance_of(self._clearance, found)
-        if measured is None:
-            return None
-        planned = self._clearance.obstacles(trigger.planned)
-        return ClearanceRow(trigger.time, "tag", measured.nearest, measured.uncertainty, planned)
 
 
 MakeObserver = Callable[[], Observer]

@@ -28,6 +28,7 @@ def real_time() -> Iterator[str]:
     try:
         yield _enter()
     finally:
+        ctypes.CDLL(None).munlockall()
         with suppress(PermissionError):
             os.sched_setscheduler(0, policy, parameter)
         gc.enable()

@@ -18,21 +18,21 @@ from executor.cycle_table import CycleTable
 from executor.loop import CycleRecord, Loop, LoopEvent
 from executor.machine import State
 from executor.mcap_log import write_mcap
-from executor.measured import clearance_table, encoder_rows
+from executor.measured import ClearanceRow, clearance_table, encoder_rows
 from executor.observer import Look
 from executor.pose_table import PoseTable, no_poses
 from executor.prepare import PreparedRun
 from executor.realtime import real_time
 from executor.report import build_report
 from executor.run_folder import RunEvent, RunFolder
-from executor.run_log import RunLog, between
+from executor.run_log import RunLog
 from executor.summary import RunContext, summarize
 from executor.versions import versions
 
 #: Clearances from drive positions are computed this often along a run, [Hz].
 CLEARANCE_RATE = 10.0
 
-Trigger = Callable[[float, Pose], None]
+Trigger = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,6 @@ class Execution:
         self._triggers: Trigger | None = None
         self._progress: Callable[[float], None] = lambda _share: None
         self._every = 1
-        self._due = 0.0
         self.loop = Loop(
             prepared.checked,
             group,
@@ -100,7 +99,7 @@ class Execution:
 
         Args:
             folder: Where events are written as they happen.
-            trigger: Called for every picture with its time [s] and the planned pose.
+            trigger: Called for every picture with its time [s].
             camera_rate: Pictures a second, [Hz].
             progress: Called with the number of rows that are done.
         """
@@ -120,15 +119,11 @@ class Execution:
 
     def _on_cycle(self, record: CycleRecord) -> None:
         self._log.add(record)
-        due, self._due = self._due, record.index
         if record.cycle % self._every:
             return
         self._progress(record.index)
         if self._triggers is not None:
-            # Now the platform is where the drives were told to be one cycle before.
-            table = self.prepared.checked.table
-            pose = Pose(between(table.positions, due), table.rotations[round(due)])
-            self._triggers(record.cycle * table.cycle, pose)
+            self._triggers(record.cycle * self.prepared.checked.table.cycle)
 
     def _on_event(self, event: LoopEvent) -> None:
         if self._folder is not None:
@@ -152,7 +147,7 @@ def conclude(
         The summary.
     """
     cycles = outcome.log.table()
-    poses = _pose_table(looks)
+    poses = _pose_table(looks, cycles)
     clearance = _clearance(prepared, cycles, looks)
     folder.write_cycles(cycles)
     folder.write_poses(poses)
@@ -177,7 +172,7 @@ def conclude(
     return summary
 
 
-def _pose_table(looks: Sequence[Look]) -> PoseTable:
+def _pose_table(looks: Sequence[Look], cycles: CycleTable) -> PoseTable:
     if not looks:
         return no_poses()
     nowhere = Pose(np.full(3, np.nan), np.full((3, 3), np.nan))
@@ -192,9 +187,17 @@ def _pose_table(looks: Sequence[Look]) -> PoseTable:
         covariance=np.array([look.covariance for look in looks]),
         tags=tuple(" ".join(map(str, look.tags)) for look in looks),
         reprojection=np.array([look.reprojection for look in looks]),
-        planned=np.array([look.planned.position for look in looks]),
+        planned=np.array([pose.position for pose in _planned(looks, cycles)]),
         picture=tuple(look.picture for look in looks),
     )
+
+
+def _planned(looks: Sequence[Look], cycles: CycleTable) -> list[Pose]:
+    """Where the platform should have been when each picture was taken."""
+    times = np.array([look.time for look in looks])
+    axes = [np.interp(times, cycles.time, cycles.planned[:, i]) for i in range(3)]
+    nearest = np.clip(np.searchsorted(cycles.time, times), 0, len(cycles) - 1)
+    return _poses(np.column_stack(axes), cycles.planned_rotation[nearest])
 
 
 def _poses(positions: Array, quaternions: Array) -> list[Pose]:
@@ -204,7 +207,17 @@ def _poses(positions: Array, quaternions: Array) -> list[Pose]:
 
 def _clearance(prepared: PreparedRun, cycles: CycleTable, looks: Sequence[Look]) -> ClearanceTable:
     model = ClearanceModel(prepared.rig, prepared.scene)
-    rows = [look.clearance for look in looks if look.clearance is not None]
+    rows = [
+        ClearanceRow(
+            look.time,
+            "tag",
+            look.clearance.nearest,
+            look.clearance.uncertainty,
+            model.obstacles(planned),
+        )
+        for look, planned in zip(looks, _planned(looks, cycles), strict=True)
+        if look.clearance is not None
+    ]
     if model.obstacle_names:
         every = max(1, round(1.0 / (CLEARANCE_RATE * prepared.checked.table.cycle)))
         chosen = np.arange(0, len(cycles), every)

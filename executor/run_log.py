@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cdpr.kinematics import poses_near
-from cdpr.poses import Array, quaternion_from_matrix
+from cdpr.poses import Array
 from cdpr.rig import Rig
-from executor.cycle_table import CycleTable
+from executor.cycle_table import CycleTable, quaternions_of
 from executor.loop import CycleRecord
 from executor.setpoints import CheckedTable
 
@@ -54,9 +54,9 @@ class RunLog:
             lateness=np.array([r.lateness for r in records]) * planned.cycle,
             missing=np.array([r.missing for r in records], dtype=np.int64),
             planned=between(planned.positions, index),
-            planned_rotation=_quaternions(planned.rotations[rows]),
+            planned_rotation=quaternions_of(planned.rotations[rows]),
             encoder=encoder,
-            encoder_rotation=_quaternions(turned),
+            encoder_rotation=quaternions_of(turned),
             following_error=np.array([r.following_error for r in records]),
             set_counts=_matrix([r.targets for r in records], rig.cable_count),
             actual_counts=actual,
@@ -64,10 +64,6 @@ class RunLog:
             planned_tensions=between(planned.tensions, index),
             tensions=np.where(taut[:, None], tensions, np.nan),
         )
-
-
-def _quaternions(rotations: Array) -> Array:
-    return np.array([quaternion_from_matrix(r) for r in rotations]).reshape(-1, 4)
 
 
 def _matrix(

@@ -15,14 +15,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
     from cdpr.rig_file import RigDocument
     from cdpr.scene import Scene
     from cdpr.scene_file import SceneDocument
     from drivers.cameras import LiveCamera
     from executor.camera_process import CameraProcess
-    from executor.observer import Look, Observer, PictureSource
+    from executor.observer import Observer, PictureSource, Trigger
     from simulation.camera import SyntheticCamera
 
 SYNTHETIC = "synthetic"
@@ -123,27 +122,17 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
     return LivePictures(LiveCamera(name, camera))
 
 
-def unseen(frame: int, time: float, planned: Pose, reason: str) -> Look:
-    """What is known of a picture that was asked for and never measured."""
-    import numpy as np
-
-    from executor.observer import Look
-
-    nothing = np.full((6, 6), np.nan)
-    return Look(frame, time, reason, None, nothing, (), float("nan"), planned, "", None)
-
-
 class RenderedPictures:
     """The synthetic camera as the run's source of pictures."""
 
     def __init__(self, camera: SyntheticCamera) -> None:
         self._camera = camera
 
-    def picture(self, true_pose: Pose | None, frame: int) -> NDArray[np.uint8]:
+    def picture(self, trigger: Trigger) -> tuple[NDArray[np.uint8], float]:
         """Renders the platform where it truly is."""
-        if true_pose is None:
+        if trigger.true_pose is None:
             raise Fault("the synthetic camera was not told where the platform is")
-        return self._camera.render(true_pose, frame)
+        return self._camera.render(trigger.true_pose, trigger.frame), 0.0
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -155,9 +144,10 @@ class LivePictures:
     def __init__(self, camera: LiveCamera) -> None:
         self._camera = camera
 
-    def picture(self, _true_pose: Pose | None, _frame: int) -> NDArray[np.uint8]:
-        """The picture of this moment."""
-        return self._camera.read().image
+    def picture(self, trigger: Trigger) -> tuple[NDArray[np.uint8], float]:
+        """The next picture, and how long after the trigger it arrived."""
+        frame = self._camera.read()
+        return frame.image, frame.time - trigger.asked
 
     def close(self) -> None:
         """Lets go of the camera."""

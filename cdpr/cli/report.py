@@ -23,9 +23,9 @@ def report(
     from executor.run_folder import RunFolder
 
     folder = RunFolder.open(run)
+    with spinner("writing the report", not as_json):
+        page = build_report(folder)
     if as_json:
         show_json(folder.summary())
         return
-    with spinner("writing the report", True):
-        page = build_report(folder)
     out.print(f"report: {page}", soft_wrap=True)

@@ -229,9 +229,9 @@ def _move(
     true_pose: Any,
     quiet: bool,
 ) -> tuple[Outcome, list[Look]]:
-    from cdpr.cli.cameras import unseen
     from cdpr.cli.output import progress_bar
     from cdpr.errors import CdprError
+    from executor.observer import unseen
     from executor.run_folder import RunEvent
 
     rows = len(execution.prepared.checked.table)
@@ -239,21 +239,25 @@ def _move(
         with progress_bar("moving", rows, not quiet) as advance:
             return execution.run(folder, progress=advance), []
 
-    asked: list[tuple[float, Pose]] = []
+    asked: list[float] = []
 
-    def trigger(time: float, planned: Pose) -> None:
-        asked.append((time, planned))
-        camera.trigger(time, planned, true_pose() if true_pose else None)
+    def trigger(time: float) -> None:
+        asked.append(time)
+        camera.trigger(time, true_pose() if true_pose else None)
 
     rate = execution.prepared.rig.cameras[0].rate
     with progress_bar("moving", rows, not quiet) as advance:
         outcome = execution.run(folder, trigger=trigger, camera_rate=rate, progress=advance)
     with progress_bar("measuring pictures", camera.triggered, not quiet) as advance:
         try:
-            return outcome, camera.finish(advance)
+            looks = camera.finish(advance)
         except CdprError as error:  # the motion is over; without pictures the run is still a record
-            folder.append_event(RunEvent(asked[-1][0] if asked else 0.0, "camera", error.what))
-            return outcome, [unseen(k, *what, error.what) for k, what in enumerate(asked)]
+            folder.append_event(RunEvent(asked[-1] if asked else 0.0, "camera", error.what))
+            return outcome, [unseen(k, time, error.what) for k, time in enumerate(asked)]
+    if camera.dropped:
+        told = f"{camera.dropped} of {len(asked)} pictures left out: the one before was not done"
+        folder.append_event(RunEvent(asked[-1], "pictures_dropped", told))
+    return outcome, looks
 
 
 def exit_code(summary: dict[str, Any]) -> int:
