@@ -14,8 +14,9 @@ from cdpr.rig import Rig, load_rig
 from cdpr.scene import Scene, load_scene
 from planner.exact.capacity import build_load, margins, orthogonal_vector
 from planner.exact.fields import World
-from planner.exact.holding import build_holding, edge_held, edges_held, tensions_prove
+from planner.exact.holding import build_holding, edge_held, edges_held
 from planner.exact.structure import factored
+from planner.exact.tension_proof import tensions_prove
 from planner.exact.world import build_world
 from planner.feasibility import capacity_margins
 from tests.planner.exact.sampled_oracle import changed_rig
