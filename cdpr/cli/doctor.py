@@ -10,7 +10,11 @@ import typer
 
 PACKAGES = ("cdpr", "planner", "executor", "drivers", "tracking", "calibration", "simulation")
 LIBRARIES = {
+    "pydantic": "pydantic",
+    "yaml": "pyyaml",
+    "rich": "rich",
     "numpy": "numpy",
+    "numba": "numba",
     "scipy": "scipy",
     "cv2": "opencv-python-headless",
     "fcl": "python-fcl",

@@ -19,12 +19,19 @@ def stop(
       cdpr stop
     """
     from cdpr.cli.output import out, show_json
+    from cdpr.errors import Fault
     from executor.running import stop_all
 
     stopped = stop_all()
     if as_json:
         show_json({"stopped_processes": stopped})
-    elif stopped:
-        out.print(f"stop sent to process {', '.join(map(str, stopped))}")
-    else:
-        out.print("no run is going on")
+        raise typer.Exit(0 if stopped else 1)
+    if not stopped:
+        raise Fault(
+            "no run of yours is going on, so nothing was stopped",
+            where="cdpr stop",
+            why="it ended already, or another user started it",
+            next_step="press the emergency stop if something moves; a run of another user is"
+            " stopped by that user or by root",
+        )
+    out.print(f"stop sent to process {', '.join(map(str, stopped))}")

@@ -85,7 +85,16 @@ def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
     assert all(
         set(one) == {"name", "good", "text", "fix"} for one in document(call("doctor", "--json"))
     )
+
+
+def test_a_stop_that_stops_nothing_is_no_success() -> None:
+    """Who presses stop and sees something move must not read that all is well."""
+    told = call("stop")
+    assert told.code == 1
+    assert "no run of yours is going on" in told.err
+    assert "emergency stop" in told.err
     assert document(call("stop", "--json")) == {"stopped_processes": []}
+    assert call("stop", "--json").code == 1
 
 
 def test_json_of_track(tmp_path: Path, short_plan: Path) -> None:
@@ -124,7 +133,7 @@ def test_an_error_is_json_too_when_json_was_asked_for(
 def test_nothing_but_the_result_is_on_standard_output_and_no_escape_codes_where_nobody_looks(
     short_plan: Path, finished_run: Path
 ) -> None:
-    for arguments in (["check", short_plan], ["report", finished_run], ["doctor"], ["stop"]):
+    for arguments in (["check", short_plan], ["report", finished_run], ["doctor"]):
         answer = call(*arguments)
         assert answer.code == 0
         assert "\x1b" not in answer.out + answer.err
