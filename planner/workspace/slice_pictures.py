@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLUMNS = 3
+_BELOW_LABELS = 0.42
+"""Where the legend begins, [in] below the axes."""
 _COSTS = ("dexterity_cost", "wrench_cost")
 _LEAST_SPREAD = 1e-12
 
@@ -26,7 +28,7 @@ def slice_figure(maps: Maps) -> Figure:
     """Every quantity over a slice, with the line beyond which a limit is broken."""
     panels = [quantity for quantity in shown_in(maps) if quantity.name != "condition_number"]
     rows = -(-(1 + len(panels)) // _COLUMNS)
-    figure = new_figure(11.0, 3.3 * rows + 0.3)
+    figure = new_figure(11.0, rows * (2.7 * height_to_width(maps.grid) + 0.8) + 0.4)
     figure.suptitle(title_of(maps.grid), x=0.01, ha="left", weight="bold")
     cells = np.asarray(figure.subplots(rows, _COLUMNS)).ravel()
     _verdict_map(cells[0], maps)
@@ -43,6 +45,7 @@ def _verdict_map(axes: Axes, maps: Maps) -> None:
     """Draws where the platform may be, and what forbids it elsewhere."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
+    from matplotlib.transforms import ScaledTranslation
 
     values = _flat(maps.verdict, maps.grid)
     x, y = _coordinates(maps.grid)
@@ -52,7 +55,11 @@ def _verdict_map(axes: Axes, maps: Maps) -> None:
     )  # fmt: skip
     present = sorted(set(values.ravel().tolist()))
     patches = [Patch(color=VERDICT_COLOURS[k], label=VERDICTS[k]) for k in present]
-    axes.legend(handles=patches, loc="upper left", bbox_to_anchor=(0.0, -0.16), fontsize=8.0)
+    below = axes.transAxes + ScaledTranslation(0.0, -_BELOW_LABELS, axes.figure.dpi_scale_trans)
+    axes.legend(
+        handles=patches, loc="upper left", bbox_to_anchor=(0.0, 0.0), bbox_transform=below,
+        borderaxespad=0.0, fontsize=8.0,
+    )  # fmt: skip
     axes.set_title("where the platform may be")
     _label(axes, maps.grid)
 
@@ -133,10 +140,16 @@ def sides_of(grid: Grid) -> tuple[int, int]:
     return across, up
 
 
+def height_to_width(grid: Grid) -> float:
+    """Shape of a picture of a slice, within what still can be read."""
+    x, y = _coordinates(grid)
+    return float(np.clip(np.ptp(y) / np.ptp(x), 0.35, 2.0))
+
+
 def title_of(grid: Grid) -> str:
     """Where the slice is."""
     normal = _normal(grid)
-    return f"{AXES[normal]} = {grid.axes[normal][0] * 1e3:g} mm"
+    return f"{AXES[normal]} = {round(float(grid.axes[normal][0]) * 1e3, 1):g} mm"
 
 
 def _normal(grid: Grid) -> int:

@@ -12,7 +12,7 @@ from cdpr.rig import Rig
 from planner.workspace.computing import Maps
 from planner.workspace.grid import Grid
 from planner.workspace.shown import Shown
-from planner.workspace.slice_pictures import colour_map, colour_range, title_of
+from planner.workspace.slice_pictures import colour_map, colour_range, height_to_width, title_of
 from planner.workspace.style import CLOSED, FEASIBLE, FRAME, FREE, MUTED, new_figure
 from planner.workspace.surface import zero_surface
 
@@ -26,6 +26,8 @@ LEVELS = 6
 
 def space_figure(maps: Maps) -> Figure:
     """Where wrenches can be balanced, where tensions suffice, and where nothing collides."""
+    from matplotlib.ticker import MaxNLocator
+
     panels = [
         ("wrench closure", maps.values["closure_margin"], CLOSED),
         ("wrench feasible", maps.values["capacity_margin"], FEASIBLE),
@@ -43,6 +45,7 @@ def space_figure(maps: Maps) -> Figure:
         axes.set_title(f"{title}: {share * 100:.1f} % of the region")
         for letter in "xyz":
             getattr(axes, f"set_{letter}label")(f"{letter} [mm]")
+            getattr(axes, f"{letter}axis").set_major_locator(MaxNLocator(4))
         axes.set_aspect("equal")
         axes.view_init(elev=24.0, azim=-58.0)
     return figure
@@ -51,7 +54,7 @@ def space_figure(maps: Maps) -> Figure:
 def level_figure(maps: Maps, quantity: Shown) -> Figure:
     """One quantity of a volume at levels of z, bottom to top, in the same colours."""
     levels = [_level(maps, number) for number in level_numbers(maps.grid)]
-    figure = new_figure(11.0, 7.0)
+    figure = new_figure(11.0, 2.0 * (3.3 * height_to_width(levels[0].grid) + 0.35) + 0.5)
     figure.suptitle(quantity.label, x=0.01, ha="left", weight="bold")
     low, high = colour_range(levels, quantity)
     cells = np.asarray(figure.subplots(2, LEVELS // 2, sharex=True, sharey=True))
