@@ -15,7 +15,7 @@ from executor.machine import State
 from executor.prepare import PreparedRun
 from executor.run import Outcome
 from simulation.rehearsal import Rehearsal
-from tests.cli.plans import RIG
+from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written
 from tests.scenarios.stage import Stage, at, path_indices, staged
 
@@ -130,3 +130,21 @@ def test_ctrl_c_before_anything_moves_leaves_no_run_folder(
         )
     assert answer.code == 130, answer
     assert "stopped before anything moved" in answer.said
+
+
+@pytest.mark.parametrize("verb", ["plan", "demo"])
+def test_ctrl_c_while_planning_ends_with_130_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    def planning(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("planner.plan.make_plan", planning)
+    scene = CONFIGS / "environment_1.yaml"
+    rest = (
+        [RIG, scene, "-o", tmp_path / "plan.json"] if verb == "plan" else ["-o", tmp_path / "run"]
+    )
+    with nothing_written(tmp_path):
+        answer = call(verb, *rest)
+    assert answer.code == 130
+    assert "interrupted" in answer.err
