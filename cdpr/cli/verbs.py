@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import typer
 
+from cdpr.cli import bench
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
@@ -26,6 +27,9 @@ def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
         app.command()(_interruptible(verb))
+    group = typer.Typer(help="Measure the planner.", no_args_is_help=True)
+    group.command()(_interruptible(bench.paper))
+    app.add_typer(group, name="bench")
 
 
 def _interruptible(verb: Callable[..., None]) -> Callable[..., None]:

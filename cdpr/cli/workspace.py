@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from cdpr.poses import Array
     from cdpr.rig import Rig
     from planner.workspace.computing import Maps
@@ -81,6 +77,7 @@ def workspace(
       --slice z=445 --slice x=0 --step-mm 5 -o maps
     """
     from cdpr.cli.output import progress_bar, show_facts, show_json, spinner
+    from cdpr.cli.workers import Count, make_folder, worker_pool
     from cdpr.cli.workspace_files import write_maps
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
@@ -93,14 +90,15 @@ def workspace(
     length = None if length_mm is None else length_mm / 1000.0
     question = Question.about(the_rig, the_scene, _rotation(rotation_wxyz), length)
     grids = _grids(the_rig, slices or [], volume, step_mm, lower_mm, upper_mm)
-    _make_folder(output, force)
+    make_folder(output, force)
     with spinner("preparing (compiles exact distances when run for the first time)", not as_json):
         extremes = Extremes.over_workspace(question)
         _warm_up(question)
     total = sum(grid.count for grid in grids)
     made: list[Maps] = []
+    cores = 1 if total <= POINTS_FOR_ONE_PROCESS else os.cpu_count() or 1
     with (
-        _pool(total, workers or os.cpu_count() or 1, dask) as pool,
+        worker_pool(workers or cores, dask) as pool,
         progress_bar("mapping", total, not as_json) as advance,
     ):
         done = Count(advance)
@@ -114,20 +112,6 @@ def workspace(
         show_json({"folder": str(output), "maps": summary})
     else:
         show_facts(f"maps of {the_rig.name} in {output}", _sentences(summary, output))
-
-
-class Count:
-    """Adds up points for a progress bar."""
-
-    def __init__(self, advance: Any) -> None:
-        """Reports sums to ``advance``."""
-        self._advance = advance
-        self._done = 0
-
-    def more(self, points: int) -> None:
-        """Counts newly done points."""
-        self._done += points
-        self._advance(self._done)
 
 
 def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array | None:
@@ -175,85 +159,11 @@ def _grids(
     return grids
 
 
-def _make_folder(folder: Path, force: bool) -> None:
-    """Before the work: a result that cannot be written would be lost.
-
-    Raises:
-        BadInput: The folder holds something and ``force`` is not set, or cannot be made.
-    """
-    from cdpr.errors import BadInput
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        taken = any(folder.iterdir())
-    except OSError as error:
-        raise BadInput(
-            "the folder cannot be made", where=str(folder), why=str(error.strerror)
-        ) from error
-    if taken and not force:
-        raise BadInput(
-            "the folder is not empty",
-            where=str(folder),
-            next_step="choose another name, or pass --force to write into it",
-        )
-    if not os.access(folder, os.W_OK):
-        raise BadInput("the folder is read-only", where=str(folder))
-
-
 def _warm_up(question: Question) -> None:
     """Compiles what is needed once, before several processes would do so."""
     from planner.workspace.maps import values_at
 
     values_at(question, question.rig.home.position[None, :])
-
-
-@contextmanager
-def _pool(points: int, workers: int, dask: str | None) -> Iterator[Executor | None]:
-    """What does the work: a Dask cluster, processes of this computer, or nobody else."""
-    if dask is not None:
-        with _dask_client(dask) as client:
-            yield client.get_executor()
-        return
-    if workers == 1 or points <= POINTS_FOR_ONE_PROCESS:
-        yield None
-        return
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_leave_interrupts)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _leave_interrupts() -> None:
-    """Ctrl-C is for the process that was started; it stops the others itself."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _dask_client(address: str) -> Any:
-    from importlib import import_module
-
-    from cdpr.errors import BadInput
-
-    try:
-        client = import_module("distributed").Client
-    except ImportError as error:
-        raise BadInput(
-            "Dask is not installed", next_step="pip install 'cdpr[dask]', or leave --dask out"
-        ) from error
-    try:
-        return client(address, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise BadInput(
-            "no Dask scheduler answers there",
-            where=address,
-            why=str(error) or type(error).__name__,
-            next_step="start one (dask scheduler), or leave --dask out",
-        ) from error
 
 
 def _lead(question: Question) -> str:

@@ -1,4 +1,4 @@
-"""What edges cost, compiled: their length, or the integral of the kinematic cost from its lattice."""
+"""What edges cost, compiled: their length, or the integral of the kinematic cost."""
 
 from __future__ import annotations
 
@@ -76,5 +76,5 @@ def _at(field: CostField, x: float, y: float, z: float) -> float:
 @kernel
 def _cell(at: float, lower: float, spacing: float, points: int) -> tuple[int, float]:
     scaled = (at - lower) / spacing
-    cell = min(max(int(math.floor(scaled)), 0), points - 2)
+    cell = min(max(math.floor(scaled), 0), points - 2)
     return cell, min(max(scaled - cell, 0.0), 1.0)

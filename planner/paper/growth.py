@@ -12,9 +12,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from planner.exact.checks import FREE
 from planner.exact.compiled import kernel
 from planner.paper.cost_field import CostField, edge_cost
-from planner.paper.limits import FREE, REASONS, Limits, problem
+from planner.paper.limits import REASONS, Limits, problem
 from planner.paper.sampling import backward, forward, goal_bias, near_way
 from planner.paper.tallies import Tallies, failure_rate, focus_node, tell
 from planner.paper.tree import Tree, add, move, nearest, squared_distance, way_to, within
@@ -164,9 +165,7 @@ def _grow(search: Search, task: Task, rules: Rules, wanted: Array) -> int:
         return -1
     step = rules.step if rules.full_step else min(rules.step, length)
     new = tree.points[near] + (wanted - tree.points[near]) * (step / length)
-    if _crowded(tree, new, rules.spacing) or not _free(
-        search, task.limits, tree.points[near], new
-    ):
+    if _crowded(tree, new, rules.spacing) or not _free(search, task.limits, tree.points[near], new):
         tell(search.tallies, near, False, rules.focus)
         return -1
     tell(search.tallies, near, True, rules.focus)
@@ -200,7 +199,7 @@ def _best_parent(
     for k in range(len(costs)):
         totals[k] = tree.costs[found[k]] + costs[k]
     for _ in range(len(costs)):
-        k = np.argmin(totals)
+        k = int(np.argmin(totals))
         if totals[k] >= bound:
             break
         if _free(search, task.limits, tree.points[found[k]], new):

@@ -1,4 +1,4 @@
-"""Everything an edge must keep, compiled, with the reason why one is refused."""
+"""Everything an edge must keep, as one argument of compiled functions."""
 
 from __future__ import annotations
 
@@ -9,33 +9,31 @@ from numpy.typing import NDArray
 
 from cdpr.rig import Rig
 from cdpr.scene import Scene
+from planner.exact.capacity import Load
+from planner.exact.checks import ExactChecks, edge_problem
 from planner.exact.compiled import kernel
-from planner.exact.edge import edge_clearance, in_workspace, obstacles_free, row_of
 from planner.exact.fields import World
-from planner.exact.self_edge import build_robot, self_edge_free
+from planner.exact.holding import Holding
 from planner.exact.self_region import Robot
-from planner.exact.world import build_world
+from planner.settings import MARGIN_RESERVE
 
 Array = NDArray[np.float64]
 
-FREE, WORKSPACE, OBSTACLE, SELF, WRENCH = range(5)
 REASONS = ("", "workspace", "obstacle clearance", "self clearance", "wrench feasibility")
+"""Why edges are refused, by what `problem` returns."""
 
 
 class Limits(NamedTuple):
-    """What edges of one rig at one orientation in one scene must keep.
-
-    Attributes:
-        world: Obstacles and workspace.
-        robot: Self clearance.
-    """
+    """What edges of one rig at one orientation in one scene must keep; see `ExactChecks`."""
 
     world: World
     robot: Robot
+    load: Load
+    holding: Holding
 
 
-def build_limits(rig: Rig, scene: Scene, rotation: Array, reserve: float) -> Limits:
-    """The limits of ``scene`` with ``reserve`` [m] on top of its clearances.
+def exact_checks(rig: Rig, scene: Scene, rotation: Array, reserve: float) -> ExactChecks:
+    """The checks of ``scene`` with ``reserve`` [m] on top of its clearances.
 
     Args:
         rig: The robot.
@@ -43,25 +41,22 @@ def build_limits(rig: Rig, scene: Scene, rotation: Array, reserve: float) -> Lim
         rotation: Orientation that is kept, shape (3, 3).
         reserve: [m].
     """
-    world = build_world(rig, scene, rotation, scene.obstacle_clearance + reserve)
-    return Limits(world, build_robot(rig, world, scene.self_clearance + reserve))
+    return ExactChecks(
+        rig,
+        scene,
+        rotation,
+        obstacle_clearance=scene.obstacle_clearance + reserve,
+        self_clearance=scene.self_clearance + reserve,
+        margin_reserve=MARGIN_RESERVE * rig.max_tension,
+    )
+
+
+def limits_of(checks: ExactChecks) -> Limits:
+    """The same checks for compiled functions."""
+    return Limits(checks.world, checks.robot, checks.load, checks.holding)
 
 
 @kernel
 def problem(limits: Limits, start: Array, end: Array) -> int:
-    """Why the straight edge between two positions, shape (3,), is refused; `FREE` if it is not."""
-    before, after = row_of(start), row_of(end)
-    if not (in_workspace(limits.world, before) and in_workspace(limits.world, after)):
-        return WORKSPACE
-    if not obstacles_free(limits.world, before, after):
-        return OBSTACLE
-    if not self_edge_free(limits.world, limits.robot, start, end):
-        return SELF
-    return FREE
-
-
-@kernel
-def blocked_by(limits: Limits, start: Array, end: Array) -> tuple[int, int]:
-    """The body (m for the platform) and the obstacle that are nearest along an edge."""
-    _, body, owner = edge_clearance(limits.world, start, end)
-    return body, owner
+    """Why the straight edge between two positions, shape (3,), is refused; 0 if it is not."""
+    return edge_problem(limits.world, limits.robot, limits.load, limits.holding, start, end)

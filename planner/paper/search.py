@@ -13,6 +13,7 @@ from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from planner.cost import KinematicCost
+from planner.exact.checks import FREE, OBSTACLE, ExactChecks
 from planner.paper.cost_field import kinematic_field, length_field
 from planner.paper.growth import (
     CHECKS,
@@ -29,7 +30,7 @@ from planner.paper.growth import (
     new_search,
     try_straight,
 )
-from planner.paper.limits import OBSTACLE, REASONS, blocked_by, build_limits, problem
+from planner.paper.limits import REASONS, exact_checks, limits_of
 from planner.paper.readings import FAILURE_RATES, FOCUSES
 from planner.paper.shortcut import shortcut
 from planner.paper.tallies import new_tallies
@@ -75,6 +76,9 @@ class PaperPlanner:
     Attributes:
         space: What is searched.
         settings: Of the searches; their seed is not used.
+        limits: What edges must keep.
+        field: What they cost.
+        checks: Edges asked about so far.
     """
 
     def __init__(
@@ -84,6 +88,7 @@ class PaperPlanner:
         settings: PlannerSettings,
         reserve: float,
         cost: KinematicCost | None = None,
+        exact: ExactChecks | None = None,
     ) -> None:
         """Prepares limits and cost.
 
@@ -93,10 +98,12 @@ class PaperPlanner:
             settings: Sampler, readings, cost, mode and sizes.
             reserve: Added to the scene's clearances, [m].
             cost: For the rig at the scene's orientation; computed when left out and needed.
+            exact: The limits with the reserve; made when left out, to be shared by planners.
         """
         self.space = TranslationSpace(rig, scene.start.rotation)
         self.settings = settings
-        self.limits = build_limits(rig, scene, self.space.rotation, reserve)
+        self._exact = exact or exact_checks(rig, scene, self.space.rotation, reserve)
+        self.limits = limits_of(self._exact)
         if settings.cost == "kinematic":
             self.field = kinematic_field(cost or KinematicCost(rig, self.space.rotation))
         else:
@@ -108,7 +115,7 @@ class PaperPlanner:
     def edge(self, start: Array, end: Array) -> bool:
         """Whether the straight edge between two positions, shape (3,), is allowed."""
         self.checks += 1
-        return problem(self.limits, start, end) == 0
+        return self._exact.problem(start, end) == FREE
 
     def search(
         self,
@@ -130,7 +137,10 @@ class PaperPlanner:
         task = Task(np.array(start), np.array(goal), lower, upper, self.limits, self.field)
         capacity = settings.max_iterations + 2
         search = new_search(
-            new_tree(start, capacity), new_tallies(capacity), goal, settings.max_iterations
+            new_tree(task.start, capacity),
+            new_tallies(capacity),
+            task.goal,
+            settings.max_iterations,
         )
         rules = _rules(settings)
         if self._tries_straight(start, goal):
@@ -180,9 +190,9 @@ class PaperPlanner:
     def _in_the_way(self, search: Search) -> dict[tuple[str, str], int]:
         found: dict[tuple[str, str], int] = {}
         for start, end in search.refused[: min(int(search.counts[REFUSALS]), KEPT_REFUSALS)]:
-            if problem(self.limits, start, end) != OBSTACLE:
+            if self._exact.problem(start, end) != OBSTACLE:
                 continue
-            body, owner = blocked_by(self.limits, start, end)
+            _, body, owner = self._exact.clearance(start, end)
             name = PLATFORM if body == self._cables else cable_name(body)
             pair = (name, self._obstacles[owner])
             found[pair] = found.get(pair, 0) + 1

@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from planner.exact.checks import FREE
 from planner.exact.compiled import kernel
 from planner.paper.cost_field import CostField, edge_cost
-from planner.paper.limits import FREE, Limits, problem
+from planner.paper.limits import Limits, problem
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

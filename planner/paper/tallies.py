@@ -95,7 +95,7 @@ def failure_rate(tallies: Tallies, reading: int) -> float:
     searches, failures = whole[_SEARCHES], whole[_FAILURES]
     if reading != _BY_TREE:
         searches, failures = tallies.nodes[whole[_LATEST], 0], tallies.nodes[whole[_LATEST], 1]
-    return failures / searches if searches > 0 else 0.0  # type: ignore[no-any-return]
+    return failures / searches if searches > 0 else 0.0
 
 
 @kernel

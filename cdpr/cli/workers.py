@@ -1,0 +1,108 @@
+"""Work on all cores or on a Dask cluster, and folders for what comes of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+
+class Count:
+    """Adds up what is done for a progress bar."""
+
+    def __init__(self, advance: Callable[[float], None]) -> None:
+        """Reports sums to ``advance``."""
+        self._advance = advance
+        self._done = 0
+
+    def more(self, done: int) -> None:
+        """Counts what is newly done."""
+        self._done += done
+        self._advance(self._done)
+
+
+def make_folder(folder: Path, force: bool) -> None:
+    """Before the work: a result that cannot be written would be lost.
+
+    Raises:
+        BadInput: The folder holds something and ``force`` is not set, or cannot be made.
+    """
+    from cdpr.errors import BadInput
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        taken = any(folder.iterdir())
+    except OSError as error:
+        raise BadInput(
+            "the folder cannot be made", where=str(folder), why=str(error.strerror)
+        ) from error
+    if taken and not force:
+        raise BadInput(
+            "the folder is not empty",
+            where=str(folder),
+            next_step="choose another name, or pass --force to write into it",
+        )
+    if not os.access(folder, os.W_OK):
+        raise BadInput("the folder is read-only", where=str(folder))
+
+
+@contextmanager
+def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
+    """What does the work: a Dask cluster, processes of this computer, or nobody else.
+
+    Args:
+        workers: Number of processes; with 1 there is no pool.
+        dask: Address of a scheduler, instead of processes.
+
+    Raises:
+        BadInput: Dask is not installed, or no scheduler answers.
+    """
+    if dask is not None:
+        with _dask_client(dask) as client:
+            yield client.get_executor()
+        return
+    if workers == 1:
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_leave_interrupts)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _leave_interrupts() -> None:
+    """Ctrl-C is for the process that was started; it stops the others itself."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _dask_client(address: str) -> Any:
+    from importlib import import_module
+
+    from cdpr.errors import BadInput
+
+    try:
+        client = import_module("distributed").Client
+    except ImportError as error:
+        raise BadInput(
+            "Dask is not installed", next_step="pip install 'cdpr[dask]', or leave --dask out"
+        ) from error
+    try:
+        return client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise BadInput(
+            "no Dask scheduler answers there",
+            where=address,
+            why=str(error) or type(error).__name__,
+            next_step="start one (dask scheduler), or leave --dask out",
+        ) from error

@@ -1,0 +1,74 @@
+"""What the paper claims of Fig. 9, beside what was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from planner.campaign.boxes import OWN, WIDE
+from planner.campaign.results import Results
+from planner.campaign.statistics import Change
+from planner.campaign.studies import (
+    ENDS,
+    FIGURE_9,
+    NEAREST_TO_THE_CLAIM,
+    VARIANTS,
+    arms_of,
+    figure_9_arm,
+)
+from planner.campaign.trial import Ends
+
+NODES, NODES_DEVIATION = -0.205, 0.0
+COST, COST_DEVIATION = -0.182, 0.0
+
+PLACES: tuple[tuple[str, Ends], ...] = tuple((box, ends) for box in (OWN, WIDE) for ends in ENDS)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One claim in one box with one kind of ends.
+
+    Attributes:
+        claim: In the paper's words, shortened.
+        claimed: Change that it claims, as a part; 0 where only "smaller" is claimed.
+        box: Where it was looked at.
+        ends: From where to where.
+        change: What was found.
+    """
+
+    claim: str
+    claimed: float
+    box: str
+    ends: Ends
+    change: Change
+
+    @property
+    def verdict(self) -> str:
+        """Whether the claim holds here, in words."""
+        change = self.change
+        if change.high < self.claimed or (self.claimed and change.mean <= self.claimed):
+            return "reached"
+        if change.low <= self.claimed:
+            return "not reached, but within the interval" if self.claimed else "no difference seen"
+        if change.high < 0.0:
+            return "smaller, but by less than claimed"
+        return "no difference seen" if change.low <= 0.0 else "the opposite"
+
+
+def findings(results: Results) -> tuple[Finding, ...]:
+    """Every claim in every box with every kind of ends."""
+    found = []
+    nodes = arms_of(NEAREST_TO_THE_CLAIM)
+    costs = figure_9_arm("adaptive", "kinematic"), figure_9_arm("adaptive", "length")
+    for box, ends in PLACES:
+        mean, deviation = results.change(VARIANTS, box, ends, nodes, "nodes")
+        found.append(Finding("20.5 % fewer nodes", NODES, box, ends, mean))
+        found.append(
+            Finding("smaller deviation of the nodes", NODES_DEVIATION, box, ends, deviation)
+        )
+        for name, quantity in (("the tree's path", "raw_cost"), ("the finished path", "cost")):
+            mean, deviation = results.change(FIGURE_9, box, ends, costs, quantity)
+            claim = f"18.2 % better kinematic cost, {name}"
+            found.append(Finding(claim, COST, box, ends, mean))
+            claim = f"smaller deviation of the kinematic cost, {name}"
+            found.append(Finding(claim, COST_DEVIATION, box, ends, deviation))
+    return tuple(found)

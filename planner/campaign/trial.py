@@ -1,0 +1,245 @@
+"""One search of the campaign, and what is measured of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from cdpr.clearance import ClearanceModel
+from cdpr.poses import Array
+from cdpr.rig import Rig, rig_from_document
+from cdpr.rig_file import RigDocument
+from cdpr.scene import Scene, scene_from_document
+from cdpr.scene_file import SceneDocument
+from planner.bounds import smallest_along
+from planner.campaign.boxes import with_box
+from planner.campaign.ends import random_ends
+from planner.check import check_path
+from planner.cost import KinematicCost
+from planner.exact.checks import ExactChecks
+from planner.paper.limits import exact_checks
+from planner.paper.readings import Readings
+from planner.paper.search import PaperPlanner, SearchResult
+from planner.settings import CLEARANCE_RESERVE, CostName, PlannerSettings, SamplerName
+from planner.track import Track
+
+Ends = Literal["scene", "random"]
+
+TEXT = Readings()
+"""The text as it is written, where it is open as the planner's defaults have it."""
+
+_SPACING = 0.010
+_CLEARANCE_TOLERANCE = 0.1e-3
+_NAN = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One planner of a comparison."""
+
+    sampler: SamplerName
+    cost: CostName = "length"
+    readings: Readings = TEXT
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Where searches take place.
+
+    Attributes:
+        box: Name of the workspace box (`planner.campaign.boxes`).
+        environment: Name of the scene.
+        ends: Whether start and goal are the scene's, or random ones as far apart.
+    """
+
+    box: str
+    environment: str
+    ends: Ends = "scene"
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Searches of one arm in one case, for any process on any machine.
+
+    Attributes:
+        study: What they are for.
+        case: Where they take place.
+        arm: The planner.
+        rig: Rig document, JSON, with its own box.
+        scene: Scene document, JSON.
+        seeds: One search each.
+        measured: Whether path and cost are measured, beyond counts.
+        clearance: Whether the true smallest clearance is found too.
+        checked: Whether the path is put to `planner.check.check_path`.
+    """
+
+    study: str
+    case: Case
+    arm: Arm
+    rig: str
+    scene: str
+    seeds: tuple[int, ...]
+    measured: bool = False
+    clearance: bool = False
+    checked: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PathFigures:
+    """What is measured of a path; NaN where it was not asked for.
+
+    Attributes:
+        raw_length_mm: Before post-processing.
+        length_mm: After Algorithm 3.
+        raw_cost: Mean kinematic cost along the path before post-processing.
+        cost: And after it.
+        clearance_mm: Smallest distance to an obstacle along the finished path, by `cdpr.clearance`.
+        passed: 1 where the finished path passed its check, 0 where it did not.
+    """
+
+    raw_length_mm: float = _NAN
+    length_mm: float = _NAN
+    raw_cost: float = _NAN
+    cost: float = _NAN
+    clearance_mm: float = _NAN
+    passed: float = _NAN
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What one search gave.
+
+    Attributes:
+        study: As in its batch.
+        case: As in its batch.
+        arm: As in its batch.
+        seed: Of its random numbers.
+        found: Whether there is a path.
+        nodes: Nodes of the tree.
+        searches: Samples drawn.
+        edge_checks: Edges asked about by the search.
+        time_ms: Processor time of the search.
+        path: Of the path, where it is measured.
+    """
+
+    study: str
+    case: Case
+    arm: Arm
+    seed: int
+    found: bool
+    nodes: int
+    searches: int
+    edge_checks: int
+    time_ms: float
+    path: PathFigures
+
+    def value(self, quantity: str) -> float:
+        """A figure of the trial or of its path, by name."""
+        return float(getattr(self.path if hasattr(self.path, quantity) else self, quantity))
+
+
+def run_batch(batch: Batch) -> list[Trial]:
+    """Does the searches; the same batch gives the same trials anywhere, times aside."""
+    planner = _planner(batch.rig, batch.scene, batch.case.box, batch.arm)
+    return [_trial(batch, planner, seed) for seed in batch.seeds]
+
+
+def _trial(batch: Batch, planner: PaperPlanner, seed: int) -> Trial:
+    scene = _scene(batch.scene)
+    start, goal = scene.start.position, scene.goal.position
+    if batch.case.ends == "random":
+        distance = float(np.linalg.norm(goal - start))
+        start, goal = random_ends(planner, distance, np.random.default_rng([seed, 1]))
+    random = np.random.default_rng(seed)
+    began = time.process_time()
+    result = planner.search(start, goal, random)
+    spent = time.process_time() - began
+    return Trial(
+        study=batch.study,
+        case=batch.case,
+        arm=batch.arm,
+        seed=seed,
+        found=result.path is not None,
+        nodes=len(result.points),
+        searches=result.iterations,
+        edge_checks=result.edge_checks,
+        time_ms=spent * 1e3,
+        path=_measured(batch, planner, scene, result),
+    )
+
+
+def _measured(
+    batch: Batch, planner: PaperPlanner, scene: Scene, result: SearchResult
+) -> PathFigures:
+    if result.path is None or not batch.measured:
+        return PathFigures()
+    path, cost = planner.shortcut(result.path), _cost(batch.rig, batch.case.box)
+    rig, poses = _rig(batch.rig, batch.case.box), [planner.space.pose(point) for point in path]
+    clearance = passed = _NAN
+    if batch.clearance and scene.obstacles:
+        clearance = _clearance(rig, scene, Track(rig, poses)) * 1e3
+    if batch.checked:
+        passed = float(check_path(rig, scene, poses, ends=False).passed)
+    return PathFigures(
+        raw_length_mm=_length(result.path) * 1e3,
+        length_mm=_length(path) * 1e3,
+        raw_cost=cost.mean_along(result.path),
+        cost=cost.mean_along(path),
+        clearance_mm=clearance,
+        passed=passed,
+    )
+
+
+def _length(path: Array) -> float:
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+
+def _clearance(rig: Rig, scene: Scene, track: Track) -> float:
+    """The smallest distance to an obstacle anywhere along a track, to 0.1 mm, [m]."""
+    model = ClearanceModel(rig, scene)
+
+    def evaluate(places: Array) -> Array:
+        nearest = [model.smallest(track.pose(place)) for place in places.tolist()]
+        return np.array([near.distance for near in nearest if near is not None])
+
+    places = track.places(_SPACING)
+    return smallest_along(places, evaluate, 1.0, -np.inf, _CLEARANCE_TOLERANCE).value
+
+
+@lru_cache(maxsize=64)
+def _planner(rig: str, scene: str, box: str, arm: Arm) -> PaperPlanner:
+    settings = PlannerSettings(
+        sampler=arm.sampler, cost=arm.cost, mode="paper", readings=arm.readings
+    )
+    the_rig = _rig(rig, box)
+    cost = _cost(rig, box) if arm.cost == "kinematic" else None
+    exact = _exact(rig, scene, box)
+    planner = PaperPlanner(the_rig, _scene(scene), settings, CLEARANCE_RESERVE, cost, exact)
+    # Machine code is loaded, or made, by the first search: its time belongs to no trial.
+    ends = _scene(scene).start.position, _scene(scene).goal.position
+    planner.search(*ends, np.random.default_rng(0))
+    return planner
+
+
+@lru_cache(maxsize=16)
+def _exact(rig: str, scene: str, box: str) -> ExactChecks:
+    return exact_checks(_rig(rig, box), _scene(scene), np.eye(3), CLEARANCE_RESERVE)
+
+
+@lru_cache(maxsize=16)
+def _cost(rig: str, box: str) -> KinematicCost:
+    return KinematicCost(_rig(rig, box), np.eye(3))
+
+
+@lru_cache(maxsize=16)
+def _rig(rig: str, box: str) -> Rig:
+    return with_box(rig_from_document(RigDocument.model_validate_json(rig)), box)
+
+
+@lru_cache(maxsize=16)
+def _scene(scene: str) -> Scene:
+    return scene_from_document(SceneDocument.model_validate_json(scene))
