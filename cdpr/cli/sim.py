@@ -77,6 +77,7 @@ def _start(
     rig: Rig, start_mm: tuple[float, float, float] | None, plan: Path | None
 ) -> tuple[Pose, Load | None]:
     """Where the platform stands, and what it carries."""
+    from cdpr.cli.plan_for_rig import require_same_rig
     from cdpr.document_types import millimetres
     from cdpr.errors import BadInput
     from cdpr.plan import load_plan
@@ -87,6 +88,8 @@ def _start(
             "--at-mm and --plan contradict each other", next_step="leave one of them out"
         )
     if plan is not None:
-        scene = load_plan(plan).scene
+        the_plan = load_plan(plan)
+        require_same_rig(the_plan, rig, plan)
+        scene = the_plan.scene
         return scene.start, scene.load
     return (rig.home if start_mm is None else Pose.level(millimetres(list(start_mm)))), None

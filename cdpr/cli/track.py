@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
     from cdpr.scene import Scene
     from tracking.pose_log import LoggedPicture
@@ -133,8 +134,14 @@ def _source(
                 where="track",
                 next_step="pass --plan plan.json",
             )
-        rendered = list(_rendered_times(rig, camera, plan))
+        rendered = _rendered_times(rig, camera, plan)
         return _rendered(rig, scene, camera, rendered), len(rendered)
+    if plan is not None:
+        raise BadInput(
+            "--plan is for the synthetic camera",
+            where="track",
+            next_step="name the obstacles with --scene, or the source 'synthetic'",
+        )
     path = Path(source)
     if path.is_dir():
         folder = ImageFolder(
@@ -153,23 +160,18 @@ def _source(
     return LiveCamera(source, camera), None
 
 
-def _rendered_times(rig: Rig, camera: Camera, plan: Path) -> Iterable[tuple[float, Any]]:
-    """Times and poses at which the synthetic camera looks: the plan at the rig's speed."""
-    import numpy as np
+def _rendered_times(rig: Rig, camera: Camera, plan: Path) -> list[tuple[float, Pose]]:
+    """Times and poses at which the synthetic camera looks: those of a run of the plan."""
+    from cdpr.cli.run import prepared_run
 
-    from cdpr.plan import load_plan
-    from executor.path import polyline, poses_of
-    from executor.timing import time_law
-
-    path = polyline(load_plan(plan).waypoints, 0.0)
-    law = time_law(path, rig.motion)
-    times = np.arange(0.0, law.duration, 1.0 / camera.rate)
-    travelled = np.array([law.at(float(time))[0] for time in times])
-    return zip(times.tolist(), poses_of(*path.at(travelled)), strict=True)
+    table = prepared_run(plan, rig, quiet=True).checked.table
+    poses = table.poses()
+    every = max(1, round(1.0 / (camera.rate * table.cycle)))
+    return [(row * table.cycle, poses[row]) for row in range(0, len(table), every)]
 
 
 def _rendered(
-    rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Any]]
+    rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
 ) -> Iterable[Picture]:
     from drivers.cameras import Frame
     from simulation.camera import SyntheticCamera
