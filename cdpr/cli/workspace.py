@@ -31,7 +31,7 @@ def workspace(
     ] = None,
     slices: Annotated[
         list[str] | None,
-        typer.Option("--slice", help="plane to map, mm, such as z=445; several are possible"),
+        typer.Option("--slice", help="plane to map; several are possible", metavar="z=MM"),
     ] = None,
     volume: Annotated[
         bool | None,
@@ -66,8 +66,8 @@ def workspace(
 ) -> None:
     """Map where the robot can be and how well it can work there.
 
-    Wrench closure, wrench feasibility with its margin, dexterity, volume of forces, clearances:
-    as pictures (PNG, SVG), tables (CSV, NPZ) and a page, index.html.
+    Wrench closure and feasibility, dexterity, volume of forces and clearances, as pictures,
+    tables and one page.
 
     [dim]Examples:[/dim]
 
