@@ -66,8 +66,7 @@ def workspace(
 ) -> None:
     """Map where the robot can be and how well it can work there.
 
-    Wrench closure and feasibility, dexterity, volume of forces and clearances, as pictures,
-    tables and one page.
+    Wrench closure and feasibility, dexterity, forces and clearances, as one page.
 
     [dim]Examples:[/dim]
 
