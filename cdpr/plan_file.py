@@ -18,6 +18,17 @@ from cdpr.rig_file import RigDocument
 from cdpr.scene_file import SceneDocument
 
 
+class ReadingsDocument(Document):
+    """How the paper's text was read where it is open (docs/paper.md)."""
+
+    failure_rate: Literal["k/(k+1)", "k/(k+2)", "tree", "node"]
+    focus: Literal["last-failed", "most-failed", "highest-rate"]
+    cone_draw: Literal["radius", "volume"]
+    steer: Literal["full-step", "to-sample"]
+    spacing_mm: NonNegative
+    goal_sight: bool
+
+
 class PlannerDocument(Document):
     """How the path was searched for."""
 
@@ -29,6 +40,7 @@ class PlannerDocument(Document):
     neighbour_radius_mm: Positive
     goal_radius_mm: Positive
     max_iterations: Annotated[int, Field(ge=1)]
+    readings: ReadingsDocument | None = None
 
 
 class StatisticsDocument(Document):
