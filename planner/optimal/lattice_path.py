@@ -1,0 +1,193 @@
+"""The cheapest path through a lattice: where random first paths all lie on the wrong side.
+
+Best-first search (A*) over the points at which the cost is known and their 26 neighbours. An edge
+is tested when its far end is about to be settled, not when it is first seen, so most never are.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.exact.compiled import kernel
+from planner.exact.edge import row_of
+from planner.exact.vectors import Vector, minus, norm
+from planner.optimal.grid import interpolated
+from planner.optimal.heap import pop, push
+from planner.optimal.problem import KINEMATIC, LENGTH, Problem, edge_allowed
+from planner.optimal.random import State, uniform
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Shape = tuple[int, int, int]
+
+_REACH = 2
+"""Steps about start and goal to whose lattice points they are joined."""
+_ROOM = 4096
+_OPEN = -2
+
+
+@kernel
+def lattice_path(
+    problem: Problem,
+    ends: Array,
+    state: State,
+    stride: int,
+    spread: float,
+    points: Array,
+    counts: Integers,
+) -> int:
+    """Searches for the cheapest path by the sums in the cost; nodes are the grid's points.
+
+    Args:
+        problem: Where, and what edges cost; smallest clearance and margin are left out.
+        ends: Start and goal, shape (2, 3), [m].
+        state: Of the random numbers; stepped.
+        stride: Every how manyth point of the grid is used, along each axis.
+        spread: Up to what part of it the cost of an edge is raised at random, for other paths.
+        points: Vertices of the path, shape (k, 3), written.
+        counts: The second number is stepped by the edge tests, shape (2,).
+
+    Returns:
+        The number of vertices; 0 without a path, or without room for it.
+    """
+    shape = _shape(problem.kinematic, stride)
+    size = shape[0] * shape[1] * shape[2]  # this is the start's number, the goal's is one more
+    parent = np.full(size + 2, _OPEN, dtype=np.int64)
+    least = problem.terms[LENGTH] + problem.terms[KINEMATIC] * problem.kinematic.min()
+    goal = row_of(ends[1])
+    keys, entries = np.empty((_ROOM, 2)), np.empty((_ROOM, 2), dtype=np.int64)
+    keys, entries, waiting = push(keys, entries, 0, 0.0, 0.0, size, -1)
+    while waiting > 0:
+        so_far, node, before = keys[0, 1], entries[0, 0], entries[0, 1]
+        waiting = pop(keys, entries, waiting)
+        if parent[node] != _OPEN:
+            continue
+        at = _point(problem, node, stride, shape, ends)
+        if before >= 0:
+            counts[1] += 1
+            if not edge_allowed(problem, _point(problem, before, stride, shape, ends), at):
+                continue
+        parent[node] = before
+        if node == size + 1:
+            return _way(problem, parent, stride, shape, ends, points)
+        weight = _weight(problem, at)
+        low, high = _around(problem, at, stride, shape, _REACH if node == size else 1)
+        for i in range(low[0], high[0] + 1):
+            for j in range(low[1], high[1] + 1):
+                for k in range(low[2], high[2] + 1):
+                    other = (i * shape[1] + j) * shape[2] + k
+                    if parent[other] != _OPEN:
+                        continue
+                    to = _point(problem, other, stride, shape, ends)
+                    there = _weight_at(problem, other, stride, shape)
+                    factor = (1.0 + spread * uniform(state)) * (weight + there) / 2.0
+                    total = so_far + factor * norm(minus(to, at))
+                    ahead = total + least * norm(minus(goal, to))
+                    keys, entries, waiting = push(keys, entries, waiting, ahead, total, other, node)
+        if _near(problem, at, goal, stride):
+            total = so_far + (weight + _weight(problem, goal)) / 2.0 * norm(minus(goal, at))
+            keys, entries, waiting = push(keys, entries, waiting, total, total, size + 1, node)
+    return 0
+
+
+@kernel
+def _weight(problem: Problem, at: Vector) -> float:
+    """What a metre costs at a point."""
+    cost = problem.terms[KINEMATIC]
+    if cost > 0.0:
+        cost *= interpolated(problem.grid, problem.kinematic, at)
+    return problem.terms[LENGTH] + cost  # type: ignore[no-any-return]
+
+
+@kernel
+def _weight_at(problem: Problem, node: int, stride: int, shape: Shape) -> float:
+    """What a metre costs at a lattice point."""
+    i, j, k = _numbers(problem, node, stride, shape)
+    kinematic = problem.terms[KINEMATIC] * problem.kinematic[i, j, k]
+    return problem.terms[LENGTH] + kinematic  # type: ignore[no-any-return]
+
+
+@kernel
+def _shape(values: Array, stride: int) -> Shape:
+    """How many points there are along each axis, those on all walls among them."""
+    return (
+        (values.shape[0] + stride - 2) // stride + 1,
+        (values.shape[1] + stride - 2) // stride + 1,
+        (values.shape[2] + stride - 2) // stride + 1,
+    )
+
+
+@kernel
+def _numbers(problem: Problem, node: int, stride: int, shape: Shape) -> Shape:
+    """The grid numbers of a lattice point."""
+    k, rest = node % shape[2], node // shape[2]
+    i, j = rest // shape[1], rest % shape[1]
+    last = problem.kinematic.shape
+    return (
+        min(i * stride, last[0] - 1),
+        min(j * stride, last[1] - 1),
+        min(k * stride, last[2] - 1),
+    )
+
+
+@kernel
+def _point(problem: Problem, node: int, stride: int, shape: Shape, ends: Array) -> Vector:
+    size = shape[0] * shape[1] * shape[2]
+    if node >= size:
+        return row_of(ends[node - size])
+    i, j, k = _numbers(problem, node, stride, shape)
+    grid = problem.grid
+    return (
+        grid[0, 0] + i * grid[1, 0],
+        grid[0, 1] + j * grid[1, 1],
+        grid[0, 2] + k * grid[1, 2],
+    )
+
+
+@kernel
+def _around(
+    problem: Problem, at: Vector, stride: int, shape: Shape, reach: int
+) -> tuple[Shape, Shape]:
+    """The first and the last lattice numbers within some steps of a point, along each axis."""
+    x = _nearest(problem, at[0], 0, stride)
+    y = _nearest(problem, at[1], 1, stride)
+    z = _nearest(problem, at[2], 2, stride)
+    return (
+        (max(x - reach, 0), max(y - reach, 0), max(z - reach, 0)),
+        (min(x + reach, shape[0] - 1), min(y + reach, shape[1] - 1), min(z + reach, shape[2] - 1)),
+    )
+
+
+@kernel
+def _nearest(problem: Problem, value: float, axis: int, stride: int) -> int:
+    step = stride * problem.grid[1, axis]
+    return math.floor((value - problem.grid[0, axis]) / step + 0.5)
+
+
+@kernel
+def _near(problem: Problem, at: Vector, goal: Vector, stride: int) -> bool:
+    steps = 0.0
+    for axis in range(3):
+        steps = max(steps, abs(at[axis] - goal[axis]) / problem.grid[1, axis])
+    return steps <= (_REACH + 0.5) * stride
+
+
+@kernel
+def _way(
+    problem: Problem, parent: Integers, stride: int, shape: Shape, ends: Array, points: Array
+) -> int:
+    """Writes the way to the goal."""
+    length, node = 0, len(parent) - 1
+    while node >= 0:
+        length, node = length + 1, parent[node]
+    if length > len(points):
+        return 0
+    node = len(parent) - 1
+    for i in range(length - 1, -1, -1):
+        at = _point(problem, node, stride, shape, ends)
+        points[i, 0], points[i, 1], points[i, 2] = at
+        node = parent[node]
+    return length

@@ -1,0 +1,114 @@
+"""What a compiled search is given: where edges are allowed, and what they cost."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.exact.compiled import kernel
+from planner.exact.edge import edge_clearance, in_workspace, obstacles_free
+from planner.exact.fields import World
+from planner.exact.self_edge import self_edge_free
+from planner.exact.self_region import Robot
+from planner.exact.vectors import Vector, along, minus, norm
+from planner.optimal.grid import interpolated
+
+Array = NDArray[np.float64]
+
+LENGTH, KINEMATIC, CLEARANCE, CAPACITY, VERTEX, WRENCH_LIMIT, UNIT = 0, 1, 2, 3, 4, 5, 6
+"""Places in `Problem.terms`."""
+
+_SAMPLING = 0.010
+"""Between samples of what is known on the grid, [m]: less than half of its spacing."""
+
+
+class Problem(NamedTuple):
+    """One question to the planner.
+
+    Attributes:
+        world: Obstacles and workspace, with the clearance that edges must keep.
+        robot: The self clearance that edges must keep.
+        grid: Lower corner of the lattice and its spacing, shape (2, 3), [m].
+        kinematic: The cost c = γ_d + γ_f at the lattice's points, shape (i, j, k).
+        margins: Capacity margins there, shape (i, j, k), [N].
+        terms: Weights of length, ∫c ds, smallest clearance and smallest margin in the cost that
+            is made small (the last two count against it); what a vertex more must save at least;
+            the smallest margin allowed at any interpolated sample (minus infinity where no pose
+            of the workspace comes near it); and what a metre of a usual path costs, shape (7,).
+    """
+
+    world: World
+    robot: Robot
+    grid: Array
+    kinematic: Array
+    margins: Array
+    terms: Array
+
+
+@kernel
+def edge_allowed(problem: Problem, start: Vector, end: Vector) -> bool:
+    """Whether an edge keeps everything asked for; wrench feasibility as far as the grid tells."""
+    if not (in_workspace(problem.world, start) and in_workspace(problem.world, end)):
+        return False
+    if not obstacles_free(problem.world, start, end):
+        return False
+    if len(problem.robot.open_pairs) + len(problem.robot.open_cables) > 0 and not self_edge_free(
+        problem.world, problem.robot, np.array(start), np.array(end)
+    ):
+        return False
+    limit = problem.terms[WRENCH_LIMIT]
+    return limit == -math.inf or lowest_margin(problem, start, end) >= limit
+
+
+@kernel
+def lowest_margin(problem: Problem, start: Vector, end: Vector) -> float:
+    """The smallest interpolated capacity margin at samples of an edge, [N]."""
+    way = minus(end, start)
+    steps = math.ceil(norm(way) / _SAMPLING) + 1
+    least = math.inf
+    for i in range(steps + 1):
+        at = along(start, way, i / steps)
+        least = min(least, interpolated(problem.grid, problem.margins, at))
+    return least
+
+
+@kernel
+def edge_cost(problem: Problem, start: Vector, end: Vector) -> float:
+    """What an edge adds to the sums in the cost: weighted length and integral of c, [m]."""
+    way = minus(end, start)
+    length = norm(way)
+    cost = problem.terms[LENGTH] * length
+    weight = problem.terms[KINEMATIC]
+    if weight == 0.0:
+        return cost
+    steps = math.ceil(length / _SAMPLING) + 1
+    total = 0.0
+    for i in range(steps):  # middles of equal parts
+        at = along(start, way, (i + 0.5) / steps)
+        total += interpolated(problem.grid, problem.kinematic, at)
+    return cost + weight * total * length / steps
+
+
+@kernel
+def edge_lows(problem: Problem, start: Vector, end: Vector) -> tuple[float, float]:
+    """Smallest clearance [m] and margin [N] of an edge; infinite where they have no weight."""
+    clearance, margin = math.inf, math.inf
+    if problem.terms[CLEARANCE] > 0.0:
+        clearance = edge_clearance(problem.world, np.array(start), np.array(end))[0]
+    if problem.terms[CAPACITY] > 0.0:
+        margin = lowest_margin(problem, start, end)
+    return clearance, margin
+
+
+@kernel
+def gained(problem: Problem, clearance: float, margin: float) -> float:
+    """What smallest clearance and margin of a whole path take off its cost."""
+    gain = 0.0
+    if problem.terms[CLEARANCE] > 0.0 and clearance < math.inf:
+        gain += problem.terms[CLEARANCE] * clearance
+    if problem.terms[CAPACITY] > 0.0 and margin < math.inf:
+        gain += problem.terms[CAPACITY] * margin
+    return gain
