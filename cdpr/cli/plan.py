@@ -8,6 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.readings import (
+    ConeDrawName,
+    ConeDrawOption,
+    FailureRateName,
+    FailureRateOption,
+    FocusName,
+    FocusOption,
+    GoalSightOption,
+    SpacingOption,
+    SteerName,
+    SteerOption,
+)
+
 if TYPE_CHECKING:
     from cdpr.plan_file import PlanDocument
     from cdpr.scene import Scene
@@ -58,6 +71,12 @@ def plan(
     goal_mm: Annotated[
         tuple[float, float, float] | None, typer.Option(help="goal instead of the scene's: x y z")
     ] = None,
+    failure_rate: FailureRateOption = FailureRateName.streak,
+    focus: FocusOption = FocusName.last_failed,
+    cone_draw: ConeDrawOption = ConeDrawName.radius,
+    steer: SteerOption = SteerName.full_step,
+    spacing_mm: SpacingOption = 0.0,
+    goal_sight: GoalSightOption = False,
     force: Annotated[bool, typer.Option("--force", help="replace an existing plan file")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
@@ -74,6 +93,7 @@ def plan(
     from cdpr.plan import save_plan
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
+    from planner.paper.readings import Readings
     from planner.plan import make_plan
     from planner.settings import PlannerSettings
 
@@ -81,8 +101,21 @@ def plan(
     the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
     check_output(output, force)
     options: dict[str, Any] = {} if max_iterations is None else {"max_iterations": max_iterations}
+    readings = Readings(
+        failure_rate=failure_rate.value,
+        focus=focus.value,
+        cone_draw=cone_draw.value,
+        steer=steer.value,
+        spacing=spacing_mm / 1000.0,
+        goal_sight=goal_sight,
+    )
     settings = PlannerSettings(
-        sampler=planner.value, cost=cost.value, mode=mode.value, seed=seed, **options
+        sampler=planner.value,
+        cost=cost.value,
+        mode=mode.value,
+        seed=seed,
+        readings=readings,
+        **options,
     )
     with progress_bar("planning", settings.max_iterations, not as_json) as advance:
         document = make_plan(

@@ -1,0 +1,274 @@
+"""The campaign: fixed searches for fixed seeds, wherever they are done; verdicts; files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from planner.campaign.boxes import OWN, SHARES, WIDE, box_text, with_box
+from planner.campaign.claims import Finding, findings
+from planner.campaign.figures import save_figures
+from planner.campaign.page import page
+from planner.campaign.results import Results
+from planner.campaign.running import run_all
+from planner.campaign.statistics import Change, change_of_means, summary
+from planner.campaign.studies import FIGURE_9, all_readings, batches, figure_9_arm
+from planner.campaign.tables import findings_json, summary_csv, trials_csv
+from planner.campaign.trial import Batch, Case, PathFigures, Trial, run_batch
+from planner.check import check_path
+from planner.cost import KinematicCost
+from planner.paper.search import PaperPlanner
+from planner.settings import CLEARANCE_RESERVE, PlannerSettings
+
+ENVIRONMENTS = ("environment_1", "environment_2", "environment_3")
+SEEDS = 3
+
+
+@pytest.fixture(scope="module")
+def scenes(ready_scene):
+    return [ready_scene(name) for name in ENVIRONMENTS]
+
+
+@pytest.fixture(scope="module")
+def work(gachon, scenes) -> tuple[Batch, ...]:
+    return batches(gachon, scenes, SEEDS)
+
+
+@pytest.fixture(scope="module")
+def figure_9_batch(work) -> Batch:
+    return next(
+        b for b in work if b.study == FIGURE_9 and b.case == Case(OWN, "environment_3", "random")
+    )
+
+
+@pytest.fixture(scope="module")
+def results(work) -> Results:
+    """Made-up trials of the whole campaign: adaptive needs 80 nodes, the goal bias 100."""
+    trials = []
+    for batch in work:
+        random = np.random.default_rng(len(trials))
+        for seed in batch.seeds:
+            nodes = 80 if batch.arm.sampler == "adaptive" else 100
+            cost = 0.5 if batch.arm.cost == "kinematic" else 0.51
+            figures = PathFigures(900.0, 800.0, cost, cost * random.uniform(0.9, 1.1), 10.5)
+            counts = (nodes + int(random.integers(-5, 6)), 300, 400, 1.0)
+            found = seed > 0 or batch.case.ends == "scene"
+            empty = figures if batch.measured and found else PathFigures()
+            trials.append(
+                Trial(batch.study, batch.case, batch.arm, seed, found, *counts, path=empty)
+            )
+    return Results(trials)
+
+
+def numbers(trials: list[Trial]) -> list[Trial]:
+    """Trials without their times, which no two runs share; NaN never equals itself."""
+    return [repr(replace(trial, time_ms=0.0)) for trial in trials]
+
+
+def test_the_campaign_has_every_case_of_figure_9_and_both_boxes(work) -> None:
+    figure = [b for b in work if b.study == FIGURE_9]
+    assert {b.case.environment for b in figure} == set(ENVIRONMENTS)
+    assert {(b.case.box, b.case.ends) for b in figure} == {
+        (box, ends) for box in (OWN, WIDE) for ends in ("scene", "random")
+    }
+    assert {(b.arm.sampler, b.arm.cost) for b in figure} == {
+        (s, c) for s in ("adaptive", "goal-bias") for c in ("kinematic", "length")
+    }
+    assert all(b.seeds == tuple(range(SEEDS)) for b in work)
+    assert len(all_readings()) == 96
+
+
+def test_the_baseline_of_figure_9_is_never_handicapped() -> None:
+    """It takes the steps of the adaptive planner, and nothing of it is rejected."""
+    adaptive = figure_9_arm("adaptive", "length").readings
+    baseline = figure_9_arm("goal-bias", "length").readings
+    assert baseline.steer == adaptive.steer
+    assert baseline.spacing == 0.0
+
+
+def test_boxes_grow_from_the_rigs_own_to_the_wide_one(gachon) -> None:
+    assert box_text(with_box(gachon, OWN)) == "x ±250, y ±250, z 150 to 650 mm"
+    assert box_text(with_box(gachon, WIDE)) == "x ±350, y ±350, z 100 to 750 mm"
+    sizes = [np.ptp([r.workspace_lower, r.workspace_upper], axis=0).prod() for r in
+             (with_box(gachon, name) for name in SHARES)]  # fmt: skip
+    assert sizes == sorted(sizes)
+
+
+def test_a_batch_gives_the_same_numbers_here_in_a_pool_and_in_any_order(figure_9_batch) -> None:
+    here = run_batch(figure_9_batch)
+    assert [trial.seed for trial in here] == list(range(SEEDS))
+    told: list[int] = []
+    single = [replace(figure_9_batch, seeds=(seed,)) for seed in figure_9_batch.seeds]
+    with ThreadPoolExecutor(1) as pool:
+        elsewhere = run_all(single, pool, told.append)
+    assert numbers(elsewhere) == numbers(here)
+    assert numbers(run_all(single, None, told.append)) == numbers(here)
+    assert sum(told) == 2 * SEEDS
+
+
+def test_a_trial_reports_what_its_search_and_the_independent_routes_find(
+    gachon, ready_scene, work
+) -> None:
+    batch = next(b for b in work if b.study == FIGURE_9 and b.case == Case(OWN, "environment_1"))
+    trial = run_batch(batch)[1]
+    scene = ready_scene("environment_1")
+    settings = PlannerSettings(
+        batch.arm.sampler, batch.arm.cost, "paper", readings=batch.arm.readings
+    )
+    planner = PaperPlanner(gachon, scene, settings, CLEARANCE_RESERVE)
+    ends = np.array(scene.start.position), np.array(scene.goal.position)
+    result = planner.search(*ends, np.random.default_rng(1))
+    path = planner.shortcut(result.path)
+    assert (trial.nodes, trial.searches) == (len(result.points), result.iterations)
+    report = check_path(gachon, scene, [planner.space.pose(point) for point in path])
+    assert report.passed
+    assert trial.path.length_mm == pytest.approx(report.length * 1e3)
+    near = report.obstacle_clearance.nearest.distance * 1e3
+    assert trial.path.clearance_mm == pytest.approx(near, abs=0.2)
+    assert trial.path.cost == pytest.approx(KinematicCost(gachon, np.eye(3)).mean_along(path))
+
+
+def test_random_ends_are_as_far_apart_as_the_scenes_and_do_not_see_each_other(
+    gachon, ready_scene
+) -> None:
+    from planner.campaign.ends import random_ends
+
+    scene = ready_scene("environment_2")
+    planner = PaperPlanner(gachon, scene, PlannerSettings(cost="length"), CLEARANCE_RESERVE)
+    for seed in range(20):
+        start, goal = random_ends(planner, 0.5, np.random.default_rng(seed))
+        assert np.linalg.norm(goal - start) == pytest.approx(0.5)
+        assert planner.edge(start, start)
+        assert planner.edge(goal, goal)
+        assert not planner.edge(start, goal)
+
+
+def test_intervals_hold_the_mean_and_shrink_with_the_sample() -> None:
+    rng = np.random.default_rng(0)
+    small, large = rng.normal(10, 2, 30), rng.normal(10, 2, 3000)
+    widths = []
+    for sample in (small, large):
+        found = summary(sample)
+        assert found.low < found.mean < found.high
+        assert found.mean == pytest.approx(sample.mean())
+        assert found.deviation == pytest.approx(sample.std(ddof=1))
+        widths.append(found.high - found.low)
+    # The interval of a mean is about ± 1.96 deviations over the root of the count.
+    assert widths[0] == pytest.approx(2 * 1.96 * small.std() / np.sqrt(30), rel=0.15)
+    assert widths[1] < widths[0] / 5
+
+
+def test_a_change_is_of_the_means_averaged_over_the_environments() -> None:
+    pairs = [(np.array([8.0, 8.0]), np.array([10.0, 10.0])), (np.ones(3), np.full(3, 2.0))]
+    change = change_of_means(pairs)
+    assert change.each == pytest.approx((-0.2, -0.5))
+    assert (change.mean, change.low, change.high) == pytest.approx((-0.35, -0.35, -0.35))
+
+
+def test_samples_tied_by_their_seeds_are_resampled_together() -> None:
+    """Twice the same hard and easy problems: the ratio is certain, though the means are not."""
+    hard = np.random.default_rng(1).exponential(100.0, 50)
+    change = change_of_means([(0.8 * hard, hard)])
+    assert change.high - change.low < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("low", "mean", "high", "claimed", "verdict"),
+    [
+        (-0.28, -0.25, -0.21, -0.205, "reached"),
+        (-0.25, -0.21, -0.15, -0.205, "reached"),
+        (-0.25, -0.18, -0.10, -0.205, "not reached, but within the interval"),
+        (-0.10, -0.05, -0.01, -0.205, "smaller, but by less than claimed"),
+        (-0.10, -0.03, 0.02, -0.205, "no difference seen"),
+        (0.01, 0.05, 0.10, -0.205, "the opposite"),
+        (-0.50, -0.30, -0.01, 0.0, "reached"),
+        (-0.50, -0.30, 0.10, 0.0, "no difference seen"),
+        (0.10, 0.30, 0.50, 0.0, "the opposite"),
+    ],
+)
+def test_a_verdict_says_no_more_than_the_interval_allows(low, mean, high, claimed, verdict) -> None:
+    finding = Finding("claim", claimed, OWN, "scene", Change((mean,), mean, low, high))
+    assert finding.verdict == verdict
+
+
+def test_only_seeds_with_which_both_found_a_path_are_compared(results) -> None:
+    by_claim = {(f.claim, f.box, f.ends): f for f in findings(results)}
+    nodes = by_claim["20.5 % fewer nodes", OWN, "random"].change
+    assert -0.25 < nodes.mean < -0.15
+    assert results.lost(FIGURE_9) == 2 * 3 * 4  # seed 0 of the random ends
+
+
+def test_tables_have_a_row_for_everything_and_their_keys_tell_arms_apart(results, work) -> None:
+    rows = list(csv.DictReader(io.StringIO(trials_csv(results))))
+    assert len(rows) == sum(len(batch.seeds) for batch in work)
+    keys = [name for name in rows[0] if name not in ("nodes", "found")]
+    figures = keys[keys.index("searches") :]
+    seen = {
+        tuple(v for k, v in row.items() if k not in (*figures, "nodes", "found")) for row in rows
+    }
+    assert len(seen) == len(rows)
+    means = list(csv.DictReader(io.StringIO(summary_csv(results))))
+    nodes = [float(row["mean"]) for row in means if row["quantity"] == "nodes"]
+    assert min(nodes) > 70
+    assert max(nodes) < 110
+
+
+class Reader(HTMLParser):
+    """Collects open tags and pictures."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.pictures: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag, attrs) -> None:
+        if tag == "img":
+            self.pictures.append(dict(attrs)["src"])
+        elif tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data) -> None:
+        self.text += data
+
+
+def test_the_page_has_every_claim_with_its_verdict_and_every_picture(results, tmp_path) -> None:
+    about = {"seeds": SEEDS, "boxes": {OWN: "its own", WIDE: "wider"}, "rig": "gachon <8 & 6>"}
+    names = save_figures(results, tmp_path)
+    reader = Reader()
+    reader.feed(page(results, about))
+    assert reader.open == []
+    assert {f"{name}.svg" for name in names} == set(reader.pictures)
+    assert all(
+        (tmp_path / f"{n}.{end}").stat().st_size > 1000 for n in names for end in ("svg", "png")
+    )
+    for finding in findings(results):
+        assert finding.claim in reader.text
+        assert finding.verdict in reader.text
+    assert "gachon <8 & 6>" in reader.text
+    told = json.loads(findings_json(results, about))
+    assert len(told["findings"]) == len(findings(results))
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_gives_the_same_numbers(figure_9_batch) -> None:
+    distributed = pytest.importorskip("distributed")
+    single = [replace(figure_9_batch, seeds=(seed,)) for seed in figure_9_batch.seeds]
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        found = run_all(single, client.get_executor(), lambda _: None)
+    assert numbers(found) == numbers(run_batch(figure_9_batch))
