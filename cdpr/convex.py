@@ -178,16 +178,6 @@ def polytope_body(points: Array, triangles: np.ndarray[Any, Any]) -> ConvexBody:
     return _body_of_faces(points, triangles)
 
 
-def hull_body(points: Array) -> ConvexBody:
-    """The convex hull of at most 31 points, flat or not, shape (3 ≤ k < 32, 3), [m].
-
-    FCL walks along the faces of a convex shape only from 32 points on; below that it looks at the
-    points alone, so that any faces will do.
-    """
-    geometry = fcl.Convex(points, len(points) - 2, _fan(len(points)))
-    return ConvexBody(points, 0.0, fcl.CollisionObject(geometry, _NOWHERE))
-
-
 def _body_of_faces(points: Array, triangles: np.ndarray[Any, Any]) -> ConvexBody:
     faces = np.column_stack([np.full(len(triangles), 3), triangles]).ravel()
     geometry = fcl.Convex(np.array(points), len(triangles), faces)
@@ -219,31 +209,6 @@ def separation(first: ConvexBody, second: ConvexBody) -> Separation:
     if gap >= length - first.radius - second.radius - PROOF_TOLERANCE:
         return _apart(first, second, gap, normal, near_first, near_second)
     return _searched(first, second, near_second - near_first)
-
-
-def is_apart(first: ConvexBody, second: ConvexBody, required: float) -> tuple[bool, Array | None]:
-    """Whether two convex bodies are at least ``required`` [m] apart, and a plane between them.
-
-    A yes is proved by the plane. A no is FCL's word where FCL sees less than that, which spares
-    the search: for a planner a wrong no is a lost edge, a wrong yes a collision.
-
-    Returns:
-        The answer, and the unit normal of a plane between the bodies, None where they touch.
-
-    Raises:
-        Fault: As for `separation`.
-    """
-    named = _named_by_fcl(first, second)
-    if named is None:
-        return False, None
-    near_first, near_second, normal = named
-    if _gap(first, second, normal) >= required:
-        return True, normal
-    length = float((near_second - near_first) @ normal)
-    if length - first.radius - second.radius < required:
-        return False, normal
-    found = separation(first, second)
-    return found.distance >= required, found.normal
 
 
 def _named_by_fcl(first: ConvexBody, second: ConvexBody) -> tuple[Array, Array, Array] | None:

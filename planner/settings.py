@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cdpr.errors import BadInput
-from planner.paper.readings import Readings
+from planner.paper.readings import TEXT, Readings
 
 SamplerName = Literal["adaptive", "goal-bias"]
 CostName = Literal["kinematic", "length"]
@@ -51,7 +51,7 @@ class PlannerSettings:
     neighbour_radius: float = 0.080
     goal_radius: float = 0.050
     max_iterations: int = 20000
-    readings: Readings = Readings()
+    readings: Readings = TEXT
 
     def __post_init__(self) -> None:
         """Refuses what no search could use.

@@ -1,8 +1,6 @@
-"""Algorithm 3 as meant, and the drawing tight of what it leaves.
+"""Beyond Algorithm 3: the cheapest way through points of a path, and its corners drawn tight.
 
-As printed, Algorithm 3 takes shortcuts that are NOT free; meant is the farthest node that can be
-reached. A shortcut keeps everything that edges keep. Under the kinematic cost a straight line can
-cost more than the way it replaces, so a shortcut must not be dearer; under the length it never is.
+Everything that edges keep is kept, and no step makes a path dearer.
 """
 
 from __future__ import annotations
@@ -16,35 +14,6 @@ from cdpr.poses import Array
 from planner.cost import Cost
 
 IsFree = Callable[[Array, Array], bool]
-_ROUND_OFF = 1e-12
-
-
-def shortcut(path: Array, is_free: IsFree, cost: Cost, dearer: float = 0.0) -> Array:
-    """Algorithm 3: from each kept node straight to the farthest node that can be reached.
-
-    Args:
-        path: Free from node to node, shape (k, n).
-        is_free: Whether an edge is allowed.
-        cost: Of edges.
-        dearer: Share by which a shortcut may cost more than what it replaces, to save corners.
-
-    Returns:
-        Some of the nodes, the first and the last among them, shape (j, n).
-    """
-    along = _costs_along(path, cost)
-    kept, i, last = [0], 0, len(path) - 1
-    while i < last:
-        i = next(
-            j
-            for j in range(last, i, -1)
-            if j == i + 1
-            or (
-                cost.edge(path[i], path[j]) <= (1.0 + dearer) * (along[j] - along[i]) + _ROUND_OFF
-                and is_free(path[i], path[j])
-            )
-        )
-        kept.append(i)
-    return path[kept]
 
 
 def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -> Array:
@@ -121,8 +90,3 @@ def _spread(path: Array, spacing: float) -> Array:
         shares = np.arange(1, count) / count
         points += [start + shares[:, None] * (end - start), end[None, :]]
     return np.concatenate(points)
-
-
-def _costs_along(path: Array, cost: Cost) -> Array:
-    edges = [cost.edge(a, b) for a, b in pairwise(path)]
-    return np.append(0.0, np.cumsum(edges))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 
@@ -48,9 +46,3 @@ class TranslationSpace:
     def coordinates(self, pose: Pose) -> Array:
         """The position of a pose, shape (3,), [m]."""
         return pose.position
-
-
-def inside(space: Space, coordinates: Array, tolerance: float = 1e-9) -> bool:
-    """Whether coordinates, shape (n,), are within the bounds."""
-    low, high = space.lower - tolerance, space.upper + tolerance
-    return bool(np.all(coordinates >= low) and np.all(coordinates <= high))

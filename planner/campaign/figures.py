@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cdpr.poses import Array
 from planner.campaign.boxes import OWN, SHARES, WIDE
 from planner.campaign.claims import NODES
 from planner.campaign.results import Results
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FIRST, SECOND, THIRD, CLAIM, MUTED = "#2f7fb5", "#c98500", "#3f9b6b", "#c0392b", "#5c6675"
-_COLOURS = {"adaptive": FIRST, "goal-bias": SECOND, "kinematic": FIRST, "length": SECOND}
+_COLOURS = {"adaptive": FIRST, "goal-bias": SECOND, "kinematic": THIRD, "length": MUTED}
+_SHOWN = ((-45.0, 75.0), (-80.0, 100.0))
+"""Changes that the picture of the readings shows in place, [%]; beyond, at its edge."""
 _SETTINGS: dict[Any, Any] = {  # matplotlib types the keys as a union of every setting's name
     "svg.fonttype": "none",
     "svg.hashsalt": "cdpr",
@@ -78,20 +81,23 @@ def figure_9(results: Results, ends: Any = "scene") -> Figure:
 
 
 def readings_figure(results: Results) -> Figure:
-    """Every reading as a dot: change of nodes and of their deviation, in both boxes."""
+    """Every reading as a dot: change of nodes and of their deviation, in both boxes.
+
+    Readings beyond the picture are triangles at its edge.
+    """
     figure, all_axes = _new(7.4, 3.2, 2)
     for axes, box in zip(all_axes, (OWN, WIDE), strict=True):
         for spacing, colour, name in ((0.0, FIRST, "none"), (0.03, SECOND, "within 30 mm")):
             chosen = [c for c in all_readings() if c.adaptive.spacing == spacing]
             changes = [results.change(READINGS, box, "scene", arms_of(c), "nodes") for c in chosen]
             points = np.array([[mean.mean, deviation.mean] for mean, deviation in changes]) * 100
-            axes.plot(*points.T, "o", ms=4, alpha=0.7, color=colour, label=f"rejects {name}")
+            _dots(axes, points, colour, f"rejects {name}")
         axes.axvline(NODES * 100, color=CLAIM, lw=1)
         axes.axvline(0.0, color=MUTED, lw=0.6)
         axes.axhline(0.0, color=MUTED, lw=0.6)
         axes.set(title=f"{box} box", xlabel="change of the mean number of nodes [%]")
     all_axes[0].set_ylabel("change of the deviation [%]")
-    all_axes[0].legend(loc="upper left")
+    all_axes[0].legend(loc="lower right")
     all_axes[1].text(
         NODES * 100,
         1.0,
@@ -100,7 +106,6 @@ def readings_figure(results: Results) -> Figure:
         color=CLAIM,
         va="top",
     )
-    _same_limits(all_axes)
     return figure
 
 
@@ -115,13 +120,13 @@ def boxes_figure(results: Results) -> Figure:
         axes.plot(places, middle, "o-", color=colour, ms=4, label=comparison.name)
         axes.fill_between(places, low, high, color=colour, alpha=0.15, lw=0)
     axes.axhline(NODES * 100, color=CLAIM, lw=1)
-    axes.text(100.0, NODES * 100, "claimed", color=CLAIM, ha="right", va="bottom")
+    axes.text(0.0, NODES * 100, "claimed", color=CLAIM, ha="left", va="top")
     axes.axhline(0.0, color=MUTED, lw=0.6)
     axes.set(
         xlabel="growth of the box, own (0) to wide (100) [%]",
         ylabel="change of the mean number of nodes [%]",
     )
-    axes.legend(loc="lower right", fontsize=8)
+    figure.legend(loc="outside upper left", fontsize=8)
     return figure
 
 
@@ -142,16 +147,19 @@ def _bars(axes: Axes, results: Results, ends: Any, arms: dict[Any, Arm], quantit
             label=name,
         )
     axes.set_xticks(np.arange(len(environments)), [e.replace("_", " ") for e in environments])
-    axes.set_ylim(bottom=0.0)
-    axes.margins(y=0.25)
+    axes.set_ylim(0.0, 1.15 * axes.get_ylim()[1])
     axes.legend(loc="upper right", ncols=len(arms), fontsize=8)
 
 
-def _same_limits(all_axes: Any) -> None:
-    for get, put in (("get_xlim", "set_xlim"), ("get_ylim", "set_ylim")):
-        limits = np.array([getattr(axes, get)() for axes in all_axes])
-        for axes in all_axes:
-            getattr(axes, put)(limits.min(), limits.max())
+def _dots(axes: Axes, points: Array, colour: str, name: str) -> None:
+    """Points in the picture as dots, those beyond it as triangles at its edge."""
+    low, high = np.array(_SHOWN).T
+    beyond = np.any((points < low) | (points > high), axis=1)
+    shown = np.clip(points, low, high)
+    style: Any = {"ms": 4, "alpha": 0.7, "color": colour, "clip_on": False}
+    axes.plot(*shown[~beyond].T, "o", **style, label=name)
+    axes.plot(*shown[beyond].T, ">", **style)
+    axes.set(xlim=_SHOWN[0], ylim=_SHOWN[1])
 
 
 def _new(width: float, height: float, columns: int) -> tuple[Figure, Any]:

@@ -9,8 +9,15 @@ from itertools import product
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from planner.campaign.boxes import OWN, SHARES, WIDE
-from planner.campaign.trial import TEXT, Arm, Batch, Case, Ends
-from planner.paper.readings import CONE_DRAWS, FAILURE_RATES, FOCUSES, STEERS, Readings
+from planner.campaign.trial import Arm, Batch, Case, Ends
+from planner.paper.readings import (
+    CONE_DRAWS,
+    FAILURE_RATES,
+    FOCUSES,
+    STEERS,
+    TEXT,
+    Readings,
+)
 from planner.settings import CostName, SamplerName
 
 FIGURE_9, VARIANTS, READINGS, BOXES = "figure 9", "variants", "readings", "boxes"

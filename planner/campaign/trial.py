@@ -22,15 +22,12 @@ from planner.check import check_path
 from planner.cost import KinematicCost
 from planner.exact.checks import ExactChecks
 from planner.paper.limits import exact_checks
-from planner.paper.readings import Readings
+from planner.paper.readings import TEXT, Readings
 from planner.paper.search import PaperPlanner, SearchResult
 from planner.settings import CLEARANCE_RESERVE, CostName, PlannerSettings, SamplerName
 from planner.track import Track
 
 Ends = Literal["scene", "random"]
-
-TEXT = Readings()
-"""The text as it is written, where it is open as the planner's defaults have it."""
 
 _SPACING = 0.010
 _CLEARANCE_TOLERANCE = 0.1e-3

@@ -36,7 +36,7 @@ def exit_point(world: World, cable: int, anchor: Vector) -> Vector:
 def exit_travel(world: World, cable: int, start: Vector, end: Vector, travel: float) -> float:
     """A bound of how far an exit travels while its anchor does; infinite where there is none.
 
-    As in `planner.swept`: an anchor that moves by dB swivels the pulley by at most dB / ρ, which
+    An anchor that moves by dB swivels the pulley by at most dB / ρ, which
     moves the exit by at most 2 r dB / ρ, and rolls the cable by at most dB / l, which moves it by
     r dB / l; ρ is the distance from the swivel axis, l the free length.
 

@@ -64,3 +64,7 @@ class Readings:
                 raise BadInput(what, next_step=f"use one of: {', '.join(choices)}")
         if not 0.0 <= self.spacing < float("inf"):
             raise BadInput(f"the spacing must be 0 mm or more, it is {self.spacing * 1000.0:g} mm")
+
+
+TEXT = Readings()
+"""The text as it is written, and where that is open what made the smallest trees."""

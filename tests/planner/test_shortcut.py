@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner.cost import LengthCost
-from planner.shortcut import cheapest_through, drawn_tight, shortcut
+from planner.shortcut import cheapest_through, drawn_tight
 
 COST = LengthCost()
 
@@ -45,9 +45,8 @@ def wandering_path(seed: int) -> np.ndarray:
 def test_every_step_keeps_ends_and_freedom_and_never_costs_more(seed: int) -> None:
     path = wandering_path(seed)
     for made in (
-        shortcut(path, is_free, COST),
         cheapest_through(path, is_free, COST, 0.05),
-        drawn_tight(shortcut(path, is_free, COST), is_free, COST),
+        drawn_tight(path, is_free, COST),
     ):
         assert np.array_equal(made[0], path[0])
         assert np.array_equal(made[-1], path[-1])
@@ -55,38 +54,10 @@ def test_every_step_keeps_ends_and_freedom_and_never_costs_more(seed: int) -> No
         assert length(made) <= length(path) + 1e-9
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_algorithm_3_leaves_no_node_that_can_be_skipped_from_a_kept_one(seed: int) -> None:
-    path = wandering_path(seed)
-    kept = shortcut(path, is_free, COST)
-    rows = [int(np.flatnonzero((path == node).all(axis=1))[0]) for node in kept]
-    for here, following in pairwise(rows):
-        assert not any(is_free(path[here], path[j]) for j in range(following + 1, len(path)))
-
-
-def test_a_free_straight_line_replaces_everything() -> None:
-    path = np.array([[-0.5, 0.5], [0.0, 0.9], [0.1, 0.5], [0.5, 0.5]])
-    assert shortcut(path, is_free, COST).tolist() == [[-0.5, 0.5], [0.5, 0.5]]
-
-
-def test_a_shortcut_that_costs_more_than_the_way_it_replaces_is_not_taken() -> None:
-    class Valley(LengthCost):
-        """Ten times as dear above y = 0.6 as below."""
-
-        def edge(self, start: np.ndarray, end: np.ndarray) -> float:
-            t = np.linspace(0, 1, 201)[:, None]
-            y = (start + t * (end - start))[:, 1]
-            return float(np.linalg.norm(end - start) * np.mean(np.where(y > 0.6, 10.0, 1.0)))
-
-    path = np.array([[-0.5, 0.7], [-0.4, 0.5], [0.4, 0.5], [0.5, 0.7]])
-    assert len(shortcut(path, is_free, Valley())) == 4
-    assert len(shortcut(path, is_free, COST)) == 2
-
-
 def test_drawing_tight_comes_within_two_percent_of_the_shortest_way() -> None:
     angles = np.linspace(np.pi, 0.0, 30)
     path = 0.5 * np.column_stack([np.cos(angles), np.sin(angles)])
-    tight = shortcut(path, is_free, COST)
+    tight = path
     for _ in range(2):
         tight = drawn_tight(cheapest_through(tight, is_free, COST, 0.03), is_free, COST)
     # Two tangents to the disc and the arc between them.
