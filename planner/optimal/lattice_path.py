@@ -164,7 +164,8 @@ def _around(
 @kernel
 def _nearest(problem: Problem, value: float, axis: int, stride: int) -> int:
     step = stride * problem.grid[1, axis]
-    return math.floor((value - problem.grid[0, axis]) / step + 0.5)
+    place: int = math.floor((value - problem.grid[0, axis]) / step + 0.5)
+    return place
 
 
 @kernel

@@ -48,7 +48,7 @@ class Change(NamedTuple):
 
     first: int
     last: int
-    count: int
+    count: int  # type: ignore[assignment]  # nobody asks this tuple to count
     one: Vector
     two: Vector
     ends_known: bool

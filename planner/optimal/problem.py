@@ -60,7 +60,7 @@ def edge_allowed(problem: Problem, start: Vector, end: Vector) -> bool:
     ):
         return False
     limit = problem.terms[WRENCH_LIMIT]
-    return limit == -math.inf or lowest_margin(problem, start, end) >= limit
+    return bool(limit == -math.inf or lowest_margin(problem, start, end) >= limit)
 
 
 @kernel
@@ -83,13 +83,13 @@ def edge_cost(problem: Problem, start: Vector, end: Vector) -> float:
     cost = problem.terms[LENGTH] * length
     weight = problem.terms[KINEMATIC]
     if weight == 0.0:
-        return cost
+        return float(cost)
     steps = math.ceil(length / _SAMPLING) + 1
     total = 0.0
     for i in range(steps):  # middles of equal parts
         at = along(start, way, (i + 0.5) / steps)
         total += interpolated(problem.grid, problem.kinematic, at)
-    return cost + weight * total * length / steps
+    return float(cost + weight * total * length / steps)
 
 
 @kernel
