@@ -40,6 +40,8 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -r constraints.txt && \
 	"$(BIN)/python" -m pip $(PIP) --no-build-isolation --no-deps -e . && \
 	"$(BIN)/python" -m pip check --disable-pip-version-check && \
+	echo "Compiling the planner (once; a minute or two) ..." && \
+	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml -o "$(VENV)/first-plan.json" --force --json >/dev/null && \
 	echo "$$place, $$pins" > "$(STAMP)"
 
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
