@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from cdpr.errors import Problem
 from cdpr.yaml_tree import KeyPath, Places
@@ -54,11 +55,14 @@ def place_of(parts: KeyPath, places: Places) -> tuple[int, int]:
 
 def problems_of(error: ValidationError, model: type[BaseModel], places: Places) -> list[Problem]:
     """Pydantic's findings as our problems, each with its place in the file."""
-    return [
-        Problem(key_path(item["loc"]), sentence_of(item, model), *place_of(item["loc"], places))
-        for item in error.errors(include_url=False)
-        if item["type"] != "invalid_key"  # told with its place by whoever read the text
-    ]
+    found = []
+    for item in error.errors(include_url=False):
+        if item["type"] != "invalid_key":  # told with its place by whoever read the text
+            parts, _ = _followed(item["loc"], model)
+            found.append(
+                Problem(key_path(parts), sentence_of(item, model), *place_of(parts, places))
+            )
+    return found
 
 
 def sentence_of(item: Mapping[str, Any], model: type[BaseModel]) -> str:
@@ -104,7 +108,7 @@ def _entries(count: int) -> str:
     return "1 entry" if count == 1 else f"{count} entries"
 
 
-def _unknown_key(parts: Sequence[str | int], model: type[BaseModel]) -> str:
+def _unknown_key(parts: KeyPath, model: type[BaseModel]) -> str:
     name = str(parts[-1])
     known = _known_keys(model, parts[:-1])
     near = difflib.get_close_matches(name, known, n=1)
@@ -113,15 +117,42 @@ def _unknown_key(parts: Sequence[str | int], model: type[BaseModel]) -> str:
     return f"unknown key {name!r}{hint or ('.' if keys else '')}{keys}"
 
 
-def _known_keys(model: type[BaseModel], parts: Sequence[str | int]) -> list[str]:
+def _known_keys(model: type[BaseModel], parts: KeyPath) -> list[str]:
     """The keys a model knows at a place; follows nested models and lists of models."""
+    _, current = _followed(parts, model)
+    return list(current.model_fields) if current is not None else []
+
+
+def _followed(parts: KeyPath, model: type[BaseModel]) -> tuple[KeyPath, type[BaseModel] | None]:
+    """A place as the file has it, and the model that stands there.
+
+    Where a key holds one of several models, pydantic puts the name of the one chosen behind the
+    key; the file has no such part.
+    """
     current: type[BaseModel] | None = model
+    kept: list[str | int] = []
+    choices: dict[str, type[BaseModel]] = {}
     for part in parts:
+        if part in choices:
+            current, choices = choices[str(part)], {}
+            continue
+        kept.append(part)
         if isinstance(part, int) or current is None:
             continue
         field = current.model_fields.get(part)
+        choices = _choices(field) if field is not None else {}
         current = model_in(field.annotation) if field is not None else None
-    return list(current.model_fields) if current is not None else []
+    return tuple(kept), current
+
+
+def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
+    """The models a key may hold, by the value of the entry that tells them apart."""
+    if not isinstance(field.discriminator, str):
+        return {}
+    name, found = field.discriminator, {}
+    for model in get_args(field.annotation):
+        found.update(dict.fromkeys(get_args(model.model_fields[name].annotation), model))
+    return found
 
 
 def model_in(annotation: Any) -> type[BaseModel] | None:

@@ -29,8 +29,28 @@ class ReadingsDocument(Document):
     goal_sight: bool
 
 
+class WeightsDocument(Document):
+    """What the path makes small (docs/plan-file.md); clearance and capacity are made large."""
+
+    length: NonNegative
+    kinematic: NonNegative
+    clearance: NonNegative
+    capacity: NonNegative
+
+
+class OptimalPlannerDocument(Document):
+    """How the path was searched for by the default planner."""
+
+    name: Literal["optimal"]
+    weights: WeightsDocument
+    seed: Annotated[int, Field(ge=0)]
+    rounds: Annotated[int, Field(ge=1)]
+    budget_ms: Positive | None
+    longest_mm: Positive | None
+
+
 class PlannerDocument(Document):
-    """How the path was searched for."""
+    """How the path was searched for by the paper's planner or its baseline."""
 
     name: Literal["adaptive", "goal-bias"]
     cost: Literal["kinematic", "length"]
@@ -50,6 +70,7 @@ class StatisticsDocument(Document):
     iterations: Annotated[int, Field(ge=0)]
     edge_checks: Annotated[int, Field(ge=0)]
     planning_time_s: NonNegative
+    search_time_s: NonNegative | None = None
 
 
 class NearestDocument(Document):
@@ -90,7 +111,7 @@ class PlanDocument(Document):
     scene_hash: str
     rig: RigDocument
     scene: SceneDocument
-    planner: PlannerDocument
+    planner: Annotated[PlannerDocument | OptimalPlannerDocument, Field(discriminator="name")]
     waypoints: Annotated[list[PoseDocument], Field(min_length=2)]
     raw_path: Annotated[list[PoseDocument], Field(min_length=2)]
     tree: TreeDocument

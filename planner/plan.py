@@ -19,6 +19,8 @@ from planner.check import check_path
 from planner.check_report import CheckReport
 from planner.cost import KinematicCost
 from planner.endpoints import require_usable_ends
+from planner.optimal.routing import OptimalRoute, optimal_route
+from planner.optimal.settings import OptimalSettings
 from planner.paper.readings import Readings
 from planner.paper.routing import paper_route
 from planner.paper.search import Progress
@@ -30,36 +32,44 @@ from planner.space import Space, TranslationSpace
 def make_plan(
     rig: Rig,
     scene: Scene,
-    settings: PlannerSettings | None = None,
+    settings: PlannerSettings | OptimalSettings | None = None,
     progress: Progress | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> PlanDocument:
     """Plans a path from the scene's start to its goal.
 
-    The same rig, scene and settings give the same path on every machine of the same libraries; the
-    clock is read for the statistics alone.
+    The same rig, scene and settings give the same path on every machine of the same libraries. The
+    clock is read for the statistics alone; except that `OptimalSettings` without a number of rounds
+    go on until a budget is spent: the plan then tells the rounds, which give its path again.
 
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load, start and goal.
-        settings: Of the search; the defaults when left out.
+        settings: Which planner, and its settings; the planner we recommend when left out.
         progress: Told how the search goes on.
-        clock: Seconds, for the planning time.
+        clock: Seconds, for the planning time and the budget.
 
     Returns:
         The plan, sealed with its hash, which has passed `planner.check.check_path`.
 
     Raises:
         BadInput: Start or goal cannot be used.
-        NoSolution: The search ended at its limit.
+        NoSolution: There is no path, or the search ended at its limit.
         Fault: The finished path failed its check; that is a fault of this program.
     """
     began = clock()
-    settings = settings or PlannerSettings()
+    settings = settings or OptimalSettings()
     require_usable_ends(rig, scene)
     space = TranslationSpace(rig, scene.start.rotation)
     kinematic = KinematicCost(rig, space.rotation)
-    route = paper_route(rig, scene, settings, kinematic, progress)
+    times: dict[str, float] = {}
+    if isinstance(settings, OptimalSettings):
+        found = optimal_route(rig, scene, settings, kinematic, progress, clock)
+        route, planner = found.route, _optimal_planner(settings, found)
+        times["search_time_s"] = max(0.0, found.search_time)
+    else:
+        route = paper_route(rig, scene, settings, kinematic, progress)
+        planner = _planner(settings)
     poses = [space.pose(point) for point in route.path]
     report = check_path(rig, scene, poses)
     if not report.passed:
@@ -75,7 +85,7 @@ def make_plan(
             "scene_hash": scene.hash,
             "rig": rig.document,
             "scene": scene.document,
-            "planner": _planner(settings),
+            "planner": planner,
             "waypoints": [PoseDocument.of(pose) for pose in poses],
             "raw_path": [PoseDocument.of(space.pose(point)) for point in route.raw],
             "tree": _tree(space, route),
@@ -84,10 +94,28 @@ def make_plan(
                 "iterations": route.iterations,
                 "edge_checks": route.edge_checks,
                 "planning_time_s": max(0.0, clock() - began),
+                **times,
             },
             "quality": _quality(report, route.raw, kinematic.mean_along(route.path)),
         }
     )
+
+
+def _optimal_planner(settings: OptimalSettings, found: OptimalRoute) -> dict[str, Any]:
+    weights, longest = settings.weights, settings.longest
+    return {
+        "name": "optimal",
+        "weights": {
+            "length": weights.length,
+            "kinematic": weights.kinematic,
+            "clearance": weights.clearance,
+            "capacity": weights.capacity,
+        },
+        "seed": settings.seed,
+        "rounds": found.rounds,
+        "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
+        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
+    }
 
 
 def _planner(settings: PlannerSettings) -> dict[str, Any]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from checkers import SPACING, EdgeCheck, FclStates
 from ompl import base, geometric, util
+from result import Result
 
 from cdpr.poses import Array
 from cdpr.rig import Rig
@@ -22,23 +22,6 @@ from cdpr.scene import Scene
 
 PLANNERS = ("RRTConnect", "RRTConnect*", "RRTstar", "InformedRRTstar", "BITstar", "AORRTC")
 """`RRTConnect*` is RRTConnect with unlimited steps, which suits exact edges best."""
-
-
-@dataclass(frozen=True)
-class Result:
-    """One run of one planner.
-
-    Attributes:
-        first_s: Processor time to the first path, [s]; infinite without one.
-        lengths_m: Length of the best path at each mark, [m]; infinite without one.
-        checks: Edges or, with python-fcl, poses that were asked about.
-        path: The last path, shape (k, 3), [m]; empty without one.
-    """
-
-    first_s: float
-    lengths_m: tuple[float, ...]
-    checks: int
-    path: Array
 
 
 class Question:

@@ -27,26 +27,21 @@ def demo(
       cdpr demo --environment 3
     """
     from cdpr.cli.cameras import SYNTHETIC
-    from cdpr.cli.output import out, progress_bar, show_facts
-    from cdpr.cli.plan import sentences_of
+    from cdpr.cli.output import out, show_facts
+    from cdpr.cli.plan import planned, sentences_of
     from cdpr.cli.run import exit_code, prepared_run, run_prepared
     from cdpr.cli.run_summary import show_prepared, show_summary
     from cdpr.plan import save_plan
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
     from executor.run_folder import RunFolder
-    from planner.plan import make_plan
-    from planner.settings import PlannerSettings
+    from planner.optimal.settings import OptimalSettings
 
     folder = output or _free_folder()
     RunFolder.require_free(folder)
     rig = load_rig(configs() / RIG)
     scene = load_scene(configs() / f"environment_{environment}.yaml")
-    settings = PlannerSettings(seed=seed)
-    with progress_bar("planning", settings.max_iterations, True) as advance:
-        document = make_plan(
-            rig, scene, settings, progress=lambda done, _most, _distance: advance(done)
-        )
+    document = planned(rig, scene, OptimalSettings(seed=seed), True)
     show_facts("plan", sentences_of(document)[:-1])
     with TemporaryDirectory(prefix="cdpr-demo-") as temporary:
         plan_path = Path(temporary) / "plan.json"

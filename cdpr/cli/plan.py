@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.plan_options import (
+    BudgetOption,
+    CostOption,
+    IterationsOption,
+    LongestOption,
+    ModeOption,
+    PlannerName,
+    PlannerOption,
+    RoundsOption,
+    WeightOption,
+    optimal_settings,
+    paper_settings,
+    refuse,
+)
 from cdpr.cli.readings import (
     ConeDrawName,
     ConeDrawOption,
@@ -23,28 +36,10 @@ from cdpr.cli.readings import (
 
 if TYPE_CHECKING:
     from cdpr.plan_file import PlanDocument
+    from cdpr.rig import Rig
     from cdpr.scene import Scene
-
-
-class PlannerName(StrEnum):
-    """How samples are drawn."""
-
-    adaptive = "adaptive"
-    goal_bias = "goal-bias"
-
-
-class CostName(StrEnum):
-    """What makes a path good."""
-
-    kinematic = "kinematic"
-    length = "length"
-
-
-class ModeName(StrEnum):
-    """How far the search goes."""
-
-    rewire = "rewire"
-    paper = "paper"
+    from planner.optimal.settings import OptimalSettings
+    from planner.settings import PlannerSettings
 
 
 def plan(
@@ -55,16 +50,14 @@ def plan(
     clearance_mm: Annotated[
         float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
     ] = None,
-    planner: Annotated[
-        PlannerName, typer.Option(help="adaptive sampling, or half of all samples at the goal")
-    ] = PlannerName.adaptive,
-    cost: Annotated[CostName, typer.Option(help="what the path minimises")] = CostName.kinematic,
-    mode: Annotated[
-        ModeName, typer.Option(help="rewire: RRT*; paper: first solution, no rewiring")
-    ] = ModeName.rewire,
-    max_iterations: Annotated[
-        int | None, typer.Option(min=1, help="give up after so many samples")
-    ] = None,
+    planner: PlannerOption = PlannerName.optimal,
+    cost: CostOption = None,
+    weight: WeightOption = None,
+    longest_mm: LongestOption = None,
+    budget_ms: BudgetOption = None,
+    rounds: RoundsOption = None,
+    mode: ModeOption = None,
+    max_iterations: IterationsOption = None,
     start_mm: Annotated[
         tuple[float, float, float] | None, typer.Option(help="start instead of the scene's: x y z")
     ] = None,
@@ -87,20 +80,20 @@ def plan(
       cdpr plan configs/gachon_8_6.yaml configs/environment_1.yaml -o plan.json
 
       cdpr plan configs/gachon_8_6.yaml configs/environment_3.yaml -o plan.json
-      --clearance-mm 20 --cost length --seed 7
+      --clearance-mm 20 --cost kinematic --longest-mm 1000
+
+      cdpr plan configs/gachon_8_6.yaml configs/environment_2.yaml -o plan.json
+      --planner adaptive --mode paper --seed 7
     """
-    from cdpr.cli.output import progress_bar, show_facts, show_json
+    from cdpr.cli.output import show_facts, show_json
     from cdpr.plan import save_plan
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
     from planner.paper.readings import Readings
-    from planner.plan import make_plan
-    from planner.settings import PlannerSettings
 
     the_rig = load_rig(rig)
     the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
     check_output(output, force)
-    options: dict[str, Any] = {} if max_iterations is None else {"max_iterations": max_iterations}
     readings = Readings(
         failure_rate=failure_rate.value,
         focus=focus.value,
@@ -109,23 +102,58 @@ def plan(
         spacing=spacing_mm / 1000.0,
         goal_sight=goal_sight,
     )
-    settings = PlannerSettings(
-        sampler=planner.value,
-        cost=cost.value,
-        mode=mode.value,
-        seed=seed,
-        readings=readings,
-        **options,
-    )
-    with progress_bar("planning", settings.max_iterations, not as_json) as advance:
-        document = make_plan(
-            the_rig, the_scene, settings, progress=lambda done, _most, _distance: advance(done)
+    settings: OptimalSettings | PlannerSettings
+    if planner is PlannerName.optimal:
+        refuse(
+            planner,
+            {
+                "--mode": mode is not None,
+                "--max-iterations": max_iterations is not None,
+                "readings of the paper": readings != Readings(),
+            },
         )
+        settings = optimal_settings(seed, cost, weight or [], budget_ms, rounds, longest_mm)
+    else:
+        refuse(
+            planner,
+            {
+                "--weight": bool(weight),
+                "--longest-mm": longest_mm is not None,
+                "--budget-ms": budget_ms is not None,
+                "--rounds": rounds is not None,
+            },
+        )
+        settings = paper_settings(planner, seed, cost, mode, max_iterations, readings)
+    document = planned(the_rig, the_scene, settings, not as_json)
     save_plan(document, output)
     if as_json:
         show_json({"plan": str(output), **facts_of(document)})
     else:
         show_facts(f"plan {output}", sentences_of(document))
+
+
+def planned(
+    rig: Rig, scene: Scene, settings: OptimalSettings | PlannerSettings, shown: bool
+) -> PlanDocument:
+    """A plan, made with a bar where the search is long, and a word where it must be compiled."""
+    from cdpr.cli.output import err, progress_bar, spinner
+    from planner.optimal.settings import OptimalSettings
+    from planner.plan import make_plan
+
+    if not isinstance(settings, OptimalSettings):
+        with progress_bar("planning", settings.max_iterations, shown) as advance:
+            return make_plan(
+                rig, scene, settings, progress=lambda done, _most, _distance: advance(done)
+            )
+    from planner.optimal.compilation import is_compiled, note_compiled
+
+    compiled = is_compiled()
+    if not compiled:
+        err.print("compiling the planner for this machine, once; about a minute …")
+    with spinner("planning" if compiled else "compiling", shown):
+        document = make_plan(rig, scene, settings)
+    note_compiled()
+    return document
 
 
 def _changed(
@@ -185,7 +213,7 @@ def facts_of(document: PlanDocument) -> dict[str, Any]:
 
 def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
     """What a plan is, for people."""
-    quality, statistics = document.quality, document.statistics
+    quality = document.quality
     facts = [
         ("rig, scene", f"{document.rig.name}, {document.scene.name}"),
         (
@@ -202,11 +230,18 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
         ("self clearance", f"{own.distance_mm:.2f} mm, {own.first} to {own.second}"),
         ("tension", f"{quality.min_tension_n:.1f} to {quality.max_tension_n:.1f} N"),
         ("kinematic cost", f"{quality.mean_kinematic_cost:.3f} on average"),
-        (
-            "search",
-            f"{statistics.nodes} nodes, {statistics.iterations} samples,"
-            f" {statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s",
-        ),
+        ("search", _search_sentence(document)),
         ("next", "cdpr check, then cdpr run"),
     ]
     return facts
+
+
+def _search_sentence(document: PlanDocument) -> str:
+    from cdpr.plan_file import OptimalPlannerDocument
+
+    statistics, planner = document.statistics, document.planner
+    rest = f"{statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s"
+    if isinstance(planner, OptimalPlannerDocument):
+        search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of it searching"
+        return f"{planner.rounds} rounds (again: --rounds {planner.rounds}), {rest}{search}"
+    return f"{statistics.nodes} nodes, {statistics.iterations} samples, {rest}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument
 from executor.report.markup import list_table, table
 from executor.report.run_data import RunData
 
@@ -52,6 +53,26 @@ def _plan(run: RunData) -> list[tuple[str, str]]:
 
 def _search(run: RunData) -> list[tuple[str, str]]:
     planner, statistics = run.plan.document.planner, run.plan.document.statistics
+    rows = _improving(planner) if isinstance(planner, OptimalPlannerDocument) else _tree(planner)
+    return [
+        *rows,
+        ("Nodes", str(statistics.nodes)),
+        ("Iterations", str(statistics.iterations)),
+        ("Edge checks", str(statistics.edge_checks)),
+        ("Planning time", f"{statistics.planning_time_s:.2f} s"),
+    ]
+
+
+def _improving(planner: OptimalPlannerDocument) -> list[tuple[str, str]]:
+    weights = planner.weights.model_dump()
+    asked = ", ".join(f"{name} {weight:g}" for name, weight in weights.items() if weight > 0.0)
+    rows = [("Planner", planner.name), ("Weights", asked), ("Seed", str(planner.seed))]
+    if planner.longest_mm is not None:
+        rows.append(("Longest path allowed", f"{planner.longest_mm:g} mm"))
+    return rows
+
+
+def _tree(planner: PlannerDocument) -> list[tuple[str, str]]:
     return [
         ("Sampling", planner.name),
         ("Cost", planner.cost),
@@ -60,10 +81,7 @@ def _search(run: RunData) -> list[tuple[str, str]]:
         ("Step", f"{planner.step_mm:g} mm"),
         ("Neighbour radius", f"{planner.neighbour_radius_mm:g} mm"),
         ("Goal radius", f"{planner.goal_radius_mm:g} mm"),
-        ("Nodes", str(statistics.nodes)),
-        ("Iterations", f"{statistics.iterations} of at most {planner.max_iterations}"),
-        ("Edge checks", str(statistics.edge_checks)),
-        ("Planning time", f"{statistics.planning_time_s:.2f} s"),
+        ("Most iterations", str(planner.max_iterations)),
     ]
 
 

@@ -59,7 +59,7 @@ def build_holding(world: World, load: Load, reserve: float) -> Holding:
                 for axis, number in enumerate((i, j, k)):
                     box[axis] = world.limits[0, axis] + number * size[axis]
                     box[axis + 3] = world.limits[0, axis] + (number + 1) * size[axis]
-                cells[i, j, k] = _box_held(world, load, reserve, box)
+                cells[i, j, k] = box_held(world, load, reserve, box)
                 everywhere = everywhere and cells[i, j, k]
     return Holding(reserve, cells, everywhere)
 
@@ -169,7 +169,7 @@ def _in_proved_cells(world: World, holding: Holding, start: Array, end: Array) -
 
 
 @kernel
-def _box_held(world: World, load: Load, reserve: float, whole: Array) -> bool:
+def box_held(world: World, load: Load, reserve: float, whole: Array) -> bool:
     """Whether a box, lower and upper corner in shape (6,), is proved by halving it."""
     boxes, halvings = np.empty((_MOST_HALVINGS + 2, 6)), np.zeros(_MOST_HALVINGS + 2, np.int64)
     boxes[0], spans = whole, np.zeros((3, 3))

@@ -164,8 +164,7 @@ def _around(
 @kernel
 def _nearest(problem: Problem, value: float, axis: int, stride: int) -> int:
     step = stride * problem.grid[1, axis]
-    place: int = math.floor((value - problem.grid[0, axis]) / step + 0.5)
-    return place
+    return int(math.floor((value - problem.grid[0, axis]) / step + 0.5))  # noqa: RUF046
 
 
 @kernel

@@ -41,7 +41,7 @@ def polish(problem: Problem, line: Polyline, state: State, trials: int) -> None:
                 break
             size *= _ON
             one, two = along(change.one, way, size), along(change.two, way, size)
-            change = Change(change.first, change.last, change.count, one, two, False)
+            change = Change(change.first, change.last, change.number, one, two, False)
 
 
 @kernel

@@ -40,7 +40,7 @@ class Change(NamedTuple):
     Attributes:
         first: Number of the vertex before those that go.
         last: Number of the vertex after them.
-        count: How many come in their place, 0, 1 or 2.
+        number: How many come in their place, 0, 1 or 2.
         one: The first of them, [m].
         two: The second of them, [m].
         ends_known: Whether the edges to ``one`` and from ``two`` are parts of present edges.
@@ -48,7 +48,7 @@ class Change(NamedTuple):
 
     first: int
     last: int
-    count: int  # type: ignore[assignment]  # nobody asks this tuple to count
+    number: int
     one: Vector
     two: Vector
     ends_known: bool
@@ -102,21 +102,21 @@ def cost_of(problem: Problem, line: Polyline) -> float:
 @kernel
 def replace(problem: Problem, line: Polyline, change: Change) -> bool:
     """Makes a change, if it makes the path cheaper and every new edge is allowed."""
-    added = change.count - (change.last - change.first - 1)
+    added = change.number - (change.last - change.first - 1)
     if line.counts[0] + added > len(line.points):
         return False
     saved = -problem.terms[VERTEX] * added
     for i in range(change.first, change.last):
         saved += line.edges[i, 0]
     costs = (0.0, 0.0, 0.0)
-    for i in range(change.count + 1):
+    for i in range(change.number + 1):
         at, to = _corner(line, change, i), _corner(line, change, i + 1)
         costs = (costs[1], costs[2], edge_cost(problem, at, to))
         saved -= costs[2]
     watched = problem.terms[CLEARANCE] > 0.0 or problem.terms[CAPACITY] > 0.0
     if not watched and saved <= _ROUND_OFF:
         return False
-    for i in range(change.count + 1):
+    for i in range(change.number + 1):
         if change.ends_known and i != 1:
             continue
         line.counts[1] += 1
@@ -124,7 +124,7 @@ def replace(problem: Problem, line: Polyline, change: Change) -> bool:
             return False
     lows = (math.inf, math.inf, math.inf, math.inf, math.inf, math.inf)
     if watched:
-        for i in range(change.count + 1):
+        for i in range(change.number + 1):
             found = edge_lows(problem, _corner(line, change, i), _corner(line, change, i + 1))
             lows = (lows[2], lows[3], lows[4], lows[5], found[0], found[1])
         saved += _gain(problem, line, change, lows)
@@ -139,7 +139,7 @@ def _corner(line: Polyline, change: Change, i: int) -> Vector:
     """Vertex ``i`` of the changed part: the one before, the new ones, the one after."""
     if i == 0:
         return row_of(line.points[change.first])
-    if i == change.count + 1:
+    if i == change.number + 1:
         return row_of(line.points[change.last])
     return change.one if i == 1 else change.two
 
@@ -176,7 +176,7 @@ def _put(
 
     The last numbers of ``costs`` and ``lows`` are those of the last new edge.
     """
-    first, count, old = change.first, change.count, line.counts[0]
+    first, count, old = change.first, change.number, line.counts[0]
     shift = count - (change.last - first - 1)
     if shift > 0:
         for i in range(old - 1, change.last - 1, -1):

@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from planner.exact.capacity import Load
 from planner.exact.compiled import kernel
 from planner.exact.edge import edge_clearance, in_workspace, obstacles_free
 from planner.exact.fields import World
+from planner.exact.holding import Holding, edge_held
 from planner.exact.self_edge import self_edge_free
 from planner.exact.self_region import Robot
 from planner.exact.vectors import Vector, along, minus, norm
@@ -18,11 +20,16 @@ from planner.optimal.grid import interpolated
 
 Array = NDArray[np.float64]
 
-LENGTH, KINEMATIC, CLEARANCE, CAPACITY, VERTEX, WRENCH_LIMIT, UNIT = 0, 1, 2, 3, 4, 5, 6
+LENGTH, KINEMATIC, CLEARANCE, CAPACITY, VERTEX, UNIT, LEAST_MARGIN = 0, 1, 2, 3, 4, 5, 6
 """Places in `Problem.terms`."""
+
+ASK_PROOF = math.inf
+"""As the least margin: wrenches are proved to be held on every edge, which takes long."""
 
 _SAMPLING = 0.010
 """Between samples of what is known on the grid, [m]: less than half of its spacing."""
+_CLEARANCE_SAMPLING = 0.020
+"""Between positions at which the clearance of cables over pulleys is looked at, [m]."""
 
 
 class Problem(NamedTuple):
@@ -31,17 +38,21 @@ class Problem(NamedTuple):
     Attributes:
         world: Obstacles and workspace, with the clearance that edges must keep.
         robot: The self clearance that edges must keep.
+        load: The wrenches that must be held on edges.
+        holding: Where in the workspace they are proved to be.
         grid: Lower corner of the lattice and its spacing, shape (2, 3), [m].
         kinematic: The cost c = γ_d + γ_f at the lattice's points, shape (i, j, k).
         margins: Capacity margins there, shape (i, j, k), [N].
         terms: Weights of length, ∫c ds, smallest clearance and smallest margin in the cost that
             is made small (the last two count against it); what a vertex more must save at least;
-            the smallest margin allowed at any interpolated sample (minus infinity where no pose
-            of the workspace comes near it); and what a metre of a usual path costs, shape (7,).
+            what a metre of a usual path costs; and the least margin of interpolated samples of
+            an edge, `ASK_PROOF`, or minus infinity where nothing comes near it, shape (7,).
     """
 
     world: World
     robot: Robot
+    load: Load
+    holding: Holding
     grid: Array
     kinematic: Array
     margins: Array
@@ -50,17 +61,22 @@ class Problem(NamedTuple):
 
 @kernel
 def edge_allowed(problem: Problem, start: Vector, end: Vector) -> bool:
-    """Whether an edge keeps everything asked for; wrench feasibility as far as the grid tells."""
-    if not (in_workspace(problem.world, start) and in_workspace(problem.world, end)):
+    """Whether an edge keeps everything asked for: workspace, clearances, wrench feasibility."""
+    world, robot = problem.world, problem.robot
+    if not (in_workspace(world, start) and in_workspace(world, end)):
         return False
-    if not obstacles_free(problem.world, start, end):
+    if not obstacles_free(world, start, end):
         return False
-    if len(problem.robot.open_pairs) + len(problem.robot.open_cables) > 0 and not self_edge_free(
-        problem.world, problem.robot, np.array(start), np.array(end)
-    ):
+    least = problem.terms[LEAST_MARGIN]
+    proved = len(robot.open_pairs) + len(robot.open_cables) == 0
+    if proved and least == -math.inf:
+        return True
+    before, after = np.array(start), np.array(end)
+    if not (proved or self_edge_free(world, robot, before, after)):
         return False
-    limit = problem.terms[WRENCH_LIMIT]
-    return bool(limit == -math.inf or lowest_margin(problem, start, end) >= limit)
+    if least == ASK_PROOF:
+        return bool(edge_held(world, problem.load, problem.holding, before, after))
+    return least == -math.inf or bool(lowest_margin(problem, start, end) >= least)
 
 
 @kernel
@@ -97,10 +113,23 @@ def edge_lows(problem: Problem, start: Vector, end: Vector) -> tuple[float, floa
     """Smallest clearance [m] and margin [N] of an edge; infinite where they have no weight."""
     clearance, margin = math.inf, math.inf
     if problem.terms[CLEARANCE] > 0.0:
-        clearance = edge_clearance(problem.world, np.array(start), np.array(end))[0]
+        clearance = _clearance(problem.world, start, end)
     if problem.terms[CAPACITY] > 0.0:
         margin = lowest_margin(problem, start, end)
     return clearance, margin
+
+
+@kernel
+def _clearance(world: World, start: Vector, end: Vector) -> float:
+    """Smallest clearance of an edge, [m]: exact, with pulleys at samples, for the cost alone."""
+    if world.pulley == 0.0:
+        return float(edge_clearance(world, np.array(start), np.array(end))[0])
+    way, least = minus(end, start), math.inf
+    steps = math.ceil(norm(way) / _CLEARANCE_SAMPLING) + 1
+    for i in range(steps + 1):
+        at = np.array(along(start, way, i / steps))
+        least = min(least, edge_clearance(world, at, at)[0])
+    return least
 
 
 @kernel

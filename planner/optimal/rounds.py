@@ -17,7 +17,7 @@ from planner.optimal.connect import NODES, connect
 from planner.optimal.lattice_path import lattice_path
 from planner.optimal.polish import polish
 from planner.optimal.polyline import MOST_VERTICES, Polyline, cost_of, measure
-from planner.optimal.problem import KINEMATIC, UNIT, VERTEX, Problem
+from planner.optimal.problem import CLEARANCE, KINEMATIC, UNIT, VERTEX, Problem
 from planner.optimal.random import State, seeded, uniform
 
 Array = NDArray[np.float64]
@@ -25,7 +25,8 @@ Integers = NDArray[np.int64]
 
 KEPT = 6
 """Paths that are kept and polished."""
-_TRIALS = 400
+_TRIALS, _SLOW_TRIALS = 400, 100
+"""Changes tried in a round; the second where clearances are asked for or edges have pulleys."""
 _SAMPLES = 1000
 _COARSE, _MIDDLE = 4, 2
 _SPREAD = 1.0
@@ -53,8 +54,9 @@ class Search(NamedTuple):
         trees: See `planner.optimal.connect.connect`, shape (2, NODES, 3), [m].
         parents: Likewise, shape (2, NODES).
         grown: Likewise (`counts`), shape (4,).
-        totals: Rounds; nodes of finished trees and edge tests in them; first paths sought, shape
-            (4,).
+        totals: Rounds; nodes of finished trees and edge tests in them; first paths sought;
+            vertices of the very first path, shape (5,).
+        first: That path, shape (MOST_VERTICES, 3), [m].
         state: Of the random numbers.
     """
 
@@ -68,6 +70,7 @@ class Search(NamedTuple):
     parents: Integers
     grown: Integers
     totals: Integers
+    first: Array
     state: State
 
 
@@ -83,7 +86,8 @@ def new_search(start: Array, goal: Array, seed: int) -> Search:
         trees=np.zeros((2, NODES, 3)),
         parents=np.zeros((2, NODES), dtype=np.int64),
         grown=np.zeros(4, dtype=np.int64),
-        totals=np.zeros(4, dtype=np.int64),
+        totals=np.zeros(5, dtype=np.int64),
+        first=np.zeros((MOST_VERTICES, 3)),
         state=seeded(seed),
     )
 
@@ -101,10 +105,18 @@ def advance(problem: Problem, search: Search, rounds: int) -> float:
                 continue
         problem.terms[VERTEX] = _vertex_price(problem, search, kept)
         line = _line(search, kept)
-        polish(problem, line, search.state, _TRIALS)
+        polish(problem, line, search.state, _trials(problem))
         search.polished[kept] += 1
         search.costs[kept] = cost_of(problem, line)
     return search.costs[best_of(search)]  # type: ignore[no-any-return]
+
+
+@kernel
+def measure_again(problem: Problem, search: Search) -> None:
+    """Finds the costs of all paths anew, after a change of what is made small."""
+    for k in range(KEPT):
+        if search.counts[k, 0] > 0:
+            search.costs[k] = measure(problem, _line(search, k))
 
 
 @kernel
@@ -115,6 +127,12 @@ def best_of(search: Search) -> int:
         if search.costs[k] < search.costs[best]:
             best = k
     return best
+
+
+@kernel
+def _trials(problem: Problem) -> int:
+    slow = problem.world.pulley > 0.0 or problem.terms[CLEARANCE] > 0.0
+    return _SLOW_TRIALS if slow else _TRIALS
 
 
 @kernel
@@ -174,6 +192,8 @@ def _begin(problem: Problem, search: Search, kept: int) -> int:
         search.totals[2] += grown[2]
         grown[:] = 0
     line.counts[0], search.polished[kept] = found, 0
+    if search.totals[4] == 0:
+        search.totals[4], search.first[:] = found, line.points
     search.costs[kept] = measure(problem, line)
     return kept
 

@@ -70,7 +70,8 @@ def test_a_start_or_goal_that_cannot_be_used_is_told_with_what_and_how_much(
 def test_a_goal_that_is_not_reached_tells_how_near_the_search_came(tmp_path: Path) -> None:
     hard = CONFIGS / "environment_3.yaml"
     with nothing_written(tmp_path):
-        answer = call("plan", RIG, hard, "-o", tmp_path / "plan.json", "--max-iterations", "5")
+        options = ("--planner", "adaptive", "--max-iterations", "5")
+        answer = call("plan", RIG, hard, "-o", tmp_path / "plan.json", *options)
     one_message(answer, 1, "5", "mm", "goal")
 
 

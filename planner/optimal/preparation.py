@@ -1,0 +1,106 @@
+"""From rig, scene and weights to the arrays that the compiled search reads."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from planner.cost import KinematicCost
+from planner.exact.capacity import Load, build_load, margins
+from planner.exact.fields import World
+from planner.exact.holding import Holding, box_held, build_holding
+from planner.exact.self_edge import build_robot
+from planner.exact.world import build_world
+from planner.optimal.problem import LEAST_MARGIN, UNIT, Problem
+from planner.optimal.settings import Weights
+from planner.optimal.stored import stored
+from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+
+_CELLS = (16, 16, 16)
+_FEW = 64
+"""Cells of the workspace left unproved that are worth proving in smaller parts."""
+_PARTS = 4
+_FAR_FROM_LIMIT = 5.0
+
+
+def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCost) -> Problem:
+    """The problem of a scene, with the reserves that `planner.settings` documents.
+
+    Args:
+        rig: The robot.
+        scene: Obstacles, clearances, load; its start gives the orientation.
+        weights: Of what is made small.
+        kinematic: The cost of poses at that orientation.
+    """
+    rotation = np.array(scene.start.rotation)
+    world = build_world(rig, scene, rotation, scene.obstacle_clearance + CLEARANCE_RESERVE)
+    load = build_load(rig, scene, rotation)
+    lattice = kinematic.lattice
+    key = [rig.plan_hash, scene.document.load.model_dump(mode="json"), rotation.tolist()]
+    reserve = MARGIN_RESERVE * rig.max_tension
+    cells = stored("holding", [*key, reserve], _CELLS, lambda: _proved_cells(world, load, reserve))
+    holding = Holding(reserve, cells, bool(cells.all()))
+    capacity = np.zeros(lattice.shape)
+    if weights.capacity > 0.0 or not holding.everywhere:
+        points = lattice.points(np.arange(lattice.count))
+        capacity = stored(
+            "margins",
+            key,
+            lattice.shape,
+            lambda: margins(world, load, points).reshape(lattice.shape),
+        )
+    problem = Problem(
+        world=world,
+        robot=build_robot(rig, world, scene.self_clearance + CLEARANCE_RESERVE),
+        load=load,
+        holding=holding,
+        grid=np.stack([lattice.lower, lattice.spacing]),
+        kinematic=np.ascontiguousarray(kinematic.values.reshape(lattice.shape)),
+        margins=np.ascontiguousarray(capacity),
+        terms=np.zeros(7),
+    )
+    set_weights(problem, weights)
+    problem.terms[LEAST_MARGIN] = _least_margin(holding, capacity)
+    return problem
+
+
+def _least_margin(holding: Holding, capacity: Array) -> float:
+    """What interpolated margins must keep while searching; finished paths are always proved."""
+    least = _FAR_FROM_LIMIT * holding.reserve
+    if holding.everywhere or float(capacity.min()) >= least:
+        return -np.inf
+    return least
+
+
+def set_weights(problem: Problem, weights: Weights) -> None:
+    """Changes what a problem makes small, in place."""
+    problem.terms[:4] = weights.length, weights.kinematic, weights.clearance, weights.capacity
+    typical = float(problem.kinematic.mean())
+    problem.terms[UNIT] = weights.length + weights.kinematic * typical
+
+
+def _proved_cells(world: World, load: Load, reserve: float) -> NDArray[np.bool_]:
+    """Cells of the workspace box; where only few are left, those in smaller parts too."""
+    cells = build_holding(world, load, reserve).cells
+    left = np.argwhere(~cells)
+    if len(left) <= _FEW:
+        size = (world.limits[1] - world.limits[0]) / _CELLS
+        for cell in left:
+            lower = world.limits[0] + cell * size
+            cells[tuple(cell)] = _proved_in_parts(world, load, reserve, lower, size, 2)
+    return cells
+
+
+def _proved_in_parts(
+    world: World, load: Load, reserve: float, lower: Array, size: Array, depth: int
+) -> bool:
+    if box_held(world, load, reserve, np.concatenate([lower, lower + size])):
+        return True
+    part = size / _PARTS
+    return depth > 0 and all(
+        _proved_in_parts(world, load, reserve, lower + np.array(k) * part, part, depth - 1)
+        for k in np.ndindex(_PARTS, _PARTS, _PARTS)
+    )

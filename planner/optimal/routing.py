@@ -1,0 +1,151 @@
+"""From start to goal with the planner we recommend: rounds until the budget is spent."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from planner.cost import KinematicCost
+from planner.exact.holding import edges_held
+from planner.optimal.length_limit import LengthLimit
+from planner.optimal.no_path import no_path
+from planner.optimal.preparation import problem_of
+from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, Problem
+from planner.optimal.rounds import Search, advance, best_of, new_search
+from planner.optimal.settings import OptimalSettings, Weights
+from planner.route import Route
+
+Progress = Callable[[int, int, float], None]
+Clock = Callable[[], float]
+
+LEAST_ROUNDS = 12
+"""Done whatever the clock says, so that a busy machine finds a path, too."""
+LEAST_WITH_LIMIT = 80
+"""Likewise where a longest path is asked for, whose price is found in steps of some rounds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OptimalRoute:
+    """A route, and what it takes to find it again.
+
+    Attributes:
+        route: The path; its nodes are those of the first path found.
+        rounds: How many were done; `OptimalSettings.rounds` repeats them.
+        preparation_time: [s].
+        search_time: [s].
+    """
+
+    route: Route
+    rounds: int
+    preparation_time: float
+    search_time: float
+
+
+def optimal_route(
+    rig: Rig,
+    scene: Scene,
+    settings: OptimalSettings,
+    kinematic: KinematicCost,
+    progress: Progress | None = None,
+    clock: Clock = time.perf_counter,
+) -> OptimalRoute:
+    """Searches and improves.
+
+    Args:
+        rig: The robot.
+        scene: Obstacles, clearances, load, start and goal.
+        settings: Objective, seed and budget.
+        kinematic: The cost of poses at the start's orientation.
+        progress: Told rounds done, the most there will be (0: as the budget allows), and the cost.
+        clock: Seconds; decides when a budget is spent.
+
+    Raises:
+        NoSolution: There is no path, none was found, or none is short enough.
+    """
+    began = clock()
+    problem = problem_of(rig, scene, settings.weights, kinematic)
+    start, goal = np.array(scene.start.position), np.array(scene.goal.position)
+    search = new_search(start, goal, settings.seed)
+    advance(problem, search, 0)  # compiled code is made, or loaded, when it is first called
+    prepared = clock()
+    path = _improved(problem, search, settings, prepared, progress, clock)
+    if not _is_settled(problem, path):
+        problem.terms[LEAST_MARGIN] = ASK_PROOF
+        search = new_search(start, goal, settings.seed)
+        path = _improved(problem, search, settings, clock(), progress, clock)
+    if path is None:
+        raise no_path(rig, scene, problem, search, settings)
+    first = search.first[: search.totals[4]].copy()
+    route = Route(
+        path=path,
+        raw=first,
+        nodes=first,
+        parents=np.arange(-1, len(first) - 1, dtype=np.int64),
+        iterations=int(search.totals[0]),
+        edge_checks=int(search.totals[2] + search.grown[2] + search.counts[:, 1].sum()),
+    )
+    return OptimalRoute(route, route.iterations, prepared - began, clock() - prepared)
+
+
+def _improved(
+    problem: Problem,
+    search: Search,
+    settings: OptimalSettings,
+    began: float,
+    progress: Progress | None,
+    clock: Clock,
+) -> Array | None:
+    """Does rounds until the budget is spent, or nothing can be better."""
+    limit = LengthLimit(settings) if settings.longest < math.inf else None
+    rounds = 0
+    while not _is_over(settings, rounds, clock() - began):
+        cost = advance(problem, search, 1)
+        rounds += 1
+        if limit is not None:
+            limit.after_round(problem, search)
+        elif cost <= _least(search, settings):
+            break
+        if progress is not None and rounds % 10 == 0:
+            progress(rounds, settings.rounds or 0, float(cost))
+    return limit.path if limit is not None else best_path(search)
+
+
+def _is_settled(problem: Problem, path: Array | None) -> bool:
+    """Whether the grid's margins misled nobody: a path is proved to hold, or none was missed."""
+    if problem.holding.everywhere:
+        return True
+    if path is None:
+        return bool(problem.terms[LEAST_MARGIN] == -math.inf)
+    held = edges_held(problem.world, problem.load, problem.holding, path[:-1], path[1:])
+    return bool(held.all())
+
+
+def _is_over(settings: OptimalSettings, rounds: int, spent: float) -> bool:
+    if settings.rounds is not None:
+        return rounds >= settings.rounds
+    least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_WITH_LIMIT
+    return rounds >= least and spent >= settings.budget
+
+
+def _least(search: Search, settings: OptimalSettings) -> float:
+    """The cost that nothing is below; only known where the length alone counts."""
+    weights = settings.weights
+    if weights.length == 0.0 or weights != Weights(length=weights.length):
+        return -math.inf
+    straight = float(np.linalg.norm(search.ends[1] - search.ends[0]))
+    return weights.length * straight * (1.0 + 1e-12)
+
+
+def best_path(search: Search) -> Array | None:
+    """The cheapest path so far, shape (k, 3), [m]; None without one."""
+    best = best_of(search)
+    if not search.costs[best] < math.inf:
+        return None
+    return search.points[best, : search.counts[best, 0]].copy()

@@ -1,0 +1,89 @@
+"""What the search is told: the objective, the seed and how long it may go on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+from cdpr.errors import BadInput
+
+_TIE = 0.02
+"""Cost of a metre beside an objective that leaves most of the path open: 1 mm of clearance is worth
+50 mm of way, and 1 N of margin as much."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What is made small: a weighted sum, of which the last two are made large.
+
+    Attributes:
+        length: Of the length, [m].
+        kinematic: Of the line integral of c = γ_d + γ_f, [m].
+        clearance: Of the smallest distance to an obstacle, [m].
+        capacity: Of the smallest capacity margin, [N].
+    """
+
+    length: float = 0.0
+    kinematic: float = 0.0
+    clearance: float = 0.0
+    capacity: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuses weights that leave nothing to make small.
+
+        Raises:
+            BadInput: A weight is negative or not finite, or neither the length nor the kinematic
+                cost has one.
+        """
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not 0.0 <= value < math.inf:
+                raise BadInput(f"the weight of {entry.name} must be 0 or more, it is {value:g}")
+        if self.length + self.kinematic == 0.0:
+            raise BadInput(
+                "without a weight of length or kinematic a path would have no reason to end",
+                next_step="give length a small weight too, such as length=0.02",
+            )
+
+
+OBJECTIVES = {
+    "length": Weights(length=1.0),
+    "kinematic": Weights(kinematic=1.0),
+    "clearance": Weights(clearance=1.0, length=_TIE),
+    "capacity": Weights(capacity=1e-3, length=_TIE),
+}
+"""What the objectives that have a name make small."""
+
+
+@dataclass(frozen=True, slots=True)
+class OptimalSettings:
+    """Settings of the search.
+
+    Attributes:
+        weights: What is made small.
+        seed: Of the random numbers.
+        budget: How long paths are sought and improved, [s]; what is prepared before is not in it.
+        rounds: Instead of the budget, for the same path again: exactly so many rounds.
+        longest: Longest path allowed, [m]; infinite for any.
+    """
+
+    weights: Weights = field(default_factory=lambda: OBJECTIVES["length"])
+    seed: int = 0
+    budget: float = 0.050
+    rounds: int | None = None
+    longest: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Refuses what no search could use.
+
+        Raises:
+            BadInput: The seed is negative, or a limit is not positive.
+        """
+        if self.seed < 0:
+            raise BadInput(f"the seed must not be negative, it is {self.seed}")
+        if not 0.0 < self.budget < math.inf:
+            raise BadInput(f"the budget must be above 0 ms, it is {self.budget * 1e3:g} ms")
+        if self.rounds is not None and self.rounds < 1:
+            raise BadInput(f"there must be at least one round, not {self.rounds}")
+        if not self.longest > 0.0:
+            raise BadInput(f"the longest path must be above 0 mm, not {self.longest * 1e3:g} mm")
