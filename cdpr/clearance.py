@@ -94,6 +94,40 @@ class RobotBodies:
         return self._made[index]
 
 
+class ShiftedBodies:
+    """The robot at one orientation wherever its origin is in the hull of some positions.
+
+    Its exits must not move with it: point exits alone.
+    """
+
+    def __init__(self, rig: Rig, rotation: Array, positions: Array) -> None:
+        """Holds what reaches farthest.
+
+        Args:
+            rig: The robot, with point exits.
+            rotation: ``world_from_platform``, shape (3, 3).
+            positions: Of the origin, shape (k, 3), [m].
+        """
+        self._exits = rig.outlets
+        self._arms = rig.anchors @ rotation.T
+        self._corners = rig.platform_corners @ rotation.T
+        self._positions = positions
+
+    def reach(self, directions: Array) -> Array:
+        """As `RobotBodies.reach`, of all that the bodies pass over.
+
+        A cable's ends reach farthest at one of the positions, and with its ends the cable does.
+        """
+        shifts = np.max(directions @ self._positions.T, axis=-1)
+        along = directions[..., :-1, :]
+        ends = np.maximum(
+            np.einsum("...i,...i", along, self._exits),
+            np.einsum("...i,...i", along, self._arms) + shifts[..., :-1],
+        )
+        platform = np.max(directions[..., -1, :] @ self._corners.T, axis=-1) + shifts[..., -1]
+        return np.concatenate([ends, platform[..., None]], axis=-1)
+
+
 class ClearanceModel:
     """Distances of one rig in one scene.
 
@@ -133,6 +167,27 @@ class ClearanceModel:
     def smallest(self, pose: Pose) -> Nearest | None:
         """The smallest distance to any obstacle; None in a scene without obstacles."""
         return min(self.obstacles(pose), key=lambda n: n.distance, default=None)
+
+    def at_least(self, middle: Pose, positions: Array, wanted: float) -> float:
+        """A distance that every obstacle keeps while the platform shifts; for point exits alone.
+
+        Args:
+            middle: A pose among those passed; gives the orientation, and planes where the last ones
+                do not suffice.
+            positions: The platform's origin stays in their hull, shape (k, 3), [m].
+            wanted: No more than this is tried to be proved, [m].
+
+        Returns:
+            A lower bound of the distances, [m]; ``wanted`` or more if they could be proved to.
+        """
+        bodies = RobotBodies(self.rig, middle)
+        shifted = ShiftedBodies(self.rig, middle.rotation, positions)
+        least = np.inf
+        for obstacle in self._obstacles:
+            least = min(least, obstacle.at_least(bodies, shifted, self._radii, wanted))
+            if least < wanted:
+                break
+        return least
 
     def self_clearance(self, pose: Pose) -> Nearest:
         """The smallest distance between cables, or between a cable and the platform.
@@ -187,7 +242,7 @@ class _ObstacleDistances:
 
     def nearest(self, bodies: RobotBodies, radii: Array) -> tuple[int, Separation]:
         """The nearest body and its distance; cable radii rank the bodies but are not taken off."""
-        bounds = -self._reach - bodies.reach(self._planes) - radii
+        bounds = self._bounds(bodies, radii)
         order = np.argsort(bounds, axis=None).tolist()
         count = bounds.shape[1]
         best_body, best = self._distance(bodies, *divmod(order[0], count))
@@ -200,6 +255,23 @@ class _ObstacleDistances:
             if found.distance - radii[body] < smallest:
                 best_body, best, smallest = body, found, found.distance - radii[body]
         return best_body, best
+
+    def at_least(
+        self, bodies: RobotBodies, shifted: ShiftedBodies, radii: Array, wanted: float
+    ) -> float:
+        """A lower bound of the distance to all shifted bodies, by one plane for each pair."""
+        bounds = self._bounds(shifted, radii)
+        for piece, body in np.argwhere(bounds < wanted).tolist():
+            self._distance(bodies, piece, body)
+            bounds = self._bounds(shifted, radii)
+            if bounds[piece, body] < wanted:
+                break
+        return float(bounds.min())
+
+    def _bounds(self, bodies: RobotBodies | ShiftedBodies, radii: Array) -> Array:
+        """What the last plane of each pair proves of its distance, shape (pieces, bodies), [m]."""
+        bounds: Array = -self._reach - bodies.reach(self._planes) - radii
+        return bounds
 
     def _distance(self, bodies: RobotBodies, piece: int, body: int) -> tuple[int, Separation]:
         found = separation(bodies.body(body), self.pieces[piece])

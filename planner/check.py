@@ -3,7 +3,8 @@
 It shares neither the swept hulls nor the rules of the search, only the model. Every quantity is
 sampled along the path, and between samples bounded by how fast it can change (`planner.bounds`):
 
-* obstacle clearance: no faster than the motion, as no point of the robot moves farther;
+* obstacle clearance: no faster than the motion, as no point of the robot moves farther; without
+  turning and pulleys by separating planes over whole stretches (`planner.stretches`);
 * self clearance: with level point exits no faster than the motion, else by a stated multiple;
 * capacity margin: by the sum of what each cable's wrench can change at its largest tension.
 
@@ -31,6 +32,7 @@ from cdpr.statics.tension_solution import TensionInfeasible
 from cdpr.statics.working import weight_wrench, working_tensions
 from planner.bounds import Smallest, smallest_along
 from planner.check_report import CheckReport, Closest, VerifiedPlan, Violation, verified
+from planner.stretches import smallest_over_stretches
 from planner.track import Track
 
 SPACING = 0.005
@@ -171,7 +173,12 @@ class _Check:
             return found
 
         required = self.scene.obstacle_clearance
-        closest, proof = self._closest(nearest, 1.0, required)
+        if self.track.turns or self.rig.pulley_radius > 0.0:
+            closest, proof = self._closest(nearest, 1.0, required)
+        else:
+            proof = smallest_over_stretches(self.model, self.track, required, CLEARANCE_TOLERANCE)
+            pose = self.track.pose(proof.at)
+            closest = Closest(nearest(pose), pose, proof.at)
         self._clearance_violation("obstacle clearance", closest, proof, required)
         return closest, proof
 

@@ -73,6 +73,12 @@ class Track:
         share = (place - self.marks[k]) / (self.marks[k + 1] - self.marks[k])
         return interpolate(start, end, float(share))
 
+    def positions(self, low: float, high: float) -> Array:
+        """Positions whose hull holds the track between two places, shape (k, 3), [m]."""
+        inner = slice(*np.searchsorted(self.marks, (low, high), side="right"))
+        ends = self.pose(low).position, self.pose(high).position
+        return np.vstack([ends[0], self._positions[inner], ends[1]])
+
     def twists(self, places: Array, turn_radius: float) -> Array:
         """Motion at places per unit of path as it is executed, shape (k, 6); zero at rest.
 

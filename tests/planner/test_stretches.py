@@ -1,0 +1,96 @@
+"""Clearances proved a whole stretch at a time, against distances at dense poses."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdpr.clearance import ClearanceModel, RobotBodies, ShiftedBodies
+from cdpr.errors import Fault
+from cdpr.poses import Pose, interpolate
+from planner.bounds import smallest_along
+from planner.stretches import smallest_over_stretches
+from planner.track import Track
+
+TOLERANCE = 0.1e-3
+SHAPES = (
+    {"box": {"size_mm": [90.0, 60.0, 200.0]}},
+    {"sphere": {"radius_mm": 50.0}},
+    {"capsule": {"radius_mm": 25.0, "length_mm": 120.0}},
+    {"cylinder": {"radius_mm": 40.0, "length_mm": 100.0}},
+)
+
+
+def random_case(gachon, scene_with, seed):
+    random = np.random.default_rng(seed)
+    obstacles = []
+    for k in range(int(random.integers(1, 4))):
+        place = random.uniform([-300, -300, 100], [300, 300, 800])
+        shape = SHAPES[int(random.integers(len(SHAPES)))]
+        obstacles.append({"name": f"thing_{k}", "position_mm": place.tolist(), **shape})
+    corners = random.uniform([-200, -200, 200], [200, 200, 600], (int(random.integers(2, 5)), 3))
+    rotation = np.array(gachon.home.rotation)
+    poses = [Pose(corner / 1e3, rotation) for corner in corners]
+    return ClearanceModel(gachon, scene_with(*obstacles)), Track(gachon, poses), poses
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_with, seed) -> None:
+    """Overlaps are left out: how deep they are is a bound, not a distance."""
+    model, track, _ = random_case(gachon, scene_with, seed)
+    places = track.places(0.005)
+
+    def evaluate(at):
+        return np.array([model.smallest(track.pose(p)).distance for p in at.tolist()])
+
+    required = 0.010
+    found = smallest_over_stretches(model, track, required, TOLERANCE)
+    other = smallest_along(places, evaluate, 1.0, required, TOLERANCE)
+    if other.proved <= 0.0:
+        assert found.proved <= 1e-9
+        return
+    assert found.proved <= other.value + 1e-9
+    assert other.proved <= found.value + 1e-9
+    assert found.value - found.proved <= TOLERANCE + 1e-9
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_pose_of_a_path_is_nearer_than_is_proved(gachon, scene_with, seed) -> None:
+    model, track, poses = random_case(gachon, scene_with, seed)
+    found = smallest_over_stretches(model, track, 0.0, TOLERANCE)
+    moves = pairwise(poses)
+    sampled = [interpolate(a, b, t) for a, b in moves for t in np.linspace(0.0, 1.0, 40)]
+    smallest = min(model.smallest(pose).distance for pose in sampled)
+    assert found.proved <= smallest + 1e-9
+    if found.value > 0.0:
+        assert found.value == pytest.approx(model.smallest(track.pose(found.at)).distance, abs=1e-9)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_shifted_bodies_reach_as_far_as_the_robot_at_any_of_the_positions(gachon, seed) -> None:
+    random = np.random.default_rng(seed)
+    positions = random.uniform(-0.2, 0.6, (4, 3))
+    directions = random.normal(size=(3, gachon.cable_count + 1, 3))
+    rotation = np.array(gachon.home.rotation)
+    reach = ShiftedBodies(gachon, rotation, positions).reach(directions)
+    each = [
+        RobotBodies(gachon, Pose(position, rotation)).reach(directions) for position in positions
+    ]
+    assert reach == pytest.approx(np.max(each, axis=0), abs=1e-12)
+    shares = random.dirichlet(np.ones(4))
+    between = Pose(shares @ positions, rotation)
+    assert (RobotBodies(gachon, between).reach(directions) <= reach + 1e-12).all()
+
+
+def test_a_distance_that_is_no_number_proves_nothing(gachon, scene_with, monkeypatch) -> None:
+    model, track, _ = random_case(gachon, scene_with, 1)
+    monkeypatch.setattr(ClearanceModel, "smallest", lambda _model, _pose: None)
+    with pytest.raises(Fault, match="not known"):
+        smallest_over_stretches(model, track, 0.0, TOLERANCE)
