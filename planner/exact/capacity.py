@@ -17,10 +17,11 @@ from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from cdpr.statics.dexterity import rms_anchor_radius
+from cdpr.statics.gravity import STANDARD_GRAVITY
 from planner.exact.compiled import kernel
 from planner.exact.fields import World
 from planner.exact.structure import factored, structure_columns
-from planner.exact.vectors import Vector
+from planner.exact.vectors import Vector, turned
 from planner.feasibility import external_wrenches
 
 Integers = NDArray[np.int64]
@@ -37,6 +38,8 @@ class Load(NamedTuple):
         length: Characteristic length, [m].
         wrench: That the cables must give in the middle, shape (6,), [N].
         spread: Half widths of the box of wrenches about it, shape (6,), [N].
+        lever: Sum of weights times their centres, platform frame, shape (3,), [N·m]: what of the
+            wrench turns with the platform.
         facets: Cables of each facet, shape (k, m - 5).
     """
 
@@ -45,6 +48,7 @@ class Load(NamedTuple):
     length: float
     wrench: Array
     spread: Array
+    lever: Array
     facets: Integers
 
 
@@ -60,8 +64,25 @@ def build_load(rig: Rig, scene: Scene, rotation: Array) -> Load:
         length=length,
         wrench=-box.centre / units,
         spread=box.half_widths / units,
+        lever=_lever(rig, scene),
         facets=np.array(facets, dtype=np.int64),
     )
+
+
+def _lever(rig: Rig, scene: Scene) -> Array:
+    moment = rig.mass * rig.centre_of_mass
+    moment = moment + scene.load.payload_mass * scene.load.payload_centre
+    lever: Array = STANDARD_GRAVITY * moment
+    return lever
+
+
+@kernel
+def load_at(load: Load, rotation: Array) -> Load:
+    """The same load with the platform turned to ``rotation``, shape (3, 3)."""
+    lever = turned(rotation, (load.lever[0], load.lever[1], load.lever[2]))
+    wrench = load.wrench.copy()
+    wrench[3], wrench[4], wrench[5] = lever[1] / load.length, -lever[0] / load.length, 0.0
+    return Load(load.low, load.high, load.length, wrench, load.spread, load.lever, load.facets)
 
 
 @kernel

@@ -18,6 +18,7 @@ from planner.exact.holding import Holding, build_holding, edge_held
 from planner.exact.moving_edge import turning_edge_free
 from planner.exact.self_edge import build_robot, self_edge_free, self_turning_edge_free
 from planner.exact.self_region import Robot
+from planner.exact.turning_held import turning_edge_held
 from planner.exact.world import build_world
 
 FREE: Final = 0
@@ -64,6 +65,41 @@ def edge_problems(
     for i in range(len(starts)):
         found[i] = edge_problem(world, robot, load, holding, starts[i], ends[i])
     return found
+
+
+@kernel
+def turning_edge_problem(
+    world: World,
+    robot: Robot,
+    load: Load,
+    reserve: float,
+    start: Array,
+    end: Array,
+    rotation: Array,
+    turn: Array,
+) -> int:
+    """What forbids a straight way with a steady turn; see `edge_problem`.
+
+    Args:
+        world: Rig and obstacles.
+        robot: Self clearance.
+        load: What the cables must hold.
+        reserve: Smallest capacity margin, [N].
+        start: World frame, shape (3,), [m].
+        end: Likewise.
+        rotation: ``world_from_platform`` at the start, shape (3, 3).
+        turn: Rotation vector from start to end, platform frame, shape (3,), [rad].
+    """
+    before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
+    if not (in_workspace(world, before) and in_workspace(world, after)):
+        return WORKSPACE
+    if not turning_edge_free(world, start, end, rotation, turn):
+        return OBSTACLE
+    if not self_turning_edge_free(world, robot, start, end, rotation, turn):
+        return SELF
+    if not turning_edge_held(world, load, reserve, start, end, rotation, turn):
+        return WRENCH
+    return FREE
 
 
 class ExactChecks:
@@ -120,20 +156,11 @@ class ExactChecks:
         return float(distance), int(body), int(obstacle)
 
     def turning_problem(self, start: Pose, end: Pose) -> int:
-        """What forbids a straight way with a steady turn: all but `WRENCH`, which is not asked."""
+        """What forbids a straight way with a steady turn; see `edge_problem`."""
         turn = _own(rotation_vector_from_matrix(start.rotation.T @ end.rotation))
         poses = (_own(start.position), _own(end.position), _own(start.rotation), turn)
-        if not (_inside(self.world, poses[0]) and _inside(self.world, poses[1])):
-            return WORKSPACE
-        if not turning_edge_free(self.world, *poses):
-            return OBSTACLE
-        if not self_turning_edge_free(self.world, self.robot, *poses):
-            return SELF
-        return FREE
-
-
-def _inside(world: World, position: Array) -> bool:
-    return bool(in_workspace(world, (position[0], position[1], position[2])))
+        args = (self.world, self.robot, self.load, self.holding.reserve)
+        return int(turning_edge_problem(*args, *poses))
 
 
 def _own(values: ArrayLike) -> Array:

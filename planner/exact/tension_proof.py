@@ -60,7 +60,20 @@ def tensions_prove(
     changes, weights = np.empty(count), np.empty(count)
     if not column_changes(world, load, middle, radius, changes, weights):
         return False
-    return _tensions_hold(world, load, reserve, spans, columns, inverse, changes, weights, middle)
+    tensions = inner_tensions(load, columns, inverse)
+    slopes = np.zeros((count, 3))
+    if world.pulley == 0.0:
+        _slopes(world, load, middle, columns, inverse, tensions, slopes)
+    travels, bends = np.zeros(count), np.empty(count)
+    for i in range(count):
+        for k in range(len(spans)):
+            travels[i] += abs(dot(row(slopes, i), row(spans, k)))
+        bends[i] = weights[i] * changes[i]
+        if world.pulley == 0.0:
+            bends[i] *= changes[i] / math.sqrt(3.0)
+        changes[i] *= weights[i]
+    residual = missing_wrench(load, columns, tensions)
+    return tensions_stay(load, reserve, inverse, tensions, travels, changes, bends, residual)
 
 
 @kernel
@@ -73,58 +86,73 @@ def column_changes(
     """
     for cable in range(len(world.cables)):
         arm = turned(world.platform[:3], anchor(world, cable))
-        at = plus(middle, arm)
-        shortest = norm(minus(exit_point(world, cable, at), at)) - radius
-        if world.pulley > 0.0:
-            offset, axis = minus(at, outlet(world, cable)), feed(world, cable)
-            reach = norm(along(offset, axis, -dot(offset, axis))) - radius
-            # The exit moves too; from the anchor to the pulley's outlet no length is shorter.
-            from_centre = norm(offset) - world.pulley - radius
-            if not (reach > 0.0 and from_centre > world.pulley):
-                return False
-            free = math.sqrt(from_centre * from_centre - world.pulley * world.pulley)
-            shortest = min(reach, free)
-        if not shortest > 0.0:
+        reach, free = levers(world, cable, plus(middle, arm), radius)
+        if not (reach > 0.0 and free > 0.0):
             return False
-        changes[cable] = radius / shortest
+        changes[cable] = radius / min(reach, free)
         weights[cable] = math.sqrt(1.0 + dot(arm, arm) / (load.length * load.length))
     return True
 
 
 @kernel
-def _tensions_hold(
-    world: World,
+def levers(world: World, cable: int, at: Vector, radius: float) -> tuple[float, float]:
+    """Least distance of an anchor from its swivel axis and least free length, [m].
+
+    A cable's unit vector turns by no more than its anchor's motion over the smaller of the two.
+    Without a pulley both are the free length; where there is no bound, 0 or less.
+
+    Args:
+        world: Where.
+        cable: Its number.
+        at: Its anchor in the middle, world frame, [m].
+        radius: The anchor is never farther from there, [m].
+    """
+    if world.pulley == 0.0:
+        free = norm(minus(exit_point(world, cable, at), at)) - radius
+        return free, free
+    offset, axis = minus(at, outlet(world, cable)), feed(world, cable)
+    reach = norm(along(offset, axis, -dot(offset, axis))) - radius
+    # The exit moves too; from the anchor to the pulley's outlet no length is shorter.
+    from_centre = norm(offset) - world.pulley - radius
+    if not (reach > 0.0 and from_centre > world.pulley):
+        return 0.0, 0.0
+    return reach, math.sqrt(from_centre * from_centre - world.pulley * world.pulley)
+
+
+@kernel
+def tensions_stay(
     load: Load,
     reserve: float,
-    spans: Array,
-    columns: Array,
     inverse: Array,
+    tensions: Array,
+    travels: Array,
     changes: Array,
-    weights: Array,
-    middle: Vector,
+    bends: Array,
+    residual: float,
 ) -> bool:
-    count = len(columns)
-    tensions = _inner_tensions(load, columns, inverse)
-    slopes = np.zeros((count, 3))
-    if world.pulley == 0.0:
-        _slopes(world, load, middle, columns, inverse, tensions, slopes)
-    follows, residual = np.empty(count), _missing(load, columns, tensions)
-    squared, norm_squared = 0.0, 0.0
+    """Whether tensions that leave a small residual wrench can be mended within their limits.
+
+    Args:
+        load: What must be held.
+        reserve: Smallest margin wanted, [N].
+        inverse: Pseudo-inverse in the middle of a region, shape (m, 6).
+        tensions: There, shape (m,), [N].
+        travels: How far each goes from there so that the wrench stays, shape (m,), [N].
+        changes: How far each column changes over the region at most, shape (m,).
+        bends: What each column at its middle tension leaves to be mended, shape (m,).
+        residual: What is left of the wrench besides, [N].
+    """
+    count, squared, norm_squared = len(tensions), 0.0, 0.0
+    follows = np.empty(count)
     for i in range(count):
-        travel, spread, row_squared = 0.0, 0.0, 0.0
-        for k in range(len(spans)):
-            travel += abs(dot(row(slopes, i), row(spans, k)))
+        spread, row_squared = 0.0, 0.0
         for k in range(6):
             spread += abs(inverse[i, k]) * load.spread[k]
             row_squared += inverse[i, k] * inverse[i, k]
         norm_squared += row_squared
-        follows[i] = travel + spread + reserve * math.sqrt(row_squared)
-        if world.pulley == 0.0:
-            bend = abs(tensions[i]) * changes[i] * changes[i] / math.sqrt(3.0)
-            residual += weights[i] * (bend + follows[i] * changes[i])
-        else:
-            residual += weights[i] * (abs(tensions[i]) + follows[i]) * changes[i]
-        squared += (weights[i] * changes[i]) ** 2
+        follows[i] = travels[i] + spread + reserve * math.sqrt(row_squared)
+        residual += abs(tensions[i]) * bends[i] + follows[i] * changes[i]
+        squared += changes[i] * changes[i]
     # ‖A⁺‖ is at most its Frobenius norm; so the smallest singular value is at least one over it.
     weakest = 1.0 / math.sqrt(norm_squared) - math.sqrt(squared)
     if not weakest > 0.0:
@@ -138,7 +166,7 @@ def _tensions_hold(
 
 
 @kernel
-def _missing(load: Load, columns: Array, tensions: Array) -> float:
+def missing_wrench(load: Load, columns: Array, tensions: Array) -> float:
     """How far the tensions are from giving the wrench, [N]: round-off, but not left out."""
     squared = 0.0
     for k in range(6):
@@ -150,7 +178,7 @@ def _missing(load: Load, columns: Array, tensions: Array) -> float:
 
 
 @kernel
-def _inner_tensions(load: Load, columns: Array, inverse: Array) -> Array:
+def inner_tensions(load: Load, columns: Array, inverse: Array) -> Array:
     """Tensions that give the wrench, drawn away from the limits by projections in turn."""
     count = len(columns)
     margin = _WANTED_SHARE * (load.high - load.low)
