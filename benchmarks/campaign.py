@@ -31,8 +31,8 @@ from cdpr.rig import Rig, load_rig
 from cdpr.scene import load_scene
 from executor.run_folder import RunFolder
 from planner.check import check_path
+from planner.optimal.settings import OptimalSettings
 from planner.plan import make_plan
-from planner.settings import PlannerSettings
 
 GOAL_ERROR_M = 1e-6
 FOLLOWING_MM = 0.1
@@ -84,7 +84,7 @@ def plan_one(rig: Rig, environment: int, clearance_mm: float, seed: int, path: P
     scene = scene.changed(clearance=clearance_mm / 1000.0)
     begin = time.perf_counter()
     try:
-        save_plan(make_plan(rig, scene, PlannerSettings(seed=seed)), path)
+        save_plan(make_plan(rig, scene, OptimalSettings(seed=seed)), path)
     except CdprError as error:
         return PlanResult(*key, problem=error.what, plan_s=time.perf_counter() - begin)
     planned = time.perf_counter()
