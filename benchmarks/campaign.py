@@ -89,7 +89,7 @@ def plan_one(rig: Rig, environment: int, clearance_mm: float, seed: int, path: P
         return PlanResult(*key, problem=error.what, plan_s=time.perf_counter() - begin)
     planned = time.perf_counter()
     plan = load_plan(path)
-    report = check_path(rig, scene, plan.waypoints)
+    report = check_path(rig, scene, plan.waypoints, plan.stops)
     return PlanResult(
         *key,
         passed=report.passed,

@@ -89,10 +89,14 @@ class PoseDocument(Document):
         unit = quaternion / np.linalg.norm(quaternion)
         return Pose.from_quaternion(np.asarray(self.position_mm) / 1000.0, unit)
 
-    @classmethod
-    def of(cls, pose: Pose) -> PoseDocument:
+    def bare(self) -> PoseDocument:
+        """The pose alone, without what else the document tells."""
+        return PoseDocument(position_mm=self.position_mm, rotation_wxyz=self.rotation_wxyz)
+
+    @staticmethod
+    def of(pose: Pose) -> PoseDocument:
         """The document of a pose; positions to a nanometre, and no negative zero among them."""
-        return cls(
+        return PoseDocument(
             position_mm=[round(float(x) * 1000.0, 6) + 0.0 for x in pose.position],
             rotation_wxyz=[float(q) for q in pose.quaternion],
         )

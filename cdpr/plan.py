@@ -17,6 +17,8 @@ from cdpr.rig import Rig, rig_from_document
 from cdpr.scene import Scene, scene_from_document
 
 ANEW = "make the plan anew with `cdpr plan`"
+STOP_TOLERANCE = 1e-6
+"""How far a marked waypoint may be from its stop, [m] and [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +29,8 @@ class Plan:
         document: The file it was made from.
         rig: The rig it was made for.
         scene: The scene it was made for.
-        waypoints: ``world_from_platform`` at the corners, start and goal included.
+        waypoints: ``world_from_platform`` at the corners, start, stops and goal included.
+        stops: Which of the waypoints are at the scene's stops.
         raw_path: The path before post-processing.
     """
 
@@ -35,6 +38,7 @@ class Plan:
     rig: Rig
     scene: Scene
     waypoints: tuple[Pose, ...]
+    stops: tuple[int, ...]
     raw_path: tuple[Pose, ...]
 
 
@@ -45,6 +49,7 @@ def plan_from_document(document: PlanDocument) -> Plan:
         rig=rig_from_document(document.rig),
         scene=scene_from_document(document.scene),
         waypoints=tuple(w.pose() for w in document.waypoints),
+        stops=tuple(mark.waypoint for mark in document.stops),
         raw_path=tuple(w.pose() for w in document.raw_path),
     )
 
@@ -84,7 +89,26 @@ def load_plan(path: Path) -> Plan:
     plan = plan_from_document(document)
     _check_hash("rig_hash", document.rig_hash, plan.rig.plan_hash, path)
     _check_hash("scene_hash", document.scene_hash, plan.scene.hash, path)
+    _check_stops(plan, path)
     return plan
+
+
+def _check_stops(plan: Plan, path: Path) -> None:
+    """The marked waypoints are the scene's stops, in its order."""
+    marks, stops = plan.document.stops, plan.scene.stops
+    places = [mark.waypoint for mark in marks]
+    if [mark.name for mark in marks] != [stop.name for stop in stops]:
+        what = f"marks the stops {[m.name for m in marks]}, its scene has {[s.name for s in stops]}"
+    elif places != sorted(set(places)) or not all(0 < p < len(plan.waypoints) for p in places):
+        what = f"marks the waypoints {places} of {len(plan.waypoints)} as stops, which is no order"
+    else:
+        away = [plan.waypoints[p].distance_to(s.pose) for p, s in zip(places, stops, strict=True)]
+        turned = [plan.waypoints[p].angle_to(s.pose) for p, s in zip(places, stops, strict=True)]
+        if max([*away, *turned], default=0.0) <= STOP_TOLERANCE:
+            return
+        what = f"passes a stop {max(away) * 1000.0:.4g} mm off"
+    why = "the file was not made by `cdpr plan`"
+    raise BadInput(f"the plan {what}", where=str(path), why=why, next_step=ANEW)
 
 
 def _json_object(path: Path) -> dict[str, Any]:

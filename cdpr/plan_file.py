@@ -44,7 +44,7 @@ class OptimalPlannerDocument(Document):
     name: Literal["optimal"]
     weights: WeightsDocument
     seed: Annotated[int, Field(ge=0)]
-    rounds: Annotated[int, Field(ge=1)]
+    rounds: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)]
     budget_ms: Positive | None
     longest_mm: Positive | None
 
@@ -95,10 +95,17 @@ class QualityDocument(Document):
 
 
 class TreeDocument(Document):
-    """The search tree, for pictures: positions, and the parent of each node (-1: the root)."""
+    """The search trees, for pictures: positions, and the parent of each node (-1: a root)."""
 
     positions_mm: list[Vector]
     parents: list[int]
+
+
+class StopMarkDocument(Document):
+    """Which waypoint is at a stop of the scene."""
+
+    name: str
+    waypoint: Annotated[int, Field(ge=0)]
 
 
 class PlanDocument(Document):
@@ -113,6 +120,7 @@ class PlanDocument(Document):
     scene: SceneDocument
     planner: Annotated[PlannerDocument | OptimalPlannerDocument, Field(discriminator="name")]
     waypoints: Annotated[list[PoseDocument], Field(min_length=2)]
+    stops: list[StopMarkDocument] = []
     raw_path: Annotated[list[PoseDocument], Field(min_length=2)]
     tree: TreeDocument
     statistics: StatisticsDocument

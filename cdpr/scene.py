@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,10 +12,12 @@ import numpy as np
 from cdpr.document_types import Document, PoseDocument, millimetres
 from cdpr.documents import content_hash, key_path, load_yaml
 from cdpr.errors import BadInput
+from cdpr.payload import Payload
 from cdpr.poses import Array, Pose, read_only
 from cdpr.scene_file import (
     BoxDocument,
     HullDocument,
+    LoadDocument,
     MeshDocument,
     ObstacleDocument,
     RoundDocument,
@@ -32,6 +35,7 @@ from cdpr.shapes import (
     convex_hull,
     read_only_indices,
 )
+from cdpr.stop_file import StopDocument
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +55,23 @@ class Load:
     moment: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Stop:
+    """A pose that is met exactly on the way; the platform comes to rest there.
+
+    Attributes:
+        name: No other stop has it.
+        kind: ``pass``, or ``pick`` and ``place``, at which the load changes.
+        pose: ``world_from_platform``.
+        dwell: How long the platform stands still, [s].
+    """
+
+    name: str
+    kind: str
+    pose: Pose
+    dwell: float
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A checked scene.
@@ -62,7 +83,8 @@ class Scene:
         self_clearance: Smallest allowed distance between cables and of cables to platform, [m].
         start: ``world_from_platform`` at the start.
         goal: ``world_from_platform`` at the goal.
-        load: What the cables carry.
+        load: What the cables carry from the start on.
+        stops: Where the way leads through, in their order; `cdpr.legs` tells the loads between.
     """
 
     document: SceneDocument
@@ -72,6 +94,7 @@ class Scene:
     start: Pose
     goal: Pose
     load: Load
+    stops: tuple[Stop, ...]
 
     @property
     def name(self) -> str:
@@ -89,11 +112,14 @@ class Scene:
         start: Pose | None = None,
         goal: Pose | None = None,
         clearance: float | None = None,
+        stops: Sequence[StopDocument] | None = None,
+        payload: Payload | None = None,
     ) -> Scene:
-        """The same scene with another start, goal or obstacle clearance [m].
+        """The same scene with another start, goal, obstacle clearance [m], stops or payload.
 
         Raises:
-            BadInput: A number is not finite, or the clearance is negative.
+            BadInput: A number is not finite, the clearance is negative, or stops do not fit the
+                payload.
         """
         document = self.document
         for name, pose in (("start", start), ("goal", goal)):
@@ -109,6 +135,10 @@ class Scene:
         if clearance is not None:
             value = {"obstacle_mm": round(clearance * 1000.0, 9)}
             update["clearance"] = document.clearance.model_copy(update=value)
+        if stops is not None:
+            update["stops"] = list(stops)
+        if payload is not None:
+            update["load"] = document.load.carrying(payload)
         return scene_from_document(document.model_copy(update=update))
 
 
@@ -131,7 +161,6 @@ def scene_from_document(document: SceneDocument) -> Scene:
     findings = [f"{key_path(parts)}: {what}" for parts, what in document.findings()]
     if findings:
         raise BadInput("; ".join(findings), where=f"scene {document.name}")
-    load = document.load
     return Scene(
         document=document,
         obstacles=tuple(_obstacle(o) for o in document.obstacles),
@@ -139,12 +168,18 @@ def scene_from_document(document: SceneDocument) -> Scene:
         self_clearance=document.clearance.self_mm / 1000.0,
         start=document.start.pose(),
         goal=document.goal.pose(),
-        load=Load(
-            payload_mass=load.payload_kg,
-            payload_centre=read_only(millimetres(load.payload_centre_mm)),
-            force=read_only(load.force_n),
-            moment=read_only(load.moment_nm),
-        ),
+        load=load_from_document(document.load),
+        stops=tuple(Stop(s.name, s.kind, s.pose(), s.dwell_s) for s in document.stops),
+    )
+
+
+def load_from_document(document: LoadDocument) -> Load:
+    """The load that a document describes."""
+    return Load(
+        payload_mass=document.payload_kg,
+        payload_centre=read_only(millimetres(document.payload_centre_mm)),
+        force=read_only(document.force_n),
+        moment=read_only(document.moment_nm),
     )
 
 

@@ -1,4 +1,4 @@
-"""The scene file: obstacles, clearances, start and goal (YAML, strict, version 1)."""
+"""The scene file: obstacles, clearances, start, stops and goal (YAML, strict, version 1)."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from cdpr.document_types import (
     Triple,
     Vector,
 )
+from cdpr.payload import Payload
+from cdpr.stop_file import StopDocument, misfits, overdrawn
 
 SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
 
@@ -96,6 +98,16 @@ class LoadDocument(Document):
         default=[0.0, 0.0, 0.0], description="external moment up to ± this, world axes"
     )
 
+    def payload(self) -> Payload:
+        """What is carried at the start."""
+        x, y, z = self.payload_centre_mm
+        return Payload(self.payload_kg, (x, y, z))
+
+    def carrying(self, payload: Payload) -> LoadDocument:
+        """The same force and moment with another payload."""
+        given = {"payload_kg": payload.mass_kg, "payload_centre_mm": list(payload.centre_mm)}
+        return self.model_copy(update=given)
+
 
 class SceneDocument(Document):
     """What a plan is made for."""
@@ -106,12 +118,22 @@ class SceneDocument(Document):
     clearance: ClearanceDocument = ClearanceDocument()
     load: LoadDocument = LoadDocument()
     start: PoseDocument
+    stops: list[StopDocument] = []
     goal: PoseDocument
     obstacles: list[ObstacleDocument] = []
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Obstacles without exactly one shape, names given twice, wrong triangles, flat hulls."""
-        return (self._one_shape_each, self._names_once, self._shapes_whole)
+        """Obstacles without exactly one shape, names given twice, wrong triangles, flat hulls.
+
+        And stops whose load changes by too little or too much.
+        """
+        return (
+            self._one_shape_each,
+            self._names_once,
+            self._shapes_whole,
+            lambda: misfits(self.stops),
+            lambda: overdrawn(self.load.payload(), self.stops),
+        )
 
     def _one_shape_each(self) -> list[Finding]:
         found: list[Finding] = []

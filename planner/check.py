@@ -14,13 +14,15 @@ Tensions and cable speeds are those at the samples, at most 5 mm apart.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from cdpr.cables import cables_at
 from cdpr.clearance import ClearanceModel, Nearest
-from cdpr.errors import Refused
+from cdpr.errors import BadInput, Refused
 from cdpr.kinematics import structure_matrix
+from cdpr.legs import legs_of
 from cdpr.plan import Plan
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
@@ -32,6 +34,7 @@ from cdpr.statics.tension_solution import TensionInfeasible
 from cdpr.statics.working import weight_wrench, working_tensions
 from planner.bounds import Smallest, smallest_along
 from planner.check_report import CheckReport, Closest, VerifiedPlan, Violation, verified
+from planner.joined_report import joined
 from planner.stretches import smallest_over_stretches
 from planner.track import Track
 
@@ -41,7 +44,7 @@ CLEARANCE_TOLERANCE = 0.1e-3
 MARGIN_TOLERANCE = 0.02
 """How exactly the smallest capacity margin is found, part of the largest tension."""
 END_TOLERANCE = 1e-6
-"""How far a path may begin and end from the scene's start and goal, [m] and [rad]."""
+"""How far a path may pass from the scene's start, stops and goal, [m] and [rad]."""
 
 
 def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
@@ -54,7 +57,7 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
     Raises:
         Refused: With every violation, what by how much and where.
     """
-    report = check_path(rig or plan.rig, plan.scene, plan.waypoints)
+    report = check_path(rig or plan.rig, plan.scene, plan.waypoints, plan.stops)
     if not report.passed:
         listed = "; ".join(v.sentence() for v in report.violations)
         raise Refused(
@@ -66,16 +69,57 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
     return verified(plan, report)
 
 
-def check_path(rig: Rig, scene: Scene, poses: Sequence[Pose], *, ends: bool = True) -> CheckReport:
+def check_path(
+    rig: Rig,
+    scene: Scene,
+    poses: Sequence[Pose],
+    stops: Sequence[int] = (),
+    *,
+    ends: bool = True,
+) -> CheckReport:
     """Checks a path, whether a few corners or thousands of poses of an executed curve.
+
+    Between two stops it is checked with the load that is carried there. Where the load changes,
+    both are: all between them is then held as well.
 
     Args:
         rig: The robot.
-        scene: Obstacles, clearances, load, start and goal.
+        scene: Obstacles, clearances, load, start, stops and goal.
         poses: ``world_from_platform``; between two the platform moves straight.
-        ends: Whether the path must begin at the scene's start and end at its goal.
+        stops: Which of the poses are at the scene's stops, one for each.
+        ends: Whether the path must begin at the scene's start, meet its stops and end at its goal.
+
+    Raises:
+        BadInput: There is no pose, or not one in order for each stop.
     """
-    return _Check(rig, scene, Track(rig, poses)).report(ends)
+    legs = legs_of(scene)
+    tracks = [Track(rig, part) for part in parted(poses, stops, len(legs) - 1)]
+    reports = [
+        _Check(rig, leg.scene, track).report((leg.begin, leg.end) if ends else None)
+        for leg, track in zip(legs, tracks, strict=True)
+    ]
+    return joined(reports, [float(track.marks[-1]) for track in tracks])
+
+
+def parted(poses: Sequence[Pose], stops: Sequence[int], count: int) -> list[Sequence[Pose]]:
+    """The poses from stop to stop; that of a stop ends one part and begins the next.
+
+    Args:
+        poses: Of the whole path.
+        stops: Which of them are at stops.
+        count: How many stops there must be.
+
+    Raises:
+        BadInput: There are more or fewer stops, or they are not in order.
+    """
+    bounds = [0, *stops, len(poses) - 1]
+    if len(stops) != count or any(a > b for a, b in pairwise(bounds)):
+        raise BadInput(
+            f"the path's stops are its poses {list(stops)}; needed are {count} in order"
+            f" between 0 and {len(poses) - 1}",
+            where="stops of a path",
+        )
+    return [poses[a : b + 1] for a, b in pairwise(bounds)]
 
 
 class _Check:
@@ -89,10 +133,11 @@ class _Check:
         self.length_unit = rms_anchor_radius(rig.anchors)
         self._poses = {place: track.pose(place) for place in self.places.tolist()}
 
-    def report(self, ends: bool) -> CheckReport:
+    def report(self, ends: tuple[str, str] | None) -> CheckReport:
+        """Figures and violations; ``ends`` are the names of what it must begin and end at."""
         self._check_workspace()
-        if ends:
-            self._check_ends()
+        if ends is not None:
+            self._check_ends(ends)
         self._check_pulleys()
         obstacle, obstacle_proof = self._obstacle_clearance()
         own, own_proof = self._self_clearance()
@@ -128,11 +173,11 @@ class _Check:
             what = "the path leaves the workspace box"
             self._violation(what, float(outside[worst]), 0.0, "mm", positions[worst])
 
-    def _check_ends(self) -> None:
+    def _check_ends(self, ends: tuple[str, str]) -> None:
         scene, poses = self.scene, self.track.poses
         for name, pose, wanted in (
-            ("start", poses[0], scene.start),
-            ("goal", poses[-1], scene.goal),
+            (ends[0], poses[0], scene.start),
+            (ends[1], poses[-1], scene.goal),
         ):
             what = f"the path does not meet the scene's {name}"
             away, turned = pose.distance_to(wanted), pose.angle_to(wanted)

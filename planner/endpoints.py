@@ -1,4 +1,4 @@
-"""Whether a start and a goal can be planned from and to, told in words when they cannot."""
+"""Whether start, stops and goal can be planned from and to, told in words when they cannot."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from cdpr.clearance import ClearanceModel, Nearest
 from cdpr.errors import BadInput
+from cdpr.legs import Leg, legs_of
 from cdpr.poses import Pose
 from cdpr.rig import Rig
 from cdpr.scene import Scene
@@ -14,28 +15,32 @@ from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 
 def require_usable_ends(rig: Rig, scene: Scene) -> None:
-    """Refuses a start or a goal that no path can begin or end at.
+    """Refuses a start, stop or goal that no path can begin or end at.
+
+    A stop must be held with the load that is brought to it and with the one taken on from it.
 
     Raises:
         BadInput: One of them is outside the workspace box, too near to an obstacle, too near to
             itself or cannot be held; or they are turned differently.
     """
-    _require_same_orientation(scene)
     model = ClearanceModel(rig, scene)
-    for name, pose in (("start", scene.start), ("goal", scene.goal)):
-        _require_in_workspace(rig, name, pose)
-        _require_clear(scene, model, name, pose)
-        _require_holdable(rig, scene, name, pose)
+    for leg in legs_of(scene):
+        _require_same_orientation(leg)
+        for name, pose in ((leg.begin, leg.scene.start), (leg.end, leg.scene.goal)):
+            _require_in_workspace(rig, name, pose)
+            _require_clear(scene, model, name, pose)
+            _require_holdable(rig, leg.scene, name, pose)
 
 
-def _require_same_orientation(scene: Scene) -> None:
-    angle = scene.start.angle_to(scene.goal)
+def _require_same_orientation(leg: Leg) -> None:
+    angle = leg.scene.start.angle_to(leg.scene.goal)
     if angle > 1e-9:
         raise BadInput(
-            f"start and goal are turned against each other by {np.degrees(angle):.3g} deg",
-            where=f"scene {scene.name}",
+            f"{leg.begin} and {leg.end} are turned against each other by"
+            f" {np.degrees(angle):.3g} deg",
+            where=f"scene {leg.scene.name}",
             why="the search keeps the platform's orientation",
-            next_step="give the goal the rotation_wxyz of the start",
+            next_step=f"give the {leg.end} the rotation_wxyz of the start",
             values={"angle_deg": float(np.degrees(angle))},
         )
 

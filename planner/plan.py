@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from cdpr.document_types import PoseDocument
 from cdpr.errors import Fault
+from cdpr.legs import legs_of
 from cdpr.plan import sealed
 from cdpr.plan_file import PlanDocument
 from cdpr.poses import Array
@@ -19,14 +20,13 @@ from planner.check import check_path
 from planner.check_report import CheckReport
 from planner.cost import KinematicCost
 from planner.endpoints import require_usable_ends
-from planner.optimal.routing import OptimalRoute, optimal_route
 from planner.optimal.settings import OptimalSettings
 from planner.paper.readings import Readings
-from planner.paper.routing import paper_route
 from planner.paper.search import Progress
 from planner.route import Route
 from planner.settings import PlannerSettings
 from planner.space import Space, TranslationSpace
+from planner.way import Way, settings_of_legs, way_through
 
 
 def make_plan(
@@ -35,8 +35,10 @@ def make_plan(
     settings: PlannerSettings | OptimalSettings | None = None,
     progress: Progress | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    *,
+    rounds: Sequence[int] = (),
 ) -> PlanDocument:
-    """Plans a path from the scene's start to its goal.
+    """Plans a path from the scene's start through its stops to its goal.
 
     The same rig, scene and settings give the same path on every machine of the same libraries. The
     clock is read for the statistics alone; except that `OptimalSettings` without a number of rounds
@@ -44,16 +46,18 @@ def make_plan(
 
     Args:
         rig: The robot.
-        scene: Obstacles, clearances, load, start and goal.
-        settings: Which planner, and its settings; the planner we recommend when left out.
+        scene: Obstacles, clearances, load, start, stops and goal.
+        settings: Which planner, and its settings; the planner we recommend when left out. A budget
+            is that of each leg between stops.
         progress: Told how the search goes on.
         clock: Seconds, for the planning time and the budget.
+        rounds: Of each leg, in place of those in the settings.
 
     Returns:
         The plan, sealed with its hash, which has passed `planner.check.check_path`.
 
     Raises:
-        BadInput: Start or goal cannot be used.
+        BadInput: Start, goal or a stop cannot be used, or settings do not fit the legs.
         NoSolution: There is no path, or the search ended at its limit.
         Fault: The finished path failed its check; that is a fault of this program.
     """
@@ -62,16 +66,12 @@ def make_plan(
     require_usable_ends(rig, scene)
     space = TranslationSpace(rig, scene.start.rotation)
     kinematic = KinematicCost(rig, space.rotation)
-    times: dict[str, float] = {}
-    if isinstance(settings, OptimalSettings):
-        found = optimal_route(rig, scene, settings, kinematic, progress, clock)
-        route, planner = found.route, _optimal_planner(settings, found)
-        times["search_time_s"] = max(0.0, found.search_time)
-    else:
-        route = paper_route(rig, scene, settings, kinematic, progress)
-        planner = _planner(settings)
+    legs = legs_of(scene)
+    of_legs = settings_of_legs(settings, rounds, len(legs))
+    way = way_through(rig, legs, of_legs, kinematic, progress, clock)
+    route = way.route
     poses = [space.pose(point) for point in route.path]
-    report = check_path(rig, scene, poses)
+    report = check_path(rig, scene, poses, way.stops)
     if not report.passed:
         raise Fault(
             "the planned path failed its own check: "
@@ -85,8 +85,12 @@ def make_plan(
             "scene_hash": scene.hash,
             "rig": rig.document,
             "scene": scene.document,
-            "planner": planner,
+            "planner": _planner(of_legs[0], way),
             "waypoints": [PoseDocument.of(pose) for pose in poses],
+            "stops": [
+                {"name": stop.name, "waypoint": waypoint}
+                for stop, waypoint in zip(scene.stops, way.stops, strict=True)
+            ],
             "raw_path": [PoseDocument.of(space.pose(point)) for point in route.raw],
             "tree": _tree(space, route),
             "statistics": {
@@ -94,31 +98,16 @@ def make_plan(
                 "iterations": route.iterations,
                 "edge_checks": route.edge_checks,
                 "planning_time_s": max(0.0, clock() - began),
-                **times,
+                "search_time_s": way.search_time,
             },
             "quality": _quality(report, route.raw, kinematic.mean_along(route.path)),
         }
     )
 
 
-def _optimal_planner(settings: OptimalSettings, found: OptimalRoute) -> dict[str, Any]:
-    weights, longest = settings.weights, settings.longest
-    return {
-        "name": "optimal",
-        "weights": {
-            "length": weights.length,
-            "kinematic": weights.kinematic,
-            "clearance": weights.clearance,
-            "capacity": weights.capacity,
-        },
-        "seed": settings.seed,
-        "rounds": found.rounds,
-        "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
-        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
-    }
-
-
-def _planner(settings: PlannerSettings) -> dict[str, Any]:
+def _planner(settings: PlannerSettings | OptimalSettings, way: Way) -> dict[str, Any]:
+    if isinstance(settings, OptimalSettings):
+        return _optimal_planner(settings, way)
     return {
         "name": settings.sampler,
         "cost": settings.cost,
@@ -129,6 +118,23 @@ def _planner(settings: PlannerSettings) -> dict[str, Any]:
         "goal_radius_mm": settings.goal_radius * 1000.0,
         "max_iterations": settings.max_iterations,
         "readings": _readings(settings.readings),
+    }
+
+
+def _optimal_planner(settings: OptimalSettings, way: Way) -> dict[str, Any]:
+    weights, longest = settings.weights, settings.longest
+    return {
+        "name": "optimal",
+        "weights": {
+            "length": weights.length,
+            "kinematic": weights.kinematic,
+            "clearance": weights.clearance,
+            "capacity": weights.capacity,
+        },
+        "seed": settings.seed,
+        "rounds": list(way.rounds),
+        "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
+        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
     }
 
 

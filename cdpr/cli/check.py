@@ -39,7 +39,7 @@ def check(
     the_rig = the_plan.rig if rig is None else load_rig(rig)
     require_same_rig(the_plan, the_rig, plan)
     with spinner("checking", not as_json):
-        report = check_path(the_rig, the_plan.scene, the_plan.waypoints)
+        report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
     if as_json:
         show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -112,7 +113,7 @@ def plan(
                 "readings of the paper": readings != Readings(),
             },
         )
-        settings = optimal_settings(seed, cost, weight or [], budget_ms, rounds, longest_mm)
+        settings = optimal_settings(seed, cost, weight or [], budget_ms, rounds or [], longest_mm)
     else:
         refuse(
             planner,
@@ -120,11 +121,12 @@ def plan(
                 "--weight": bool(weight),
                 "--longest-mm": longest_mm is not None,
                 "--budget-ms": budget_ms is not None,
-                "--rounds": rounds is not None,
+                "--rounds": bool(rounds),
             },
         )
         settings = paper_settings(planner, seed, cost, mode, max_iterations, readings)
-    document = planned(the_rig, the_scene, settings, not as_json)
+    of_legs = rounds if rounds is not None and len(rounds) > 1 else []
+    document = planned(the_rig, the_scene, settings, not as_json, of_legs)
     save_plan(document, output)
     if as_json:
         show_json({"plan": str(output), **facts_of(document)})
@@ -133,7 +135,11 @@ def plan(
 
 
 def planned(
-    rig: Rig, scene: Scene, settings: OptimalSettings | PlannerSettings, shown: bool
+    rig: Rig,
+    scene: Scene,
+    settings: OptimalSettings | PlannerSettings,
+    shown: bool,
+    rounds: Sequence[int] = (),
 ) -> PlanDocument:
     """A plan, made with a bar where the search is long, and a word where it must be compiled."""
     from cdpr.cli.output import err, progress_bar, spinner
@@ -151,7 +157,7 @@ def planned(
     if not compiled:
         err.print("compiling the planner for this machine, once; about a minute …")
     with spinner("planning" if compiled else "compiling", shown):
-        document = make_plan(rig, scene, settings)
+        document = make_plan(rig, scene, settings, rounds=rounds)
     note_compiled()
     return document
 
@@ -243,5 +249,6 @@ def _search_sentence(document: PlanDocument) -> str:
     rest = f"{statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s"
     if isinstance(planner, OptimalPlannerDocument):
         search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of it searching"
-        return f"{planner.rounds} rounds (again: --rounds {planner.rounds}), {rest}{search}"
+        again = " ".join(f"--rounds {rounds}" for rounds in planner.rounds)
+        return f"{sum(planner.rounds)} rounds (again: {again}), {rest}{search}"
     return f"{statistics.nodes} nodes, {statistics.iterations} samples, {rest}"

@@ -56,7 +56,8 @@ BudgetOption = Annotated[
     float | None, typer.Option(min=0.001, help="how long optimal goes on improving [default: 50]")
 ]
 RoundsOption = Annotated[
-    int | None, typer.Option(min=1, help="optimal: so many rounds instead, the same path again")
+    list[int] | None,
+    typer.Option(min=1, help="optimal: so many rounds instead, the same path again"),
 ]
 LongestOption = Annotated[
     float | None, typer.Option(min=0.001, help="optimal: the best path that is no longer")
@@ -75,7 +76,7 @@ def optimal_settings(
     cost: CostName | None,
     weights: list[str],
     budget_ms: float | None,
-    rounds: int | None,
+    rounds: list[int],
     longest_mm: float | None,
 ) -> OptimalSettings:
     """The settings of the planner we recommend.
@@ -85,7 +86,7 @@ def optimal_settings(
     """
     from planner.optimal.settings import OBJECTIVES, OptimalSettings
 
-    if budget_ms is not None and rounds is not None:
+    if budget_ms is not None and rounds:
         raise BadInput("--budget-ms and --rounds both say how long to go on", next_step="give one")
     if weights and cost is not None:
         raise BadInput("--cost and --weight both say what to optimise", next_step="give one")
@@ -93,7 +94,7 @@ def optimal_settings(
     return OptimalSettings(
         weights=_weights(weights) if weights else OBJECTIVES[(cost or CostName.length).value],
         seed=seed,
-        rounds=rounds,
+        rounds=rounds[0] if rounds else None,
         longest=math.inf if longest_mm is None else longest_mm / 1000.0,
         **options,
     )
