@@ -22,8 +22,7 @@ from planner.cost import KinematicCost
 from planner.endpoints import require_usable_ends
 from planner.optimal.settings import OptimalSettings
 from planner.paper.readings import Readings
-from planner.paper.search import Progress
-from planner.route import Route
+from planner.route import Progress, Route
 from planner.settings import PlannerSettings
 from planner.space import Space, TranslationSpace
 from planner.way import Way, settings_of_legs, way_through

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdpr.poses import Array
+
+Progress = Callable[[float, float, float], None]
+"""Told by a search: what is done, the most there will be, and how near or how good it has come."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

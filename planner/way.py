@@ -17,8 +17,7 @@ from planner.cost import KinematicCost
 from planner.optimal.routing import OptimalRoute, optimal_route
 from planner.optimal.settings import OptimalSettings
 from planner.paper.routing import paper_route
-from planner.paper.search import Progress
-from planner.route import Route
+from planner.route import Progress, Route
 from planner.settings import PlannerSettings
 
 

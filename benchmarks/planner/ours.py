@@ -17,7 +17,8 @@ from planner.optimal.connect import connect
 from planner.optimal.preparation import problem_of
 from planner.optimal.problem import Problem
 from planner.optimal.random import State
-from planner.optimal.rounds import Search, advance, best_of, new_search
+from planner.optimal.rounds import advance
+from planner.optimal.search import BEST, Search, new_search
 from planner.optimal.settings import Weights
 
 NAME = "optimal"
@@ -53,8 +54,7 @@ class Contestant:
             spent = time.process_time() - begin
             while len(lengths) < len(marks_s) and spent >= marks_s[len(lengths)]:
                 lengths.append(float(length))
-        best = best_of(search)
-        path = search.points[best, : search.counts[best, 0]].copy()
+        path = search.points[BEST, : search.counts[BEST, 0]].copy()
         return Result(first, tuple(lengths), _checks(search), path)
 
     def rounds_us(self, rounds: int, seed: int) -> float:

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from planner.optimal.settings import OptimalSettings
     from planner.settings import PlannerSettings
 
+_LONG = 1000.0
+"""Milliseconds or rounds from which a bar is shown."""
+
 
 def plan(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
@@ -156,8 +159,20 @@ def planned(
     compiled = is_compiled()
     if not compiled:
         err.print("compiling the planner for this machine, once; about a minute …")
-    with spinner("planning" if compiled else "compiling", shown):
-        document = make_plan(rig, scene, settings, rounds=rounds)
+    unit, scale = ("ms", 1e3) if settings.rounds is None else ("rounds", 1.0)
+    total = scale * (settings.rounds or settings.budget)
+    if compiled and total >= _LONG:
+        with progress_bar(f"planning, {unit}", total, shown) as advance:
+            document = make_plan(
+                rig,
+                scene,
+                settings,
+                progress=lambda done, _most, _cost: advance(scale * done),
+                rounds=rounds,
+            )
+    else:
+        with spinner("planning" if compiled else "compiling", shown):
+            document = make_plan(rig, scene, settings, rounds=rounds)
     note_compiled()
     return document
 

@@ -15,7 +15,8 @@ from cdpr.poses import Array
 from planner.optimal.polyline import Polyline, measure
 from planner.optimal.preparation import set_weights
 from planner.optimal.problem import Problem
-from planner.optimal.rounds import Search, best_of, measure_again
+from planner.optimal.rounds import measure_again
+from planner.optimal.search import BEST, Search
 from planner.optimal.settings import OptimalSettings
 
 _ROUNDS = 6
@@ -43,10 +44,9 @@ class LengthLimit:
 
     def after_round(self, problem: Problem, search: Search) -> None:
         """Looks at the best path, and changes λ when it is time to."""
-        best = best_of(search)
-        if not search.costs[best] < math.inf:
+        if not search.costs[BEST] < math.inf:
             return
-        path = search.points[best, : search.counts[best, 0]].copy()
+        path = search.points[BEST, : search.counts[BEST, 0]].copy()
         length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
         self.shortest = min(self.shortest, length)
         short_enough = length <= self._settings.longest

@@ -13,7 +13,7 @@ from cdpr.scene import Scene
 from planner.exact.checks import edge_problem
 from planner.exact.edge import edge_clearance
 from planner.optimal.problem import Problem
-from planner.optimal.rounds import Search
+from planner.optimal.search import Search
 from planner.optimal.separation import is_separated
 from planner.optimal.settings import OptimalSettings
 from planner.paper.limits import REASONS

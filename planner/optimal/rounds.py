@@ -1,30 +1,32 @@
 """The search in rounds: some first paths, and more and more polishing of the best of them.
 
 A round costs a fraction of a millisecond, and depends on the seed and on the rounds before alone.
-So a search can end after any of them, and be repeated from the number of rounds.
+So a search can end after any of them, and be repeated from the number of rounds. The best path is
+kept apart from those under work, so that more rounds never give a worse one.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from planner.exact.compiled import kernel
-from planner.optimal.connect import NODES, connect
+from planner.exact.holding import edge_held
+from planner.optimal.connect import connect
 from planner.optimal.lattice_path import lattice_path
 from planner.optimal.polish import polish
-from planner.optimal.polyline import MOST_VERTICES, Polyline, cost_of, measure
-from planner.optimal.problem import CLEARANCE, KINEMATIC, UNIT, VERTEX, Problem
-from planner.optimal.random import State, seeded, uniform
+from planner.optimal.polyline import Polyline, cost_of, measure
+from planner.optimal.problem import (
+    ASK_PROOF,
+    CLEARANCE,
+    KINEMATIC,
+    LEAST_MARGIN,
+    UNIT,
+    VERTEX,
+    Problem,
+)
+from planner.optimal.random import uniform
+from planner.optimal.search import BEST, KEPT, Search
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
-KEPT = 6
-"""Paths that are kept and polished."""
 _TRIALS, _SLOW_TRIALS = 400, 100
 """Changes tried in a round; the second where clearances are asked for or edges have pulleys."""
 _SAMPLES = 1000
@@ -39,94 +41,89 @@ _TO_THE_BEST = 0.7
 _VERTEX_PRICES = ((2, 1.5e-3), (5, 5e-4), (12, 2e-4))
 """What a vertex must save, as part of the straight way, up to so many rounds of polishing."""
 _LAST_VERTEX_PRICE = 1e-4
-
-
-class Search(NamedTuple):
-    """The state of a search; kernels change it in place.
-
-    Attributes:
-        ends: Start and goal, shape (2, 3), [m].
-        points: Vertices of the paths kept, shape (KEPT, MOST_VERTICES, 3), [m].
-        edges: See `planner.optimal.polyline.Polyline`, shape (KEPT, MOST_VERTICES, 3).
-        counts: Vertices (0: no path) and edge tests of each path, shape (KEPT, 2).
-        costs: Of each path; infinite for none, shape (KEPT,).
-        polished: Rounds spent on each path, shape (KEPT,).
-        trees: See `planner.optimal.connect.connect`, shape (2, NODES, 3), [m].
-        parents: Likewise, shape (2, NODES).
-        grown: Likewise (`counts`), shape (4,).
-        totals: Rounds; nodes of finished trees and edge tests in them; first paths sought;
-            vertices of the very first path, shape (5,).
-        first: That path, shape (MOST_VERTICES, 3), [m].
-        state: Of the random numbers.
-    """
-
-    ends: Array
-    points: Array
-    edges: Array
-    counts: Integers
-    costs: Array
-    polished: Integers
-    trees: Array
-    parents: Integers
-    grown: Integers
-    totals: Integers
-    first: Array
-    state: State
-
-
-def new_search(start: Array, goal: Array, seed: int) -> Search:
-    """A search that has not begun; start and goal shape (3,), [m]."""
-    return Search(
-        ends=np.stack([start, goal]),
-        points=np.zeros((KEPT, MOST_VERTICES, 3)),
-        edges=np.zeros((KEPT, MOST_VERTICES, 3)),
-        counts=np.zeros((KEPT, 2), dtype=np.int64),
-        costs=np.full(KEPT, np.inf),
-        polished=np.zeros(KEPT, dtype=np.int64),
-        trees=np.zeros((2, NODES, 3)),
-        parents=np.zeros((2, NODES), dtype=np.int64),
-        grown=np.zeros(4, dtype=np.int64),
-        totals=np.zeros(5, dtype=np.int64),
-        first=np.zeros((MOST_VERTICES, 3)),
-        state=seeded(seed),
-    )
+_PATIENCE = 8
+"""Rounds without a path after which the grid's margins are no longer relied upon."""
 
 
 @kernel
 def advance(problem: Problem, search: Search, rounds: int) -> float:
-    """Does some rounds; returns the cost of the best path so far, infinite without one."""
+    """Does some rounds; returns the cost of the best path so far, infinite without one.
+
+    Where the grid's margins misled, `Problem.terms` is changed to ask for proofs from then on.
+    """
     for _ in range(rounds):
         begun = search.totals[0]
         search.totals[0] += 1
+        if begun == _PATIENCE and search.costs[BEST] == math.inf and _may_mislead(problem):
+            _begin_anew(problem, search)
         kept = _chosen(search, begun)
         if search.counts[kept, 0] == 0:
             kept = _begin(problem, search, kept)
             if kept < 0:
                 continue
-        problem.terms[VERTEX] = _vertex_price(problem, search, kept)
+        problem.terms[VERTEX] = _vertex_price(problem, search, float(search.polished[kept]))
         line = _line(search, kept)
         polish(problem, line, search.state, _trials(problem))
         search.polished[kept] += 1
         search.costs[kept] = cost_of(problem, line)
-    return search.costs[best_of(search)]  # type: ignore[no-any-return]
+        if _worth(problem, search, kept) < _worth(problem, search, BEST):
+            _remember(problem, search, kept)
+    return search.costs[BEST]  # type: ignore[no-any-return]
 
 
 @kernel
 def measure_again(problem: Problem, search: Search) -> None:
     """Finds the costs of all paths anew, after a change of what is made small."""
-    for k in range(KEPT):
+    for k in range(KEPT + 1):
         if search.counts[k, 0] > 0:
             search.costs[k] = measure(problem, _line(search, k))
 
 
 @kernel
-def best_of(search: Search) -> int:
-    """The number of the cheapest path."""
+def _cheapest(search: Search) -> int:
+    """The number of the cheapest of the paths under work."""
     best = 0
     for k in range(1, KEPT):
         if search.costs[k] < search.costs[best]:
             best = k
     return best
+
+
+@kernel
+def _worth(problem: Problem, search: Search, k: int) -> float:
+    """The cost of a path with the last price of its vertices: what the best has least of."""
+    price = _vertex_price(problem, search, math.inf)
+    return search.costs[k] + price * search.counts[k, 0]  # type: ignore[no-any-return]
+
+
+@kernel
+def _remember(problem: Problem, search: Search, kept: int) -> None:
+    """Keeps a path as the best, if wrenches are proved to be held along it; else begins anew."""
+    line = _line(search, kept)
+    if _may_mislead(problem):
+        for i in range(line.counts[0] - 1):
+            start, end = line.points[i], line.points[i + 1]
+            if not edge_held(problem.world, problem.load, problem.holding, start, end):
+                _begin_anew(problem, search)
+                return
+    search.points[BEST], search.edges[BEST] = line.points, line.edges
+    search.counts[BEST, 0], search.costs[BEST] = line.counts[0], search.costs[kept]
+
+
+@kernel
+def _may_mislead(problem: Problem) -> bool:
+    """Whether edges are allowed by interpolated margins, which prove nothing."""
+    return not problem.holding.everywhere and problem.terms[LEAST_MARGIN] != ASK_PROOF
+
+
+@kernel
+def _begin_anew(problem: Problem, search: Search) -> None:
+    """Forgets all but the best path, and asks for proofs from now on."""
+    problem.terms[LEAST_MARGIN] = ASK_PROOF
+    search.totals[2] += search.grown[2]
+    search.totals[3], search.totals[5] = 0, search.totals[0]
+    search.counts[:KEPT, 0], search.costs[:KEPT] = 0, math.inf
+    search.grown[:], search.polished[:] = 0, 0
 
 
 @kernel
@@ -143,11 +140,11 @@ def _line(search: Search, kept: int) -> Polyline:
 @kernel
 def _chosen(search: Search, begun: int) -> int:
     """Which path to work on; one without vertices is to be found first."""
-    best, worst = best_of(search), 0
+    best, worst = _cheapest(search), 0
     for k in range(1, KEPT):
         if search.costs[k] > search.costs[worst]:
             worst = k
-    if begun < KEPT or search.costs[best] == math.inf:
+    if search.totals[3] < KEPT or search.costs[best] == math.inf:
         return worst
     if begun % _ANOTHER_EVERY == 0:
         search.counts[worst, 0] = 0
@@ -185,7 +182,7 @@ def _begin(problem: Problem, search: Search, kept: int) -> int:
             line.points,
         )
     if found == 0:
-        best = best_of(search)
+        best = _cheapest(search)
         return best if search.costs[best] < math.inf else -1
     if begun % 2 == 0:
         search.totals[1] += grown[0] + grown[1]
@@ -199,13 +196,14 @@ def _begin(problem: Problem, search: Search, kept: int) -> int:
 
 
 @kernel
-def _vertex_price(problem: Problem, search: Search, kept: int) -> float:
+def _vertex_price(problem: Problem, search: Search, polished: float) -> float:
+    """What a vertex must save, after so many rounds of polishing."""
     straight = 0.0
     for axis in range(3):
         straight += (search.ends[1, axis] - search.ends[0, axis]) ** 2
     share = _LAST_VERTEX_PRICE
     for rounds, price in _VERTEX_PRICES:
-        if search.polished[kept] < rounds:
+        if polished < rounds:
             share = price
             break
     return share * math.sqrt(straight) * problem.terms[UNIT]  # type: ignore[no-any-return]

@@ -13,22 +13,23 @@ from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from planner.cost import KinematicCost
-from planner.exact.holding import edges_held
 from planner.optimal.length_limit import LengthLimit
 from planner.optimal.no_path import no_path
 from planner.optimal.preparation import problem_of
-from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, Problem
-from planner.optimal.rounds import Search, advance, best_of, new_search
+from planner.optimal.problem import Problem
+from planner.optimal.rounds import advance
+from planner.optimal.search import BEST, Search, new_search
 from planner.optimal.settings import OptimalSettings, Weights
-from planner.route import Route
+from planner.route import Progress, Route
 
-Progress = Callable[[int, int, float], None]
 Clock = Callable[[], float]
 
 LEAST_ROUNDS = 12
 """Done whatever the clock says, so that a busy machine finds a path, too."""
 LEAST_WITH_LIMIT = 80
 """Likewise where a longest path is asked for, whose price is found in steps of some rounds."""
+_TELL_EVERY = 0.1
+"""Between calls of a progress, [s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +64,8 @@ def optimal_route(
         scene: Obstacles, clearances, load, start and goal.
         settings: Objective, seed and budget.
         kinematic: The cost of poses at the start's orientation.
-        progress: Told rounds done, the most there will be (0: as the budget allows), and the cost.
+        progress: Told what is done and the most there will be, both in seconds of the budget or in
+            rounds, and the cost of the best path; about ten times a second.
         clock: Seconds; decides when a budget is spent.
 
     Raises:
@@ -76,10 +78,6 @@ def optimal_route(
     advance(problem, search, 0)  # compiled code is made, or loaded, when it is first called
     prepared = clock()
     path = _improved(problem, search, settings, prepared, progress, clock)
-    if not _is_settled(problem, path):
-        problem.terms[LEAST_MARGIN] = ASK_PROOF
-        search = new_search(start, goal, settings.seed)
-        path = _improved(problem, search, settings, clock(), progress, clock)
     if path is None:
         raise no_path(rig, scene, problem, search, settings)
     first = search.first[: search.totals[4]].copy()
@@ -104,34 +102,34 @@ def _improved(
 ) -> Array | None:
     """Does rounds until the budget is spent, or nothing can be better."""
     limit = LengthLimit(settings) if settings.longest < math.inf else None
-    rounds = 0
-    while not _is_over(settings, rounds, clock() - began):
+    spent, told = 0.0, 0.0
+    while not _is_over(settings, search, spent):
         cost = advance(problem, search, 1)
-        rounds += 1
         if limit is not None:
             limit.after_round(problem, search)
         elif cost <= _least(search, settings):
             break
-        if progress is not None and rounds % 10 == 0:
-            progress(rounds, settings.rounds or 0, float(cost))
+        spent = clock() - began
+        if progress is not None and spent - told >= _TELL_EVERY:
+            told = spent
+            _tell(progress, settings, search, spent)
     return limit.path if limit is not None else best_path(search)
 
 
-def _is_settled(problem: Problem, path: Array | None) -> bool:
-    """Whether the grid's margins misled nobody: a path is proved to hold, or none was missed."""
-    if problem.holding.everywhere:
-        return True
-    if path is None:
-        return bool(problem.terms[LEAST_MARGIN] == -math.inf)
-    held = edges_held(problem.world, problem.load, problem.holding, path[:-1], path[1:])
-    return bool(held.all())
-
-
-def _is_over(settings: OptimalSettings, rounds: int, spent: float) -> bool:
+def _is_over(settings: OptimalSettings, search: Search, spent: float) -> bool:
+    rounds, begun = int(search.totals[0]), int(search.totals[5])
     if settings.rounds is not None:
         return rounds >= settings.rounds
     least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_WITH_LIMIT
-    return rounds >= least and spent >= settings.budget
+    return rounds - begun >= least and spent >= settings.budget
+
+
+def _tell(progress: Progress, settings: OptimalSettings, search: Search, spent: float) -> None:
+    cost = float(search.costs[BEST])
+    if settings.rounds is not None:
+        progress(float(search.totals[0]), float(settings.rounds), cost)
+    else:
+        progress(min(spent, settings.budget), settings.budget, cost)
 
 
 def _least(search: Search, settings: OptimalSettings) -> float:
@@ -145,7 +143,6 @@ def _least(search: Search, settings: OptimalSettings) -> float:
 
 def best_path(search: Search) -> Array | None:
     """The cheapest path so far, shape (k, 3), [m]; None without one."""
-    best = best_of(search)
-    if not search.costs[best] < math.inf:
+    if not search.costs[BEST] < math.inf:
         return None
-    return search.points[best, : search.counts[best, 0]].copy()
+    return search.points[BEST, : search.counts[BEST, 0]].copy()

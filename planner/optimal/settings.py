@@ -38,7 +38,10 @@ class Weights:
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not 0.0 <= value < math.inf:
-                raise BadInput(f"the weight of {entry.name} must be 0 or more, it is {value:g}")
+                raise BadInput(
+                    f"the weight of {entry.name} must be 0 or more, it is {value:g}",
+                    next_step="leave it out, or give it a finite number",
+                )
         if self.length + self.kinematic == 0.0:
             raise BadInput(
                 "without a weight of length or kinematic a path would have no reason to end",

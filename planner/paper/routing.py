@@ -11,8 +11,8 @@ from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from planner.cost import Cost, KinematicCost, LengthCost
-from planner.paper.search import PaperPlanner, Progress, SearchResult
-from planner.route import Route
+from planner.paper.search import PaperPlanner, SearchResult
+from planner.route import Progress, Route
 from planner.settings import ATTEMPT_WITH_ROOM, CLEARANCE_RESERVE, PlannerSettings
 from planner.shortcut import cheapest_through, drawn_tight
 

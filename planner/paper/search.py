@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,10 +34,10 @@ from planner.paper.readings import FAILURE_RATES, FOCUSES
 from planner.paper.shortcut import shortcut
 from planner.paper.tallies import new_tallies
 from planner.paper.tree import new_tree, way_to
+from planner.route import Progress
 from planner.settings import IMPROVING_ITERATIONS, PlannerSettings
 from planner.space import TranslationSpace
 
-Progress = Callable[[int, int, float], None]
 """Called with iterations done, iterations at most, and the tree's distance to the goal [m]."""
 
 _CHUNK = 500

@@ -1,0 +1,68 @@
+"""Options of `cdpr plan`: each planner takes its own, and says what it cannot heed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import call, nothing_written, one_message
+
+SCENE = CONFIGS / "environment_1.yaml"
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        (["--mode", "paper"], ["optimal", "--mode"]),
+        (["--max-iterations", "9"], ["optimal", "--max-iterations"]),
+        (["--spacing-mm", "30"], ["optimal", "readings of the paper"]),
+        (["--planner", "adaptive", "--rounds", "5"], ["adaptive", "--rounds"]),
+        (["--planner", "goal-bias", "--budget-ms", "5"], ["goal-bias", "--budget-ms"]),
+        (["--planner", "adaptive", "--weight", "length=1"], ["adaptive", "--weight"]),
+        (["--planner", "adaptive", "--longest-mm", "700"], ["adaptive", "--longest-mm"]),
+        (["--planner", "adaptive", "--cost", "clearance"], ["adaptive", "clearance"]),
+        (["--budget-ms", "5", "--rounds", "5"], ["--budget-ms", "--rounds", "give one"]),
+        (["--cost", "length", "--weight", "length=1"], ["--cost", "--weight", "give one"]),
+        (["--weight", "speed=1"], ["speed", "no objective", "kinematic"]),
+        (["--weight", "length=1", "--weight", "length=2"], ["length", "stands twice"]),
+        (["--weight", "length=much"], ["much", "no number"]),
+        (["--weight", "length"], ["no number"]),
+        (["--weight", "length=-1"], ["length", "0 or more"]),
+        (["--weight", "length=nan"], ["length", "0 or more"]),
+        (["--weight", "clearance=1"], ["no reason to end", "length"]),
+    ],
+)
+def test_options_that_cannot_be_heeded_are_one_clear_message(
+    tmp_path: Path, options: list[str], parts: list[str]
+) -> None:
+    with nothing_written(tmp_path):
+        answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", *options)
+    one_message(answer, 2, *parts)
+
+
+def test_weights_seed_rounds_and_limit_are_in_the_plan(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.json"
+    options = ["--weight", "length=1", "--weight", "kinematic=0.5", "--seed", "3"]
+    options += ["--rounds", "90", "--longest-mm", "700", "--json"]
+    answer = call("plan", RIG, SCENE, "-o", plan, *options)
+    assert answer.code == 0, answer
+    told = json.loads(answer.out)["planner"]
+    assert told == json.loads(plan.read_text())["planner"]
+    assert told == {
+        "name": "optimal",
+        "weights": {"length": 1.0, "kinematic": 0.5, "clearance": 0.0, "capacity": 0.0},
+        "seed": 3,
+        "rounds": [90],
+        "budget_ms": None,
+        "longest_mm": 700.0,
+    }
+
+
+def test_a_limit_that_no_path_keeps_is_one_message_and_no_file(tmp_path: Path) -> None:
+    with nothing_written(tmp_path):
+        limit = ("--longest-mm", "600", "--rounds", "10")
+        answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", *limit)
+    one_message(answer, 1, "600.0 mm", "--cost length")

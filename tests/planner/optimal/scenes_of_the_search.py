@@ -1,0 +1,80 @@
+"""Problems for the compiled search: the ready scenes, walls, posts and random obstacles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cdpr.errors import BadInput
+from cdpr.poses import Array, Pose
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from planner.cost import KinematicCost
+from planner.endpoints import require_usable_ends
+from planner.optimal.polyline import Polyline
+from planner.optimal.preparation import problem_of
+from planner.optimal.problem import Problem
+from planner.optimal.rounds import advance
+from planner.optimal.search import BEST, Search, new_search
+from planner.optimal.settings import Weights
+from tests.planner.exact.sampled_oracle import random_scene
+
+KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull")
+LENGTH = Weights(length=1.0)
+
+
+def problem(rig: Rig, scene: Scene, weights: Weights = LENGTH) -> Problem:
+    """A problem with the cost of the scene's orientation."""
+    return problem_of(rig, scene, weights, KinematicCost(rig, scene.start.rotation))
+
+
+def ends_of(scene: Scene) -> Array:
+    """Start and goal, shape (2, 3), [m]."""
+    return np.array([scene.start.position, scene.goal.position])
+
+
+def searched(asked: Problem, scene: Scene, rounds: int, seed: int = 0) -> Search:
+    """A search after so many rounds."""
+    search = new_search(*ends_of(scene), seed)
+    advance(asked, search, rounds)
+    return search
+
+
+def best_points(search: Search) -> Array:
+    """The best path, shape (k, 3), [m]; k is 0 without one."""
+    return search.points[BEST, : search.counts[BEST, 0]].copy()
+
+
+def polyline(points: Array) -> Polyline:
+    """A polyline with room for a few more vertices."""
+    room = len(points) + 20
+    line = Polyline(np.zeros((room, 3)), np.zeros((room, 3)), np.array([len(points), 0]))
+    line.points[: len(points)] = points
+    return line
+
+
+def post(x: float, y: float, low: float, high: float, width: float = 40.0) -> dict[str, Any]:
+    """An upright square post as a scene file names it, [mm]."""
+    return {
+        "name": f"post at {x:g} {y:g}",
+        "box": {"size_mm": [width, width, high - low]},
+        "position_mm": [x, y, (low + high) / 2.0],
+    }
+
+
+def random_question(rig: Rig, seed: int) -> Scene | None:
+    """A random scene with two ends that can be used; None where some draws gave none."""
+    rng = np.random.default_rng(seed)
+    scene = random_scene(rng, rig, int(rng.integers(1, 4)), KINDS)
+    ends: list[Pose] = []
+    for _ in range(40):
+        pose = Pose.level(rng.uniform(rig.workspace_lower, rig.workspace_upper))
+        try:
+            require_usable_ends(rig, scene.changed(start=pose, goal=pose))
+        except BadInput:
+            continue
+        ends.append(pose)
+        if len(ends) == 2:
+            return scene.changed(start=ends[0], goal=ends[1])
+    return None
