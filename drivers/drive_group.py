@@ -26,7 +26,8 @@ class GroupState(Enum):
     CONFIGURED = auto()
     """Set up and read back; positions are valid after the first cycle; no drive is enabled."""
     ENABLING = auto()
-    """On the way to ENABLED; each drive is told to stay where it is."""
+    """On the way to ENABLED; each drive is told to stay where it is. The group gives up by itself,
+    in FAULT, when a drive takes too long."""
     ENABLED = auto()
     """All drives follow the set-points."""
     QUICK_STOP = auto()
@@ -176,6 +177,13 @@ class DriveGroup(Protocol):
     def close(self) -> None:
         """Lets go of the bus without sending anything; the bus itself is the caller's."""
         ...
+
+
+def drive_states(status_words: Sequence[int]) -> tuple[str, ...]:
+    """What status words of a `CycleStatus` say, for people."""
+    from drivers.cia402.states import state_of
+
+    return tuple(state_of(word).value for word in status_words)
 
 
 def make_drive_group(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveGroup:

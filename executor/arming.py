@@ -7,7 +7,7 @@ import numpy as np
 from cdpr.errors import Refused
 from cdpr.poses import Array
 from drivers.drive_group import Capabilities
-from executor.setpoints import CheckedTable
+from executor.course import Course
 
 
 def require_capabilities(drives: Capabilities, cycle: float) -> None:
@@ -34,29 +34,34 @@ def require_capabilities(drives: Capabilities, cycle: float) -> None:
         )
 
 
-def require_unchanged(checked: CheckedTable) -> None:
-    """The table is still the one that was checked.
+def require_unchanged(course: Course) -> None:
+    """The set-points are still those that were checked.
 
     Raises:
-        Refused: It is not.
+        Refused: They are not.
     """
-    if checked.table.hash != checked.hash:
-        raise Refused("the set-point table is not the one that was checked", where="arming")
+    if not course.unchanged:
+        raise Refused(
+            "the set-points are not those that were checked",
+            where="arming",
+            why="memory was written to after the check: a defect of the program or the computer",
+            next_step="run it again, and test the computer's memory; nothing was enabled",
+        )
 
 
-def require_at_start(checked: CheckedTable, actual: Array) -> None:
-    """The drives stand where the table begins.
+def require_at_start(course: Course, actual: Array) -> None:
+    """The drives stand where the set-points begin.
 
     Args:
-        checked: The table.
+        course: The set-points.
         actual: Positions of the drives, shape (m,), [counts].
 
     Raises:
         Refused: One is farther from its first set-point than the rig's start tolerance.
     """
-    rig = checked.rig
+    rig = course.rig
     per_metre = np.array([w.counts_per_metre for w in rig.winches])
-    off = np.abs((actual - checked.table.setpoints[0]) / per_metre)
+    off = np.abs((actual - course.setpoints[0]) / per_metre)
     worst = int(off.argmax())
     if not off[worst] <= rig.motion.start_tolerance:
         raise Refused(

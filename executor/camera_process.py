@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from time import monotonic
 
 from cdpr.errors import CdprError, Fault
 from cdpr.poses import Pose
@@ -70,11 +69,12 @@ class CameraProcess:
             self.close()
             raise
 
-    def trigger(self, time: float, true_pose: Pose | None) -> None:
+    def trigger(self, time: float, asked: float, true_pose: Pose | None) -> None:
         """Asks for a picture now.
 
         Args:
             time: Since the start of the run, [s].
+            asked: The same moment on the monotonic clock, [s].
             true_pose: Where the simulated platform is; None with a real camera.
 
         Raises:
@@ -87,7 +87,7 @@ class CameraProcess:
         if not self._may_wait and self._measured < self.triggered:
             self.dropped += 1
             return
-        self._send(Trigger(self.triggered, time, monotonic(), true_pose))
+        self._send(Trigger(self.triggered, time, asked, true_pose))
         self.triggered += 1
 
     def finish(self, progress: Callable[[float], None]) -> list[Look]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import os
 import time
 from typing import Protocol
 
@@ -12,6 +15,10 @@ class Clock(Protocol):
     @property
     def simulated(self) -> bool:
         """True when time advances with the cycles only."""
+
+    @property
+    def time(self) -> float:
+        """When the cycle under way began, [s]; only differences have a meaning."""
 
     def next_cycle(self) -> float:
         """Waits until the next cycle begins; returns how late it is, in cycles."""
@@ -25,8 +32,18 @@ class SimulatedClock:
 
     simulated = True
 
+    def __init__(self, cycle: float) -> None:
+        """Begins at 0 with the first call of `next_cycle`."""
+        self._cycle, self._cycles = cycle, -1
+
+    @property
+    def time(self) -> float:
+        """Cycles times their length, [s]."""
+        return max(0, self._cycles) * self._cycle
+
     def next_cycle(self) -> float:
         """The next cycle begins at once."""
+        self._cycles += 1
         return 0.0
 
     def time_left(self) -> float:
@@ -54,19 +71,25 @@ class RealClock:
         """The first cycle begins with the first call of `next_cycle`."""
         self._cycle_ns = round(cycle * 1e9)
         self._begin_ns: int | None = None
+        self._woke_ns = 0
+
+    @property
+    def time(self) -> float:
+        """On the system's monotonic clock, the same in all processes, [s]."""
+        return (self._woke_ns or time.monotonic_ns()) / 1e9
 
     def next_cycle(self) -> float:
         """Sleeps until the deadline."""
-        now = time.monotonic_ns()
+        self._woke_ns = time.monotonic_ns()
         if self._begin_ns is None:
-            self._begin_ns = now
+            self._begin_ns = self._woke_ns
             return 0.0
         deadline = self._begin_ns + self._cycle_ns
-        if now < deadline:
-            time.sleep((deadline - now) / 1e9)
-            now = time.monotonic_ns()
-        late = (now - deadline) / self._cycle_ns
-        self._begin_ns = deadline if late <= self.CAUGHT_UP else now
+        if self._woke_ns < deadline:
+            sleep_until(deadline)
+            self._woke_ns = time.monotonic_ns()
+        late = (self._woke_ns - deadline) / self._cycle_ns
+        self._begin_ns = deadline if late <= self.CAUGHT_UP else self._woke_ns
         return late
 
     def time_left(self) -> float:
@@ -75,3 +98,28 @@ class RealClock:
             return 0.0
         end = self._begin_ns + self._cycle_ns - round(self.RESERVE * 1e9)
         return max(0.0, (end - time.monotonic_ns()) / 1e9)
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+_LIBC = ctypes.CDLL(None)
+_TIMER_ABSTIME = 1
+
+
+def sleep_until(deadline_ns: int) -> None:
+    """Sleeps until a moment of the monotonic clock, whatever happens before the call or in it.
+
+    Raises:
+        OSError: The system refuses to.
+    """
+    moment = _Timespec(*divmod(deadline_ns, 1_000_000_000))
+    while True:
+        result = _LIBC.clock_nanosleep(
+            time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(moment), None
+        )
+        if result == 0:
+            return
+        if result != errno.EINTR:
+            raise OSError(result, os.strerror(result))

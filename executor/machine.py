@@ -16,6 +16,8 @@ class State(Enum):
     """The last fraction of a millimetre to the first set-point."""
     MOVING = "moving"
     """Along the path."""
+    HOLDING = "holding"
+    """Feed hold: slowing down on the path or at rest there, enabled; a resume goes on."""
     STOPPING = "stopping"
     """Slowing down along the path, all drives together."""
     SECURING = "securing"
@@ -34,6 +36,8 @@ class Event(Enum):
     ENABLE = "enable"
     ENABLED = "enabled"
     AT_START = "at_start"
+    HOLD = "hold"
+    RESUME = "resume"
     STOP = "stop"
     PATH_FAULT = "path_fault"
     FAULT = "fault"
@@ -51,6 +55,10 @@ _NEXT = {
     (State.ENABLING, Event.STOP): State.SECURING,
     (State.APPROACHING, Event.AT_START): State.MOVING,
     (State.APPROACHING, Event.STOP): State.SECURING,
+    (State.MOVING, Event.HOLD): State.HOLDING,
+    (State.HOLDING, Event.RESUME): State.MOVING,
+    (State.HOLDING, Event.STOP): State.STOPPING,
+    (State.HOLDING, Event.PATH_FAULT): State.STOPPING,
     (State.MOVING, Event.STOP): State.STOPPING,
     (State.MOVING, Event.PATH_FAULT): State.STOPPING,
     (State.MOVING, Event.AT_REST): State.SECURING,

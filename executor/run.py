@@ -1,134 +1,29 @@
-"""One run from a prepared table to a run folder."""
+"""What a run leaves: its tables, its summary and its report, from what the motion left behind."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from cdpr.clearance import ClearanceModel
 from cdpr.poses import Array, Pose
-from drivers.drive_group import DriveGroup
 from executor.clearance_table import ClearanceTable
-from executor.clock import Clock
 from executor.cycle_table import CycleTable
-from executor.loop import CycleRecord, Loop, LoopEvent
-from executor.machine import State
+from executor.execution import Outcome
 from executor.mcap_log import write_mcap
 from executor.measured import ClearanceRow, clearance_table, encoder_rows
 from executor.observer import Look
 from executor.pose_table import PoseTable, no_poses
 from executor.prepare import PreparedRun
-from executor.realtime import real_time
 from executor.report import build_report
-from executor.run_folder import RunEvent, RunFolder
-from executor.run_log import RunLog
+from executor.run_folder import RunFolder
 from executor.summary import RunContext, summarize
 from executor.versions import versions
 
 #: Clearances from drive positions are computed this often along a run, [Hz].
 CLEARANCE_RATE = 10.0
-
-Trigger = Callable[[float], None]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """What the motion left behind.
-
-    Attributes:
-        state: Where the run ended.
-        cause: Why it did not finish, if it did not.
-        log: Its cycles.
-        started: When, UTC.
-    """
-
-    state: State
-    cause: str
-    log: RunLog
-    started: datetime
-
-
-class Execution:
-    """The motion of one prepared run on configured drives."""
-
-    def __init__(
-        self,
-        prepared: PreparedRun,
-        group: DriveGroup,
-        clock: Clock,
-        *,
-        stop_requested: Callable[[], bool],
-    ) -> None:
-        """Prepares the loop; nothing is sent.
-
-        Args:
-            prepared: The checked run.
-            group: Configured drives.
-            clock: Real or simulated.
-            stop_requested: Asked every cycle.
-        """
-        self.prepared = prepared
-        self._clock = clock
-        self._log = RunLog(prepared.rig, prepared.checked)
-        self._folder: RunFolder | None = None
-        self._triggers: Trigger | None = None
-        self._progress: Callable[[float], None] = lambda _share: None
-        self._every = 1
-        self.loop = Loop(
-            prepared.checked,
-            group,
-            clock,
-            stop_requested=stop_requested,
-            on_cycle=self._on_cycle,
-            on_event=self._on_event,
-        )
-
-    def run(
-        self,
-        folder: RunFolder,
-        *,
-        trigger: Trigger | None = None,
-        camera_rate: float = CLEARANCE_RATE,
-        progress: Callable[[float], None] | None = None,
-    ) -> Outcome:
-        """Moves along the path; ends with the drives holding by themselves.
-
-        Args:
-            folder: Where events are written as they happen.
-            trigger: Called for every picture with its time [s].
-            camera_rate: Pictures a second, [Hz].
-            progress: Called with the number of rows that are done.
-        """
-        cycle = self.prepared.checked.table.cycle
-        self._folder, self._triggers = folder, trigger
-        self._every = max(1, round(1.0 / (camera_rate * cycle)))
-        self._progress = progress or self._progress
-        started = datetime.now(UTC)
-        if self._clock.simulated:
-            self.loop.run()
-        else:
-            with real_time() as denied:
-                if denied:
-                    self._on_event(LoopEvent(0, "no_real_time", denied))
-                self.loop.run()
-        return Outcome(self.loop.machine.state, self.loop.cause, self._log, started)
-
-    def _on_cycle(self, record: CycleRecord) -> None:
-        self._log.add(record)
-        if record.cycle % self._every:
-            return
-        self._progress(record.index)
-        if self._triggers is not None:
-            self._triggers(record.cycle * self.prepared.checked.table.cycle)
-
-    def _on_event(self, event: LoopEvent) -> None:
-        if self._folder is not None:
-            time = event.cycle * self.prepared.checked.table.cycle
-            self._folder.append_event(RunEvent(time, event.code, event.text))
 
 
 def conclude(
@@ -159,7 +54,7 @@ def conclude(
         simulated=simulated,
         fast=fast,
         started=outcome.started,
-        duration=len(cycles) * prepared.checked.table.cycle,
+        duration=_duration(cycles, prepared.checked.table.cycle),
         final_state=outcome.state.value,
         events=tuple(folder.events()),
         versions=versions(),
@@ -170,6 +65,11 @@ def conclude(
     write_mcap(folder, context, cycles, poses, clearance)
     build_report(folder)
     return summary
+
+
+def _duration(cycles: CycleTable, cycle: float) -> float:
+    """From the begin of the first cycle to the end of the last, [s]."""
+    return float(cycles.time[-1]) + cycle if len(cycles) else 0.0
 
 
 def _pose_table(looks: Sequence[Look], cycles: CycleTable) -> PoseTable:

@@ -234,6 +234,8 @@ class RunFolder:
         try:
             with (self.path / EVENTS).open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(asdict(event), ensure_ascii=False) + "\n")
+                stream.flush()
+                os.fsync(stream.fileno())
         except OSError as error:
             raise self._not_written(EVENTS, error) from None
 

@@ -9,7 +9,7 @@ from cdpr.kinematics import poses_near
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from executor.cycle_table import CycleTable, quaternions_of
-from executor.loop import CycleRecord
+from executor.records import CycleRecord
 from executor.setpoints import CheckedTable
 
 
@@ -47,7 +47,7 @@ class RunLog:
         )
         encoder, turned = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
         return CycleTable(
-            time=np.array([r.cycle for r in records]) * planned.cycle,
+            time=np.array([r.at - records[0].at for r in records]),
             state=tuple(r.state.value for r in records),
             path_index=rows,
             travelled=between(planned.travelled, index),

@@ -1,28 +1,31 @@
-"""Which runs are going on, so that `cdpr stop` reaches them from any terminal of the user.
+"""Which runs are under way, so that `cdpr stop` and its like reach them from any terminal.
 
-A run leaves a file named after its process in the user's run-time folders and holds a lock on it; a
-file without a lock was left by a process that is gone. It is announced in every folder that another
+A run listens on a socket named after its process in the user's run-time folders; a socket on which
+nobody listens was left by a process that is gone. It is announced in every folder that another
 terminal may look into, and only in folders that nobody else can write to: a folder in /tmp that
-another user made could hold links to this user's files, or name processes that are no runs.
+another user made could hold links to this user's files, or sockets of somebody else.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import signal
+import socket
 import stat
+import struct
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
 from cdpr.errors import Refused
+from executor.wishes import WishBoard
 
 #: A closed terminal (SIGHUP) must not leave the rig without its loop.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_ENDING = ".run"
+_ENDING = ".sock"
 
 
 def _candidates() -> list[Path]:
@@ -64,13 +67,15 @@ def _folders(*, make: bool) -> Iterator[list[int]]:
 
 
 @contextlib.contextmanager
-def announced() -> Iterator[None]:
-    """Makes this process known to `stop_all` for as long as the block runs.
+def announced() -> Iterator[list[socket.socket]]:
+    """Listens for the operator for as long as the block runs, in every usable folder.
+
+    Yields:
+        The listening sockets, one a folder.
 
     Raises:
         Refused: There is no folder for it that only this user can write to.
     """
-    name = f"{os.getpid()}{_ENDING}"
     with _folders(make=True) as folders, contextlib.ExitStack() as announcements:
         if not folders:
             raise Refused(
@@ -79,23 +84,32 @@ def announced() -> Iterator[None]:
                 why="no such folder belongs to this user alone; another user may have made it",
                 next_step="remove it or close it to others (chmod 700), or set XDG_RUNTIME_DIR",
             )
+        name = f"{os.getpid()}{_ENDING}"
+        listeners = []
         for folder in folders:
-            announcements.callback(os.close, _locked(folder, name))
+            listeners.append(announcements.enter_context(_listening(folder, name)))
             announcements.callback(_removed, folder, name)
-        yield
+        yield listeners
 
 
-def _locked(folder: int, name: str) -> int:
-    """The file's descriptor, locked, and certainly the one that the name stands for."""
-    while True:
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-        file = os.open(name, flags, 0o600, dir_fd=folder)
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with contextlib.suppress(FileNotFoundError):
-            named = os.stat(name, dir_fd=folder, follow_symlinks=False)
-            if os.path.samestat(named, os.fstat(file)):
-                return file
-        os.close(file)  # `stop_all` took it for a stale one and removed it before it was locked
+def _listening(folder: int, name: str) -> socket.socket:
+    """A socket that listens under a name of the folder, from the moment the name is there on."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        os.fchmod(listener.fileno(), 0o600)
+        _removed(folder, name + ".new")
+        listener.bind(_place(folder, name + ".new"))
+        listener.listen()
+        os.rename(name + ".new", name, src_dir_fd=folder, dst_dir_fd=folder)
+    except BaseException:
+        listener.close()
+        raise
+    return listener
+
+
+def _place(folder: int, name: str) -> str:
+    """A path to what is in an open folder; short enough for a socket, and of that very folder."""
+    return f"/proc/self/fd/{folder}/{name}"
 
 
 def _removed(folder: int, name: str) -> None:
@@ -103,51 +117,64 @@ def _removed(folder: int, name: str) -> None:
         os.unlink(name, dir_fd=folder)
 
 
-def stop_all() -> list[int]:
-    """Asks every run of this user to stop; returns their process numbers."""
-    running: set[int] = set()
-    with _folders(make=False) as folders:
-        for folder in folders:
-            names = (name for name in os.listdir(folder) if name.endswith(_ENDING))
-            numbers = (name.removesuffix(_ENDING) for name in names)
-            running |= {int(n) for n in numbers if n.isdecimal() and _is_held(folder, n + _ENDING)}
-    return [number for number in sorted(running) if _asked_to_stop(number)]
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """A run that listens.
 
+    Attributes:
+        process: Its number.
+        link: Connected to it; the owner closes it.
+    """
 
-def _is_held(folder: int, name: str) -> bool:
-    """Whether a run holds the file; one that nobody holds is removed."""
-    try:
-        file = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
-    except OSError:  # gone meanwhile, or no file of ours
-        return False
-    try:
-        # Shared, so that two `cdpr stop` at once do not take each other for a run.
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    else:
-        _removed(folder, name)
-        return False
-    finally:
-        os.close(file)
-
-
-def _asked_to_stop(number: int) -> bool:
-    try:
-        os.kill(number, signal.SIGTERM)
-    except ProcessLookupError:  # it ended meanwhile
-        return False
-    return True
+    process: int
+    link: socket.socket
 
 
 @contextlib.contextmanager
-def stop_requests() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C, SIGTERM and a closed terminal into a request the loop asks for every cycle."""
-    requested = False
+def reached_runs() -> Iterator[list[Reached]]:
+    """Connections to all runs of this user that are under way, in the order of their numbers."""
+    runs: dict[int, Reached] = {}
+    with contextlib.ExitStack() as links:
+        with _folders(make=False) as folders:
+            for folder in folders:
+                for name in sorted(n for n in os.listdir(folder) if n.endswith(_ENDING)):
+                    run = _reached(folder, name)
+                    if run is None:
+                        continue
+                    links.callback(run.link.close)
+                    runs.setdefault(run.process, run)
+        yield [runs[number] for number in sorted(runs)]
+
+
+def _reached(folder: int, name: str) -> Reached | None:
+    """The run behind a name; a name behind which nobody listens is removed."""
+    with contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISSOCK(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
+            return None
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        link.connect(_place(folder, name))
+    except ConnectionRefusedError:
+        link.close()
+        _removed(folder, name)
+        return None
+    except OSError:  # gone meanwhile
+        link.close()
+        return None
+    credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    process, user, _ = struct.unpack("3i", credentials)
+    if user != os.getuid():
+        link.close()
+        return None
+    return Reached(process, link)
+
+
+@contextlib.contextmanager
+def stop_requests(board: WishBoard) -> Iterator[None]:
+    """Turns Ctrl-C, SIGTERM and a closed terminal into the wish to stop."""
 
     def on_signal(_number: int, _frame: FrameType | None) -> None:
-        nonlocal requested
-        requested = True
+        board.ask_stop()
 
     before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
     if before[signal.SIGHUP] is signal.SIG_IGN:  # started with nohup: meant to outlive its terminal
@@ -155,7 +182,7 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
     try:
         for number in before:
             signal.signal(number, on_signal)
-        yield lambda: requested
+        yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)

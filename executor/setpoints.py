@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,6 +15,7 @@ from cdpr.rig import Rig
 from cdpr.scene import Scene
 from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
+from executor.course import fingerprint
 from executor.path import Path, poses_of
 from executor.timing import TimeLaw
 from planner.check import check_path
@@ -68,9 +68,7 @@ class SetpointTable:
     @property
     def hash(self) -> str:
         """SHA-256 over the set-points and their cycle, computed anew every time."""
-        digest = hashlib.sha256(repr(self.cycle).encode())
-        digest.update(np.ascontiguousarray(self.setpoints).tobytes())
-        return "sha256:" + digest.hexdigest()
+        return fingerprint(self.cycle, self.setpoints)
 
     def poses(self) -> list[Pose]:
         """The executed poses, one a row."""

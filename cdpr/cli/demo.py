@@ -29,7 +29,8 @@ def demo(
     from cdpr.cli.cameras import SYNTHETIC
     from cdpr.cli.output import out, show_facts
     from cdpr.cli.plan import planned, sentences_of
-    from cdpr.cli.run import exit_code, prepared_run, run_prepared
+    from cdpr.cli.run import exit_code, prepared_run
+    from cdpr.cli.run_motion import run_prepared
     from cdpr.cli.run_summary import show_prepared, show_summary
     from cdpr.plan import save_plan
     from cdpr.rig import load_rig

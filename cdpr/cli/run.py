@@ -10,11 +10,7 @@ import typer
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
-    from executor.camera_process import CameraProcess
-    from executor.observer import Look
     from executor.prepare import PreparedRun
-    from executor.run import Execution, Outcome
-    from executor.run_folder import RunFolder
 
 
 def run(
@@ -57,6 +53,7 @@ def run(
     """
     from cdpr.cli.cameras import choose_camera
     from cdpr.cli.drives import IN_PROCESS
+    from cdpr.cli.run_motion import run_prepared
     from cdpr.cli.run_summary import show_prepared, show_summary
     from executor.run_folder import RunFolder
 
@@ -154,110 +151,6 @@ def prepared_run(plan: Path, rig: Rig, *, quiet: bool) -> PreparedRun:
     require_same_rig(the_plan, rig, plan)
     with spinner("checking the plan and its set-points", not quiet):
         return prepare(verify(the_plan, rig), rig)
-
-
-def run_prepared(
-    prepared: PreparedRun,
-    output: Path,
-    camera_name: str | None,
-    *,
-    fast: bool,
-    start: Pose | None,
-    quiet: bool,
-) -> dict[str, Any]:
-    """Arms, moves, measures and writes the run folder; returns the run's summary.
-
-    A run that is refused before anything moved leaves no folder.
-
-    Args:
-        prepared: The checked run.
-        output: The run folder to make.
-        camera_name: From `choose_camera`.
-        fast: Simulated time.
-        start: Where the simulated platform stands; None at the plan's start.
-        quiet: No progress.
-    """
-    from cdpr.cli.cameras import open_camera
-    from cdpr.cli.drives import IN_PROCESS, open_drives
-    from cdpr.cli.output import spinner
-    from cdpr.errors import StoppedByOperator
-    from executor.clock import RealClock, SimulatedClock
-    from executor.run import Execution, conclude
-    from executor.run_folder import RunFolder
-    from executor.running import announced, stop_requests
-
-    rig, scene = prepared.rig, prepared.scene
-    pictures = int(prepared.law.duration * (rig.cameras[0].rate if camera_name else 0.0))
-    folder = RunFolder.create(output)
-    moved = False
-    try:
-        with (
-            stop_requests() as stop_requested,
-            announced(),
-            open_camera(rig, scene, camera_name, output, pictures, fast) as camera,
-            open_drives(rig, start or scene.start, scene.load) as drives,
-        ):
-            clock = SimulatedClock() if fast else RealClock(prepared.checked.table.cycle)
-            execution = Execution(prepared, drives.group, clock, stop_requested=stop_requested)
-            execution.loop.arm()
-            if stop_requested():
-                raise StoppedByOperator("stopped before anything moved")
-            moved = True
-            outcome, looks = _move(execution, folder, camera, drives.true_pose, quiet)
-    finally:
-        if not moved:
-            folder.discard()
-    interface = rig.document.bus.interface
-    with spinner("writing the run folder and its report", not quiet):
-        folder.write_plan(prepared.plan.plan.document)
-        folder.write_rig(rig.document)
-        return conclude(
-            prepared,
-            outcome,
-            folder,
-            looks,
-            interface=interface,
-            simulated=interface == IN_PROCESS,
-            fast=fast,
-        )
-
-
-def _move(
-    execution: Execution,
-    folder: RunFolder,
-    camera: CameraProcess | None,
-    true_pose: Any,
-    quiet: bool,
-) -> tuple[Outcome, list[Look]]:
-    from cdpr.cli.output import progress_bar
-    from cdpr.errors import CdprError
-    from executor.observer import unseen
-    from executor.run_folder import RunEvent
-
-    rows = len(execution.prepared.checked.table)
-    if camera is None:
-        with progress_bar("moving", rows, not quiet) as advance:
-            return execution.run(folder, progress=advance), []
-
-    asked: list[float] = []
-
-    def trigger(time: float) -> None:
-        asked.append(time)
-        camera.trigger(time, true_pose() if true_pose else None)
-
-    rate = execution.prepared.rig.cameras[0].rate
-    with progress_bar("moving", rows, not quiet) as advance:
-        outcome = execution.run(folder, trigger=trigger, camera_rate=rate, progress=advance)
-    with progress_bar("measuring pictures", camera.triggered, not quiet) as advance:
-        try:
-            looks = camera.finish(advance)
-        except CdprError as error:  # the motion is over; without pictures the run is still a record
-            folder.append_event(RunEvent(asked[-1] if asked else 0.0, "camera", error.what))
-            return outcome, [unseen(k, time, error.what) for k, time in enumerate(asked)]
-    if camera.dropped:
-        told = f"{camera.dropped} of {len(asked)} pictures left out: the one before was not done"
-        folder.append_event(RunEvent(asked[-1], "pictures_dropped", told))
-    return outcome, looks
 
 
 def exit_code(summary: dict[str, Any]) -> int:

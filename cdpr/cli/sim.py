@@ -44,6 +44,7 @@ def sim(
     from drivers.bus import BusSettings, open_bus
     from executor.realtime import real_time
     from executor.running import stop_requests
+    from executor.wishes import OwnBoard
     from simulation.rehearsal import Rehearsal
 
     the_rig = rig_on_bus(rig, interface, channel)
@@ -64,10 +65,11 @@ def sim(
             f" {BusSettings.of(the_rig)}; platform at {x:.1f}, {y:.1f}, {z:.1f} mm; Ctrl-C ends it",
             soft_wrap=True,
         )
-        with stop_requests() as stop_requested, real_time() as denied:
+        board = OwnBoard()
+        with stop_requests(board), real_time() as denied:
             if denied:
                 err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
-            rehearsal.serve(stop_requested)
+            rehearsal.serve(lambda: board.read().stop)
     finally:
         bus.shutdown()
     out.print("the simulated drives are gone")

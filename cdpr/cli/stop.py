@@ -19,19 +19,19 @@ def stop(
       cdpr stop
     """
     from cdpr.cli.output import out, show_json
-    from cdpr.errors import Fault
-    from executor.running import stop_all
+    from executor.command_client import ask_all, no_answer, no_run
+    from executor.running import reached_runs
 
-    stopped = stop_all()
+    with reached_runs() as runs:
+        answers = ask_all(runs, "stop")
+    stopped = [answer.process for answer in answers if answer.status is not None]
+    silent = [answer.process for answer in answers if answer.status is None]
     if as_json:
-        show_json({"stopped_processes": stopped})
-        raise typer.Exit(0 if stopped else 1)
-    if not stopped:
-        raise Fault(
-            "no run of yours is going on, so nothing was stopped",
-            where="cdpr stop",
-            why="it ended already, or another user started it",
-            next_step="press the emergency stop if something moves; a run of another user is"
-            " stopped by that user or by root",
-        )
-    out.print(f"stop sent to process {', '.join(map(str, stopped))}")
+        show_json({"stopped_processes": stopped, "silent_processes": silent})
+        raise typer.Exit(0 if stopped and not silent else 1)
+    if not answers:
+        raise no_run("stop")
+    if stopped:
+        out.print(f"stop sent to process {', '.join(map(str, stopped))}")
+    if silent:
+        raise no_answer("stop", silent)

@@ -63,6 +63,7 @@ def track(
     from cdpr.cli.plan import check_output
     from cdpr.rig import load_rig
     from executor.running import stop_requests
+    from executor.wishes import OwnBoard
     from tracking.pose_log import write_pose_log
     from tracking.track import track as tracked
     from tracking.tracker import Tracker
@@ -73,8 +74,9 @@ def track(
     the_scene = _scene(scene, plan)
     frames, total = _source(the_rig, the_scene, the_camera, source, plan)
     logged: list[LoggedPicture] = []
+    board = OwnBoard()
     with (
-        stop_requests() as stopped,
+        stop_requests(board),
         progress_bar("tracking", pictures or total, not as_json) as show,
     ):
         patience = PATIENCE if total is None else None
@@ -83,7 +85,7 @@ def track(
         ):
             logged.append(found)
             show(len(logged))
-            if stopped():
+            if board.read().stop:
                 break
     write_pose_log(output, logged)
     facts = _facts(the_rig, the_scene, logged, output)

@@ -11,6 +11,8 @@ from cdpr.cli import bench
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
+from cdpr.cli.monitor import monitor
+from cdpr.cli.operate import hold, resume, speed
 from cdpr.cli.plan import plan
 from cdpr.cli.report import report
 from cdpr.cli.run import run
@@ -20,7 +22,22 @@ from cdpr.cli.track import track
 from cdpr.cli.workspace import workspace
 from cdpr.errors import StoppedByOperator
 
-VERBS = (demo, plan, check, run, stop, track, sim, report, workspace, doctor)
+VERBS = (
+    demo,
+    plan,
+    check,
+    run,
+    stop,
+    hold,
+    resume,
+    speed,
+    monitor,
+    track,
+    sim,
+    report,
+    workspace,
+    doctor,
+)
 
 
 def add_verbs(app: typer.Typer) -> None:

@@ -87,13 +87,29 @@ def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    "verb", [("hold",), ("resume",), ("speed", "50"), ("monitor",), ("monitor", "--once", "--json")]
+)
+def test_a_wish_that_reaches_no_run_is_no_success(verb: tuple[str, ...]) -> None:
+    told = call(*verb)
+    assert told.code == 1
+    assert "no run of yours is going on" in told.err
+    assert "emergency stop" in told.err
+
+
+@pytest.mark.parametrize("percent", ["0", "101", "-5", "fast"])
+def test_a_speed_that_is_none_is_bad_input(percent: str) -> None:
+    assert call("speed", percent).code == 2
+
+
 def test_a_stop_that_stops_nothing_is_no_success() -> None:
     """Who presses stop and sees something move must not read that all is well."""
     told = call("stop")
     assert told.code == 1
     assert "no run of yours is going on" in told.err
     assert "emergency stop" in told.err
-    assert document(call("stop", "--json")) == {"stopped_processes": []}
+    nobody = {"stopped_processes": [], "silent_processes": []}
+    assert document(call("stop", "--json")) == nobody
     assert call("stop", "--json").code == 1
 
 

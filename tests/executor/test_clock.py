@@ -26,10 +26,10 @@ class _Time:
     def monotonic_ns(self) -> int:
         return self.now
 
-    def sleep(self, seconds: float) -> None:
-        assert seconds > 0
-        self.slept.append(round(seconds * 1e9))
-        self.now += round(seconds * 1e9) + self.overshoot
+    def sleep_until(self, deadline: int) -> None:
+        assert deadline > self.now
+        self.slept.append(deadline - self.now)
+        self.now = deadline + self.overshoot
 
     def work(self, seconds: float) -> None:
         self.now += round(seconds * 1e9)
@@ -39,13 +39,17 @@ class _Time:
 def time(monkeypatch: pytest.MonkeyPatch) -> _Time:
     hand_moved = _Time()
     monkeypatch.setattr(clock, "time", hand_moved)
+    monkeypatch.setattr(clock, "sleep_until", hand_moved.sleep_until)
     return hand_moved
 
 
 def test_simulated_time_costs_nothing_and_is_never_late():
-    simulated = SimulatedClock()
+    simulated = SimulatedClock(CYCLE)
     assert simulated.simulated
-    assert (simulated.next_cycle(), simulated.time_left()) == (0.0, 0.0)
+    assert simulated.time == 0.0
+    for cycle in range(4):
+        assert (simulated.next_cycle(), simulated.time_left()) == (0.0, 0.0)
+        assert simulated.time == cycle * CYCLE
 
 
 def test_cycles_begin_on_time_whatever_the_work_takes(time):
@@ -85,6 +89,7 @@ def test_no_two_cycles_are_closer_than_nine_tenths(works):
     time, real = _Time(), RealClock(CYCLE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clock, "time", time)
+        patch.setattr(clock, "sleep_until", time.sleep_until)
         begins = []
         for work in works:
             assert real.next_cycle() >= 0.0
@@ -92,6 +97,22 @@ def test_no_two_cycles_are_closer_than_nine_tenths(works):
             time.work(work)
     for before, after in pairwise(begins):
         assert after - before >= 0.9 * CYCLE_NS - 1
+
+
+def test_the_time_of_a_cycle_is_when_it_truly_began(time):
+    real = RealClock(CYCLE)
+    assert real.time == time.now / 1e9
+    real.next_cycle()
+    first = real.time
+    time.work(0.004)
+    assert real.time == first, "work in a cycle does not change when it began"
+    time.overshoot = 80_000
+    real.next_cycle()
+    assert real.time - first == pytest.approx(CYCLE + 80e-6)
+
+
+def test_a_moment_that_is_over_is_not_slept_for():
+    clock.sleep_until(1)
 
 
 def test_time_left_ends_before_the_cycle_does(time):

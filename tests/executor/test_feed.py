@@ -115,6 +115,74 @@ def test_a_stop_harder_than_one_cycle_can_show_is_at_rest_at_once():
     assert places[-1] <= 11.0
 
 
+def _walked(motion: Motion, wishes: list[tuple[int, float]], rows: int = 5000) -> list[float]:
+    """Places of a feed that is asked for another rate after so many cycles each."""
+    feed = Feed(rows, CYCLE, motion)
+    places = [feed.index]
+    for cycles, rate in wishes:
+        feed.go_to(rate)
+        places += [feed.advance() for _ in range(cycles)]
+    return places
+
+
+@given(
+    wishes=st.lists(st.tuples(st.integers(0, 60), st.floats(0.0, 1.0)), min_size=1, max_size=8),
+    motion=motions,
+)
+@settings(max_examples=80)
+def test_whatever_is_asked_for_it_keeps_between_rest_and_full_rate_and_changes_smoothly(
+    wishes, motion
+):
+    """Also when one change is interrupted by the next."""
+    places = np.array(_walked(motion, wishes))
+    rates = np.diff(places)
+    assert (rates >= 0.0).all()
+    assert (rates <= 1.0 + 1e-9).all()
+    metres = places * motion.speed * CYCLE
+    limit = motion.acceleration * (1 + 1e-6)
+    assert np.abs(np.diff(metres, 2)).max(initial=0.0) / CYCLE**2 <= limit
+    limit = motion.jerk * (1 + 1e-6)
+    assert np.abs(np.diff(metres, 3)).max(initial=0.0) / CYCLE**3 <= limit
+
+
+@given(rate=st.floats(0.01, 1.0), motion=motions)
+@settings(max_examples=30)
+def test_it_reaches_the_rate_that_was_asked_for_and_keeps_it(rate, motion):
+    places = _walked(motion, [(5, 1.0), (1000, rate)])
+    assert np.diff(places[-50:]) == pytest.approx(rate, abs=1e-9)
+
+
+@given(motion=motions, before=st.integers(0, 60), held=st.integers(0, 300))
+@settings(max_examples=30)
+def test_after_a_hold_it_goes_on_to_the_end_without_leaving_a_row_out(motion, before, held):
+    feed = Feed(600, CYCLE, motion)
+    for _ in range(before):
+        feed.advance()
+    feed.stop()
+    for _ in range(held):
+        feed.advance()
+    feed.go_to(1.0)
+    places = _to_rest(feed)
+    assert places[-1] == 599
+    assert feed.at_end
+    assert (np.diff(places) <= 1.0 + 1e-9).all()
+
+
+def test_asking_again_for_the_same_rate_changes_nothing():
+    once, often = (Feed(500, CYCLE, GACHON) for _ in range(2))
+    for feed in (once, often):
+        feed.go_to(0.3)
+    for _ in range(60):
+        often.go_to(0.3)
+        assert often.advance() == once.advance()
+
+
+@pytest.mark.parametrize("rate", [-0.01, 1.01, float("nan")])
+def test_a_rate_the_table_was_not_proved_for_is_refused(rate):
+    with pytest.raises(ValueError, match="not from 0 to 1"):
+        Feed(10, CYCLE, GACHON).go_to(rate)
+
+
 def test_targets_at_a_row_are_the_row_and_plain_integers():
     table = np.array([[1, -5], [7, 100], [2**31 - 1, -(2**31)]], dtype=np.int32)
     for row, values in enumerate(table.tolist()):

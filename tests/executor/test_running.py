@@ -1,9 +1,10 @@
-"""Stopping from elsewhere: every announced run is reached, and nothing else is touched."""
+"""Reaching runs from elsewhere: every announced run is reached, and nothing else is touched."""
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -15,15 +16,18 @@ from pathlib import Path
 import pytest
 
 from cdpr.errors import Refused
-from executor.running import STOP_SIGNALS, announced, stop_all, stop_requests
+from executor.running import STOP_SIGNALS, announced, reached_runs, stop_requests
+from executor.wishes import OwnBoard
 
 #: A run as the command line makes one: tells that it is announced, ends when it was asked to.
 RUN = """
-import signal, sys
+import signal
 from executor.running import announced, stop_requests
-with stop_requests() as requested, announced():
+from executor.wishes import OwnBoard
+board = OwnBoard()
+with stop_requests(board), announced() as listeners:
     print("announced", flush=True)
-    while not requested():
+    while not board.read().stop:
         signal.sigtimedwait([], 0.01)
 print("stopped", flush=True)
 """
@@ -61,75 +65,62 @@ def _run() -> Iterator[subprocess.Popen[str]]:
         process.stdout.close()
 
 
-def _end(process: subprocess.Popen[str]) -> tuple[str, int]:
-    """What it said last, and its exit code; it is killed when it does not end in time."""
-    assert process.stdout is not None
-    return process.stdout.read(), process.wait()
+def _reached() -> list[int]:
+    with reached_runs() as runs:
+        return [run.process for run in runs]
 
 
 @pytest.mark.parametrize("without", ["", "XDG_RUNTIME_DIR"])
-def test_stop_reaches_a_run_also_from_a_terminal_without_a_run_time_folder(
+def test_a_run_is_reached_also_from_a_terminal_without_a_run_time_folder(
     folders, monkeypatch, without
 ):
     with _run() as process:
         if without:
             monkeypatch.delenv(without)
-        assert stop_all() == [process.pid]
-        assert _end(process) == ("stopped\n", 0)
-    assert stop_all() == []
+        assert _reached() == [process.pid]
+        process.terminate()
+        process.wait()
+        assert _reached() == []
 
 
-def test_stop_reaches_every_run(folders):
+def test_every_run_is_reached(folders):
     with _run() as one, _run() as other:
-        assert stop_all() == sorted([one.pid, other.pid])
-        assert _end(one) == _end(other) == ("stopped\n", 0)
+        assert _reached() == sorted([one.pid, other.pid])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_a_signal_and_a_closed_terminal_are_requests_not_ends(folders, number):
+def test_ctrl_c_a_signal_and_a_closed_terminal_are_wishes_not_ends(folders, number):
     with _run() as process:
         process.send_signal(number)
-        assert _end(process) == ("stopped\n", 0)
+        assert process.stdout is not None
+        assert (process.stdout.read(), process.wait()) == ("stopped\n", 0)
 
 
-def test_a_run_that_was_killed_leaves_nothing_that_is_stopped(folders):
-    """Its number may be another process's by now."""
+def test_a_run_that_was_killed_is_not_reached_and_its_name_is_cleared_away(folders):
     with _run() as process:
         process.kill()
         process.wait()
-        assert [list(folder.iterdir()) for folder in folders] != [[], []]
-        assert stop_all() == []
-    assert [list(folder.iterdir()) for folder in folders] == [[], []]
+        assert all(list(folder.iterdir()) for folder in folders)
+        assert _reached() == []
+        assert not any(list(folder.iterdir()) for folder in folders)
 
 
-def test_an_announcement_ends_with_its_block(folders):
+def test_a_run_that_ended_leaves_nothing(folders):
     with announced():
-        names = [[path.name for path in folder.iterdir()] for folder in folders]
-        assert names == [[f"{os.getpid()}.run"]] * 2
-    assert [list(folder.iterdir()) for folder in folders] == [[], []]
+        assert _reached() == [os.getpid()]
+    assert not any(list(folder.iterdir()) for folder in folders)
+    assert _reached() == []
 
 
-def test_an_announcement_ends_also_when_its_block_breaks(folders):
-    with pytest.raises(KeyError), announced():
-        raise KeyError
-    assert [list(folder.iterdir()) for folder in folders] == [[], []]
+def test_names_of_other_things_are_left_alone(folders):
+    folders[0].mkdir(mode=0o700)
+    for name in ("12.sock", "notes.txt", "x.sock"):
+        (folders[0] / name).write_text("mine")
+    assert _reached() == []
+    assert len(list(folders[0].iterdir())) == 3
 
 
-def test_nothing_runs_where_nothing_was_announced(folders):
-    assert stop_all() == []
-    assert not any(folder.exists() for folder in folders), "asking makes no folders"
-
-
-@pytest.mark.parametrize("name", ["notes.txt", "abc.run", "-5.run", "12x.run", ".run"])
-def test_other_files_are_left_alone(folders, name):
-    for folder in folders:
-        folder.mkdir(mode=0o700)
-        (folder / name).write_text("mine")
-    assert stop_all() == []
-    assert [(folder / name).read_text() for folder in folders] == ["mine", "mine"]
-
-
-def test_a_new_file_is_closed_to_others(folders):
+def test_folder_and_socket_are_closed_to_others(folders):
     with announced():
         for folder in folders:
             (file,) = folder.iterdir()
@@ -137,16 +128,15 @@ def test_a_new_file_is_closed_to_others(folders):
             assert file.stat().st_mode & 0o077 == 0
 
 
-def test_a_link_in_place_of_the_file_is_not_followed(folders, tmp_path):
-    """Who could write to the folder before it was closed could have had any file emptied."""
+def test_a_link_in_place_of_the_socket_is_not_followed(folders, tmp_path):
+    """Who could write to the folder before it was closed could have had any file replaced."""
     precious = tmp_path / "precious"
     precious.write_text("mine")
     folders[0].mkdir(mode=0o700)
-    (folders[0] / f"{os.getpid()}.run").symlink_to(precious)
-    with pytest.raises(OSError, match="symbolic link"), announced():
-        pass
-    assert precious.read_text() == "mine"
-    assert stop_all() == []
+    for ending in ("sock", "sock.new"):
+        (folders[0] / f"{os.getpid()}.{ending}").symlink_to(precious)
+    with announced():
+        assert _reached() == [os.getpid()]
     assert precious.read_text() == "mine"
 
 
@@ -184,7 +174,7 @@ def test_a_folder_that_others_control_is_not_used_while_there_is_another(
     safe, doubtful = folders
     _spoil(doubtful, how, tmp_path, monkeypatch)
     with announced():
-        assert [path.name for path in safe.iterdir()] == [f"{os.getpid()}.run"]
+        assert [path.name for path in safe.iterdir()] == [f"{os.getpid()}.sock"]
         assert list(doubtful.iterdir()) == []
 
 
@@ -198,82 +188,45 @@ def test_a_run_that_no_stop_could_reach_is_refused(folders, tmp_path, monkeypatc
 
 
 @spoilt
-def test_no_process_is_stopped_on_the_word_of_a_folder_that_others_control(
-    folders, tmp_path, monkeypatch, how
-):
-    with _run() as process:
-        name = f"{process.pid}.run"
-        (tmp_path / name).hardlink_to(folders[1] / name)  # locked, whatever it is called
-        for folder in folders:
-            (folder / name).unlink()
-            folder.rmdir()
+def test_nobody_is_spoken_to_in_a_folder_that_others_control(folders, tmp_path, monkeypatch, how):
+    """A stop that goes to somebody else's socket stops nothing."""
+    with socket.socket(socket.AF_UNIX) as listener:
         _spoil(folders[1], how, tmp_path, monkeypatch)
-        (folders[1] / name).hardlink_to(tmp_path / name)
-        assert stop_all() == []
-        assert process.poll() is None
+        monkeypatch.chdir(folders[1])
+        listener.bind("77.sock")
+        listener.listen()
+        assert _reached() == []
+        assert (folders[1] / "77.sock").exists()
 
 
-def test_two_stops_at_once_do_not_take_each_other_for_a_run(folders, monkeypatch):
-    """One looks at a stale file while the other does; its number may be anybody's."""
-    import fcntl
-
-    folders[0].mkdir(mode=0o700)
-    stale = folders[0] / f"{os.getpid()}.run"
-    stale.touch()
-    with stale.open() as other:
-        fcntl.flock(other, fcntl.LOCK_SH)
-        killed: list[int] = []
-        monkeypatch.setattr(os, "kill", lambda number, _signal: killed.append(number))
-        assert stop_all() == []
-        assert killed == []
-
-
-def test_a_run_that_ends_while_it_is_asked_to_stop_is_no_error(folders, monkeypatch):
-    with _run():
-
-        def gone(_number: int, _signal: int) -> None:
-            raise ProcessLookupError
-
-        monkeypatch.setattr(os, "kill", gone)
-        assert stop_all() == []
-        monkeypatch.undo()
-
-
-def test_an_announcement_that_was_removed_before_it_was_locked_is_made_again(folders, monkeypatch):
-    """A stop at the very beginning of a run takes the file that is not yet locked for stale."""
-    import fcntl
-
-    real, removed = fcntl.flock, []
-
-    def flock(file: int, operation: int) -> None:
-        if operation == fcntl.LOCK_EX and not removed:
-            removed.append(file)
-            (folders[0] / f"{os.getpid()}.run").unlink()
-        real(file, operation)
-
-    monkeypatch.setattr(fcntl, "flock", flock)
+def test_a_listener_of_another_user_is_not_spoken_to(folders, monkeypatch):
     with announced():
-        assert removed
-        assert (folders[0] / f"{os.getpid()}.run").exists()
+        real = os.getuid()
+        other = os.stat(folders[0]).st_uid
+        assert other == real
+        monkeypatch.setattr("executor.running.struct.unpack", lambda *_: (1, real + 1, 0))
+        assert _reached() == []
 
 
 def test_handlers_are_put_back(folders):
     before = [signal.getsignal(number) for number in STOP_SIGNALS]
-    with stop_requests() as requested:
-        assert requested() is False
+    board = OwnBoard()
+    with stop_requests(board):
+        assert board.read().stop is False
         os.kill(os.getpid(), signal.SIGINT)
-        assert requested() is True
+        assert board.read().stop is True
     assert [signal.getsignal(number) for number in STOP_SIGNALS] == before
 
 
 def test_a_run_under_nohup_outlives_its_terminal():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    board = OwnBoard()
     try:
-        with stop_requests() as requested:
+        with stop_requests(board):
             os.kill(os.getpid(), signal.SIGHUP)
-            assert requested() is False
+            assert board.read().stop is False
             os.kill(os.getpid(), signal.SIGTERM)
-            assert requested() is True
+            assert board.read().stop is True
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -14,9 +14,12 @@ from cdpr.poses import Array
 from drivers.bus import BusSettings, open_bus
 from drivers.cia402.states import DriveState
 from drivers.drive_group import DriveGroup, make_drive_group
+from executor.execution import Outcome, run_here
 from executor.prepare import PreparedRun
-from executor.run import Execution, Outcome
+from executor.recorder import Recorder, Trigger
 from executor.run_folder import RunEvent, RunFolder
+from executor.status import RunStatus
+from executor.wishes import OwnBoard
 from simulation.drive import SimulatedDrive
 from simulation.rehearsal import Rehearsal
 
@@ -34,7 +37,8 @@ class Stage:
         folder: The run folder.
         script: Called at the beginning of every cycle with the stage.
         cycle: Counted from 0.
-        stop: What the executor sees as the operator's wish.
+        board: What the executor sees as the operator's wishes.
+        status: What it tells those who ask.
         lateness: What the clock tells, in cycles.
         simulated: This clock costs no time.
     """
@@ -45,9 +49,10 @@ class Stage:
     folder: RunFolder
     script: Callable[[Stage], None]
     cycle: int = -1
-    stop: bool = False
+    board: OwnBoard = field(default_factory=OwnBoard)
     lateness: float = 0.0
     simulated: bool = True
+    status: RunStatus | None = None
     drive_states: list[tuple[DriveState, ...]] = field(default_factory=list)
 
     def next_cycle(self) -> float:
@@ -66,20 +71,31 @@ class Stage:
     def drives(self) -> tuple[SimulatedDrive, ...]:
         return self.rehearsal.drives
 
-    def execution(self) -> Execution:
-        """Armed and ready to move."""
-        execution = Execution(
+    @property
+    def time(self) -> float:
+        """Cycles times their length."""
+        return max(0, self.cycle) * self.prepared.checked.table.cycle
+
+    def run(
+        self,
+        trigger: Trigger | None = None,
+        progress: Callable[[float], None] = lambda _row: None,
+        before_motion: Callable[[], None] = lambda: None,
+    ) -> Outcome:
+        """Arms and does the whole motion."""
+        self.status = RunStatus(self.prepared, self.folder.path, self.board, simulated_time=True)
+        recorder = Recorder(
+            self.prepared, self.folder, self.status, trigger=trigger, every=10, progress=progress
+        )
+        return run_here(
             self.prepared,
             self.group,
             self,
-            stop_requested=lambda: self.stop,
+            self.board,
+            recorder,
+            true_pose=None,
+            before_motion=before_motion,
         )
-        execution.loop.arm()
-        return execution
-
-    def run(self) -> Outcome:
-        """The whole motion."""
-        return self.execution().run(self.folder)
 
     def events(self) -> list[RunEvent]:
         return self.folder.events()

@@ -80,9 +80,8 @@ def late(stage: Stage) -> None:
 def jump_in_table(stage: Stage) -> None:
     """As if memory had been written to after the check."""
     table: SetpointTable = stage.prepared.checked.table
-    jumped = table.setpoints.copy()
-    jumped[CRUISING + 5 :, 3] += 4000
-    table.__dict__["setpoints"] = jumped
+    table.setpoints.setflags(write=True)
+    table.setpoints[CRUISING + 5 :, 3] += 4000
 
 
 def unplug(stage: Stage) -> None:
@@ -145,9 +144,12 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def table_restored(prepared: PreparedRun) -> Iterator[None]:
-    kept = prepared.checked.table.setpoints
+    setpoints = prepared.checked.table.setpoints
+    kept = setpoints.copy()
     yield
-    prepared.checked.table.__dict__["setpoints"] = kept
+    if setpoints.flags.writeable:
+        setpoints[:] = kept
+        setpoints.setflags(write=False)
 
 
 def concluded(stage: Stage, outcome: Any) -> dict[str, Any]:
@@ -217,7 +219,7 @@ def test_an_error_in_a_callback_stops_the_drives_and_is_on_record(
             raise ZeroDivisionError("a defect in a callback")
 
     with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
-        outcome = stage.execution().run(stage.folder, **{callback: broken})  # type: ignore[arg-type]
+        outcome = stage.run(**{callback: broken})  # type: ignore[arg-type]
         assert outcome.state is State.LATCHED
         assert "recorder" in [event.code for event in stage.events()]
         stage.rehearsal.pump()
@@ -265,7 +267,7 @@ def test_the_first_of_several_causes_is_the_one_that_is_told(
 def test_a_stop_wish_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path) -> None:
     def both(stage: Stage) -> None:
         if stage.cycle == CRUISING:
-            stage.stop = True
+            stage.board.ask_stop()
         elif stage.cycle == CRUISING + 5:
             stage.drives[3].silent = True
 
@@ -311,15 +313,15 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
     """Through the real program with its real camera process, killed as the system would."""
     from executor.camera_process import CameraProcess
 
-    cycles = 0
+    cycles, real = 0, SimulatedClock.next_cycle
     finish = CameraProcess.finish
 
-    def next_cycle(_clock: SimulatedClock) -> float:
+    def next_cycle(clock: SimulatedClock) -> float:
         nonlocal cycles
         cycles += 1
         if cycles == cycle:
             die("killed")()
-        return 0.0
+        return real(clock)
 
     def finish_or_die(process: CameraProcess, progress: Callable[[float], None]) -> Any:
         if cycles < cycle:

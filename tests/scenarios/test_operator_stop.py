@@ -24,7 +24,7 @@ PHASES = {"enabling": 1, "approaching": 8, "speeding up": 25, "cruising": 150, "
 
 
 def stop(stage: Stage) -> None:
-    stage.stop = True
+    stage.board.ask_stop()
 
 
 def stopped_in(prepared: PreparedRun, path: Path, cycle: int) -> tuple[Stage, Outcome]:
@@ -93,14 +93,14 @@ def test_a_stop_at_rest_at_the_goal_changes_nothing(prepared: PreparedRun, tmp_p
 def test_ctrl_c_in_the_program_stops_along_the_path_and_exits_130(
     short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cycles = 0
+    cycles, real = 0, SimulatedClock.next_cycle
 
-    def next_cycle(_clock: SimulatedClock) -> float:
+    def next_cycle(clock: SimulatedClock) -> float:
         nonlocal cycles
         cycles += 1
         if cycles == 150:
             signal.raise_signal(signal.SIGINT)
-        return 0.0
+        return real(clock)
 
     monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
     run = tmp_path / "run"

@@ -96,7 +96,9 @@ def test_a_run_with_the_drives_in_another_process_loses_no_frame(
     assert summary["fast"] is False
     assert summary["following_error_mm"]["max"] <= 0.1
     assert summary["lateness_ms"]["p50"] < CYCLE_MS
-    assert summary["duration_s"] == pytest.approx(summary["cycles"] * CYCLE_MS / 1000.0)
+    # On a clock of its own, beside the number of the cycle: late cycles make it longer.
+    nominal = summary["cycles"] * CYCLE_MS / 1000.0
+    assert nominal - CYCLE_MS / 1000.0 <= summary["duration_s"] <= 2.0 * nominal
     assert last == "the simulated drives are gone\n"
     assert load_rig(RIG).document.bus.cycle_ms == CYCLE_MS
 
@@ -118,7 +120,7 @@ def test_stop_from_another_terminal_ends_a_run_along_its_path(
         waited_for(run / "events.jsonl", "moving", moving)
         code, out, err = finished("stop", "--json")
         assert (code, err) == (0, "")
-        assert json.loads(out) == {"stopped_processes": [moving.pid]}
+        assert json.loads(out) == {"stopped_processes": [moving.pid], "silent_processes": []}
         said, trouble = moving.communicate()
         assert moving.returncode == 130, trouble
     assert "STOPPED" in said
@@ -126,7 +128,9 @@ def test_stop_from_another_terminal_ends_a_run_along_its_path(
     assert summary["final_state"] == "stopped"
     assert summary["travelled_mm"] < summary["path_length_mm"] - 1.0
     assert [event["code"] for event in summary["events"]][-2:] == ["stop", "held"]
-    assert finished("stop", "--json")[1].split() == ["{", '"stopped_processes":', "[]", "}"]
+    code, out, _ = finished("stop", "--json")
+    assert code == 1
+    assert json.loads(out) == {"stopped_processes": [], "silent_processes": []}
 
 
 def test_a_terminal_that_is_closed_is_a_stop_too(short_plan: Path, tmp_path: Path) -> None:

@@ -1,0 +1,173 @@
+"""`cdpr monitor`: looks at a run that is under way, live in a terminal or once for a program."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.console import Group
+
+_STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latched": "bold red"}
+
+
+def monitor(
+    once: Annotated[bool, typer.Option("--once", help="look once instead of all the time")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON: one document with --once, otherwise a line a look")
+    ] = False,
+    rate: Annotated[
+        float, typer.Option("--rate-hz", min=0.1, max=50.0, help="looks a second")
+    ] = 5.0,
+    process: Annotated[
+        int | None, typer.Option("--process", help="which run, where several are under way")
+    ] = None,
+) -> None:
+    """Watch a run: its state, every drive, tension, lateness, progress and events, to its end.
+
+    It only looks; `cdpr stop`, `hold`, `resume` and `speed` act. Ctrl-C ends the monitor, not the
+    run.
+
+    [dim]Examples:[/dim]
+
+      cdpr monitor
+
+      cdpr monitor --once --json
+    """
+    from cdpr.cli.operate import told
+    from cdpr.cli.output import out, show_json
+
+    if once:
+        status = told("status", process)
+        if as_json:
+            show_json(status)
+        else:
+            typer.echo(_plain(status))
+        return
+    looks = _looks(process, rate)
+    if as_json or not out.is_terminal:
+        _lines(looks, as_json)
+    else:
+        _live(looks)
+
+
+def _looks(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
+    """How the run stands, again and again, on one connection; until it ends."""
+    import time
+
+    from executor.command_client import ask_all, the_one
+    from executor.running import reached_runs
+
+    with reached_runs() as runs:
+        run = the_one(runs, process, "monitor")
+        while True:
+            (answer,) = ask_all([run], "status")
+            if answer.status is None:
+                return
+            yield answer.status
+            time.sleep(1.0 / rate)
+
+
+def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
+    """For a file or a program: a line a look, and each event once."""
+    import json
+
+    seen: list[dict[str, Any]] = []
+    try:
+        for status in looks:
+            if as_json:
+                typer.echo(json.dumps(status, allow_nan=False))
+                continue
+            for event in status["events"]:
+                if event not in seen:
+                    typer.echo(f"{event['time_s']:9.3f} s  {event['code']}: {event['text']}")
+            seen = status["events"]
+            typer.echo(_head(status))
+    except KeyboardInterrupt:
+        return
+
+
+def _live(looks: Iterator[dict[str, Any]]) -> None:
+    from rich.live import Live
+
+    from cdpr.cli.output import out
+
+    state = "gone"
+    try:
+        with Live(console=out, auto_refresh=False, transient=False) as live:
+            for status in looks:
+                live.update(_view(status), refresh=True)
+                state = status["state"]
+    except KeyboardInterrupt:
+        return
+    out.print(f"the run ended; last seen {state}")
+
+
+def _head(status: dict[str, Any]) -> str:
+    """One line: where the run is."""
+    if status["cycle"] is None:
+        return f"{status['state']}  {status['rig']} on {status['bus']}"
+    parts = [
+        f"{status['elapsed_s']:9.3f} s",
+        status["state"],
+        f"{status['path_mm']:.1f} of {status['path_length_mm']:.1f} mm",
+        f"{status['feed_percent']:.0f} % of {status['wished']['speed_percent']} %",
+        _lateness(status),
+        f"following error {_number(status['following_error_mm'], '.3f')} mm",
+        f"{status['lost_replies']} lost replies",
+    ]
+    return "  ".join(parts)
+
+
+def _lateness(status: dict[str, Any]) -> str:
+    if status["simulated_time"]:
+        return "simulated time"
+    return f"late {status['lateness_ms']:.2f} ms, at most {status['worst_lateness_ms']:.2f} ms"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _plain(status: dict[str, Any]) -> str:
+    """Everything as text without a terminal."""
+    drives = [
+        f"  drive {d['node']:<3} {d['state']:<24} {d['position_counts']:>11}"
+        f" ({d['position_counts'] - d['set_counts']:+d}) counts {d['tension_n']:8.2f} N"
+        for d in status["drives"]
+    ]
+    events = [f"  {e['time_s']:9.3f} s  {e['code']}: {e['text']}" for e in status["events"]]
+    first = f"process {status['process']}: {status['rig']} on {status['bus']}, {status['folder']}"
+    return "\n".join([first, _head(status), *drives, *events])
+
+
+def _view(status: dict[str, Any]) -> Group:
+    """The live picture."""
+    from rich.console import Group
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+    from rich.text import Text
+
+    title = Text.assemble(
+        (status["state"].upper(), _STATES.get(status["state"], "bold")),
+        f"  {status['rig']} on {status['bus']}  process {status['process']}  {status['folder']}",
+    )
+    drives = Table("drive", "state", box=None, padding=(0, 2), header_style="dim")
+    for name in ("position [counts]", "off [counts]", "tension [N]"):
+        drives.add_column(name, justify="right")
+    for drive in status["drives"]:
+        drives.add_row(
+            str(drive["node"]),
+            drive["state"],
+            str(drive["position_counts"]),
+            f"{drive['position_counts'] - drive['set_counts']:+d}",
+            f"{drive['tension_n']:.2f}",
+        )
+    events = Table(box=None, show_header=False, padding=(0, 2))
+    for event in status["events"]:
+        events.add_row(f"{event['time_s']:.2f} s", event["code"], event["text"])
+    bar = ProgressBar(total=status["rows"], completed=status["row"] or 0.0, width=60)
+    return Group(title, Text(_head(status)), bar, drives, events)

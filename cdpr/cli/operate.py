@@ -1,0 +1,80 @@
+"""`cdpr hold`, `cdpr resume`, `cdpr speed`: what an operator wants of a run that is under way."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+_Process = Annotated[
+    int | None, typer.Option("--process", help="which run, where several are under way")
+]
+_Json = Annotated[bool, typer.Option("--json", help="print how the run stands, as JSON")]
+
+
+def hold(process: _Process = None, as_json: _Json = False) -> None:
+    """Feed hold: the platform slows down along the path, waits there, and keeps its tension.
+
+    [dim]Example:[/dim]
+
+      cdpr hold
+    """
+    _tell("hold", process, as_json)
+
+
+def resume(process: _Process = None, as_json: _Json = False) -> None:
+    """Go on after `cdpr hold`, at the speed that was asked for last.
+
+    [dim]Example:[/dim]
+
+      cdpr resume
+    """
+    _tell("resume", process, as_json)
+
+
+def speed(
+    percent: Annotated[
+        int, typer.Argument(min=1, max=100, help="of the planned speed", metavar="PERCENT")
+    ],
+    process: _Process = None,
+    as_json: _Json = False,
+) -> None:
+    """Go at a share of the planned speed along the path, from the next cycle on.
+
+    [dim]Example:[/dim]
+
+      cdpr speed 25
+    """
+    _tell("speed", process, as_json, percent)
+
+
+def _tell(verb: str, process: int | None, as_json: bool, percent: int | None = None) -> None:
+    from cdpr.cli.output import out, show_json
+
+    status = told(verb, process, percent)
+    if as_json:
+        show_json(status)
+        return
+    wish = {"hold": "hold", "resume": "go on", "speed": f"go at {percent} %"}[verb]
+    out.print(
+        f"process {status['process']} was told to {wish}; it is {status['state']}", soft_wrap=True
+    )
+    if verb == "speed" and status["wished"]["hold"]:
+        out.print("it holds: the speed counts from `cdpr resume` on")
+
+
+def told(verb: str, process: int | None, percent: int | None = None) -> dict[str, Any]:
+    """Says it to the run that is meant; how that run stands.
+
+    Raises:
+        Fault: No run is under way, or it does not answer.
+        BadInput: It is not clear which run is meant.
+    """
+    from executor.command_client import ask_all, no_answer, the_one
+    from executor.running import reached_runs
+
+    with reached_runs() as runs:
+        (answer,) = ask_all([the_one(runs, process, verb)], verb, percent)
+    if answer.status is None:
+        raise no_answer(verb, [answer.process])
+    return answer.status

@@ -1,0 +1,174 @@
+"""The moving part of `cdpr run` and `cdpr demo`: arms, moves, measures, writes the run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cdpr.poses import Pose
+    from executor.camera_process import CameraProcess
+    from executor.execution import Outcome
+    from executor.observer import Look
+    from executor.prepare import PreparedRun
+    from executor.recorder import Recorder
+    from executor.run_folder import RunFolder
+    from executor.wishes import WishBoard
+
+
+#: Without a camera the progress is told this often, [Hz].
+PROGRESS_RATE = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """One run and how it is to be done."""
+
+    prepared: PreparedRun
+    folder: RunFolder
+    camera_name: str | None
+    fast: bool
+    start: Pose | None
+    quiet: bool
+
+
+def run_prepared(
+    prepared: PreparedRun,
+    output: Path,
+    camera_name: str | None,
+    *,
+    fast: bool,
+    start: Pose | None,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Arms, moves, measures and writes the run folder; returns the run's summary.
+
+    A run that is refused before anything moved leaves no folder.
+
+    Args:
+        prepared: The checked run.
+        output: The run folder to make.
+        camera_name: From `choose_camera`.
+        fast: Simulated time.
+        start: Where the simulated platform stands; None at the plan's start.
+        quiet: No progress.
+    """
+    from cdpr.cli.drives import IN_PROCESS
+    from cdpr.cli.output import spinner
+    from executor.run import conclude
+    from executor.run_folder import RunFolder
+
+    folder = RunFolder.create(output)
+    job = _Job(prepared, folder, camera_name, fast, start, quiet)
+    moved = False
+
+    def before_motion() -> None:
+        nonlocal moved
+        moved = True
+
+    try:
+        folder.write_plan(prepared.plan.plan.document)
+        folder.write_rig(prepared.rig.document)
+        outcome, looks = _move_and_look(job, before_motion)
+    finally:
+        if not moved:
+            folder.discard()
+    interface = prepared.rig.document.bus.interface
+    with spinner("writing the run folder and its report", not quiet):
+        return conclude(
+            prepared,
+            outcome,
+            folder,
+            looks,
+            interface=interface,
+            simulated=interface == IN_PROCESS,
+            fast=fast,
+        )
+
+
+def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcome, list[Look]]:
+    """The motion and its pictures; `cdpr stop` and its like reach the run all the time."""
+    from cdpr.cli.cameras import open_camera
+    from cdpr.cli.output import progress_bar
+    from executor.command_server import serving
+    from executor.recorder import Recorder
+    from executor.running import announced, stop_requests
+    from executor.status import RunStatus
+    from executor.wishes import OwnBoard
+
+    prepared = job.prepared
+    rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
+    rate = prepared.rig.cameras[0].rate if job.camera_name else PROGRESS_RATE
+    pictures = int(prepared.law.duration * rate)
+    board = OwnBoard()
+    status = RunStatus(prepared, job.folder.path, board, simulated_time=job.fast)
+    camera_at = (prepared.rig, prepared.scene, job.camera_name, job.folder.path)
+    with (
+        stop_requests(board),
+        announced() as listeners,
+        serving(listeners, board, status),
+        open_camera(*camera_at, pictures, job.fast) as camera,
+    ):
+        with progress_bar("moving", rows, not job.quiet) as advance:
+            recorder = Recorder(
+                prepared,
+                job.folder,
+                status,
+                trigger=camera.trigger if camera else None,
+                every=max(1, round(1.0 / (rate * cycle))),
+                progress=advance,
+            )
+            outcome = _move(job, board, recorder, before_motion)
+        return outcome, _looks(camera, recorder, job) if camera else []
+
+
+def _move(
+    job: _Job, board: WishBoard, recorder: Recorder, before_motion: Callable[[], None]
+) -> Outcome:
+    """Arms the drives and runs the loop."""
+    from cdpr.cli.drives import open_drives
+    from cdpr.errors import StoppedByOperator
+    from executor.clock import RealClock, SimulatedClock
+    from executor.execution import run_here
+
+    def last_chance() -> None:
+        if board.read().stop:
+            raise StoppedByOperator("stopped before anything moved")
+        before_motion()
+
+    prepared = job.prepared
+    cycle = prepared.checked.table.cycle
+    start, load = job.start or prepared.scene.start, prepared.scene.load
+    with open_drives(prepared.rig, start, load) as drives:
+        return run_here(
+            prepared,
+            drives.group,
+            SimulatedClock(cycle) if job.fast else RealClock(cycle),
+            board,
+            recorder,
+            true_pose=drives.true_pose,
+            before_motion=last_chance,
+        )
+
+
+def _looks(camera: CameraProcess, recorder: Recorder, job: _Job) -> list[Look]:
+    """What the camera saw; when it failed, that it did, for every picture."""
+    from cdpr.cli.output import progress_bar
+    from cdpr.errors import CdprError
+    from executor.observer import unseen
+    from executor.run_folder import RunEvent
+
+    asked = recorder.asked
+    last = asked[-1] if asked else 0.0
+    with progress_bar("measuring pictures", camera.triggered, not job.quiet) as advance:
+        try:
+            looks = camera.finish(advance)
+        except CdprError as error:  # the motion is over; without pictures the run is still a record
+            job.folder.append_event(RunEvent(last, "camera", error.what))
+            return [unseen(k, time, error.what) for k, time in enumerate(asked)]
+    if camera.dropped:
+        told = f"{camera.dropped} of {len(asked)} pictures left out: the one before was not done"
+        job.folder.append_event(RunEvent(last, "pictures_dropped", told))
+    return looks

@@ -1,0 +1,134 @@
+"""One cycle with the drives: wait, ask the gate, send, receive, look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.poses import Array
+from drivers.drive_group import CycleStatus, DriveGroup, GroupState
+from executor.clock import Clock
+from executor.course import Course
+from executor.safety.gate import Purpose, Request, Verdict, examine
+from executor.safety.limits import gate_limits, watch_limits
+from executor.safety.watch import Finding, Observation, Watch
+
+
+@dataclass(frozen=True, slots=True)
+class Exchanged:
+    """What came of one cycle.
+
+    Attributes:
+        verdict: Of the gate; when it denied, nothing was sent and there is nothing else.
+        status: What the drives told.
+        following_error: Largest over the cables, [m]; NaN while the drives do not follow.
+        lateness: In cycles.
+        findings: What the watch saw.
+    """
+
+    verdict: Verdict
+    lateness: float
+    status: CycleStatus | None = None
+    following_error: float = float("nan")
+    findings: tuple[Finding, ...] = ()
+
+
+class Exchange:
+    """The way to the drives and back; nothing is sent but what the gate allows.
+
+    Attributes:
+        armed: The course's hash was confirmed, and the platform stands at its start.
+        latched: A fault is latched.
+        targets: Sent last; None before the first cycle with targets.
+        actual: Positions as last received, [counts].
+    """
+
+    def __init__(self, course: Course, group: DriveGroup, clock: Clock) -> None:
+        """Nothing is sent yet."""
+        rig = course.rig
+        self._group, self._clock = group, clock
+        self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
+        self._rated = np.array([w.torque_constant for w in rig.winches])
+        self._limits = gate_limits(rig, course.setpoints, course.cycle)
+        self._watch = Watch.fresh(watch_limits(rig), rig.cable_count)
+        self.armed = False
+        self.latched = False
+        self.targets: tuple[int, ...] | None = None
+        self.actual: tuple[int, ...] = ()
+
+    @property
+    def resting_targets(self) -> tuple[int, ...]:
+        """Targets that move nothing."""
+        return self.targets or self.actual
+
+    def largest_way(self, first: Array, second: Array) -> float:
+        """The longest cable between two sets of drive positions, [m]."""
+        return float(np.max(np.abs((second - first) / self._per_metre)))
+
+    def allows(self, purpose: Purpose, targets: tuple[int, ...]) -> Verdict:
+        """What the gate says to targets now."""
+        request = Request(
+            purpose=purpose,
+            targets=targets,
+            previous=self.targets,
+            actual=self.actual,
+            armed=self.armed,
+            enabled=self._group.state is GroupState.ENABLED,
+            latched=self.latched,
+        )
+        return examine(self._limits, request)
+
+    def take_over(self) -> Verdict:
+        """Goes on from where the group held each drive while it enabled them."""
+        held = tuple(int(target) for target in self._group.targets)
+        first = Request(Purpose.HOLD, held, None, self.actual, self.armed, False, self.latched)
+        verdict = examine(self._limits, first)
+        if verdict.allowed:
+            self.targets = held
+        return verdict
+
+    def cycle(self, purpose: Purpose, targets: tuple[int, ...], *, at_rest: bool) -> Exchanged:
+        """One cycle.
+
+        Args:
+            purpose: Why the targets are sent.
+            targets: One position a drive, [counts].
+            at_rest: Nothing moves, so that nothing can be late.
+        """
+        lateness = self._clock.next_cycle()
+        verdict = self.allows(purpose, targets)
+        if not verdict.allowed:
+            return Exchanged(verdict, lateness)
+        self._group.send_cycle(targets)
+        self.targets = targets
+        status = self._group.receive(self._clock.time_left())
+        self.actual = tuple(int(p) for p in status.positions)
+        errors = self._following_errors(status)
+        findings = self._look(status, errors, 0.0 if at_rest else lateness)
+        return Exchanged(verdict, lateness, status, _largest(errors), findings)
+
+    def _following_errors(self, status: CycleStatus) -> Array:
+        """Signed, in cable length, shape (m,), [m]; NaN while drives do not follow or answer."""
+        if status.state is not GroupState.ENABLED:
+            return np.full(len(self._per_metre), np.nan)
+        errors: Array = (status.positions - status.demands) / self._per_metre
+        return np.where(status.missing, np.nan, errors)
+
+    def _look(self, status: CycleStatus, errors: Array, lateness: float) -> tuple[Finding, ...]:
+        seen = Observation(
+            following=status.state is GroupState.ENABLED,
+            following_errors=errors.tolist(),
+            tensions=(np.asarray(status.torques) / 1000.0 * self._rated).tolist(),
+            missing=[bool(m) for m in status.missing],
+            faults=[f"node {node}: {text}" for node, text in status.faults],
+            lateness=lateness,
+        )
+        self._watch, findings = self._watch.look(seen)
+        return findings
+
+
+def _largest(errors: Array) -> float:
+    """Of those that are known; NaN when none is."""
+    known = np.abs(errors[np.isfinite(errors)])
+    return float(known.max()) if known.size else float("nan")

@@ -1,0 +1,80 @@
+"""Takes in what the loop tells of a run: cycles to the log, events to the disk, pictures asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from cdpr.poses import Pose
+from executor.prepare import PreparedRun
+from executor.records import CycleRecord, LoopEvent
+from executor.run_folder import RunEvent, RunFolder
+from executor.run_log import RunLog
+from executor.status import RunStatus
+
+#: Asks for a picture: time since the start of the run [s], the same moment on the monotonic clock
+#: [s], and where the simulated platform is then.
+Trigger = Callable[[float, float, Pose | None], None]
+
+
+class Recorder:
+    """The record of one run while it goes on."""
+
+    def __init__(
+        self,
+        prepared: PreparedRun,
+        folder: RunFolder,
+        status: RunStatus,
+        *,
+        trigger: Trigger | None,
+        every: int,
+        progress: Callable[[float], None],
+    ) -> None:
+        """Nothing happened yet.
+
+        Args:
+            prepared: What is run.
+            folder: Where events are written as they happen.
+            status: Kept up to date for those who ask.
+            trigger: Called for every picture.
+            every: Cycles from one picture to the next.
+            progress: Called now and then with the number of rows that are done.
+        """
+        self.log = RunLog(prepared.rig, prepared.checked)
+        self._folder, self._status = folder, status
+        self._trigger, self._every, self._progress = trigger, every, progress
+        self._began: float | None = None
+        self.asked: list[float] = []
+        """When pictures were asked for, since the start of the run, [s]."""
+
+    def wants_pose(self, cycle: int) -> bool:
+        """Whether a picture will be asked for in this cycle."""
+        return self._trigger is not None and cycle % self._every == 0
+
+    def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
+        """A cycle is over.
+
+        Args:
+            record: What happened in it.
+            true_pose: Where the simulated platform is, in cycles with a picture.
+        """
+        if self._began is None:
+            self._began = record.at
+        self.log.add(record)
+        self._status.take_cycle(record)
+        if record.cycle % self._every:
+            return
+        self._progress(record.index)
+        if self._trigger is not None:
+            self.asked.append(record.at - self._began)
+            self._trigger(self.asked[-1], record.at, true_pose)
+
+    def take_event(self, event: LoopEvent) -> None:
+        """Something happened; it is on disk when this returns.
+
+        Raises:
+            Fault: The disk is full or gone.
+        """
+        time = 0.0 if self._began is None else event.at - self._began
+        told = RunEvent(round(time, 6), event.code, event.text)
+        self._status.take_event(told)
+        self._folder.append_event(told)

@@ -1,0 +1,195 @@
+"""The command socket: what is a command, who is answered, and that nobody keeps others waiting."""
+
+from __future__ import annotations
+
+import json
+import socket
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdpr.errors import BadInput, Fault
+from executor.command_client import ask_all, the_one
+from executor.command_server import LONGEST_QUESTION, MOST_CLIENTS, serving
+from executor.commands import NotACommand, answer_to, make_line, parse_command
+from executor.running import Reached, announced, reached_runs
+from executor.wishes import OwnBoard, Wishes
+
+
+class _Status:
+    """Stands in for `RunStatus`: its content is not what these tests are about."""
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"state": "moving"}
+
+
+STATUS: Any = _Status()
+
+
+def _answer(line: bytes, board: OwnBoard | None = None) -> dict[str, Any]:
+    return json.loads(answer_to(line, board or OwnBoard(), STATUS))
+
+
+def test_each_command_puts_up_its_wish_and_leaves_the_others():
+    board = OwnBoard()
+    assert _answer(make_line("status"), board) == {"ok": True, "status": {"state": "moving"}}
+    assert board.read() == Wishes()
+    for command, percent, wishes in (
+        ("speed", 40, Wishes(speed=0.4)),
+        ("hold", None, Wishes(speed=0.4, hold=True)),
+        ("resume", None, Wishes(speed=0.4)),
+        ("stop", None, Wishes(speed=0.4, stop=True)),
+        ("resume", None, Wishes(speed=0.4, stop=True)),
+    ):
+        assert _answer(make_line(command, percent), board)["ok"] is True
+        assert board.read() == wishes
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"",
+        b"stop",
+        b"{}",
+        b"[]",
+        b'{"command": "go"}',
+        b'{"command": "stop", "percent": 5}',
+        b'{"command": "speed"}',
+        b'{"command": "speed", "percent": 0}',
+        b'{"command": "speed", "percent": 101}',
+        b'{"command": "speed", "percent": "50"}',
+        b'{"command": "speed", "percent": 50.5}',
+        b'{"command": "speed", "percent": NaN}',
+        b"\xff\xfe",
+    ],
+)
+def test_what_is_no_command_changes_nothing_and_is_told(line):
+    board = OwnBoard()
+    answer = _answer(line, board)
+    assert answer["ok"] is False
+    assert answer["what"].startswith("not a command: ")
+    assert board.read() == Wishes()
+
+
+@given(line=st.binary(max_size=200))
+def test_no_bytes_do_anything_but_a_command(line):
+    board = OwnBoard()
+    answer = _answer(line, board)
+    if not answer["ok"]:
+        assert board.read() == Wishes()
+
+
+@given(percent=st.integers(1, 100))
+def test_a_speed_travels_as_it_was_said(percent):
+    command = parse_command(make_line("speed", percent))
+    assert command.percent == percent  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("percent", [0, 101])
+def test_a_speed_that_is_none_is_no_command(percent):
+    with pytest.raises(NotACommand):
+        parse_command(make_line("speed", percent))
+
+
+@pytest.fixture
+def board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[OwnBoard]:
+    """Of a run that answers."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    board = OwnBoard()
+    with announced() as listeners, serving(listeners, board, STATUS):
+        yield board
+
+
+def test_a_run_hears_and_answers(board):
+    with reached_runs() as runs:
+        (answer,) = ask_all(runs, "speed", 30)
+        assert answer.status == {"state": "moving"}
+        (answer,) = ask_all(runs, "hold")
+        assert answer.status == {"state": "moving"}
+    assert board.read() == Wishes(hold=True, speed=0.3)
+
+
+def _connected() -> socket.socket:
+    with reached_runs() as runs:
+        link = runs[0].link.dup()
+    link.settimeout(5.0)
+    return link
+
+
+def test_several_lines_at_once_and_a_line_in_pieces_are_understood(board):
+    with _connected() as link, link.makefile("rb") as answers:
+        link.sendall(b'{"command": "hold"}\n{"command": "speed", ')
+        assert json.loads(answers.readline())["ok"] is True
+        link.sendall(b'"percent": 7}\nnonsense\n')
+        assert json.loads(answers.readline())["ok"] is True
+        assert json.loads(answers.readline())["ok"] is False
+    assert board.read() == Wishes(hold=True, speed=0.07)
+
+
+def test_a_line_without_end_is_cut_off(board):
+    with _connected() as link:
+        link.sendall(b"x" * (LONGEST_QUESTION + 1))
+        with suppress(ConnectionResetError):  # what was not read yet is thrown away
+            assert link.recv(10) == b""
+
+
+def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
+    with _connected() as deaf:
+        deaf.setblocking(False)
+        with suppress(OSError):  # full, or let go
+            for _ in range(100_000):
+                deaf.send(make_line("status") * 20)
+        idle = [_connected() for _ in range(MOST_CLIENTS + 5)]
+        try:
+            with reached_runs() as runs:
+                (answer,) = ask_all(runs, "stop")
+            assert answer.status is not None
+            assert board.read().stop
+        finally:
+            for link in idle:
+                link.close()
+
+
+def test_a_run_that_ends_or_hangs_is_told_as_such(monkeypatch):
+    monkeypatch.setattr("executor.command_client.ANSWER_TIMEOUT", 0.05)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        assert ask_all([Reached(7, ours)], "stop")[0].status is None, "it hangs"
+        assert theirs.recv(100) == make_line("stop")
+    ours, theirs = socket.socketpair()
+    theirs.close()
+    with ours:
+        assert ask_all([Reached(7, ours)], "stop")[0].status is None, "it ended"
+
+
+@pytest.mark.parametrize("said", [b"no json\n", b"[]\n", b'{"ok": false}\n', b'{"status": 3}\n'])
+def test_an_answer_that_is_none_counts_as_silence(said):
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        thread = threading.Thread(target=lambda: (theirs.recv(100), theirs.sendall(said)))
+        thread.start()
+        assert ask_all([Reached(7, ours)], "status")[0].status is None
+        thread.join()
+
+
+def test_which_run_is_meant_must_be_clear():
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        one, other = Reached(7, ours), Reached(8, theirs)
+        assert the_one([one], None, "hold") is one
+        assert the_one([one, other], 8, "hold") is other
+        with pytest.raises(BadInput, match="2 runs"):
+            the_one([one, other], None, "hold")
+        with pytest.raises(BadInput, match="process 9 is no run"):
+            the_one([one, other], 9, "hold")
+        with pytest.raises(Fault, match="no run of yours"):
+            the_one([], None, "hold")
