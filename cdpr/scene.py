@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,12 +15,14 @@ from cdpr.documents import content_hash, key_path, load_yaml
 from cdpr.errors import BadInput
 from cdpr.payload import Payload
 from cdpr.poses import Array, Pose, read_only
+from cdpr.rotation_limits import RotationLimits
 from cdpr.scene_file import (
     BoxDocument,
     HullDocument,
     LoadDocument,
     MeshDocument,
     ObstacleDocument,
+    RotationLimitsDocument,
     RoundDocument,
     SceneDocument,
     SphereDocument,
@@ -85,6 +88,8 @@ class Scene:
         goal: ``world_from_platform`` at the goal.
         load: What the cables carry from the start on.
         stops: Where the way leads through, in their order; `cdpr.legs` tells the loads between.
+        rotation_limits: How far the platform may be tilted and turned; None where the scene does
+            not say, and the platform then keeps its orientation.
     """
 
     document: SceneDocument
@@ -95,6 +100,7 @@ class Scene:
     goal: Pose
     load: Load
     stops: tuple[Stop, ...]
+    rotation_limits: RotationLimits | None
 
     @property
     def name(self) -> str:
@@ -170,6 +176,7 @@ def scene_from_document(document: SceneDocument) -> Scene:
         goal=document.goal.pose(),
         load=load_from_document(document.load),
         stops=tuple(Stop(s.name, s.kind, s.pose(), s.dwell_s) for s in document.stops),
+        rotation_limits=_rotation_limits(document.rotation_limits),
     )
 
 
@@ -181,6 +188,12 @@ def load_from_document(document: LoadDocument) -> Load:
         force=read_only(document.force_n),
         moment=read_only(document.moment_nm),
     )
+
+
+def _rotation_limits(document: RotationLimitsDocument | None) -> RotationLimits | None:
+    if document is None:
+        return None
+    return RotationLimits(math.radians(document.tilt_deg), math.radians(document.turn_deg))
 
 
 def _obstacle(document: ObstacleDocument) -> Obstacle:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
@@ -21,6 +22,7 @@ from cdpr.document_types import (
     Vector,
 )
 from cdpr.payload import Payload
+from cdpr.rotation_limits import RotationLimits
 from cdpr.stop_file import StopDocument, misfits, overdrawn
 
 SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
@@ -109,6 +111,17 @@ class LoadDocument(Document):
         return self.model_copy(update=given)
 
 
+class RotationLimitsDocument(Document):
+    """How far the platform may be tilted and turned, measured from level and not turned."""
+
+    tilt_deg: Annotated[float, Field(ge=0, le=90, allow_inf_nan=False)] = Field(
+        description="largest angle of the platform's z axis from the vertical"
+    )
+    turn_deg: Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)] = Field(
+        description="largest turn about the vertical, either way; 180 for any"
+    )
+
+
 class SceneDocument(Document):
     """What a plan is made for."""
 
@@ -120,18 +133,20 @@ class SceneDocument(Document):
     start: PoseDocument
     stops: list[StopDocument] = []
     goal: PoseDocument
+    rotation_limits: RotationLimitsDocument | None = None
     obstacles: list[ObstacleDocument] = []
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Obstacles without exactly one shape, names given twice, wrong triangles, flat hulls.
 
-        And stops whose load changes by too little or too much.
+        And stops whose load changes by too little or too much; and a pose beyond the rotation limits.
         """
         return (
             self._one_shape_each,
             self._names_once,
             self._shapes_whole,
             lambda: misfits(self.stops),
+            self._ends_in_limits,
             lambda: overdrawn(self.load.payload(), self.stops),
         )
 
@@ -162,6 +177,24 @@ class SceneDocument(Document):
             if obstacle.mesh is not None:
                 place = ("obstacles", i, "mesh", "triangles")
                 found += [((*place, t), what) for t, what in _wrong_triangles(obstacle.mesh)]
+        return found
+
+    def _ends_in_limits(self) -> list[Finding]:
+        limits = self.rotation_limits
+        if limits is None:
+            return []
+        allowed = RotationLimits(math.radians(limits.tilt_deg), math.radians(limits.turn_deg))
+        ends: list[tuple[str, tuple[str | int, ...], PoseDocument]] = [
+            ("start", ("start",), self.start),
+            ("goal", ("goal",), self.goal),
+            *((f"stop {stop.name!r}", ("stops", i), stop) for i, stop in enumerate(self.stops)),
+        ]
+        found: list[Finding] = []
+        for name, place, end in ends:
+            pose = end.pose()
+            excess = allowed.excess(pose, pose)
+            if excess is not None:
+                found.append(((*place, "rotation_wxyz"), f"the {name} is {excess.sentence()}"))
         return found
 
 

@@ -61,12 +61,18 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
 
 
 def _keeps_clearance(rig: Rig, scene: Scene) -> IsAllowed:
-    """Dense poses keep the scene's clearances and half of the way between two of them as well."""
+    """Dense poses keep the scene's clearances and half of the way between two of them as well.
+
+    And every move between them the scene's rotation limits.
+    """
     model = ClearanceModel(rig, scene)
 
     def is_allowed(poses: Sequence[Pose]) -> bool:
         reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
         half_way = 0.5 * max(a.distance_to(b) + reach * a.angle_to(b) for a, b in pairwise(poses))
+        limits = scene.rotation_limits
+        if limits and any(limits.excess(a, b) for a, b in pairwise(poses)):
+            return False
         for pose in poses:
             near = model.smallest(pose)
             if near is not None and near.distance < scene.obstacle_clearance + half_way:

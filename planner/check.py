@@ -138,6 +138,7 @@ class _Check:
         self._check_workspace()
         if ends is not None:
             self._check_ends(ends)
+        self._check_rotations()
         self._check_pulleys()
         obstacle, obstacle_proof = self._obstacle_clearance()
         own, own_proof = self._self_clearance()
@@ -185,6 +186,18 @@ class _Check:
                 self._violation(what, away, END_TOLERANCE, "mm", pose.position)
             if not turned <= END_TOLERANCE:
                 self._violation(what, turned, END_TOLERANCE, "°", pose.position)
+
+    def _check_rotations(self) -> None:
+        """The scene's limits along every move, in closed form."""
+        limits = self.scene.rotation_limits
+        if limits is None:
+            return
+        for start, end in pairwise(self.track.poses):
+            excess = limits.excess(start, end)
+            if excess is not None:
+                what = f"the platform is {excess.how} too far"
+                self._violation(what, excess.measured, excess.limit, "°", start.position)
+                return
 
     def _check_pulleys(self) -> None:
         """Anchors four pulley radii from the swivel axis, so that exits move half as fast at most.

@@ -1,0 +1,156 @@
+"""From start to goal with the platform free to turn: rounds until the budget is spent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.errors import BadInput, NoSolution
+from cdpr.poses import Array, Pose
+from cdpr.rig import Rig
+from cdpr.scene import Scene
+from cdpr.statics.dexterity import rms_anchor_radius
+from planner.exact.capacity import build_load
+from planner.exact.self_edge import build_robot
+from planner.exact.world import build_world
+from planner.paper.limits import REASONS
+from planner.route import Route
+from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+from planner.turning.problem import Problem
+from planner.turning.search import Search
+from planner.turning.settings import TurningSettings
+
+Progress = Callable[[int, int, float], None]
+Clock = Callable[[], float]
+
+LEAST_ROUNDS = 12
+"""Done whatever the clock says, so that a busy machine finds a path, too."""
+_ROTATION_ROUND_OFF = 5e-8
+"""Added to the rotation limits, [rad]: half of what the check leaves for round-off in files."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurningRoute:
+    """A route, and what it takes to find it again.
+
+    Attributes:
+        route: The path, of positions [m] and quaternions, shape (k, 7).
+        rounds: How many were done; `TurningSettings.rounds` repeats them.
+        search_time: [s].
+    """
+
+    route: Route
+    rounds: int
+    search_time: float
+
+
+def turning_problem(rig: Rig, scene: Scene) -> Problem:
+    """The problem of a scene, with the reserves that `planner.settings` documents.
+
+    Raises:
+        BadInput: The scene has no rotation limits.
+    """
+    limits = scene.rotation_limits
+    if limits is None:
+        raise BadInput(
+            "the scene does not say how far the platform may turn",
+            where=f"scene {scene.name}",
+            why="--free-rotation searches orientations within the scene's rotation_limits",
+            next_step="add a line such as `rotation_limits: {tilt_deg: 10, turn_deg: 30}`",
+        )
+    rotation = np.array(scene.start.rotation)
+    world = build_world(rig, scene, rotation, scene.obstacle_clearance + CLEARANCE_RESERVE)
+    return Problem(
+        world=world,
+        robot=build_robot(rig, world, scene.self_clearance + CLEARANCE_RESERVE),
+        load=build_load(rig, scene, rotation),
+        reserve=MARGIN_RESERVE * rig.max_tension,
+        tilt=limits.tilt + _ROTATION_ROUND_OFF,
+        turn=limits.turn + _ROTATION_ROUND_OFF,
+        radian=float(rms_anchor_radius(rig.anchors)),
+    )
+
+
+def turning_route(
+    rig: Rig,
+    scene: Scene,
+    settings: TurningSettings,
+    progress: Progress | None = None,
+    clock: Clock = time.perf_counter,
+) -> TurningRoute:
+    """Searches and improves.
+
+    Args:
+        rig: The robot.
+        scene: Obstacles, clearances, load, rotation limits, start and goal.
+        settings: Seed and budget.
+        progress: Told rounds done, the most there will be (0: as the budget allows), and the cost.
+        clock: Seconds; decides when a budget is spent.
+
+    Raises:
+        BadInput: The scene has no rotation limits.
+        NoSolution: No path was found.
+    """
+    problem = turning_problem(rig, scene)
+    start, goal = coordinates_of(scene.start), coordinates_of(scene.goal)
+    Search(problem, start, goal, settings.seed).advance()  # makes or loads compiled code
+    search, began = Search(problem, start, goal, settings.seed), clock()
+    while not _is_over(settings, search, clock() - began):
+        search.advance()
+        if progress is not None and search.rounds % 10 == 0:
+            progress(search.rounds, settings.rounds or 0, search.cost)
+    path = search.path
+    if path is None:
+        raise _no_path(scene, search, settings)
+    route = Route(
+        path=path,
+        raw=search.first,
+        nodes=search.first,
+        parents=np.arange(-1, len(search.first) - 1, dtype=np.int64),
+        iterations=search.rounds,
+        edge_checks=int(search.tallies.sum()),
+    )
+    return TurningRoute(route, search.rounds, clock() - began)
+
+
+def coordinates_of(pose: Pose) -> Array:
+    """Position [m] and unit quaternion (w, x, y, z) of a pose, shape (7,)."""
+    return np.concatenate([pose.position, pose.quaternion])
+
+
+def _is_over(settings: TurningSettings, search: Search, spent: float) -> bool:
+    if search.cost <= search.shortest * (1.0 + 1e-12):
+        return True
+    if settings.rounds is not None:
+        return search.rounds >= settings.rounds
+    return search.rounds >= LEAST_ROUNDS and spent >= settings.budget
+
+
+def _no_path(scene: Scene, search: Search, settings: TurningSettings) -> NoSolution:
+    names = (*REASONS, "rotation limits")
+    refused = [
+        (int(count), name)
+        for count, name in zip(search.tallies, names, strict=True)
+        if name and count
+    ]
+    listed = ", ".join(f"{name} ({count})" for count, name in sorted(refused, reverse=True))
+    gap = search.gap()
+    spent = f"{search.rounds} rounds" + (
+        f" of the {settings.budget * 1e3:g} ms budget" if settings.rounds is None else ""
+    )
+    return NoSolution(
+        f"no path after {spent}; what start and goal reach comes within {gap * 1e3:.1f} mm"
+        " of each other",
+        where=f"scene {scene.name}",
+        why=f"it is not proved that there is none; moves were refused for: {listed}",
+        next_step="raise --budget-ms, ask for less clearance, allow more in rotation_limits, try"
+        " another seed, or move the goal or an obstacle",
+        values={
+            "rounds": float(search.rounds),
+            "seed": float(settings.seed),
+            "best_distance_mm": gap * 1e3,
+        },
+    )

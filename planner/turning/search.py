@@ -1,0 +1,132 @@
+"""The search in rounds: some first paths, and more and more polishing of the best of them.
+
+A round depends on the seed and on the rounds before alone. So a search can end after any of them,
+and be repeated from the number of rounds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.poses import Array
+from planner.turning import connect as connecting
+from planner.turning import polish as polishing
+from planner.turning.connect import connect
+from planner.turning.moves import move_length
+from planner.turning.polish import MOST_POSES, path_length, polish
+from planner.turning.problem import Problem
+
+_KEPT = 4
+_SAMPLES, _TRIALS = 50, 40
+_ANOTHER_EVERY = 10
+"""After the first rounds, one in so many begins with a new path."""
+_TO_THE_BEST = 0.7
+
+
+@dataclass(slots=True, eq=False)
+class _Kept:
+    """A path under improvement: poses, shape (MOST_POSES, 7), how many, and the cost, [m]."""
+
+    poses: Array
+    count: int
+    cost: float
+
+
+class Search:
+    """The state of a search.
+
+    Attributes:
+        rounds: Done so far.
+        tallies: Moves asked about, by what forbids them; see `planner.turning.problem`.
+        first: The very first path, shape (k, 7); empty without one.
+        nodes: In the trees that found paths, and in the present ones.
+    """
+
+    def __init__(self, problem: Problem, start: Array, goal: Array, seed: int) -> None:
+        """A search that has not begun; start and goal shape (7,)."""
+        self.problem = problem
+        self.rounds = 0
+        self.tallies = np.zeros(6, dtype=np.int64)
+        self.first: Array = np.zeros((0, 7))
+        self.nodes = 0
+        self._ends = np.stack([start, goal])
+        self._random = np.random.default_rng(seed)
+        self._kept: list[_Kept] = []
+        self._trees = np.zeros((2, connecting.NODES, 7))
+        self._parents = np.zeros((2, connecting.NODES), dtype=np.int64)
+        self._grown = np.zeros(3, dtype=np.int64)
+
+    @property
+    def cost(self) -> float:
+        """Length of the best path, turning counted, [m]; infinite without one."""
+        return min((kept.cost for kept in self._kept), default=math.inf)
+
+    @property
+    def path(self) -> Array | None:
+        """The best path, shape (k, 7); None without one."""
+        if not self._kept:
+            return None
+        best = min(self._kept, key=lambda kept: kept.cost)
+        return best.poses[: best.count].copy()
+
+    @property
+    def shortest(self) -> float:
+        """Length that no path is below, [m]."""
+        return float(move_length(self._ends[0], self._ends[1], self.problem.radian))
+
+    def gap(self) -> float:
+        """Smallest distance of positions in the two trees, [m]."""
+        first, second = (self._trees[k, : max(self._grown[k], 1), :3] for k in (0, 1))
+        if self._grown[0] == 0:
+            first, second = self._ends[:1, :3], self._ends[1:, :3]
+        return float(np.linalg.norm(first[:, None, :] - second[None, :, :], axis=-1).min())
+
+    def advance(self) -> None:
+        """Does one round."""
+        begun = self.rounds
+        self.rounds += 1
+        kept = self._chosen(begun)
+        if kept is None:
+            return
+        draws = self._random.random((_TRIALS, polishing.DRAWS))
+        kept.count = polish(self.problem, kept.poses, kept.count, draws, self.tallies)
+        kept.cost = float(path_length(self.problem, kept.poses, kept.count))
+
+    def _chosen(self, begun: int) -> _Kept | None:
+        """Which path to work on; a new one now and then."""
+        if len(self._kept) < _KEPT or begun % _ANOTHER_EVERY == 0:
+            new = self._begun()
+            if new is not None:
+                if len(self._kept) == _KEPT:
+                    self._kept.remove(max(self._kept, key=lambda kept: kept.cost))
+                self._kept.append(new)
+                return new
+        if not self._kept:
+            return None
+        if self._random.random() < _TO_THE_BEST:
+            return min(self._kept, key=lambda kept: kept.cost)
+        return self._kept[int(self._random.random() * len(self._kept))]
+
+    def _begun(self) -> _Kept | None:
+        poses = np.zeros((MOST_POSES, 7))
+        draws = self._random.random((_SAMPLES, connecting.DRAWS))
+        count = connect(
+            self.problem,
+            self._ends,
+            draws,
+            self._trees,
+            self._parents,
+            self._grown,
+            self.tallies,
+            poses,
+        )
+        if count == 0:
+            return None
+        self.nodes += int(self._grown[0] + self._grown[1])
+        self._grown[:] = 0
+        if not len(self.first):
+            self.first = poses[:count].copy()
+        return _Kept(poses, count, float(path_length(self.problem, poses, count)))
