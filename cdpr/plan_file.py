@@ -49,6 +49,15 @@ class OptimalPlannerDocument(Document):
     longest_mm: Positive | None
 
 
+class TurningPlannerDocument(Document):
+    """How the path was searched for where the platform was free to turn."""
+
+    name: Literal["turning"]
+    seed: Annotated[int, Field(ge=0)]
+    rounds: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)]
+    budget_ms: Positive | None
+
+
 class PlannerDocument(Document):
     """How the path was searched for by the paper's planner or its baseline."""
 
@@ -118,7 +127,10 @@ class PlanDocument(Document):
     scene_hash: str
     rig: RigDocument
     scene: SceneDocument
-    planner: Annotated[PlannerDocument | OptimalPlannerDocument, Field(discriminator="name")]
+    planner: Annotated[
+        PlannerDocument | OptimalPlannerDocument | TurningPlannerDocument,
+        Field(discriminator="name"),
+    ]
     waypoints: Annotated[list[PoseDocument], Field(min_length=2)]
     stops: list[StopMarkDocument] = []
     raw_path: Annotated[list[PoseDocument], Field(min_length=2)]

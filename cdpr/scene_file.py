@@ -139,7 +139,7 @@ class SceneDocument(Document):
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Obstacles without exactly one shape, names given twice, wrong triangles, flat hulls.
 
-        And stops whose load changes by too little or too much; and a pose beyond the rotation limits.
+        And stops whose load changes by too little or too much; and poses turned too far.
         """
         return (
             self._one_shape_each,

@@ -7,6 +7,7 @@ inverse volume of the force set, each scaled to 0..1 between its extremes over t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Protocol
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from cdpr.cables import cables_to
 from cdpr.kinematics import structure_matrix_of
-from cdpr.poses import Array
+from cdpr.poses import Array, Pose, interpolate
 from cdpr.rig import Rig
 from cdpr.statics.dexterity import condition_number, rms_anchor_radius
 from cdpr.statics.wrench_set import force_volume
@@ -65,13 +66,14 @@ class KinematicCost:
         self.rig = rig
         self._rotation = rotation
         self.lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
-        condition, inverse = self._indices(self.lattice.points(np.arange(self.lattice.count)))
+        points = self.lattice.points(np.arange(self.lattice.count))
+        condition, inverse = self._indices(points, rotation)
         self._extremes = [(float(v.min()), float(v.max())) for v in (condition, inverse)]
         self.values = self._scaled(condition, inverse)
 
     def at(self, positions: Array) -> Array:
         """The cost c of poses, exact; positions shape (k, 3), [m]; shape (k,)."""
-        return self._scaled(*self._indices(positions))
+        return self._scaled(*self._indices(positions, self._rotation))
 
     def edge(self, start: Array, end: Array) -> float:
         """Line integral of c along the edge, [m]."""
@@ -93,20 +95,32 @@ class KinematicCost:
 
     def mean_along(self, waypoints: Array) -> float:
         """Mean of c over the length of a path, exact at samples; waypoints shape (k, 3), [m]."""
+        return self.mean_along_poses([Pose(point, self._rotation) for point in waypoints])
+
+    def mean_along_poses(self, poses: Sequence[Pose]) -> float:
+        """Mean of c over the length of a path on which the platform may turn, exact at samples.
+
+        The scaling stays that of the one orientation.
+        """
         total, length = 0.0, 0.0
-        for start, end in pairwise(waypoints):
-            part = float(np.linalg.norm(end - start))
+        for start, end in pairwise(poses):
+            part = start.distance_to(end)
             count = max(2, int(np.ceil(part / _SAMPLING)) + 1)
-            points = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-            values = self.at(points)
+            samples = [interpolate(start, end, s) for s in np.linspace(0.0, 1.0, count).tolist()]
+            values = self._at_poses(samples)
             total += part * float(np.mean((values[1:] + values[:-1]) / 2.0))
             length += part
-        return total / length if length > 0.0 else float(self.at(waypoints[:1])[0])
+        return total / length if length > 0.0 else float(self._at_poses(poses[:1])[0])
 
-    def _indices(self, positions: Array) -> tuple[Array, Array]:
+    def _at_poses(self, poses: Sequence[Pose]) -> Array:
+        """The cost c of poses, each with its own orientation; shape (k,)."""
+        rotations = np.array([pose.rotation for pose in poses])
+        return self._scaled(*self._indices(np.array([p.position for p in poses]), rotations))
+
+    def _indices(self, positions: Array, rotations: Array) -> tuple[Array, Array]:
         """Condition number and inverse volume of the force set, shape (k,) each."""
         rig = self.rig
-        anchors = rig.anchors @ self._rotation.T + positions[:, None, :]
+        anchors = rig.anchors @ np.swapaxes(rotations, -1, -2) + positions[:, None, :]
         matrices = structure_matrix_of(cables_to(rig, anchors), positions)
         condition = condition_number(matrices, rms_anchor_radius(rig.anchors))
         return condition, 1.0 / force_volume(matrices, rig.max_tension - rig.min_tension)

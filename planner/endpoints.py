@@ -14,10 +14,15 @@ from planner.feasibility import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 
-def require_usable_ends(rig: Rig, scene: Scene) -> None:
+def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) -> None:
     """Refuses a start, stop or goal that no path can begin or end at.
 
     A stop must be held with the load that is brought to it and with the one taken on from it.
+
+    Args:
+        rig: The robot.
+        scene: Start, stops and goal.
+        free_rotation: Whether they may be turned differently.
 
     Raises:
         BadInput: One of them is outside the workspace box, too near to an obstacle, too near to
@@ -25,7 +30,8 @@ def require_usable_ends(rig: Rig, scene: Scene) -> None:
     """
     model = ClearanceModel(rig, scene)
     for leg in legs_of(scene):
-        _require_same_orientation(leg)
+        if not free_rotation:
+            _require_same_orientation(leg)
         for name, pose in ((leg.begin, leg.scene.start), (leg.end, leg.scene.goal)):
             _require_in_workspace(rig, name, pose)
             _require_clear(scene, model, name, pose)
@@ -39,8 +45,9 @@ def _require_same_orientation(leg: Leg) -> None:
             f"{leg.begin} and {leg.end} are turned against each other by"
             f" {np.degrees(angle):.3g} deg",
             where=f"scene {leg.scene.name}",
-            why="the search keeps the platform's orientation",
-            next_step=f"give the {leg.end} the rotation_wxyz of the start",
+            why="without --free-rotation the search keeps the platform's orientation",
+            next_step=f"plan with --free-rotation (the scene then needs rotation_limits), or give"
+            f" the {leg.end} the rotation_wxyz of the start",
             values={"angle_deg": float(np.degrees(angle))},
         )
 

@@ -23,15 +23,15 @@ from planner.endpoints import require_usable_ends
 from planner.optimal.settings import OptimalSettings
 from planner.paper.readings import Readings
 from planner.route import Progress, Route
-from planner.settings import PlannerSettings
-from planner.space import Space, TranslationSpace
-from planner.way import Way, settings_of_legs, way_through
+from planner.space import PoseSpace, Space, TranslationSpace
+from planner.turning.settings import TurningSettings
+from planner.way import Settings, Way, settings_of_legs, way_through
 
 
 def make_plan(
     rig: Rig,
     scene: Scene,
-    settings: PlannerSettings | OptimalSettings | None = None,
+    settings: Settings | None = None,
     progress: Progress | None = None,
     clock: Callable[[], float] = time.perf_counter,
     *,
@@ -40,7 +40,7 @@ def make_plan(
     """Plans a path from the scene's start through its stops to its goal.
 
     The same rig, scene and settings give the same path on every machine of the same libraries. The
-    clock is read for the statistics alone; except that `OptimalSettings` without a number of rounds
+    clock is read for the statistics alone; except that settings without a number of rounds
     go on until a budget is spent: the plan then tells the rounds, which give its path again.
 
     Args:
@@ -62,9 +62,10 @@ def make_plan(
     """
     began = clock()
     settings = settings or OptimalSettings()
-    require_usable_ends(rig, scene)
-    space = TranslationSpace(rig, scene.start.rotation)
-    kinematic = KinematicCost(rig, space.rotation)
+    turns = isinstance(settings, TurningSettings)
+    require_usable_ends(rig, scene, free_rotation=turns)
+    space: Space = PoseSpace(rig) if turns else TranslationSpace(rig, scene.start.rotation)
+    kinematic = KinematicCost(rig, scene.start.rotation)
     legs = legs_of(scene)
     of_legs = settings_of_legs(settings, rounds, len(legs))
     way = way_through(rig, legs, of_legs, kinematic, progress, clock)
@@ -99,12 +100,14 @@ def make_plan(
                 "planning_time_s": max(0.0, clock() - began),
                 "search_time_s": way.search_time,
             },
-            "quality": _quality(report, route.raw, kinematic.mean_along(route.path)),
+            "quality": _quality(report, route.raw, kinematic.mean_along_poses(poses)),
         }
     )
 
 
-def _planner(settings: PlannerSettings | OptimalSettings, way: Way) -> dict[str, Any]:
+def _planner(settings: Settings, way: Way) -> dict[str, Any]:
+    if isinstance(settings, TurningSettings):
+        return _turning_planner(settings, way)
     if isinstance(settings, OptimalSettings):
         return _optimal_planner(settings, way)
     return {
@@ -117,6 +120,15 @@ def _planner(settings: PlannerSettings | OptimalSettings, way: Way) -> dict[str,
         "goal_radius_mm": settings.goal_radius * 1000.0,
         "max_iterations": settings.max_iterations,
         "readings": _readings(settings.readings),
+    }
+
+
+def _turning_planner(settings: TurningSettings, way: Way) -> dict[str, Any]:
+    return {
+        "name": "turning",
+        "seed": settings.seed,
+        "rounds": list(way.rounds),
+        "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
     }
 
 
@@ -158,7 +170,7 @@ def _tree(space: Space, route: Route) -> dict[str, Any]:
 
 def _quality(report: CheckReport, raw: Array, mean_cost: float) -> dict[str, Any]:
     closest = report.obstacle_clearance
-    steps = np.linalg.norm(np.diff(raw, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(raw[:, :3], axis=0), axis=1)
     return {
         "length_mm": report.length * 1000.0,
         "raw_length_mm": float(steps.sum()) * 1000.0,

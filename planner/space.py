@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 
@@ -28,6 +30,26 @@ class Space(Protocol):
     def coordinates(self, pose: Pose) -> Array:
         """The coordinates of a pose, shape (n,)."""
         ...
+
+
+class PoseSpace:
+    """Positions [m] and unit quaternions (w, x, y, z); n = 7.
+
+    The bounds of the quaternion are those of its numbers; the scene's rotation limits are narrower.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        """The workspace of ``rig`` with the platform turned in any way."""
+        self.lower = np.append(rig.workspace_lower, np.full(4, -1.0))
+        self.upper = np.append(rig.workspace_upper, np.full(4, 1.0))
+
+    def pose(self, coordinates: Array) -> Pose:
+        """The pose of a position and a quaternion, shape (7,)."""
+        return Pose.from_quaternion(coordinates[:3], coordinates[3:])
+
+    def coordinates(self, pose: Pose) -> Array:
+        """Position and quaternion of a pose, shape (7,)."""
+        return np.append(pose.position, pose.quaternion)
 
 
 class TranslationSpace:

@@ -19,6 +19,11 @@ from planner.optimal.settings import OptimalSettings
 from planner.paper.routing import paper_route
 from planner.route import Progress, Route
 from planner.settings import PlannerSettings
+from planner.turning.routing import TurningRoute, turning_route
+from planner.turning.settings import TurningSettings
+
+Settings = PlannerSettings | OptimalSettings | TurningSettings
+"""Of any planner."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +46,7 @@ class Way:
 def way_through(
     rig: Rig,
     legs: Sequence[Leg],
-    settings: Sequence[PlannerSettings | OptimalSettings],
+    settings: Sequence[Settings],
     kinematic: KinematicCost,
     progress: Progress | None,
     clock: Callable[[], float],
@@ -60,11 +65,14 @@ def way_through(
         NoSolution: A leg has no path, or its search ended at its limit; it is named.
     """
     routes: list[Route] = []
-    found: list[OptimalRoute] = []
+    found: list[OptimalRoute | TurningRoute] = []
     for leg, own in zip(legs, settings, strict=True):
         try:
             if isinstance(own, OptimalSettings):
                 found.append(optimal_route(rig, leg.scene, own, kinematic, progress, clock))
+                routes.append(found[-1].route)
+            elif isinstance(own, TurningSettings):
+                found.append(turning_route(rig, leg.scene, own, progress, clock))
                 routes.append(found[-1].route)
             else:
                 routes.append(paper_route(rig, leg.scene, own, kinematic, progress))
@@ -79,20 +87,18 @@ def way_through(
     )
 
 
-def settings_of_legs(
-    settings: PlannerSettings | OptimalSettings, rounds: Sequence[int], count: int
-) -> Sequence[PlannerSettings | OptimalSettings]:
+def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> Sequence[Settings]:
     """The settings of each leg: all alike, but for rounds that are given for each.
 
     Raises:
         BadInput: Rounds are not one number for each leg, or are for a planner that has none; or a
             longest path is asked for with stops.
     """
-    if not isinstance(settings, OptimalSettings):
+    if isinstance(settings, PlannerSettings):
         if rounds:
             raise BadInput("the paper's planners know no rounds", next_step="leave them out")
         return [settings] * count
-    if count > 1 and settings.longest < np.inf:
+    if count > 1 and isinstance(settings, OptimalSettings) and settings.longest < np.inf:
         raise BadInput(
             "a longest path cannot be asked for in a scene with stops",
             why="each leg is planned for itself, and none knows what the others need",

@@ -10,7 +10,9 @@ import typer
 
 from cdpr.cli.plan_options import (
     BudgetOption,
+    CostName,
     CostOption,
+    FreeRotationOption,
     IterationsOption,
     LongestOption,
     ModeOption,
@@ -21,6 +23,8 @@ from cdpr.cli.plan_options import (
     optimal_settings,
     paper_settings,
     refuse,
+    refuse_with_rotation,
+    turning_settings,
 )
 from cdpr.cli.readings import (
     ConeDrawName,
@@ -39,8 +43,7 @@ if TYPE_CHECKING:
     from cdpr.plan_file import PlanDocument
     from cdpr.rig import Rig
     from cdpr.scene import Scene
-    from planner.optimal.settings import OptimalSettings
-    from planner.settings import PlannerSettings
+    from planner.way import Settings
 
 _LONG = 1000.0
 """Milliseconds or rounds from which a bar is shown."""
@@ -60,6 +63,7 @@ def plan(
     longest_mm: LongestOption = None,
     budget_ms: BudgetOption = None,
     rounds: RoundsOption = None,
+    free_rotation: FreeRotationOption = False,
     mode: ModeOption = None,
     max_iterations: IterationsOption = None,
     start_mm: Annotated[
@@ -106,7 +110,7 @@ def plan(
         spacing=spacing_mm / 1000.0,
         goal_sight=goal_sight,
     )
-    settings: OptimalSettings | PlannerSettings
+    settings: Settings
     if planner is PlannerName.optimal:
         refuse(
             planner,
@@ -116,12 +120,25 @@ def plan(
                 "readings of the paper": readings != Readings(),
             },
         )
-        settings = optimal_settings(seed, cost, weight or [], budget_ms, rounds or [], longest_mm)
+        if free_rotation:
+            refuse_with_rotation(
+                {
+                    f"--cost {cost}": cost not in (None, CostName.length),
+                    "--weight": bool(weight),
+                    "--longest-mm": longest_mm is not None,
+                }
+            )
+            settings = turning_settings(seed, budget_ms, rounds or [])
+        else:
+            settings = optimal_settings(
+                seed, cost, weight or [], budget_ms, rounds or [], longest_mm
+            )
     else:
         refuse(
             planner,
             {
                 "--weight": bool(weight),
+                "--free-rotation": free_rotation,
                 "--longest-mm": longest_mm is not None,
                 "--budget-ms": budget_ms is not None,
                 "--rounds": bool(rounds),
@@ -140,23 +157,26 @@ def plan(
 def planned(
     rig: Rig,
     scene: Scene,
-    settings: OptimalSettings | PlannerSettings,
+    settings: Settings,
     shown: bool,
     rounds: Sequence[int] = (),
 ) -> PlanDocument:
     """A plan, made with a bar where the search is long, and a word where it must be compiled."""
     from cdpr.cli.output import err, progress_bar, spinner
-    from planner.optimal.settings import OptimalSettings
     from planner.plan import make_plan
+    from planner.settings import PlannerSettings
 
-    if not isinstance(settings, OptimalSettings):
+    if isinstance(settings, PlannerSettings):
         with progress_bar("planning", settings.max_iterations, shown) as advance:
             return make_plan(
                 rig, scene, settings, progress=lambda done, _most, _distance: advance(done)
             )
+    from planner import optimal, turning
     from planner.optimal.compilation import is_compiled, note_compiled
+    from planner.turning.settings import TurningSettings
 
-    compiled = is_compiled()
+    kernels = Path((turning if isinstance(settings, TurningSettings) else optimal).__path__[0])
+    compiled = is_compiled(kernels)
     if not compiled:
         err.print("compiling the planner for this machine, once; about a minute …")
     unit, scale = ("ms", 1e3) if settings.rounds is None else ("rounds", 1.0)
@@ -173,7 +193,7 @@ def planned(
     else:
         with spinner("planning" if compiled else "compiling", shown):
             document = make_plan(rig, scene, settings, rounds=rounds)
-    note_compiled()
+    note_compiled(kernels)
     return document
 
 
@@ -258,11 +278,11 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
 
 
 def _search_sentence(document: PlanDocument) -> str:
-    from cdpr.plan_file import OptimalPlannerDocument
+    from cdpr.plan_file import PlannerDocument
 
     statistics, planner = document.statistics, document.planner
     rest = f"{statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s"
-    if isinstance(planner, OptimalPlannerDocument):
+    if not isinstance(planner, PlannerDocument):
         search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of it searching"
         again = " ".join(f"--rounds {rounds}" for rounds in planner.rounds)
         return f"{sum(planner.rounds)} rounds (again: {again}), {rest}{search}"

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from planner.optimal.settings import OptimalSettings, Weights
     from planner.paper.readings import Readings
     from planner.settings import PlannerSettings
+    from planner.turning.settings import TurningSettings
 
 
 class PlannerName(StrEnum):
@@ -62,6 +63,10 @@ RoundsOption = Annotated[
 LongestOption = Annotated[
     float | None, typer.Option(min=0.001, help="optimal: the best path that is no longer")
 ]
+FreeRotationOption = Annotated[
+    bool,
+    typer.Option("--free-rotation", help="optimal: turn as well, within the scene's limits"),
+]
 ModeOption = Annotated[
     ModeName | None,
     typer.Option(help="the paper's planners: RRT* (rewire), or stop at the first path (paper)"),
@@ -98,6 +103,35 @@ def optimal_settings(
         longest=math.inf if longest_mm is None else longest_mm / 1000.0,
         **options,
     )
+
+
+def turning_settings(seed: int, budget_ms: float | None, rounds: list[int]) -> TurningSettings:
+    """The settings of the planner we recommend with the platform free to turn.
+
+    Raises:
+        BadInput: Options contradict each other.
+    """
+    from planner.turning.settings import TurningSettings
+
+    if budget_ms is not None and rounds:
+        raise BadInput("--budget-ms and --rounds both say how long to go on", next_step="give one")
+    options: dict[str, Any] = {} if budget_ms is None else {"budget": budget_ms / 1000.0}
+    return TurningSettings(seed=seed, rounds=rounds[0] if rounds else None, **options)
+
+
+def refuse_with_rotation(options: dict[str, bool]) -> None:
+    """Refuses options that were given but that `--free-rotation` would not heed.
+
+    Raises:
+        BadInput: Names them.
+    """
+    given = [name for name, is_given in options.items() if is_given]
+    if given:
+        raise BadInput(
+            f"--free-rotation knows no {', '.join(given)}",
+            why="it makes the way short, with the turning in it, and nothing else yet",
+            next_step="leave one of them out",
+        )
 
 
 def _weights(given: list[str]) -> Weights:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument
+from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument, TurningPlannerDocument
 from executor.report.markup import list_table, table
 from executor.report.run_data import RunData
 
@@ -53,7 +53,13 @@ def _plan(run: RunData) -> list[tuple[str, str]]:
 
 def _search(run: RunData) -> list[tuple[str, str]]:
     planner, statistics = run.plan.document.planner, run.plan.document.statistics
-    rows = _improving(planner) if isinstance(planner, OptimalPlannerDocument) else _tree(planner)
+    match planner:
+        case OptimalPlannerDocument():
+            rows = _improving(planner)
+        case TurningPlannerDocument():
+            rows = [("Planner", "optimal, free to turn"), ("Seed", str(planner.seed))]
+        case _:
+            rows = _tree(planner)
     return [
         *rows,
         ("Nodes", str(statistics.nodes)),

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from cdpr.errors import BadInput, NoSolution
-from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from cdpr.statics.dexterity import rms_anchor_radius
@@ -19,6 +18,7 @@ from planner.exact.world import build_world
 from planner.paper.limits import REASONS
 from planner.route import Route
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+from planner.space import PoseSpace
 from planner.turning.problem import Problem
 from planner.turning.search import Search
 from planner.turning.settings import TurningSettings
@@ -37,7 +37,7 @@ class TurningRoute:
     """A route, and what it takes to find it again.
 
     Attributes:
-        route: The path, of positions [m] and quaternions, shape (k, 7).
+        route: The path in `planner.space.PoseSpace`.
         rounds: How many were done; `TurningSettings.rounds` repeats them.
         search_time: [s].
     """
@@ -95,7 +95,8 @@ def turning_route(
         NoSolution: No path was found.
     """
     problem = turning_problem(rig, scene)
-    start, goal = coordinates_of(scene.start), coordinates_of(scene.goal)
+    space = PoseSpace(rig)
+    start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
     Search(problem, start, goal, settings.seed).advance()  # makes or loads compiled code
     search, began = Search(problem, start, goal, settings.seed), clock()
     while not _is_over(settings, search, clock() - began):
@@ -114,11 +115,6 @@ def turning_route(
         edge_checks=int(search.tallies.sum()),
     )
     return TurningRoute(route, search.rounds, clock() - began)
-
-
-def coordinates_of(pose: Pose) -> Array:
-    """Position [m] and unit quaternion (w, x, y, z) of a pose, shape (7,)."""
-    return np.concatenate([pose.position, pose.quaternion])
 
 
 def _is_over(settings: TurningSettings, search: Search, spent: float) -> bool:
