@@ -1,0 +1,134 @@
+"""How long proofs of turning moves take, and how good paths are after a time.
+
+    python -m benchmarks.planner.turning [--seeds 10]
+
+Times are of the processor, so that other programs count less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from cdpr.poses import Array
+from cdpr.rig import Rig, load_rig
+from cdpr.scene import Scene, load_scene, scene_from_document
+from cdpr.scene_file import SceneDocument
+from planner.exact.moving_edge import turning_edge_free
+from planner.exact.self_edge import self_turning_edge_free
+from planner.exact.turning_held import turning_edge_held
+from planner.space import PoseSpace
+from planner.turning.moves import matrix_of, put_turned, turn_between
+from planner.turning.problem import Problem, move_allowed
+from planner.turning.routing import turning_problem
+from planner.turning.search import Search
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+WAY, ANGLE = 0.040, np.radians(2.0)
+MARKS = (0.050, 0.500)
+REPEATS = 20
+
+
+def hall() -> tuple[Rig, Scene]:
+    """The hall with a goal that is tilted and turned."""
+    document = load_scene(CONFIGS / "hall_pillar.yaml").document.model_dump()
+    tilt = [float(np.cos(0.05)), 0.0, float(np.sin(0.05)), 0.0]
+    document["goal"]["rotation_wxyz"] = tilt
+    document["rotation_limits"] = {"tilt_deg": 8.0, "turn_deg": 4.0}
+    scene = scene_from_document(SceneDocument.model_validate(document))
+    return load_rig(CONFIGS / "hall_10_6.yaml"), scene
+
+
+def allowed_moves(problem: Problem, count: int) -> list[tuple[Array, Array]]:
+    """Random moves of `WAY` and `ANGLE` that keep everything."""
+    random, found = np.random.default_rng(0), []
+    limits, tallies = problem.world.limits, np.zeros(6, dtype=np.int64)
+    while len(found) < count:
+        start, end = np.zeros(7), np.zeros(7)
+        start[:3], start[3] = random.uniform(*limits), 1.0
+        tip, way, turn = random.normal(size=(3, 3))
+        tip *= 0.5 * problem.tilt / np.linalg.norm(tip)
+        put_turned(start.copy(), (tip[0], tip[1], 0.0), start)
+        end[:3] = start[:3] + WAY * way / np.linalg.norm(way)
+        turn *= ANGLE / np.linalg.norm(turn)
+        put_turned(start, (turn[0], turn[1], turn[2]), end)
+        if move_allowed(problem, start, end, tallies):
+            found.append((start, end))
+    return found
+
+
+def microseconds(check: Callable[[int], object], count: int) -> float:
+    """Processor time of a check, [µs]."""
+    check(0)
+    began = time.process_time()
+    for _ in range(REPEATS):
+        for k in range(count):
+            check(k)
+    return (time.process_time() - began) / (REPEATS * count) * 1e6
+
+
+def edges(problem: Problem) -> None:
+    """Prints what the parts of the proof of one allowed move take."""
+    moves = allowed_moves(problem, 60)
+    given = [
+        (a[:3], b[:3], matrix_of(a), np.array(turn_between(a, b))) for a, b in moves
+    ]  # what each check reads
+    tallies = np.zeros(6, dtype=np.int64)
+    world, robot, load, reserve = problem.world, problem.robot, problem.load, problem.reserve
+    parts: dict[str, Callable[[int], object]] = {
+        "obstacles": lambda k: turning_edge_free(world, *given[k]),
+        "self": lambda k: self_turning_edge_free(world, robot, *given[k]),
+        "wrenches": lambda k: turning_edge_held(world, load, reserve, *given[k]),
+        "all": lambda k: move_allowed(problem, *moves[k], tallies),
+    }
+    told = ", ".join(f"{name} {microseconds(f, len(moves)):.1f}" for name, f in parts.items())
+    print(f"  µs for an allowed move of {WAY * 1e3:g} mm and {np.degrees(ANGLE):g} deg: {told}")
+
+
+def searches(rig: Rig, scene: Scene, problem: Problem, seeds: int) -> None:
+    """Prints the time to the first path, and the lengths reached."""
+    space = PoseSpace(rig)
+    ends = space.coordinates(scene.start), space.coordinates(scene.goal)
+    Search(problem, *ends, 0).advance()
+    firsts, lengths = [], []
+    for seed in range(seeds):
+        search, began, first = Search(problem, *ends, seed), time.process_time(), 0.0
+        reached = []
+        for mark in MARKS:
+            while time.process_time() - began < mark:
+                search.advance()
+                if not first and search.path is not None:
+                    first = time.process_time() - began
+            reached.append(search.cost * 1e3)
+        firsts.append(first * 1e3)
+        lengths.append(reached)
+    low, middle, high = np.quantile(firsts, (0.0, 0.5, 1.0))
+    print(
+        f"  first path, one round of polishing in it: median {middle:.1f} ms, {low:.1f}–{high:.1f}"
+    )
+    for mark, column in zip(MARKS, np.array(lengths).T, strict=True):
+        print(
+            f"  after {mark * 1e3:g} ms: median {np.median(column):.1f} mm,"
+            f" best {column.min():.1f}, worst {column.max():.1f}"
+        )
+
+
+def main() -> None:
+    """Prints the table for two scenes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=10)
+    seeds = parser.parse_args().seeds
+    ready = load_rig(CONFIGS / "gachon_8_6.yaml"), load_scene(CONFIGS / "turn.yaml")
+    for rig, scene in (ready, hall()):
+        print(f"{rig.name}, {scene.name}")
+        problem = turning_problem(rig, scene)
+        edges(problem)
+        searches(rig, scene, problem, seeds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""Planning with the platform free to turn: ends, seeds, refusals, and plans that pass."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from cdpr.cli.plan import plan as plan_verb
+from cdpr.cli.plan_options import CostName
+from cdpr.errors import BadInput, InvalidFile, NoSolution
+from cdpr.plan import load_plan, plan_from_document, save_plan
+from cdpr.plan_file import PlanDocument
+from cdpr.poses import Pose
+from cdpr.rig import Rig
+from cdpr.scene import Scene, load_scene
+from cdpr.statics.dexterity import rms_anchor_radius
+from planner.check import check_path, verify
+from planner.plan import make_plan
+from planner.turning.routing import turning_route
+from planner.turning.settings import TurningSettings
+from tests.planner.turning.turning_scenes import (
+    CONFIGS,
+    GACHON,
+    HALL,
+    Judge,
+    quaternion,
+    turning,
+)
+
+ROUNDS = TurningSettings(rounds=60)
+RAMP = load_scene(CONFIGS / "turn.yaml")
+
+
+def proved(rig: Rig, scene: Scene, settings: TurningSettings) -> PlanDocument:
+    """The plan's document, after it passed its check and met its ends."""
+    document = make_plan(rig, scene, settings)
+    plan = verify(plan_from_document(document)).plan
+    for pose, wanted in ((plan.waypoints[0], scene.start), (plan.waypoints[-1], scene.goal)):
+        assert pose.distance_to(wanted) < 1e-6
+        assert pose.angle_to(wanted) < 1e-6
+    return document
+
+
+def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> None:
+    document = proved(GACHON, RAMP, ROUNDS)
+    judge, poses = Judge(GACHON, RAMP), plan_from_document(document).waypoints
+    for start, end in itertools.pairwise(poses):
+        assert judge.fault(start, end, 40) == ""
+    assert document.quality.length_mm < 800.0
+    assert document.planner.name == "turning"
+    assert document.planner.rounds == [60]
+
+
+def test_the_same_seed_and_rounds_give_the_same_path_and_others_another() -> None:
+    first, again = (turning_route(GACHON, RAMP, ROUNDS).route for _ in range(2))
+    assert first.path.tolist() == again.path.tolist()
+    assert first.edge_checks == again.edge_checks
+    other = turning_route(GACHON, RAMP, TurningSettings(seed=1, rounds=60)).route
+    assert other.path.tolist() != first.path.tolist()
+
+
+def test_more_rounds_are_never_worse_and_a_plan_with_a_budget_tells_them() -> None:
+    ticks = itertools.count()
+    settings = TurningSettings(budget=0.040)
+    found = turning_route(GACHON, RAMP, settings, clock=lambda: 1e-3 * next(ticks))
+    again = turning_route(GACHON, RAMP, TurningSettings(rounds=found.rounds))
+    assert again.route.path.tolist() == found.route.path.tolist()
+    lengths = [
+        turning_route(GACHON, RAMP, TurningSettings(rounds=rounds)).route.path
+        for rounds in (15, 40, 90)
+    ]
+    ways = [_length(path) for path in lengths]
+    assert ways == sorted(ways, reverse=True)
+
+
+def _length(path: np.ndarray) -> float:
+    """Length with the turning in it, by rotation vectors of the model."""
+    poses = [Pose.from_quaternion(row[:3], row[3:]) for row in path]
+    radian = rms_anchor_radius(GACHON.anchors)
+    return sum(
+        float(np.hypot(a.distance_to(b), radian * a.angle_to(b)))
+        for a, b in itertools.pairwise(poses)
+    )
+
+
+def test_where_nothing_is_in_the_way_the_single_move_is_the_path() -> None:
+    goal = {"position_mm": [60, 40, 430], "rotation_wxyz": quaternion(4.0, -3.0)}
+    scene = turning("environment_1", 8.0, 2.0, goal=goal, obstacles=[])
+    route = turning_route(GACHON, scene, ROUNDS)
+    assert route.rounds == 1
+    assert len(route.route.path) == 2
+
+
+@pytest.mark.slow
+def test_a_robot_with_pulleys_turns_on_its_way_around_the_pillar() -> None:
+    goal = {"position_mm": [-700, 0, 900], "rotation_wxyz": quaternion(0.0, 6.0, 2.0)}
+    document = proved(HALL, turning("hall_pillar", 8.0, 4.0, goal=goal), ROUNDS)
+    assert document.quality.obstacle_clearance is not None
+    assert document.quality.obstacle_clearance.distance_mm >= 40.0
+
+
+def test_without_limits_in_the_scene_the_next_step_is_told() -> None:
+    scene = load_scene(CONFIGS / "environment_1.yaml")
+    with pytest.raises(BadInput, match="does not say how far the platform may turn") as caught:
+        make_plan(GACHON, scene, ROUNDS)
+    assert "rotation_limits: {tilt_deg" in str(caught.value)
+
+
+def test_ends_turned_differently_need_the_option() -> None:
+    with pytest.raises(BadInput, match="turned against each other by 6 deg") as caught:
+        make_plan(GACHON, RAMP)
+    assert "--free-rotation" in str(caught.value)
+
+
+def test_a_search_that_finds_nothing_tells_what_was_in_the_way() -> None:
+    wall = [{"name": "wall", "box": {"size_mm": [20, 900, 900]}, "position_mm": [0, 0, 400]}]
+    ends = {"start": {"position_mm": [200, 0, 400]}, "goal": {"position_mm": [-200, 0, 400]}}
+    scene = turning("environment_1", 5.0, 2.0, obstacles=wall, **ends)
+    with pytest.raises(NoSolution, match="no path after 3 rounds") as caught:
+        turning_route(GACHON, scene, TurningSettings(rounds=3))
+    assert "obstacle clearance" in str(caught.value)
+    assert caught.value.values["rounds"] == 3.0
+
+
+def test_the_check_refuses_a_path_turned_farther_than_the_scene_allows() -> None:
+    far = Pose.from_quaternion([0.0, 0.0, 0.445], quaternion(0.0, 9.0))
+    ends = {"start": {"position_mm": [0, 0, 445]}, "goal": {"position_mm": [0, 0, 445]}}
+    scene = turning("environment_1", 8.0, 2.0, obstacles=[], **ends)
+    report = check_path(GACHON, scene, [scene.start, far, scene.goal], ends=False)
+    said = [violation.sentence() for violation in report.violations]
+    assert any("tilted too far: 9 ° (limit 8 °)" in sentence for sentence in said)
+
+
+def test_a_goal_beyond_the_limits_is_refused_with_its_place(tmp_path) -> None:
+    text = (CONFIGS / "turn.yaml").read_text().replace("tilt_deg: 8", "tilt_deg: 4")
+    path = tmp_path / "scene.yaml"
+    path.write_text(text)
+    with pytest.raises(InvalidFile, match="the goal is tilted by 6 deg") as caught:
+        load_scene(path)
+    assert "goal.rotation_wxyz" in str(caught.value)
+
+
+def test_a_plan_survives_its_file(tmp_path) -> None:
+    document = make_plan(GACHON, RAMP, ROUNDS)
+    save_plan(document, tmp_path / "plan.json")
+    plan = load_plan(tmp_path / "plan.json")
+    assert verify(plan).report.proved_obstacle_clearance >= 0.010
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"cost": CostName.kinematic}, "--cost kinematic"),
+        ({"weight": ["length=1"]}, "--weight"),
+        ({"longest_mm": 900.0}, "--longest-mm"),
+    ],
+)
+def test_options_that_would_not_be_heeded_are_refused(tmp_path, given, named) -> None:
+    with pytest.raises(BadInput, match=f"--free-rotation knows no {named}"):
+        plan_verb(
+            CONFIGS / "gachon_8_6.yaml",
+            CONFIGS / "turn.yaml",
+            tmp_path / "plan.json",
+            free_rotation=True,
+            **given,
+        )
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"budget": 0.0}, {"rounds": 0}])
+def test_settings_that_no_search_can_use_are_refused(wrong) -> None:
+    with pytest.raises(BadInput):
+        TurningSettings(**wrong)
