@@ -16,18 +16,18 @@ from planner.exact.capacity import build_load
 from planner.exact.self_edge import build_robot
 from planner.exact.world import build_world
 from planner.paper.limits import REASONS
-from planner.route import Route
+from planner.route import Progress, Route
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 from planner.space import PoseSpace
 from planner.turning.problem import Problem
 from planner.turning.search import Search
 from planner.turning.settings import TurningSettings
 
-Progress = Callable[[int, int, float], None]
 Clock = Callable[[], float]
 
 LEAST_ROUNDS = 12
 """Done whatever the clock says, so that a busy machine finds a path, too."""
+_TELL_EVERY = 20
 _ROTATION_ROUND_OFF = 5e-8
 """Added to the rotation limits, [rad]: half of what the check leaves for round-off in files."""
 
@@ -87,7 +87,7 @@ def turning_route(
         rig: The robot.
         scene: Obstacles, clearances, load, rotation limits, start and goal.
         settings: Seed and budget.
-        progress: Told rounds done, the most there will be (0: as the budget allows), and the cost.
+        progress: Told time spent [s] and the budget, or rounds, and the cost.
         clock: Seconds; decides when a budget is spent.
 
     Raises:
@@ -99,10 +99,15 @@ def turning_route(
     start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
     Search(problem, start, goal, settings.seed).advance()  # makes or loads compiled code
     search, began = Search(problem, start, goal, settings.seed), clock()
-    while not _is_over(settings, search, clock() - began):
+    spent = 0.0
+    while not _is_over(settings, search, spent):
         search.advance()
-        if progress is not None and search.rounds % 10 == 0:
-            progress(search.rounds, settings.rounds or 0, search.cost)
+        spent = clock() - began
+        if progress is not None and search.rounds % _TELL_EVERY == 0:
+            if settings.rounds is not None:
+                progress(search.rounds, settings.rounds, search.cost)
+            else:
+                progress(min(spent, settings.budget), settings.budget, search.cost)
     path = search.path
     if path is None:
         raise _no_path(scene, search, settings)
