@@ -37,8 +37,8 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	case "$$stamp" in "" | "$$place, "*) ;; *) rm -rf "$(VENV)" ;; esac; \
 	rm -f "$(STAMP)"; \
 	"$(PYTHON)" -m venv "$(VENV)" && \
-	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -r constraints.txt && \
-	"$(BIN)/python" -m pip $(PIP) --no-build-isolation --no-deps -e . && \
+	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling && \
+	"$(BIN)/python" -m pip $(PIP) --only-binary :all: --no-build-isolation -c constraints.txt -e ".[dev]" && \
 	"$(BIN)/python" -m pip check --disable-pip-version-check && \
 	echo "Compiling the planner (once; a minute or two) ..." && \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml -o "$(VENV)/first-plan.json" --force --json >/dev/null && \

@@ -107,7 +107,9 @@ def _dask_client(address: str) -> Any:
         client = import_module("distributed").Client
     except ImportError as error:
         raise BadInput(
-            "Dask is not installed", next_step="pip install distributed, or leave --dask out"
+            "Dask is not installed",
+            next_step="pip install 'cdpr[dask]' (in a source checkout as docs/workspace.md says),"
+            " or leave --dask out",
         ) from error
     try:
         return client(address, timeout="10s")
