@@ -43,7 +43,11 @@ table { border-collapse: collapse; margin: 1rem 0; font-size: 13px; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid #dde1e7; text-align: left; }
 td + td { font-variant-numeric: tabular-nums; }
 img { max-width: 100%; }
+th { vertical-align: bottom; }
 .wide { overflow-x: auto; }
+.figures { font-size: 12px; }
+.figures th, .figures td { padding: .2rem .5rem; }
+.figures td { white-space: nowrap; }
 """
 
 
@@ -92,7 +96,7 @@ def _claims(results: Results) -> str:
         row = [claim]
         for place in PLACES:
             here = next(f for f in found if f.claim == claim and (f.box, f.ends) == place)
-            row.append(f"{change_text(here.change)}: {here.verdict}")
+            row.append(f"{change_text(here.change)}\n{here.verdict}")
         rows.append(row)
     return _table(["claim", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows)
 
@@ -107,12 +111,12 @@ def _figure_9_table(results: Results, ends: Any) -> str:
                 row = [environment, sampler, cost]
                 for quantity in (*COUNTED, *MEASURED):
                     s = summary(results.values(FIGURE_9, case, arm, quantity))
-                    row.append(f"{s.mean:.4g} ± {s.deviation:.3g} ({s.low:.4g} to {s.high:.4g})")
+                    row.append(f"{s.mean:.4g} ± {s.deviation:.3g}\n({s.low:.4g} to {s.high:.4g})")
                 rows.append(row)
     head = ["environment", "sampler", "minimises"]
     title = f"Own box, {ends} ends: mean ± standard deviation (interval of the mean)"
     quantities = [_QUANTITIES[q] for q in (*COUNTED, *MEASURED)]
-    return f"<h3>{title}</h3>" + _table([*head, *quantities], rows)
+    return f"<h3>{title}</h3>" + _table([*head, *quantities], rows, "figures")
 
 
 def _comparisons(results: Results) -> str:
@@ -122,7 +126,7 @@ def _comparisons(results: Results) -> str:
         for box, ends in PLACES:
             arms = arms_of(comparison)
             mean, deviation = results.change(VARIANTS, box, ends, arms, "nodes")
-            row.append(f"{change_text(mean)}; deviation {percent(deviation.mean)}")
+            row.append(f"{change_text(mean)}\ndeviation {percent(deviation.mean)}")
         rows.append(row)
     return _table(["nodes", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows)
 
@@ -135,7 +139,7 @@ def _readings(results: Results) -> str:
     ]
     changes.sort(key=lambda entry: entry[1][0][0].mean)
     rows = [
-        [name, *(f"{change_text(m)}; deviation {percent(d.mean)}" for m, d in by_box)]
+        [name, *(f"{change_text(m)}\ndeviation {percent(d.mean)}" for m, d in by_box)]
         for name, by_box in changes
     ]
     return _table(["reading", "own box, scene ends", "wide box, scene ends"], rows)
@@ -149,7 +153,7 @@ def _boxes(results: Results) -> str:
         for comparison in chosen:
             mean, _ = results.change(BOXES, box, "scene", arms_of(comparison), "nodes")
             each = ", ".join(percent(part) for part in mean.each)
-            row.append(f"{change_text(mean)}; by environment {each}")
+            row.append(f"{change_text(mean)}\nby environment {each}")
         rows.append(row)
     return _table(["box", *(c.name for c in chosen)], rows)
 
@@ -173,12 +177,15 @@ def change_text(change: Change) -> str:
     return f"{percent(change.mean)} ({percent(change.low)} to {percent(change.high)})"
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
     first = "".join(f"<th>{escape(name)}</th>" for name in head)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>\n" for row in rows
-    )
-    return f'<div class="wide"><table><tr>{first}</tr>\n{body}</table></div>'
+    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>\n" for row in rows)
+    table = f'<table class="{kind}"><tr>{first}</tr>\n{body}</table>'
+    return f'<div class="wide">{table}</div>'
+
+
+def _cell(text: str) -> str:
+    return "<td>" + escape(text).replace("\n", "<br>") + "</td>"
 
 
 def _paragraph(text: str) -> str:
