@@ -10,15 +10,15 @@ live as long as the process.
 from __future__ import annotations
 
 import hashlib
-import os
 import platform
-import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+
+from planner.exact.cache import use_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -42,20 +42,7 @@ def kernel(function: Function) -> Function:
 @cache
 def cache_folder(sources: Path) -> Path | None:
     """The folder of the machine code of kernels in ``sources``; None where none can be written."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    if given:
-        parent = Path(given)
-    else:
-        cache_home = os.environ.get("XDG_CACHE_HOME")
-        parent = Path(cache_home) if cache_home else Path.home() / ".cache"
-        parent = parent / "cdpr" / "kernels"
-    folder = parent / _version(sources)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:  # read-only or full: compiled code is then not kept
-        return None
+    return use_folder(_version(sources))
 
 
 @cache

@@ -1,0 +1,71 @@
+"""Which folders of machine code are kept, and which are thrown away."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+import pytest
+
+from planner.exact.cache import UNUSED, throw_away_unused, use_folder
+
+NOW = 1.8e9
+OLD, RECENT = NOW - UNUSED - 1.0, NOW - UNUSED + 1.0
+
+
+def made(parent: Path, name: str, used: float) -> Path:
+    folder = parent / name
+    folder.mkdir(parents=True)
+    (folder / "kernel.nbc").write_bytes(b"code")
+    os.utime(folder, (used, used))
+    return folder
+
+
+def test_only_versions_that_nobody_used_for_long_are_thrown_away(tmp_path: Path) -> None:
+    old, recent = made(tmp_path, "a" * 16, OLD), made(tmp_path, "b" * 16, RECENT)
+    other = made(tmp_path, "somebody-elses", OLD)
+    left_over = made(tmp_path, "removed-x1_y2", OLD)
+    throw_away_unused(tmp_path, NOW)
+    assert not old.exists()
+    assert not left_over.exists()
+    assert sorted(tmp_path.iterdir()) == sorted([recent, other])
+    assert (recent / "kernel.nbc").read_bytes() == b"code"
+
+
+def test_a_version_in_use_is_kept_however_old_and_goes_when_it_is_let_go(tmp_path: Path) -> None:
+    folder = made(tmp_path, "c" * 16, NOW)
+    lock = os.open(folder / "in-use", os.O_RDWR | os.O_CREAT)
+    fcntl.flock(lock, fcntl.LOCK_SH)
+    os.utime(folder, (OLD, OLD))
+    throw_away_unused(tmp_path, NOW)
+    assert (folder / "kernel.nbc").exists()
+    os.close(lock)
+    throw_away_unused(tmp_path, NOW)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_using_a_version_holds_it_and_a_new_one_throws_old_ones_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    parent = tmp_path / "cdpr" / "kernels"
+    old = made(parent, "d" * 16, 1e9)
+    first = use_folder("e" * 16)
+    assert first == parent / ("e" * 16)
+    assert not old.exists()
+    os.utime(first, (1e9, 1e9))  # as if used for days by this process, which holds it
+    assert use_folder("f" * 16) == parent / ("f" * 16)
+    assert first.exists()
+    assert use_folder("e" * 16) == first
+    assert first.stat().st_mtime > 1e9
+
+
+def test_a_folder_that_the_user_named_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    old = made(tmp_path, "a" * 16, 1e9)
+    assert use_folder("b" * 16) == tmp_path / ("b" * 16)
+    assert old.exists()
