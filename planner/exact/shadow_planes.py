@@ -19,6 +19,8 @@ from cdpr.poses import Array
 from planner.exact.pieces import Piece
 
 _TURNS = 16
+_HALVINGS = 20
+"""Of a right angle: a plane is turned back from touching by some millionths at most."""
 _MOST_PLANES = 12
 _MOST_EDGES = 60
 _EYE_ROUND_OFF = 1e-13
@@ -123,7 +125,7 @@ def _touching_all_round(piece: Piece, eye: Array, needed: float) -> Array:
     turns = 2.0 * np.pi * np.arange(_TURNS) / _TURNS
     sideways = np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * up
     low, high = np.zeros(_TURNS), np.full(_TURNS, np.pi / 2.0)
-    for _ in range(45):  # the room falls to zero where the plane touches
+    for _ in range(_HALVINGS):  # the room falls to zero where the plane touches
         middle = (low + high) / 2.0
         normals = np.cos(middle)[:, None] * sight + np.sin(middle)[:, None] * sideways
         behind = piece.least(normals) - needed - normals @ eye >= 0.0
