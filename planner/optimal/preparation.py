@@ -14,7 +14,8 @@ from planner.exact.fields import World
 from planner.exact.holding import Holding, box_held, build_holding
 from planner.exact.self_edge import build_robot
 from planner.exact.world import build_world
-from planner.optimal.problem import LEAST_MARGIN, UNIT, Problem
+from planner.lattice import Lattice, corners_and_weights
+from planner.optimal.problem import LEAST_MARGIN, NO_MARGIN, UNIT, Problem
 from planner.optimal.settings import Weights
 from planner.optimal.stored import stored
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
@@ -24,6 +25,8 @@ _FEW = 64
 """Cells of the workspace left unproved that are worth proving in smaller parts."""
 _PARTS = 4
 _FAR_FROM_LIMIT = 5.0
+"""Times the reserve: where margins are as large as this, their interpolation misleads seldom."""
+_OF_AN_END = 0.9
 
 
 def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCost) -> Problem:
@@ -63,16 +66,22 @@ def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCos
         terms=np.zeros(7),
     )
     set_weights(problem, weights)
-    problem.terms[LEAST_MARGIN] = _least_margin(holding, capacity)
+    ends = np.array([scene.start.position, scene.goal.position])
+    problem.terms[LEAST_MARGIN] = _least_margin(holding, lattice, capacity, ends)
     return problem
 
 
-def _least_margin(holding: Holding, capacity: Array) -> float:
-    """What interpolated margins must keep while searching; finished paths are always proved."""
+def _least_margin(holding: Holding, lattice: Lattice, capacity: Array, ends: Array) -> float:
+    """What interpolated margins must keep while searching; finished paths are always proved.
+
+    Less where an end, shape (2, 3), [m], has no more: a path has to leave it.
+    """
     least = _FAR_FROM_LIMIT * holding.reserve
     if holding.everywhere or float(capacity.min()) >= least:
-        return -np.inf
-    return least
+        return NO_MARGIN
+    corners, weights = corners_and_weights(lattice, ends)
+    there = np.sum(capacity.ravel()[corners] * weights, axis=1)
+    return min(least, _OF_AN_END * float(there.min()))
 
 
 def set_weights(problem: Problem, weights: Weights) -> None:

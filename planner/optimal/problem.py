@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 LENGTH, KINEMATIC, CLEARANCE, CAPACITY, VERTEX, UNIT, LEAST_MARGIN = 0, 1, 2, 3, 4, 5, 6
 """Places in `Problem.terms`."""
 
+NO_MARGIN = -math.inf
+"""As the least margin: interpolated ones are not looked at."""
 ASK_PROOF = math.inf
 """As the least margin: wrenches are proved to be held on every edge, which takes long."""
 
@@ -46,7 +48,7 @@ class Problem(NamedTuple):
         terms: Weights of length, ∫c ds, smallest clearance and smallest margin in the cost that
             is made small (the last two count against it); what a vertex more must save at least;
             what a metre of a usual path costs; and the least margin of interpolated samples of
-            an edge, `ASK_PROOF`, or minus infinity where nothing comes near it, shape (7,).
+            an edge, or `NO_MARGIN`, or `ASK_PROOF`, shape (7,).
     """
 
     world: World
@@ -69,14 +71,17 @@ def edge_allowed(problem: Problem, start: Vector, end: Vector) -> bool:
         return False
     least = problem.terms[LEAST_MARGIN]
     proved = len(robot.open_pairs) + len(robot.open_cables) == 0
-    if proved and least == -math.inf:
+    if proved and least == NO_MARGIN:
         return True
     before, after = np.array(start), np.array(end)
     if not (proved or self_edge_free(world, robot, before, after)):
         return False
-    if least == ASK_PROOF:
-        return bool(edge_held(world, problem.load, problem.holding, before, after))
-    return least == -math.inf or bool(lowest_margin(problem, start, end) >= least)
+    if least == NO_MARGIN:
+        return True
+    margin = lowest_margin(problem, start, end)
+    if least < ASK_PROOF or margin < 0.0:  # far from held: not worth the time of a proof
+        return bool(margin >= least)
+    return bool(edge_held(world, problem.load, problem.holding, before, after))
 
 
 @kernel

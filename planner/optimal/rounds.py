@@ -20,6 +20,7 @@ from planner.optimal.problem import (
     CLEARANCE,
     KINEMATIC,
     LEAST_MARGIN,
+    NO_MARGIN,
     UNIT,
     VERTEX,
     Problem,
@@ -49,13 +50,15 @@ _PATIENCE = 8
 def advance(problem: Problem, search: Search, rounds: int) -> float:
     """Does some rounds; returns the cost of the best path so far, infinite without one.
 
-    Where the grid's margins misled, `Problem.terms` is changed to ask for proofs from then on.
+    Where the grid's margins mislead, `Problem.terms` is changed: where they leave no path they are
+    no longer asked, which tells whether obstacles do; and where a path is found that is not proved
+    to hold the wrenches, proofs are asked for from then on.
     """
     for _ in range(rounds):
         begun = search.totals[0]
         search.totals[0] += 1
         if begun == _PATIENCE and search.costs[BEST] == math.inf and _may_mislead(problem):
-            _begin_anew(problem, search)
+            _begin_anew(problem, search, NO_MARGIN)
         kept = _chosen(search, begun)
         if search.counts[kept, 0] == 0:
             kept = _begin(problem, search, kept)
@@ -104,7 +107,7 @@ def _remember(problem: Problem, search: Search, kept: int) -> None:
         for i in range(line.counts[0] - 1):
             start, end = line.points[i], line.points[i + 1]
             if not edge_held(problem.world, problem.load, problem.holding, start, end):
-                _begin_anew(problem, search)
+                _begin_anew(problem, search, ASK_PROOF)
                 return
     search.points[BEST], search.edges[BEST] = line.points, line.edges
     search.counts[BEST, 0], search.costs[BEST] = line.counts[0], search.costs[kept]
@@ -117,9 +120,9 @@ def _may_mislead(problem: Problem) -> bool:
 
 
 @kernel
-def _begin_anew(problem: Problem, search: Search) -> None:
-    """Forgets all but the best path, and asks for proofs from now on."""
-    problem.terms[LEAST_MARGIN] = ASK_PROOF
+def _begin_anew(problem: Problem, search: Search, least: float) -> None:
+    """Forgets all but the best path, and asks for another least margin from now on."""
+    problem.terms[LEAST_MARGIN] = least
     search.totals[2] += search.grown[2]
     search.totals[3], search.totals[5] = 0, search.totals[0]
     search.counts[:KEPT, 0], search.costs[:KEPT] = 0, math.inf

@@ -16,7 +16,7 @@ from planner.cost import KinematicCost
 from planner.optimal.length_limit import LengthLimit
 from planner.optimal.no_path import no_path
 from planner.optimal.preparation import problem_of
-from planner.optimal.problem import Problem
+from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, Problem
 from planner.optimal.rounds import advance
 from planner.optimal.search import BEST, Search, new_search
 from planner.optimal.settings import OptimalSettings, Weights
@@ -26,6 +26,8 @@ Clock = Callable[[], float]
 
 LEAST_ROUNDS = 12
 """Done whatever the clock says, so that a busy machine finds a path, too."""
+LEAST_WITH_PROOFS = 2
+"""Likewise from where wrenches have to be proved on every edge, which takes long."""
 LEAST_WITH_LIMIT = 80
 """Likewise where a longest path is asked for, whose price is found in steps of some rounds."""
 _TELL_EVERY = 0.1
@@ -103,7 +105,7 @@ def _improved(
     """Does rounds until the budget is spent, or nothing can be better."""
     limit = LengthLimit(settings) if settings.longest < math.inf else None
     spent, told = 0.0, 0.0
-    while not _is_over(settings, search, spent):
+    while not _is_over(problem, settings, search, spent):
         cost = advance(problem, search, 1)
         if limit is not None:
             limit.after_round(problem, search)
@@ -116,11 +118,13 @@ def _improved(
     return limit.path if limit is not None else best_path(search)
 
 
-def _is_over(settings: OptimalSettings, search: Search, spent: float) -> bool:
+def _is_over(problem: Problem, settings: OptimalSettings, search: Search, spent: float) -> bool:
     rounds, begun = int(search.totals[0]), int(search.totals[5])
     if settings.rounds is not None:
         return rounds >= settings.rounds
     least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_WITH_LIMIT
+    if problem.terms[LEAST_MARGIN] == ASK_PROOF:
+        least = LEAST_WITH_PROOFS
     return rounds - begun >= least and spent >= settings.budget
 
 

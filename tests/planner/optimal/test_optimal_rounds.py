@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from cdpr.poses import Pose
+from cdpr.scene import scene_from_document
 from planner.check import check_path
 from planner.exact.checks import FREE, ExactChecks
-from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN
+from planner.feasibility import capacity_margins
+from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, NO_MARGIN
 from planner.optimal.rounds import advance
 from planner.optimal.search import BEST, KEPT, new_search
 from planner.optimal.settings import OBJECTIVES
@@ -155,6 +157,26 @@ def test_a_grid_of_margins_that_forbids_everything_is_not_believed_for_long(aske
     )
     wrong.terms[LEAST_MARGIN] = 1e9
     search = searched(wrong, scene, 12)
-    assert wrong.terms[LEAST_MARGIN] == ASK_PROOF
+    assert wrong.terms[LEAST_MARGIN] == NO_MARGIN
     assert 0 < search.totals[5] < 12
     assert len(best_points(search)) > 2
+
+
+def test_an_end_with_little_margin_is_left_without_asking_for_proofs(hall, ready_scene) -> None:
+    """Margins of the grid must be large on edges, but not larger than an end's own."""
+    scene = ready_scene("hall_pillar")
+    low = 0.0
+    for force in np.linspace(0.0, 600.0, 61):
+        load = scene.document.load.model_copy(update={"force_n": [force] * 3})
+        loaded = scene_from_document(scene.document.model_copy(update={"load": load}))
+        margin = capacity_margins(hall, loaded, scene.start.position[None, :], np.eye(3))[0]
+        if margin < 4.0 * MARGIN_RESERVE * hall.max_tension:
+            break
+        low = margin
+    assert 1.5 * MARGIN_RESERVE * hall.max_tension < margin < low
+    question = problem(hall, loaded)
+    search = searched(question, loaded, 12)
+    assert question.terms[LEAST_MARGIN] < 5.0 * MARGIN_RESERVE * hall.max_tension
+    path = best_points(search)
+    assert len(path) > 1
+    assert check_path(hall, loaded, [Pose(p, scene.start.rotation) for p in path]).passed
