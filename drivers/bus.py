@@ -5,20 +5,27 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import can
+from can.interfaces.udp_multicast import UdpMulticastBus
 
-from cdpr.errors import BadInput, Fault, HardwareMissing
+from cdpr.errors import BadInput, HardwareMissing
 from cdpr.rig import Rig
+from drivers.bus_faults import bus_fault
 
 UDP_DEFAULT_GROUP = "239.74.163.2"
 """python-can's own IPv4 group. Source: python-can, interfaces/udp_multicast."""
 
 RECEIVE_BUFFER_BYTES = 4 * 2**20
 """A socket of the default size drops the newest frames after 278 without a word."""
+
+SO_MEMINFO = 55
+MEMINFO_BYTES = 36
+"""Nine counters, the last of them the frames thrown away. Source: linux/sock_diag.h."""
 
 MIN_TRANSMIT_QUEUE = 64
 """Frames a kernel CAN interface must queue: a cycle and a stop in one burst, with room to spare."""
@@ -176,34 +183,56 @@ def _prepare_socket(bus: can.BusABC) -> None:
             bus_socket.setsockopt(socket.IPPROTO_IP, ip_multicast_all, 0)
 
 
+def hears_itself(bus: can.BusABC) -> bool:
+    """Whether a sender receives its own frames; multicast brings them back, CAN does not."""
+    return isinstance(bus, UdpMulticastBus)
+
+
+def lost_frames(bus: can.BusABC) -> int:
+    """Frames the kernel threw away since the bus was opened, because nobody fetched them in time.
+
+    0 for buses without a socket; there only missing replies tell.
+    """
+    try:
+        descriptor = bus.fileno()
+    except NotImplementedError:
+        return 0
+    if descriptor < 0:
+        return 0
+    bus_socket = socket.socket(fileno=descriptor)
+    try:
+        # python-can refuses the control message of SO_RXQ_OVFL; this asks for the same counter.
+        memory = bus_socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_BYTES)
+    finally:
+        bus_socket.detach()
+    (lost,) = struct.unpack_from("=I", memory, MEMINFO_BYTES - 4)
+    return int(lost)
+
+
 def transmit(bus: can.BusABC, message: can.Message) -> None:
     """Sends one frame.
 
     Raises:
-        Fault: The bus did not take it. A full queue is a fault too: a set-point sent late is wrong.
+        BusFault: The bus did not take it. A full queue is one too: a set-point sent late is wrong.
     """
     try:
         bus.send(message)
     except Exception as error:  # back ends raise errors of their own libraries
-        raise _failed(bus, "did not take a frame", error) from error
+        raise bus_fault("the bus did not take a frame", bus_name(bus), error) from error
 
 
 def take(bus: can.BusABC, timeout: float) -> can.Message | None:
     """The next frame, or None when there is none within the time [s].
 
     Raises:
-        Fault: The bus failed.
+        BusFault: The bus failed.
     """
     try:
         return bus.recv(timeout)
     except Exception as error:  # back ends raise errors of their own libraries
-        raise _failed(bus, "cannot be read", error) from error
+        raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
 
 
-def _failed(bus: can.BusABC, what: str, error: Exception) -> Fault:
-    return Fault(
-        f"the bus {what}: {str(error) or type(error).__name__}",
-        where=f"bus {bus.channel_info}",
-        why="the interface went down, the controller went bus-off, or its queue is full",
-        next_step="the drives stop by themselves; check cable and termination, then start again",
-    )
+def bus_name(bus: can.BusABC) -> str:
+    """The bus as messages name it."""
+    return f"bus {bus.channel_info}"

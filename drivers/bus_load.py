@@ -10,6 +10,13 @@ from cdpr.rig import Rig
 MAX_LOAD = 0.70
 """Above it, a stop frame may wait too long behind others."""
 
+TESTED_HZ = 250.0
+"""The tested ceiling; arming refuses shorter cycles, so none is ever advised."""
+
+FASTEST_TENTHS_MS = round(10_000.0 / TESTED_HZ)
+SLOWEST_TENTHS_MS = 1000
+"""Cycles that may be advised, [0.1 ms]; a rig file allows up to 100 ms."""
+
 HEARTBEAT_PERIOD = 0.03
 """Between two heartbeats of the master and of each drive, [s]; two may be lost."""
 
@@ -68,14 +75,20 @@ def check_bus_load(rig: Rig) -> float:
     cycle = bus.cycle_ms / 1000.0
     load = bus_load(rig.cable_count, cycle, bus.bitrate)
     if load > MAX_LOAD:
-        slowest = 1000.0 * cycle * load / MAX_LOAD
         raise Refused(
             f"{rig.cable_count} drives every {bus.cycle_ms:g} ms need {load:.0%} of a bus of"
             f" {bus.bitrate} bit/s; the limit is {MAX_LOAD:.0%}",
             where=f"rig {rig.name}: bus",
             why=f"a cycle is {cycle_bits(rig.cable_count)} bits at worst; a stop must get through",
-            next_step=f"set bus.cycle_ms to {math.ceil(10 * slowest) / 10:g} or more,"
-            " or raise the bitrate",
+            next_step=_advice(rig.cable_count, bus.bitrate),
             values={"load": load, "limit": MAX_LOAD, "cycle_ms": bus.cycle_ms},
         )
     return load
+
+
+def _advice(drives: int, bitrate: int) -> str:
+    """The shortest cycle with room for everything, but none that arming would refuse."""
+    for tenths in range(FASTEST_TENTHS_MS, SLOWEST_TENTHS_MS + 1):
+        if bus_load(drives, tenths / 10_000.0, bitrate) <= MAX_LOAD:
+            return f"set bus.cycle_ms to {tenths / 10.0:g} or more, or raise the bitrate"
+    return "raise the bitrate; no cycle that a rig may have is long enough for this one"

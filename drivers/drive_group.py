@@ -18,6 +18,10 @@ Pump = Callable[[], None]
 """Lets drives that live in the caller's process work off what the bus holds for them."""
 
 
+WHOLE_BUS = 0
+"""In place of a node: the fault is not one drive's."""
+
+
 class GroupState(Enum):
     """Where the whole group stands; it never moves towards power without a command."""
 
@@ -80,11 +84,14 @@ class CycleStatus:
             rated torque]. Tension at rest is torque / 1000 times the winch's `torque_constant`.
         status_words: As received, shape (m,).
         missing: True for drives that did not answer in this cycle, shape (m,).
-        faults: Node and text of every fault since the last reset, oldest first.
+        faults: Node and text of every fault since the last reset, oldest first; the node is
+            `WHOLE_BUS` where it is the bus that failed.
         state: State of the group.
         holding: Every drive holds under torque (enabled or in quick stop).
         stopped: Every drive told in this cycle that it follows no set-points.
-        rejected: Replies thrown away since `configure` because their length was wrong.
+        rejected: Frames thrown away since `configure` because their length or their content could
+            not be true.
+        error_frames: Error frames of the bus since `configure`.
     """
 
     positions: Counts
@@ -97,6 +104,7 @@ class CycleStatus:
     holding: bool
     stopped: bool
     rejected: int
+    error_frames: int
 
 
 class DriveGroup(Protocol):
@@ -117,8 +125,11 @@ class DriveGroup(Protocol):
         """Targets last sent, shape (m,), [counts]; motion after ENABLING starts from them."""
         ...
 
-    def configure(self) -> None:
+    def configure(self) -> tuple[str, ...]:
         """Sets every drive up and reads every setting back.
+
+        Returns:
+            Remarks for the operator: what drives cannot do although a run would use it.
 
         Raises:
             HardwareMissing: A drive does not answer.

@@ -44,6 +44,7 @@ def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]
         HardwareMissing: The bus cannot be opened or a drive does not answer.
         Refused: The bus is too slow, or a drive does not keep a setting.
     """
+    from cdpr.cli.output import err
     from drivers.bus import BusSettings, open_bus
     from drivers.drive_group import make_drive_group
 
@@ -61,5 +62,6 @@ def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]
             pump, true_pose = rehearsal.pump, lambda: rehearsal.pose
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)
-        group.configure()
+        for remark in group.configure():
+            err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
         yield Drives(group, true_pose)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import can
 
@@ -27,38 +27,63 @@ from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 
 
-def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> None:
+def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> tuple[str, ...]:
     """Writes and reads back every object of every drive, then starts their process data.
+
+    Returns:
+        Remarks: what drives cannot do although a run would use it.
 
     Raises:
         HardwareMissing: Drives do not answer; with all their nodes.
         Refused: A drive is no CiA 402 drive, is enabled already, refuses an object or does not
-            keep it; or another master sends SYNC on this bus.
+            keep it; two devices have one node id; or another master is at work on this bus.
         BadInput: A value of the rig does not fit its object.
         Fault: The bus does not take frames.
     """
     winch_map = WinchMap(rig)
     settings = [settings_for(rig, i, winch_map) for i in range(rig.cable_count)]
-    network = SetupNetwork(bus, pump)
-    network.discard_waiting()
     nodes = [winch.node_id for winch in rig.winches]
+    network = SetupNetwork(bus, pump, nodes)
+    network.discard_waiting()
     _find_all(network, nodes)
+    _refuse_duplicates(network)
+    entries = []
     for drive, node in enumerate(nodes):
         _check_idle(network, node)
         network.command(NmtCommand.PRE_OPERATIONAL, node)
         _write_all(network, node, settings[drive])
-        _watch_heartbeats(network, node, rig, drive)
+        entries.append(_watch_heartbeats(network, node, rig, drive))
         _switch_off_unused(network, node)
         _expect(network, node, AFTER)
-    if network.foreign_sync:
-        raise Refused(
-            "another program sends SYNC on this bus",
-            where="configuring the drives",
-            why="two masters would move the same drives",
-            next_step="end the other program, or wait until its run is over",
-        )
     for node in nodes:
         network.command(NmtCommand.START, node)
+    network.take_waiting()
+    return tuple(_unwatched_peers(nodes, entries))
+
+
+def _refuse_duplicates(network: SetupNetwork) -> None:
+    for node in network.nodes_answering_twice():
+        raise Refused(
+            f"drive {node} answers twice",
+            where="configuring the drives",
+            why="two devices have this node id, or `cdpr sim` was started twice",
+            next_step="give every device on the bus its own node id",
+            values={"node": node},
+        )
+
+
+def _unwatched_peers(nodes: Sequence[int], entries: Sequence[int]) -> Iterator[str]:
+    """One remark for all drives that have the same number of heartbeat entries too few."""
+    for count in sorted(set(entries)):
+        if count >= len(nodes):
+            continue
+        drives = ", ".join(str(n) for n, own in zip(nodes, entries, strict=True) if own == count)
+        yield (
+            f"drive {drives}: 1016h has {count} heartbeat {'entry' if count == 1 else 'entries'},"
+            f" so the master and {count - 1} of {len(nodes) - 1} other drives are watched; when"
+            " another one falls silent together with the master, SYNC and set-point time-outs stop"
+            " the drive instead"
+        )
 
 
 def _find_all(network: SetupNetwork, nodes: Iterable[int]) -> None:
@@ -127,7 +152,8 @@ def _write_all(network: SetupNetwork, node: int, settings: Sequence[Setting]) ->
             raise _wrong(node, str(setting), found, str(setting.value), setting.why)
 
 
-def _watch_heartbeats(network: SetupNetwork, node: int, rig: Rig, drive: int) -> None:
+def _watch_heartbeats(network: SetupNetwork, node: int, rig: Rig, drive: int) -> int:
+    """Sets the heartbeat consumer up; returns how many producers it can watch."""
     data = network.client(node).read(HEARTBEAT_CONSUMERS, 0, "consumer heartbeat entries")
     entries = int.from_bytes(data, "little")
     if entries < 1:
@@ -135,6 +161,7 @@ def _watch_heartbeats(network: SetupNetwork, node: int, rig: Rig, drive: int) ->
             node, "1016h:00 consumer heartbeat entries", "0", "1 or more", "watch the master"
         )
     _write_all(network, node, heartbeat_consumers(rig, drive, entries))
+    return entries
 
 
 def _switch_off_unused(network: SetupNetwork, node: int) -> None:

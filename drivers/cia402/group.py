@@ -9,13 +9,15 @@ import numpy as np
 
 from cdpr.errors import HardwareMissing, Refused
 from cdpr.rig import Rig
-from drivers.bus_load import check_bus_load, heartbeat_cycles
+from drivers.bus_faults import BusFault
+from drivers.bus_load import TESTED_HZ, check_bus_load, heartbeat_cycles
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.cyclic import CyclicBus
 from drivers.cia402.sequence import Goal, next_words
 from drivers.cia402.states import FAULTED, TORQUE_ON, ControlWord, DriveState
 from drivers.cia402.watch import DriveWatch
 from drivers.drive_group import (
+    WHOLE_BUS,
     Capabilities,
     Counts,
     CycleStatus,
@@ -31,7 +33,13 @@ STEP_TIMEOUT = 1.0
 RESET_CYCLES = 10
 """Cycles a drive has to leave the state FAULT after a reset."""
 
+JUMP_RESERVE = 4.0
+"""A position that changes this much faster than its winch may turn is no position."""
+
 FIRST_READING_ATTEMPTS = 10
+FIRST_READINGS = 2
+"""Of each drive that must agree before its position is believed: one frame may be wrong."""
+
 FIRST_READING_TIMEOUT = 0.1
 """A drive that was just started may let the first SYNC pass; [s] for each."""
 
@@ -48,13 +56,15 @@ class Cia402Group:
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
-        self._cyclic = CyclicBus(bus, self._nodes)
+        steps = [JUMP_RESERVE * w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches]
+        self._max_steps = tuple(steps)
         self._state = GroupState.OFFLINE
         self._reset_memory()
 
     def _reset_memory(self) -> None:
         count = len(self._nodes)
-        self._watch = DriveWatch(self._nodes)
+        self._cyclic = CyclicBus(self._bus, self._nodes)
+        self._watch = DriveWatch(self._nodes, self._max_steps)
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
         self._released = [False] * count
@@ -73,7 +83,7 @@ class Cia402Group:
             holds_on_comm_loss=True,
             holds_on_quick_stop=True,
             has_brake=False,
-            max_hz=250.0,
+            max_hz=TESTED_HZ,
         )
 
     @property
@@ -86,7 +96,7 @@ class Cia402Group:
         """Targets last sent, shape (m,), [counts]."""
         return np.array(self._targets, dtype=np.int64)
 
-    def configure(self) -> None:
+    def configure(self) -> tuple[str, ...]:
         """Sets every drive up and reads every setting back; see `DriveGroup.configure`."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused(
@@ -96,15 +106,23 @@ class Cia402Group:
             )
         self._state = GroupState.OFFLINE
         self._reset_memory()
-        configure_drives(self._rig, self._bus, self._pump)
+        remarks = configure_drives(self._rig, self._bus, self._pump)
         self._state = GroupState.CONFIGURED
+        return remarks
 
     def read_positions(self) -> CycleStatus:
         """Sends SYNC until every drive has told its position; see `DriveGroup.read_positions`."""
+        self._watch.forget_positions()
+        agreed = 0
         for _ in range(FIRST_READING_ATTEMPTS):
             self.send_cycle(self._watch.positions)
             status = self.receive(FIRST_READING_TIMEOUT)
-            if not status.missing.any():
+            if status.missing.any():
+                self._watch.forget_positions()
+                agreed = 0
+                continue
+            agreed += 1
+            if agreed == FIRST_READINGS:
                 return status
         silent = [n for n, missing in zip(self._nodes, status.missing, strict=True) if missing]
         names = ", ".join(str(node) for node in silent)
@@ -119,7 +137,11 @@ class Cia402Group:
     def send_cycle(self, targets: Sequence[int]) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
-        self._cyclic.discard_stale(self._watch)
+        try:
+            self._cyclic.discard_stale(self._watch)
+        except BusFault as fault:
+            self._latch_bus(fault)
+            raise
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._released)
         self._demands = self._targets if self._known else list(self._watch.positions)
@@ -141,7 +163,12 @@ class Cia402Group:
         if self._pump is not None:
             self._pump()
             timeout_s = 0.0
-        self._cyclic.take_replies(self._watch, timeout_s)
+        try:
+            self._cyclic.take_replies(self._watch, timeout_s)
+            self._cyclic.end_cycle()
+        except BusFault as fault:
+            self._latch_bus(fault)
+            raise
         self._watch.end_cycle()
         self._look_for_faults()
         self._advance()
@@ -202,6 +229,10 @@ class Cia402Group:
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
 
+    def _latch_bus(self, fault: BusFault) -> None:
+        """A bus that fails stops the group for good, whatever the caller does with the error."""
+        self._latch([(WHOLE_BUS, fault.what)])
+
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:
             if fault not in self._faults:
@@ -257,6 +288,7 @@ class Cia402Group:
             ),
             stopped=DriveState.OPERATION_ENABLED not in watch.states and not missing.any(),
             rejected=watch.rejected,
+            error_frames=self._cyclic.error_frames,
         )
 
     def _stop(self) -> None:
@@ -308,6 +340,7 @@ class Cia402Group:
         self._cycles_to_goal = 0
         self._faults.clear()
         self._watch.forget_emergencies()
+        self._cyclic.forget_faults()
         if self._state is GroupState.FAULT:
             self._goal = Goal.RESET_FAULT if faulted else Goal.STOP
             self._state = GroupState.CONFIGURED if faulted else GroupState.QUICK_STOP

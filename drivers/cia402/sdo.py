@@ -8,25 +8,27 @@ caller of a request takes the frames off the bus itself.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import can
 import canopen
 from canopen.sdo.client import SdoClient
 
-from cdpr.errors import Fault, HardwareMissing, Refused
-from drivers.bus import take, transmit
+from cdpr.errors import CdprError, Fault, HardwareMissing, Refused
+from drivers.bus import bus_name, hears_itself, take, transmit
+from drivers.bus_faults import ForeignMaster
 from drivers.cia402.frames import (
     NMT_ID,
     SDO_REPLY_BASE,
     SDO_REQUEST_BASE,
-    SYNC_ID,
     NmtCommand,
     make_nmt,
 )
+from drivers.cia402.own_frames import OwnFrames, foreign_text, set_up_ids
 from drivers.cia402.texts import abort_text
 from drivers.drive_group import Pump
+from drivers.error_frames import error_frame_fault
 
 RESPONSE_TIMEOUT = 0.5
 """For the answer to one request, [s]."""
@@ -36,20 +38,21 @@ ATTEMPTS = 2
 
 T = TypeVar("T")
 
+ECHO_WAIT = 0.05
+"""A second device with the same node id answers within this time of the first, [s]."""
+
 OBJECT_DOES_NOT_EXIST = frozenset({0x06020000, 0x06090011})
 
 
 class SetupNetwork:
     """The bus during set-up: sends NMT and SDO frames and takes the replies."""
 
-    def __init__(self, bus: can.BusABC, pump: Pump | None) -> None:
-        """Takes an open bus; ``pump`` as for `drivers.drive_group.make_drive_group`."""
+    def __init__(self, bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> None:
+        """Takes an open bus, ``pump`` as for `drivers.drive_group.make_drive_group`, the drives."""
         self._bus, self._pump = bus, pump
         self._network = canopen.Network(bus)
         self._clients: dict[int, _Client] = {}
-        self.foreign_sync = False
-        """A SYNC came by: another master is at work on this bus."""
-        self._network.subscribe(SYNC_ID, self._on_sync)
+        self._own = OwnFrames(set_up_ids(nodes), hears_itself=hears_itself(bus))
 
     def client(self, node: int) -> _Client:
         """The SDO client for a node."""
@@ -63,7 +66,24 @@ class SetupNetwork:
     def command(self, command: NmtCommand, node: int) -> None:
         """Sends an NMT command to one node."""
         data = make_nmt(command, node)
+        self.note_sent(NMT_ID)
         transmit(self._bus, can.Message(arbitration_id=NMT_ID, data=data, is_extended_id=False))
+
+    def note_sent(self, can_id: int) -> None:
+        """A frame of this identifier goes out; it is not another master's when it comes back."""
+        self._own.sent(can_id)
+
+    def nodes_answering_twice(self) -> list[int]:
+        """Nodes from which more answers have come than requests went to them."""
+        deadline = time.monotonic() + ECHO_WAIT
+        while (left := deadline - time.monotonic()) > 0.0 and self.hand_over(left):
+            pass
+        return [node for node, client in self._clients.items() if client.has_surplus]
+
+    def take_waiting(self) -> None:
+        """Hands over all that has come in up to now."""
+        while self.hand_over(0.0):
+            pass
 
     def discard_waiting(self) -> None:
         """Forgets frames that came in before; they say nothing about now."""
@@ -71,19 +91,43 @@ class SetupNetwork:
             pass
 
     def hand_over(self, timeout: float) -> bool:
-        """Hands one frame over; false when none came within the time [s]."""
+        """Hands one frame over; false when none came within the time [s].
+
+        Raises:
+            Refused: It is another master's.
+            BusFault: The bus failed.
+        """
         if self._pump is not None:
             self._pump()
             timeout = 0.0  # drives of this process have answered by now, or never will
         message = take(self._bus, timeout)
         if message is None:
             return False
-        if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
+        if message.is_error_frame:
+            self._judge_error(message)
+        elif not (message.is_remote_frame or message.is_extended_id):
+            self._refuse_foreign(message.arbitration_id)
             self._network.notify(message.arbitration_id, message.data, message.timestamp)
         return True
 
-    def _on_sync(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        self.foreign_sync = True
+    def _judge_error(self, message: can.Message) -> None:
+        where = bus_name(self._bus)
+        fault = error_frame_fault(message.arbitration_id, message.data, where)
+        if fault is not None:
+            raise fault
+
+    def _refuse_foreign(self, can_id: int) -> None:
+        if self._own.is_foreign(can_id):
+            raise Refused(
+                foreign_text(can_id),
+                where="configuring the drives",
+                why=ForeignMaster.cause,
+                next_step=ForeignMaster.remedy,
+            )
+
+
+class _NoAnswer(canopen.SdoCommunicationError):
+    """Nothing came in time."""
 
 
 class _Client(SdoClient):
@@ -96,6 +140,17 @@ class _Client(SdoClient):
         )
         self.node = node
         self._setup = network
+        self._gave_up = False
+
+    @property
+    def has_surplus(self) -> bool:
+        """Whether an answer waits that no request asked for; a late one does not count."""
+        return not (self._gave_up or self.responses.empty())
+
+    def send_request(self, request: bytes) -> None:
+        """Puts a request on the bus."""
+        self._setup.note_sent(SDO_REQUEST_BASE + self.node)
+        super().send_request(request)  # type: ignore[no-untyped-call]
 
     def request_response(self, sdo_request: bytes) -> bytes:
         """Sends one request and returns the reply.
@@ -106,12 +161,13 @@ class _Client(SdoClient):
         """
         while not self.responses.empty():  # replies to requests given up before
             self.responses.get_nowait()
-        self.send_request(sdo_request)  # type: ignore[no-untyped-call]
+        self.send_request(sdo_request)
         deadline = time.monotonic() + RESPONSE_TIMEOUT
         while self.responses.empty():
             left = deadline - time.monotonic()
             if left <= 0.0 or not self._setup.hand_over(left):
-                raise canopen.SdoCommunicationError("no answer")
+                self._gave_up = True
+                raise _NoAnswer("no answer")
         reply: bytes = self.read_response()  # type: ignore[no-untyped-call]
         return reply
 
@@ -163,17 +219,26 @@ class _Client(SdoClient):
                 ) from error
             except canopen.SdoCommunicationError as error:
                 if attempt == ATTEMPTS:
-                    raise _silent(self.node, where) from error
+                    raise _no_sense(self.node, where, error) from error
             except can.CanError as error:
                 raise Fault(
                     f"the bus did not take a frame: {error}",
                     where=where,
                     next_step="check cable, termination and bit rate",
                 ) from error
-        raise _silent(self.node, where)
+        raise AssertionError("the last attempt either returned or raised")
 
 
-def _silent(node: int, where: str) -> HardwareMissing:
+def _no_sense(node: int, where: str, error: canopen.SdoCommunicationError) -> CdprError:
+    """No answer, or one to another question."""
+    if not isinstance(error, _NoAnswer):
+        return Refused(
+            f"drive {node} answers something else than it was asked: {error}",
+            where=where,
+            why="two devices have this node id, or another program talks to the drive",
+            next_step="give every device on the bus its own node id; end other programs",
+            values={"node": node},
+        )
     return HardwareMissing(
         f"drive {node} does not answer",
         where=where,

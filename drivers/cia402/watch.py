@@ -12,8 +12,8 @@ from drivers.cia402.frames import (
     Reply,
     parse_emergency,
     parse_heartbeat,
-    parse_reply,
 )
+from drivers.cia402.reply_check import ReplyCheck
 from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.cia402.texts import emergency_text
 
@@ -24,8 +24,8 @@ MISSED_REPLIES = 3
 class DriveWatch:
     """The last word of every drive: replies, emergencies, heartbeats."""
 
-    def __init__(self, nodes: Sequence[int]) -> None:
-        """Takes the node ids in the order of the winches."""
+    def __init__(self, nodes: Sequence[int], max_steps: Sequence[float]) -> None:
+        """Takes node ids, and the farthest each drive can turn in a cycle, [counts]."""
         count = len(nodes)
         self.nodes = tuple(nodes)
         self.status_words = [0] * count
@@ -34,8 +34,9 @@ class DriveWatch:
         self.states = [DriveState.NOT_READY] * count
         self.answered = [False] * count
         self.missed = [0] * count
-        self.rejected = 0
         self.restarted: set[int] = set()
+        self._wrong_lengths = 0
+        self._check = ReplyCheck(nodes, max_steps)
         self._news: list[tuple[int, str]] = []
         self._dropped: list[tuple[int, str]] = []
         self._emergencies: dict[int, str] = {}
@@ -45,14 +46,25 @@ class DriveWatch:
 
     def begin_cycle(self) -> None:
         """From now on replies count for a new cycle."""
+        self._check.begin_cycle()
         self.answered = [False] * len(self.nodes)
 
     def end_cycle(self) -> None:
-        """Counts the replies that did not come."""
+        """Counts the replies that did not come, or could not be believed."""
+        self._check.end_cycle()
         self.missed = [
             0 if answered else missed + 1
             for answered, missed in zip(self.answered, self.missed, strict=True)
         ]
+
+    def forget_positions(self) -> None:
+        """The drives may have been moved since: their next positions are believed as they come."""
+        self._check.forget_positions()
+
+    @property
+    def rejected(self) -> int:
+        """Frames thrown away because their length or their content could not be true."""
+        return self._check.rejected + self._wrong_lengths
 
     @property
     def complete(self) -> bool:
@@ -73,10 +85,11 @@ class DriveWatch:
             if other is not None:
                 other(can_id & 0x7F, data)
             return
-        reply = parse_reply(data)
-        if reply is None:
-            self.rejected += 1
-        elif not stale:
+        self._check.hear(drive)
+        if stale or self.answered[drive]:
+            return
+        reply = self._check.believed(drive, data)
+        if reply is not None:
             self._note(drive, reply)
 
     def _note(self, drive: int, reply: Reply) -> None:
@@ -111,7 +124,7 @@ class DriveWatch:
                 found.append((node, f"drive {node} is in {state.value}: {cause}"))
             if powered and missed >= MISSED_REPLIES:
                 found.append((node, f"drive {node} does not answer"))
-        return found
+        return found + (self._check.faults() if powered else [])
 
     def forget_emergencies(self) -> None:
         """After a reset by the operator."""
@@ -121,7 +134,7 @@ class DriveWatch:
     def _emergency(self, node: int, data: bytes | bytearray) -> None:
         message = parse_emergency(data)
         if message is None:
-            self.rejected += 1
+            self._wrong_lengths += 1
         elif message.code & 0xFF00:
             text = emergency_text(message.code)
             self._emergencies[node] = text
@@ -130,7 +143,7 @@ class DriveWatch:
     def _heartbeat(self, node: int, data: bytes | bytearray) -> None:
         state = parse_heartbeat(data)
         if state is None:
-            self.rejected += 1
+            self._wrong_lengths += 1
         elif state == NmtState.BOOT_UP:
             self.restarted.add(node)
             self._news.append(

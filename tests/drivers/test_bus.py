@@ -103,6 +103,24 @@ def test_a_bus_that_is_too_slow_is_refused_with_the_cycle_it_can_do(rig: Rig) ->
     assert check_bus_load(with_bus(rig, cycle_ms=enough)) <= 0.7
 
 
+@pytest.mark.parametrize(("cycle_ms", "bitrate"), [(1, 1_000_000), (2, 1_000_000), (3, 500_000)])
+def test_no_cycle_is_advised_that_arming_would_refuse(
+    rig: Rig, cycle_ms: float, bitrate: int
+) -> None:
+    """250 Hz is the fastest that was tested, whatever the bus could carry."""
+    with pytest.raises(Refused) as caught:
+        check_bus_load(with_bus(rig, cycle_ms=cycle_ms, bitrate=bitrate))
+    advised = float(caught.value.next_step.split("bus.cycle_ms to ")[1].split()[0])
+    assert advised >= 4.0
+    assert check_bus_load(with_bus(rig, cycle_ms=advised, bitrate=bitrate)) <= 0.7
+
+
+def test_a_bus_that_no_cycle_helps_needs_more_bits(rig: Rig) -> None:
+    with pytest.raises(Refused) as caught:
+        check_bus_load(with_bus(rig, bitrate=20_000))
+    assert caught.value.next_step.startswith("raise the bitrate")
+
+
 @pytest.mark.parametrize("cycle_ms", [1, 3, 4, 10, 30, 100])
 def test_heartbeats_come_several_times_within_their_time_out(cycle_ms: int) -> None:
     assert heartbeat_cycles(cycle_ms / 1000.0) * cycle_ms <= max(30, cycle_ms)

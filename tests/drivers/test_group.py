@@ -63,7 +63,7 @@ class TestFromSetUpToPowerOff:
         bench.before_cycle()
         bench.group.quick_stop_now()
         bench.group.receive(5.0)  # replies of the stop's own SYNC
-        network = SetupNetwork(bench.group._bus, None)
+        network = SetupNetwork(bench.group._bus, None, range(1, 9))
         for node in range(1, 9):
             word = network.client(node).read(0x6041, 0, "status word")
             assert state_of(int.from_bytes(word, "little")) is HOLDING

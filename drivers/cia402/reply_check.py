@@ -1,0 +1,91 @@
+"""Which replies of drives are believed: right length, one a cycle, no jump. No bus, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drivers.cia402.frames import Reply, parse_reply
+
+BAD_CYCLES = 2
+"""Cycles in a row that are one too many: one bad frame may happen, two are a defect."""
+
+
+class ReplyCheck:
+    """Looks at every reply before it counts.
+
+    Attributes:
+        rejected: Replies that were not believed, of all drives.
+    """
+
+    def __init__(self, nodes: Sequence[int], max_steps: Sequence[float]) -> None:
+        """Takes node ids and how far each drive's position can change in a cycle, [counts]."""
+        count = len(nodes)
+        self.rejected = 0
+        self._nodes, self._max_steps = tuple(nodes), tuple(max_steps)
+        self._positions: list[int | None] = [None] * count
+        self._age = [1] * count
+        self._heard = [0] * count
+        self._reasons: list[str] = [""] * count
+        self._bad_cycles = [0] * count
+        self._repeats = [0] * count
+
+    def forget_positions(self) -> None:
+        """The next position of each drive is believed whatever it is."""
+        self._positions = [None] * len(self._nodes)
+
+    def begin_cycle(self) -> None:
+        """Counts who answered the last SYNC more than once, up to now, when the next one goes."""
+        self._repeats = [
+            repeats + 1 if heard > 1 else 0
+            for repeats, heard in zip(self._repeats, self._heard, strict=True)
+        ]
+        self._heard = [0] * len(self._nodes)
+        self._reasons = [""] * len(self._nodes)
+
+    def hear(self, drive: int) -> None:
+        """Notes that a drive answered, in time or late."""
+        self._heard[drive] += 1
+
+    def believed(self, drive: int, data: bytes | bytearray) -> Reply | None:
+        """The reply in a frame, or None when it cannot be true."""
+        reply = parse_reply(data)
+        if reply is None:
+            self._reject(drive, f"its reply has {len(data)} bytes instead of 8")
+            return None
+        last = self._positions[drive]
+        if last is not None:
+            step, allowed = abs(reply.position - last), self._max_steps[drive] * self._age[drive]
+            if step > allowed:
+                text = f"its position jumped by {step} counts, at most {allowed:.0f} are possible"
+                self._reject(drive, text)
+                return None
+        self._reasons[drive] = ""
+        self._positions[drive] = reply.position
+        self._age[drive] = 0
+        return reply
+
+    def _reject(self, drive: int, reason: str) -> None:
+        self.rejected += 1
+        self._reasons[drive] = reason
+
+    def end_cycle(self) -> None:
+        """Counts the cycles in which a drive sent nothing that could be believed."""
+        self._age = [age + 1 for age in self._age]
+        self._bad_cycles = [
+            bad + 1 if reason else 0
+            for bad, reason in zip(self._bad_cycles, self._reasons, strict=True)
+        ]
+
+    def faults(self) -> list[tuple[int, str]]:
+        """Drives whose answers cannot be relied on, by node."""
+        found = [
+            (node, f"drive {node}: {reason}, {bad} cycles in a row")
+            for node, reason, bad in zip(self._nodes, self._reasons, self._bad_cycles, strict=True)
+            if bad >= BAD_CYCLES
+        ]
+        found += [
+            (node, f"drive {node} answers twice: two devices have this node id")
+            for node, repeats in zip(self._nodes, self._repeats, strict=True)
+            if repeats >= BAD_CYCLES
+        ]
+        return found

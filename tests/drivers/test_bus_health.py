@@ -1,0 +1,367 @@
+"""What is wrong with the bus, or with what comes over it, ends in a fault with a name."""
+
+from __future__ import annotations
+
+import errno
+import socket
+from collections.abc import Callable
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdpr.errors import Fault, Refused
+from drivers.bus import BusSettings, lost_frames, open_bus
+from drivers.bus_faults import (
+    BusDown,
+    BusErrors,
+    BusFault,
+    BusGone,
+    BusOff,
+    BusPassive,
+    ForeignMaster,
+    ReceiveOverflow,
+    TransmitQueueFull,
+    bus_fault,
+)
+from drivers.cia402.frames import make_reply
+from drivers.cia402.own_frames import OwnFrames, commanding_ids
+from drivers.cia402.reply_check import ReplyCheck
+from drivers.cia402.states import DriveState
+from drivers.drive_group import WHOLE_BUS, GroupCommand, GroupState
+from drivers.error_frames import ERROR_CYCLES, ErrorFrames, error_frame_fault
+from tests.drivers.drive_bench import Bench, free_udp_channel
+
+HOLDING = DriveState.QUICK_STOP_ACTIVE
+NODES = tuple(range(1, 9))
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (can.CanOperationError("Failed to transmit: down", errno.ENETDOWN), BusDown),
+        (can.CanOperationError("Failed to receive: gone", errno.ENODEV), BusGone),
+        (can.CanOperationError("Failed to transmit: full", errno.ENOBUFS), TransmitQueueFull),
+        (can.CanOperationError("Transmit buffer full"), TransmitQueueFull),
+        (can.CanOperationError("something of the maker's"), BusFault),
+        (RuntimeError("a defect of the back end"), BusFault),
+    ],
+)
+def test_what_a_back_end_raises_gets_a_name(error: Exception, kind: type[BusFault]) -> None:
+    fault = bus_fault("the bus cannot be read", "bus can0", error)
+    assert type(fault) is kind
+    assert str(error) in fault.what
+    assert "stop by themselves" in fault.next_step
+
+
+def test_an_error_number_may_be_in_the_cause() -> None:
+    """The UDP back end tells it only there."""
+    error = can.CanOperationError("failed to send via socket")
+    error.__cause__ = OSError(errno.ENETDOWN, "Network is down")
+    assert type(bus_fault("sending", "bus", error)) is BusDown
+
+
+def test_every_bus_fault_has_a_code_of_its_own() -> None:
+    kinds = [BusFault, *BusFault.__subclasses__()]
+    assert len({kind.code for kind in kinds}) == len(kinds)
+    assert Fault.code not in {kind.code for kind in kinds}
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "kind"),
+    [
+        (0x040, bytes(8), BusOff),
+        (0x004, b"\0\x01" + bytes(6), ReceiveOverflow),
+        (0x004, b"\0\x10" + bytes(6), BusPassive),
+        (0x004, b"\0\x20" + bytes(6), BusPassive),
+        (0x004, b"\0\x08" + bytes(6), None),  # warning level
+        (0x004, b"", None),
+        (0x008, bytes(8), None),  # a protocol error: the frame is sent again
+        (0x020, bytes(8), None),  # not acknowledged: as above, until error-passive
+        (0x100, bytes(8), None),  # restarted
+    ],
+)
+def test_which_error_frames_end_a_run(
+    identifier: int, data: bytes, kind: type[BusFault] | None
+) -> None:
+    fault = error_frame_fault(identifier, data, "bus can0")
+    assert (type(fault) if fault else None) is kind
+
+
+def test_errors_that_do_not_cease_end_a_run_too() -> None:
+    errors = ErrorFrames("bus can0")
+    for _ in range(ERROR_CYCLES - 1):
+        assert errors.take(0x008, bytes(8)) is None
+        assert errors.end_cycle() is None
+    assert errors.end_cycle() is None  # a good cycle: counted from the beginning
+    for _ in range(ERROR_CYCLES - 1):
+        errors.take(0x008, bytes(8))
+        assert errors.end_cycle() is None
+    errors.take(0x008, bytes(8))
+    fault = errors.end_cycle()
+    assert isinstance(fault, BusErrors)
+    assert errors.total == fault.values["error_frames"] == 2 * ERROR_CYCLES - 1
+
+
+def test_a_frame_that_the_kernel_threw_away_is_counted() -> None:
+    with open_bus(BusSettings("udp_multicast", free_udp_channel())) as bus:
+        with socket.socket(fileno=socket.dup(bus.fileno())) as its_socket:
+            its_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        assert lost_frames(bus) == 0
+        for _ in range(50):
+            bus.send(can.Message(arbitration_id=0x123, data=bytes(8), is_extended_id=False))
+        taken = 0
+        while bus.recv(0) is not None:
+            taken += 1
+        assert taken + lost_frames(bus) == 50
+        assert lost_frames(bus) > 0
+
+
+def test_a_bus_without_a_socket_loses_nothing_that_could_be_counted() -> None:
+    with open_bus(BusSettings("virtual", "no-socket")) as bus:
+        assert lost_frames(bus) == 0
+
+
+def say(bench: Bench, can_id: int, data: bytes = b"", *, error: bool = False) -> None:
+    """Somebody else on the bus sends a frame."""
+    bench._ear.send(
+        can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_error_frame=error)
+    )
+
+
+@pytest.mark.parametrize(
+    ("happens", "kind"),
+    [
+        (lambda b: say(b, 0x040, bytes(8), error=True), BusOff),
+        (lambda b: say(b, 0x004, b"\0\x30" + bytes(6), error=True), BusPassive),
+        (lambda b: say(b, 0x004, b"\0\x01" + bytes(6), error=True), ReceiveOverflow),
+        (lambda b: say(b, 0x080), ForeignMaster),
+        (lambda b: say(b, 0x000, b"\x02\x00"), ForeignMaster),
+        (lambda b: say(b, 0x77F, b"\x05"), ForeignMaster),
+        (lambda b: say(b, 0x203, bytes(8)), ForeignMaster),
+    ],
+)
+def test_it_stops_the_drives_and_is_latched(
+    bench: Bench, happens: Callable[[Bench], None], kind: type[BusFault]
+) -> None:
+    bench.enable()
+    happens(bench)
+    with pytest.raises(kind) as caught:
+        bench.cycle()
+    assert bench.group.state is GroupState.FAULT
+    status = bench.cycle()  # told once; what the drives do now is still taken in
+    assert (WHOLE_BUS, caught.value.what) in status.faults
+    bench.cycle()
+    assert [d.state for d in bench.drives] == [HOLDING] * 8
+    with pytest.raises(Refused, match="latched"):
+        bench.group.command(GroupCommand.ENABLE)
+    bench.group.command(GroupCommand.RESET_FAULT)
+    happens(bench)
+    with pytest.raises(kind):  # what is still wrong is told again
+        bench.cycle()
+
+
+def test_frames_of_others_that_command_nothing_are_let_be(bench: Bench) -> None:
+    """Another device's data, a tool that reads an object, an extended and a remote frame."""
+    bench.enable()
+    say(bench, 0x1B0, bytes(8))
+    say(bench, 0x603, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)))
+    bench._ear.send(can.Message(arbitration_id=0x080, is_extended_id=True))
+    bench._ear.send(can.Message(arbitration_id=0x080, is_extended_id=False, is_remote_frame=True))
+    status = bench.cycle()
+    assert not status.faults
+    assert not status.missing.any()
+
+
+def test_single_error_frames_are_counted_and_do_not_stop(bench: Bench) -> None:
+    bench.enable()
+    say(bench, 0x008, bytes(8), error=True)
+    status = bench.cycle()
+    assert status.error_frames == 1
+    assert bench.group.state is GroupState.ENABLED
+
+
+def test_a_flood_of_frames_does_not_hold_the_stop_up(bench: Bench) -> None:
+    bench.enable()
+    bench.drives[2].silent = True  # a whole cycle never comes
+    for _ in range(5000):
+        say(bench, 0x123)
+    with pytest.raises(ReceiveOverflow):
+        bench.cycle()
+    bench.group.quick_stop_now()
+    bench.rehearsal.pump()
+    assert [d.state for d in bench.drives if d.node != 3] == [HOLDING] * 7
+
+
+class TestAnotherProgramWhileDrivesAreSetUp:
+    """Nothing is enabled, and the drives of the other program are left alone."""
+
+    @pytest.mark.parametrize(
+        ("can_id", "words"),
+        [
+            (0x080, "SYNC"),
+            (0x000, "NMT"),
+            (0x77F, "heartbeat"),
+            (0x205, "set-points to drive 5"),
+            (0x605, "objects of drive 5"),
+        ],
+    )
+    def test_is_told(self, bench: Bench, can_id: int, words: str) -> None:
+        reply = bench.drives[0]._bus_send
+        read = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
+        bench.drives[0]._bus_send = lambda i, d: (say(bench, can_id, read), reply(i, d))
+        with pytest.raises(Refused, match=words) as caught:
+            bench.group.configure()
+        assert "end the other program" in caught.value.next_step
+        assert bench.group.state is GroupState.OFFLINE
+
+
+def test_two_devices_with_one_node_id_are_told_before_anything_is_written(bench: Bench) -> None:
+    send = bench.drives[4]._bus_send
+    bench.drives[4]._bus_send = lambda i, d: (send(i, d), send(i, d))
+    with pytest.raises(Refused, match="drive 5 answers twice"):
+        bench.group.configure()
+    assert bench.drives[4].objects[0x6007, 0] == 1
+
+
+def test_a_second_device_that_comes_later_is_a_fault(bench: Bench) -> None:
+    bench.enable()
+    send = bench.drives[4]._bus_send
+    bench.drives[4]._bus_send = lambda i, d: (send(i, d), send(i, d))
+    for _ in range(4):
+        bench.cycle()
+    assert bench.group.state is GroupState.FAULT
+    assert any(node == 5 and "answers twice" in text for node, text in bench.status.faults)
+
+
+def test_an_answer_to_another_question_is_no_silence(bench: Bench) -> None:
+    send = bench.drives[1]._bus_send
+
+    def another(can_id: int, data: bytes) -> None:
+        wrong = bytes((data[0], data[1] ^ 1, *data[2:])) if can_id == 0x582 else data
+        send(can_id, wrong)
+
+    bench.drives[1]._bus_send = another
+    with pytest.raises(Refused, match="drive 2 answers something else"):
+        bench.group.configure()
+
+
+def spoil(bench: Bench, drive: int, times: int, change: Callable[[bytes], bytes]) -> None:
+    """Changes the next replies of a drive on their way."""
+    send, left = bench.drives[drive]._bus_send, [times]
+
+    def on_its_way(can_id: int, data: bytes) -> None:
+        if can_id == 0x181 + drive and left[0]:
+            left[0] -= 1
+            data = change(bytes(data))
+        send(can_id, data)
+
+    bench.drives[drive]._bus_send = on_its_way
+
+
+def spiked(data: bytes) -> bytes:
+    """A high bit of the position flipped."""
+    return data[:4] + bytes((data[4] ^ 0x40,)) + data[5:]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data[:2], "2 bytes instead of 8"),
+        (spiked, "position jumped"),
+    ],
+)
+def test_one_reply_that_cannot_be_true_is_not_used_and_two_in_a_row_are_a_fault(
+    bench: Bench, change: Callable[[bytes], bytes], words: str
+) -> None:
+    bench.enable()
+    before = bench.status
+    spoil(bench, 5, 1, change)
+    status = bench.cycle()
+    assert status.missing.tolist() == [False] * 5 + [True] + [False] * 2
+    assert status.positions.tolist() == before.positions.tolist()
+    assert status.rejected == before.rejected + 1
+    assert not bench.cycle().missing.any()
+    assert bench.group.state is GroupState.ENABLED
+    spoil(bench, 5, 2, change)
+    bench.cycle()
+    status = bench.cycle()
+    assert bench.group.state is GroupState.FAULT
+    assert any(node == 6 and words in text for node, text in status.faults)
+    bench.cycle()
+    bench.cycle()
+    assert [d.state for d in bench.drives] == [HOLDING] * 8
+
+
+def test_a_first_position_that_is_wrong_becomes_no_target(bench: Bench) -> None:
+    """With drives that hold already, the next cycle could enable them."""
+    bench.group.configure()
+    true = [round(d.motor.position) for d in bench.drives]
+    spoil(bench, 3, 1, spiked)
+    assert bench.group.read_positions().positions.tolist() == true
+
+
+def test_drives_that_were_turned_by_hand_between_two_readings_are_believed(bench: Bench) -> None:
+    bench.group.configure()
+    bench.group.read_positions()
+    for drive, position in zip(bench.drives, bench.lifted(0.05), strict=True):
+        drive.motor.position = position
+    true = [round(d.motor.position) for d in bench.drives]
+    assert bench.group.read_positions().positions.tolist() == true
+
+
+def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
+    check = ReplyCheck((1,), (500.0,))
+    check.begin_cycle()
+    assert check.believed(0, make_reply(0, 40_000, 0)) is not None
+    assert check.believed(0, make_reply(0, -40_000, 0)) is None
+    assert check.rejected == 1
+
+
+@given(
+    step=st.integers(-3000, 3000),
+    gap=st.integers(0, 5),
+    start=st.integers(-(2**30), 2**30),
+)
+def test_a_position_is_believed_exactly_when_the_drum_can_have_turned_so_far(
+    step: int, gap: int, start: int
+) -> None:
+    check = ReplyCheck((1,), (500.0,))
+    check.begin_cycle()
+    assert check.believed(0, make_reply(0, start, 0)) is not None
+    check.end_cycle()
+    for _ in range(gap):
+        check.begin_cycle()
+        check.end_cycle()
+    check.begin_cycle()
+    believed = check.believed(0, make_reply(0, start + step, 0)) is not None
+    assert believed == (abs(step) <= 500 * (gap + 1))
+
+
+@given(st.lists(st.sampled_from(["send", "own", "foreign"]), max_size=30))
+def test_where_a_sender_hears_itself_only_what_was_not_sent_is_foreign(script: list[str]) -> None:
+    own = OwnFrames(commanding_ids(NODES), hears_itself=True)
+    waiting = 0
+    for what in script:
+        if what == "send" and waiting < OwnFrames.MOST_CREDIT:
+            own.sent(0x080)
+            waiting += 1
+        elif what == "own" and waiting:
+            waiting -= 1
+            assert not own.is_foreign(0x080)
+        elif what == "foreign" and not waiting:
+            assert own.is_foreign(0x080)
+
+
+def test_drives_with_few_heartbeat_entries_are_told_of(bench: Bench) -> None:
+    assert bench.group.configure() == ()
+    bench.group.close()
+    for drive in (2, 6):
+        bench.drives[drive].power_on()
+        bench.drives[drive].objects[0x1016, 0] = 2
+    (remark,) = bench.group.configure()
+    assert "drive 3, 7" in remark
+    assert "1 of 7 other drives" in remark
+    assert bench.drives[2].objects[0x1016, 2] == 1 << 16 | 100
+    assert bench.drives[2].objects[0x1016, 3] == 0
