@@ -111,11 +111,16 @@ def self_turning_edge_free(
         turn: Rotation vector from start to end, platform frame, shape (3,), [rad].
     """
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
-    for pair in range(len(robot.pairs)):
-        if not _clear(world, robot, pair, before, after, rotation, turn):
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    # Most comparisons are decided over the whole edge, the middle of which is then found but once.
+    ends, there = np.empty((2, 3)), turned_by(rotation, turn, 0.5)
+    ends[0], ends[1] = before, after
+    middle = along(before, minus(after, before), 0.5)
+    for which in range(len(robot.pairs) + len(world.cables)):
+        found = _compared(world, robot, which, there, ends, middle, angle / 2.0)
+        if found == REFUTED:
             return False
-    for cable in range(len(world.cables)):
-        if not _clear(world, robot, len(robot.pairs) + cable, before, after, rotation, turn):
+        if found != PROVED and not _clear(world, robot, which, before, after, rotation, turn):
             return False
     return True
 

@@ -93,6 +93,21 @@ def test_where_nothing_is_in_the_way_the_single_move_is_the_path() -> None:
     assert len(route.route.path) == 2
 
 
+def test_a_stop_may_be_tilted_otherwise_than_start_and_goal() -> None:
+    stop = {
+        "name": "look",
+        "kind": "pass",
+        "position_mm": [150, 60, 400],
+        "rotation_wxyz": quaternion(-3.0, 2.0),
+    }
+    goal = {"position_mm": [80, -120, 420], "rotation_wxyz": quaternion(0.0, 4.0)}
+    scene = turning("environment_1", 8.0, 2.0, goal=goal, stops=[stop])
+    document = proved(GACHON, scene, ROUNDS)
+    met = plan_from_document(document).waypoints[document.stops[0].waypoint]
+    assert met.angle_to(scene.stops[0].pose) < 1e-6
+    assert len(document.planner.rounds) == 2
+
+
 @pytest.mark.slow
 def test_a_robot_with_pulleys_turns_on_its_way_around_the_pillar() -> None:
     goal = {"position_mm": [-700, 0, 900], "rotation_wxyz": quaternion(0.0, 6.0, 2.0)}
