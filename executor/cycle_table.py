@@ -36,6 +36,9 @@ class CycleTable:
         time: Since the start of the run, shape (n,), [s].
         state: State of the executor, n texts.
         path_index: Row of the set-point table that was sent, shape (n,).
+        leg: Part of the way between stops, counted from 1, shape (n,); it ends when its stop is
+            left.
+        stop: Name of the stop at which the platform stands, n texts; nothing on the way.
         travelled: Length along the path, shape (n,), [m].
         lateness: Of the cycle behind its deadline, shape (n,), [s]; 0 in simulated time.
         missing: Drives that did not answer, shape (n,).
@@ -54,6 +57,8 @@ class CycleTable:
     time: Array
     state: tuple[str, ...]
     path_index: Integers
+    leg: Integers
+    stop: tuple[str, ...]
     travelled: Array
     lateness: Array
     missing: Integers
@@ -104,6 +109,8 @@ class CycleTable:
             numbers("time_s", self.time),
             texts("state", self.state),
             integers("path_index", self.path_index),
+            integers("leg", self.leg),
+            texts("stop", self.stop),
             numbers("path_mm", self.travelled, _MM),
             numbers("lateness_ms", self.lateness, _MS, 4),
             integers("missing", self.missing),
@@ -139,6 +146,8 @@ class CycleTable:
             time=table.floats("time_s"),
             state=table.texts("state"),
             path_index=table.ints("path_index"),
+            leg=table.ints("leg"),
+            stop=table.texts("stop"),
             travelled=table.floats("path_mm", _MM),
             lateness=table.floats("lateness_ms", _MS),
             missing=table.ints("missing"),

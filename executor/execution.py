@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from cdpr.poses import Pose
+from cdpr.scene import Load
 from drivers.drive_group import DriveGroup
+from executor.announcing import load_changes
 from executor.clock import Clock
 from executor.course import course_of
 from executor.loop import Loop
-from executor.machine import State
+from executor.machine import ON_PATH, State
 from executor.prepare import PreparedRun
 from executor.recorder import Recorder
 from executor.records import CycleRecord
@@ -44,6 +46,7 @@ def run_here(
     recorder: Recorder,
     *,
     true_pose: Callable[[], Pose] | None,
+    carry: Callable[[Load], None],
     before_motion: Callable[[], None],
 ) -> Outcome:
     """Moves along the path; ends with the drives holding by themselves.
@@ -55,14 +58,19 @@ def run_here(
         board: What the operator wants.
         recorder: Takes in what happens.
         true_pose: Where the simulated platform is.
+        carry: Gives the simulated platform another load.
         before_motion: Called when all is armed; what it raises prevents the motion.
 
     Raises:
         Refused: Arming was refused; nothing was enabled.
         HardwareMissing: A drive does not answer.
     """
+    loads = load_changes(prepared.scene, prepared.checked.table.stands)
 
     def on_cycle(record: CycleRecord) -> None:
+        if record.state in ON_PATH:
+            for load in loads.due(record.index):
+                carry(load)
         wanted = true_pose is not None and recorder.wants_pose(record.cycle)
         recorder.take_cycle(record, true_pose() if wanted and true_pose else None)
 

@@ -19,7 +19,7 @@ from executor.clock import Clock
 from executor.course import Course
 from executor.exchange import Exchange, Exchanged
 from executor.feed import Feed, targets_at
-from executor.machine import Event, Machine, State
+from executor.machine import ON_PATH, Event, Machine, State
 from executor.records import CycleRecord, LoopEvent
 from executor.safety.gate import Purpose
 from executor.safety.watch import Finding, Reaction
@@ -189,7 +189,7 @@ class Loop:
             at=self._clock.time,
             state=self.machine.state,
             index=self._feed.index,
-            rate=self._feed.rate if self.machine.state in _ON_PATH else 0.0,
+            rate=self._feed.rate if self.machine.state in ON_PATH else 0.0,
             targets=self._exchange.resting_targets,
             actual=self._exchange.actual,
             torques=tuple(int(t) for t in done.status.torques),
@@ -285,10 +285,9 @@ class Loop:
         self._told_outside(lambda: self._on_event(event))
 
 
-_ON_PATH = frozenset({State.MOVING, State.HOLDING, State.STOPPING})
-_ACTIVE = _ON_PATH | {State.ENABLING, State.APPROACHING, State.SECURING}
+_ACTIVE = ON_PATH | {State.ENABLING, State.APPROACHING, State.SECURING}
 #: Where the drives move along the path together, or are at rest already.
-_WITHOUT_QUICK_STOP = _ON_PATH | {State.SECURING}
+_WITHOUT_QUICK_STOP = ON_PATH | {State.SECURING}
 _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.HOLDING})
 
 _HELD = "at rest; the drives hold by themselves under torque"

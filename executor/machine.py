@@ -30,6 +30,10 @@ class State(Enum):
     """Stopped by a fault; this run is over, and another begins only with a new command."""
 
 
+ON_PATH = frozenset({State.MOVING, State.HOLDING, State.STOPPING})
+"""Where the place in the table is the place of the platform."""
+
+
 class Event(Enum):
     """What may happen to a run."""
 

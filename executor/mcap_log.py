@@ -128,6 +128,8 @@ def _drives(cycles: CycleTable) -> Iterator[Message]:
     heads = zip(
         cycles.state,
         cycles.path_index.tolist(),
+        cycles.leg.tolist(),
+        cycles.stop,
         _column(cycles.travelled * 1e3),
         _column(cycles.lateness * 1e3),
         cycles.missing.tolist(),
@@ -142,7 +144,8 @@ def _drives(cycles: CycleTable) -> Iterator[Message]:
         _rows(cycles.tensions),
         strict=True,
     )
-    head_keys = ("state", "path_index", "path_mm", "lateness_ms", "missing", "following_error_mm")
+    where, how = ("state", "path_index", "leg", "stop", "path_mm"), ("lateness_ms", "missing")
+    head_keys = (*where, *how, "following_error_mm")
     every = zip(cycles.time.tolist(), heads, drives, strict=True)
     for number, (time, head, values) in enumerate(every):
         content: dict[str, Any] = {"cycle": number, **dict(zip(head_keys, head, strict=True))}

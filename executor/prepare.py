@@ -1,4 +1,7 @@
-"""From a plan to a checked set-point table: round the corners, time the path, check all of it."""
+"""From a plan to a checked set-point table: round the corners, time the path, check all of it.
+
+Leg by leg between stops: each begins and ends at rest, so that no corner is rounded at a stop.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,9 @@ from cdpr.poses import Pose
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from executor.blending import IsAllowed, rounded
-from executor.path import Path
 from executor.setpoints import CheckedTable, build_table, check_table
-from executor.timing import TimeLaw, time_law
+from executor.timing import time_law
+from planner.check import parted
 from planner.check_report import VerifiedPlan
 
 
@@ -26,21 +29,27 @@ class PreparedRun:
     Attributes:
         plan: The plan, verified for this rig.
         rig: The rig file as given; its winches, bus and motion may be newer than the plan's.
-        path: With rounded corners.
-        law: How fast it is run.
         checked: The set-points.
     """
 
     plan: VerifiedPlan
     rig: Rig
-    path: Path
-    law: TimeLaw
     checked: CheckedTable
 
     @property
     def scene(self) -> Scene:
         """The plan's scene."""
         return self.plan.plan.scene
+
+    @property
+    def length(self) -> float:
+        """Of the path with rounded corners, [m]."""
+        return float(self.checked.table.travelled[-1])
+
+    @property
+    def duration(self) -> float:
+        """With the time at stops, [s]."""
+        return (len(self.checked.table) - 1) * self.checked.table.cycle
 
 
 def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
@@ -50,14 +59,16 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
         Refused: The executed curve does not keep what the scene and the rig ask for.
         TensionInfeasible: A pose on it cannot be held.
     """
-    scene = verified.plan.scene
+    plan = verified.plan
     weight = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
-    tolerance = rig.motion.blend_tolerance
-    path = rounded(verified.plan.waypoints, tolerance, weight, _keeps_clearance(rig, scene))
-    law = time_law(path, rig.motion)
+    is_allowed = _keeps_clearance(rig, plan.scene)
+    legs = []
+    for waypoints in parted(plan.waypoints, plan.stops, len(plan.scene.stops)):
+        path = rounded(waypoints, rig.motion.blend_tolerance, weight, is_allowed)
+        legs.append((path, time_law(path, rig.motion)))
     cycle = rig.document.bus.cycle_ms / 1000.0
-    checked = check_table(rig, scene, build_table(rig, scene, path, law, cycle))
-    return PreparedRun(verified, rig, path, law, checked)
+    table = build_table(rig, plan.scene, legs, cycle)
+    return PreparedRun(verified, rig, check_table(rig, plan.scene, table))
 
 
 def _keeps_clearance(rig: Rig, scene: Scene) -> IsAllowed:

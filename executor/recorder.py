@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cdpr.poses import Pose
+from executor.announcing import announcements
+from executor.machine import ON_PATH
 from executor.prepare import PreparedRun
 from executor.records import CycleRecord, LoopEvent
 from executor.run_folder import RunEvent, RunFolder
@@ -28,6 +30,7 @@ class Recorder:
         trigger: Trigger | None,
         every: int,
         progress: Callable[[float], None],
+        announce: Callable[[str], None],
     ) -> None:
         """Nothing happened yet.
 
@@ -38,8 +41,11 @@ class Recorder:
             trigger: Called for every picture.
             every: Cycles from one picture to the next.
             progress: Called now and then with the number of rows that are done.
+            announce: Told in a sentence when a stop is reached and left.
         """
-        self.log = RunLog(prepared.rig, prepared.checked)
+        self.log = RunLog(prepared.rig, prepared.scene, prepared.checked)
+        self._announcements = announcements(prepared.scene, prepared.checked.table.stands)
+        self._announce = announce
         self._folder, self._status = folder, status
         self._trigger, self._every, self._progress = trigger, every, progress
         self._began: float | None = None
@@ -61,6 +67,10 @@ class Recorder:
             self._began = record.at
         self.log.add(record)
         self._status.take_cycle(record)
+        if record.state in ON_PATH:
+            for code, text in self._announcements.due(record.index):
+                self.take_event(LoopEvent(record.cycle, record.at, code, text))
+                self._announce(text)
         if record.cycle % self._every:
             return
         self._progress(record.index)

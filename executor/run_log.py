@@ -8,17 +8,19 @@ from numpy.typing import ArrayLike
 from cdpr.kinematics import poses_near
 from cdpr.poses import Array
 from cdpr.rig import Rig
+from cdpr.scene import Scene
 from executor.cycle_table import CycleTable, quaternions_of
 from executor.records import CycleRecord
 from executor.setpoints import CheckedTable
+from executor.standing import legs_at
 
 
 class RunLog:
     """The cycles of one run, in the order in which they were sent."""
 
-    def __init__(self, rig: Rig, checked: CheckedTable) -> None:
-        """An empty log of a run of a checked table on a rig."""
-        self._rig, self._checked = rig, checked
+    def __init__(self, rig: Rig, scene: Scene, checked: CheckedTable) -> None:
+        """An empty log of a run of a checked table on a rig in a scene."""
+        self._rig, self._scene, self._checked = rig, scene, checked
         self._records: list[CycleRecord] = []
 
     def add(self, record: CycleRecord) -> None:
@@ -46,10 +48,13 @@ class RunLog:
             winches.unstrained_from_counts(actual.astype(np.float64)), stretch
         )
         encoder, turned = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
+        legs = legs_at(planned.stands, index)
         return CycleTable(
             time=np.array([r.at - records[0].at for r in records]),
             state=tuple(r.state.value for r in records),
             path_index=rows,
+            leg=legs,
+            stop=tuple(self._stop_at(row) for row in rows.tolist()),
             travelled=between(planned.travelled, index),
             lateness=np.array([r.lateness for r in records]) * planned.cycle,
             missing=np.array([r.missing for r in records], dtype=np.int64),
@@ -64,6 +69,13 @@ class RunLog:
             planned_tensions=between(planned.tensions, index),
             tensions=np.where(taut[:, None], tensions, np.nan),
         )
+
+    def _stop_at(self, row: int) -> str:
+        """Name of the stop at which the platform stands; nothing on the way."""
+        for stop, stand in zip(self._scene.stops, self._checked.table.stands, strict=True):
+            if stand.first <= row <= stand.last:
+                return stop.name
+        return ""
 
 
 def _matrix(

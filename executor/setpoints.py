@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,13 +11,21 @@ from numpy.typing import NDArray
 
 from cdpr.cables import cables_to
 from cdpr.errors import Refused
+from cdpr.legs import legs_of
 from cdpr.poses import Array, Pose, read_only
 from cdpr.rig import Rig
-from cdpr.scene import Scene
+from cdpr.scene import Load, Scene
 from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
 from executor.course import fingerprint
 from executor.path import Path, poses_of
+from executor.standing import (
+    Stand,
+    load_violations,
+    order_violations,
+    rows_of,
+    stand_violations,
+)
 from executor.timing import TimeLaw
 from planner.check import check_path
 from planner.check_report import CheckReport
@@ -39,6 +48,7 @@ class SetpointTable:
         lengths: Free cable lengths, shape (n, m), [m].
         tensions: Planned tensions, shape (n, m), [N].
         counts: Drive positions, not yet rounded, shape (n, m).
+        stands: Rows at the scene's stops.
     """
 
     cycle: float
@@ -48,6 +58,7 @@ class SetpointTable:
     lengths: Array
     tensions: Array
     counts: Array
+    stands: tuple[Stand, ...]
 
     def __post_init__(self) -> None:
         """Copies the arrays and makes them read-only, so that what was checked is what is sent."""
@@ -103,22 +114,39 @@ class CheckedTable:
             raise TypeError("a CheckedTable comes only from executor.setpoints.check_table")
 
 
-def build_table(rig: Rig, scene: Scene, path: Path, law: TimeLaw, cycle: float) -> SetpointTable:
+def build_table(
+    rig: Rig, scene: Scene, legs: Sequence[tuple[Path, TimeLaw]], cycle: float
+) -> SetpointTable:
     """Samples the run at every cycle and turns poses into drive positions.
 
-    Tensions are the rig's working tensions under the scene's payload; the cables' stretch under
+    Tensions are the rig's working tensions under the load of each leg; the cables' stretch under
     them is fed forward.
+
+    Args:
+        rig: The robot.
+        scene: Its stops, dwells and loads.
+        legs: The curve of each leg between stops, and how fast it is run.
+        cycle: [s].
 
     Raises:
         TensionInfeasible: A pose cannot be held.
     """
-    times = np.arange(int(np.ceil(law.duration / cycle)) + 1) * cycle
-    travelled = np.array([law.at(float(t))[0] for t in times])
-    positions, rotations = path.at(travelled)
+    parts: list[list[Array]] = []
+    stands: list[Stand] = []
+    reached: list[Array] = []
+    for (path, law), leg in zip(legs, legs_of(scene), strict=True):
+        part = _leg_rows(rig, leg.scene.load, path, law, cycle)
+        if parts:
+            part[0] += reached[0]
+            first = sum(len(rows[0]) for rows in parts) - 1
+            waiting = rows_of(scene.stops[len(stands)].dwell, cycle)
+            stands.append(Stand(first, first + waiting))
+            parts.append(_standing_rows(reached, part, max(waiting - 1, 0)))
+        reached = [values[-1] for values in part]
+        parts.append(part if not stands or waiting else [values[1:] for values in part])
+    travelled, positions, rotations, tensions = map(np.concatenate, zip(*parts, strict=True))
     anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
     lengths = cables_to(rig, anchors).lengths
-    poses = poses_of(positions, rotations)
-    tensions = np.array([working_tensions(rig, pose, scene.load).tensions for pose in poses])
     winches = WinchMap(rig)
     return SetpointTable(
         cycle=cycle,
@@ -128,7 +156,26 @@ def build_table(rig: Rig, scene: Scene, path: Path, law: TimeLaw, cycle: float) 
         lengths=lengths,
         tensions=tensions,
         counts=winches.counts(winches.unstrained(lengths, tensions)),
+        stands=tuple(stands),
     )
+
+
+def _leg_rows(rig: Rig, load: Load, path: Path, law: TimeLaw, cycle: float) -> list[Array]:
+    """Travelled lengths, positions, rotations and tensions of a leg, from rest to rest."""
+    times = np.arange(int(np.ceil(law.duration / cycle)) + 1) * cycle
+    travelled = np.array([law.at(float(t))[0] for t in times])
+    positions, rotations = path.at(travelled)
+    poses = poses_of(positions, rotations)
+    tensions = np.array([working_tensions(rig, pose, load).tensions for pose in poses])
+    return [travelled, positions, rotations, tensions]
+
+
+def _standing_rows(reached: list[Array], after: list[Array], count: int) -> list[Array]:
+    """Rows between the last of a leg and the first of the next, which stand at the same pose."""
+    travelled, positions, rotations = (np.repeat(v[None], count, axis=0) for v in reached[:3])
+    shares = np.linspace(0.0, 1.0, count + 2)[1:-1, None]
+    tensions = reached[3] + shares * (after[3][0] - reached[3])
+    return [travelled, positions, rotations, tensions]
 
 
 def check_table(rig: Rig, scene: Scene, table: SetpointTable) -> CheckedTable:
@@ -136,20 +183,24 @@ def check_table(rig: Rig, scene: Scene, table: SetpointTable) -> CheckedTable:
 
     Raises:
         Refused: A value is not finite or no int32; a winch is too fast; a tension is outside the
-            rig's limits; drive positions are not those of the poses; the ends are not the scene's
-            start and goal; or the executed curve fails the independent check.
+            rig's limits or tensions do not hold the load; drive positions are not those of the
+            poses; ends and stands are not the scene's start, stops and goal; or the executed curve
+            fails the independent check.
     """
-    found = _number_violations(rig, table)
+    found = _number_violations(rig, table) or order_violations(scene, table.stands, len(table))
+    poses = [] if found else table.poses()
     if not found:
         found = [
             *_end_violations(scene, table),
+            *stand_violations(scene, table.stands, poses, table.cycle),
+            *load_violations(rig, scene, table.stands, poses, table.tensions),
             *_speed_violations(rig, table),
             *_tension_violations(rig, table),
             *_count_violations(rig, table),
         ]
     if found:
         raise _refusal(found)
-    report = check_path(rig, scene, table.poses())
+    report = check_path(rig, scene, poses, [stand.first for stand in table.stands])
     if not report.passed:
         raise _refusal(
             [violation.sentence() for violation in report.violations],

@@ -67,7 +67,7 @@ class RunStatus:
             "simulated_time": self._simulated_time,
             **self._motion(self._record),
             "rows": len(prepared.checked.table),
-            "path_length_mm": round(prepared.path.length * 1e3, 3),
+            "path_length_mm": round(prepared.length * 1e3, 3),
             "wished": {
                 "stop": wishes.stop,
                 "hold": wishes.hold,

@@ -4,7 +4,8 @@ Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, 
 ``reasons`` (the sentences that decided), ``checks`` [{``name``, ``passed``, ``text``}], ``rig``,
 ``scene``, ``plan_hash``, ``rig_hash``, ``interface``, ``simulated``, ``fast``, ``started`` (ISO
 8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``path_length_mm``,
-``travelled_mm``, ``following_error_mm`` {``max``, ``rms``, ``limit``}, ``encoder_error_mm``
+``travelled_mm``, ``stops`` [{``name``, ``kind``, ``reached_s``, ``left_s``}],
+``following_error_mm`` {``max``, ``rms``, ``limit``}, ``encoder_error_mm``
 {``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``, ``frames_without_pose``} or null
 without a camera, ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
 ``measured_uncertainty``, ``pair``, ``at_s``, ``source``} or null without obstacles, ``tension_n``
@@ -20,6 +21,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cdpr.plan import Plan
 from cdpr.poses import Array
@@ -99,6 +101,10 @@ def summarize(
         "lost_replies": int(cycles.missing.sum()),
         "path_length_mm": context.plan.document.quality.length_mm,
         "travelled_mm": _last(cycles.travelled * 1e3),
+        "stops": [
+            {"name": stop.name, "kind": stop.kind, **_times_at(cycles, number, stop.name)}
+            for number, stop in enumerate(context.plan.scene.stops, start=1)
+        ],
         "following_error_mm": {
             **_size(cycles.following_error * 1e3),
             "limit": context.rig.motion.following_error * 1e3,
@@ -112,6 +118,17 @@ def summarize(
         "events": [asdict(event) for event in context.events],
         "versions": dict(context.versions),
     }
+
+
+def _times_at(cycles: CycleTable, number: int, name: str) -> dict[str, float | None]:
+    """When the stop that ends a leg was reached and left; null for never."""
+    left = cycles.leg > number
+    reached = left | (np.array(cycles.stop, dtype=str) == name)
+    return {"reached_s": _first(cycles, reached), "left_s": _first(cycles, left)}
+
+
+def _first(cycles: CycleTable, chosen: NDArray[np.bool_]) -> float | None:
+    return _number(cycles.time[int(np.argmax(chosen))]) if chosen.any() else None
 
 
 def _number(value: float, digits: int = 6) -> float | None:

@@ -53,6 +53,15 @@ class Plant:
         self.tensions: Array = read_only(tensions)
         self.settle(self._unstrained)
 
+    def carry(self, load: Load) -> None:
+        """Moves the platform to its equilibrium with another load on it.
+
+        Raises:
+            Fault: There is none.
+        """
+        self._weight, self._centre = _weight(self._rig, load)
+        self.settle(self._unstrained)
+
     def counts_for(self, pose: Pose, tensions: Array) -> Array:
         """Drive positions that hold a pose with given tensions, not rounded, shape (m,).
 

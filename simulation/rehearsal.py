@@ -106,6 +106,15 @@ class Rehearsal:
         self._settle()
         return self.plant.tensions
 
+    def carry(self, load: Load) -> None:
+        """The platform carries something else from now on.
+
+        Raises:
+            Fault: The platform has no equilibrium with it.
+        """
+        self._settle()
+        self.plant.carry(load)
+
     def pump(self) -> None:
         """Works off every frame that waits, and answers; each SYNC lets one cycle pass.
 

@@ -31,6 +31,7 @@ def check(
     """
     from cdpr.cli.output import out, show_facts, show_json, spinner
     from cdpr.cli.plan_for_rig import require_same_rig
+    from cdpr.cli.stops import stop_facts
     from cdpr.plan import load_plan
     from cdpr.rig import load_rig
     from planner.check import check_path
@@ -43,7 +44,8 @@ def check(
     if as_json:
         show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
     else:
-        show_facts(f"check of {plan}", sentences_of(report))
+        facts = [*stop_facts(the_plan.scene), *sentences_of(report)]
+        show_facts(f"check of {plan}", facts)
         for violation in report.violations:
             out.print(f"[red]violated[/red] {violation.sentence()}", soft_wrap=True)
         out.print("[green]passed[/green]" if report.passed else "[red]not passed[/red]")

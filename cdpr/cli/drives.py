@@ -24,10 +24,12 @@ class Drives:
     Attributes:
         group: All of them.
         true_pose: Where the simulated platform is; None on a real bus.
+        carry: Gives the simulated platform another load; on a real bus it happens by itself.
     """
 
     group: DriveGroup
     true_pose: Callable[[], Pose] | None
+    carry: Callable[[Load], None]
 
 
 @contextmanager
@@ -53,15 +55,20 @@ def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]
         bus = open_bus(settings)
         stack.callback(bus.shutdown)
         pump, true_pose = None, None
+        carry: Callable[[Load], None] = _happens_by_itself
         if settings.interface == IN_PROCESS:
             from simulation.rehearsal import Rehearsal
 
             far_end = open_bus(settings)
             stack.callback(far_end.shutdown)
             rehearsal = Rehearsal(rig, far_end, simulated_start, load)
-            pump, true_pose = rehearsal.pump, lambda: rehearsal.pose
+            pump, true_pose, carry = rehearsal.pump, lambda: rehearsal.pose, rehearsal.carry
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)
         for remark in group.configure():
             err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
-        yield Drives(group, true_pose)
+        yield Drives(group, true_pose, carry)
+
+
+def _happens_by_itself(_load: Load) -> None:
+    """What a real gripper takes or leaves is nothing to send."""

@@ -247,6 +247,7 @@ def facts_of(document: PlanDocument) -> dict[str, Any]:
         "scene": document.scene.name,
         "planner": document.planner.model_dump(mode="json"),
         "waypoints": len(document.waypoints),
+        "stops": [mark.model_dump(mode="json") for mark in document.stops],
         "quality": document.quality.model_dump(mode="json"),
         "statistics": document.statistics.model_dump(mode="json"),
     }
@@ -254,9 +255,13 @@ def facts_of(document: PlanDocument) -> dict[str, Any]:
 
 def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
     """What a plan is, for people."""
+    from cdpr.cli.stops import stop_facts
+    from cdpr.scene import scene_from_document
+
     quality = document.quality
     facts = [
         ("rig, scene", f"{document.rig.name}, {document.scene.name}"),
+        *stop_facts(scene_from_document(document.scene)),
         (
             "length",
             f"{quality.length_mm:.1f} mm ({len(document.waypoints)} waypoints;"

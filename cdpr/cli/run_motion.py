@@ -91,7 +91,7 @@ def run_prepared(
 def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcome, list[Look]]:
     """The motion and its pictures; `cdpr stop` and its like reach the run all the time."""
     from cdpr.cli.cameras import open_camera
-    from cdpr.cli.output import progress_bar
+    from cdpr.cli.output import err, progress_bar
     from executor.command_server import serving
     from executor.recorder import Recorder
     from executor.running import announced, stop_requests
@@ -101,7 +101,7 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
     prepared = job.prepared
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
     rate = prepared.rig.cameras[0].rate if job.camera_name else PROGRESS_RATE
-    pictures = int(prepared.law.duration * rate)
+    pictures = int(prepared.duration * rate)
     board = OwnBoard()
     status = RunStatus(prepared, job.folder.path, board, simulated_time=job.fast)
     camera_at = (prepared.rig, prepared.scene, job.camera_name, job.folder.path)
@@ -119,6 +119,7 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
                 trigger=camera.trigger if camera else None,
                 every=max(1, round(1.0 / (rate * cycle))),
                 progress=advance,
+                announce=lambda text: None if job.quiet else err.print(text, markup=False),
             )
             outcome = _move(job, board, recorder, before_motion)
         return outcome, _looks(camera, recorder, job) if camera else []
@@ -149,6 +150,7 @@ def _move(
             board,
             recorder,
             true_pose=drives.true_pose,
+            carry=drives.carry,
             before_motion=last_chance,
         )
 

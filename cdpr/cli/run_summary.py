@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdpr.cli.output import out, show_facts, show_json
+from cdpr.cli.stops import stop_facts
 
 if TYPE_CHECKING:
     from executor.prepare import PreparedRun
@@ -24,9 +25,10 @@ def show_prepared(prepared: PreparedRun, simulated: bool) -> None:
             ("rig, scene", f"{rig.name}, {prepared.scene.name}"),
             ("from", f"{start[0]:.1f}, {start[1]:.1f}, {start[2]:.1f} mm"),
             ("to", f"{goal[0]:.1f}, {goal[1]:.1f}, {goal[2]:.1f} mm"),
+            *stop_facts(prepared.scene),
             (
                 "motion",
-                f"{prepared.path.length * 1000:.1f} mm in {prepared.law.duration:.1f} s,"
+                f"{prepared.length * 1000:.1f} mm in {prepared.duration:.1f} s,"
                 f" at most {rig.motion.speed * 1000:g} mm/s",
             ),
             ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),

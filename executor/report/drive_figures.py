@@ -16,6 +16,7 @@ from executor.report.figure_style import (
     thinned,
 )
 from executor.report.run_data import RunData
+from executor.report.stop_marks import mark_stops
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,6 +93,7 @@ def _tension(axes: Axes, run: RunData, i: int) -> None:
     axes.axhline(lower, color=STAND_IN["limit"], linestyle=(0, (1, 1.5)), label="limits")
     axes.axhline(upper, color=STAND_IN["limit"], linestyle=(0, (1, 1.5)))
     axes.set_title(f"cable {i + 1}")
+    mark_stops(axes, run)
 
 
 def _tension_text(run: RunData) -> str:

@@ -15,7 +15,7 @@ from executor.report.position_figure import position_figure
 from executor.report.run_data import RunData
 from executor.report.scene_picture import AZIMUTH, ELEVATION, scene_picture
 from executor.report.scene_view import SceneView, scene_view, viewer_data
-from executor.report.tables import event_table, facts
+from executor.report.tables import event_table, facts, stop_table
 from executor.report.tiles import chips, key_figures, verdict_banner
 
 #: Layer, its name on the page, the colour's role, whether it is shown at first.
@@ -60,6 +60,7 @@ def _sections(run: RunData, view: SceneView) -> list[Section]:
     moved = len(run.cycles) > 1
     return [
         ("scene", "Scene and path", _scene(run, view)),
+        ("stops", "Stops", stop_table(run)),
         ("clearance", "Clearance", _clearance(run) if moved else ""),
         ("position", "Position", _position(run) if moved else ""),
         ("frames", "Pictures", frames(run)),

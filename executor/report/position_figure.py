@@ -14,6 +14,7 @@ from executor.report.figure_style import (
     with_gaps,
 )
 from executor.report.run_data import RunData
+from executor.report.stop_marks import mark_stops
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,6 +30,8 @@ def position_figure(run: RunData) -> str:
         legend_above(rows[0])
         _error(rows[3], run)
         rows[3].set_xlim(0.0, float(run.cycles.time[-1]))
+        for axes in rows:
+            mark_stops(axes, run, named=axes is rows[0])
         figure.align_ylabels(rows)
         return as_svg(figure, "position", _alternative(run))
 

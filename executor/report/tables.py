@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from cdpr.legs import legs_of
 from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument, TurningPlannerDocument
-from executor.report.markup import list_table, table
+from executor.report.markup import known, list_table, table
 from executor.report.run_data import RunData
 
 
@@ -18,6 +19,26 @@ def facts(run: RunData) -> str:
     ]
     blocks = "".join(f"<div><h3>{title}</h3>{table(rows)}</div>" for title, rows in parts if rows)
     return f'<div class="tables">{blocks}</div>'
+
+
+def stop_table(run: RunData) -> str:
+    """What was carried to each stop and on from it, and when; nothing without stops."""
+    loads = [leg.scene.load.payload_mass for leg in legs_of(run.plan.scene)]
+    rows = [
+        (
+            stop.name,
+            stop.kind,
+            ", ".join(f"{x * 1e3:.1f}" for x in stop.pose.position) + " mm",
+            f"{before:g} → {after:g} kg",
+            known(told["reached_s"], 2, "s"),
+            known(told["left_s"], 2, "s"),
+        )
+        for stop, before, after, told in zip(
+            run.plan.scene.stops, loads[:-1], loads[1:], run.summary["stops"], strict=True
+        )
+    ]
+    head = ("Stop", "Kind", "Position", "Payload", "Reached", "Left")
+    return list_table(head, rows) if rows else ""
 
 
 def event_table(run: RunData) -> str:

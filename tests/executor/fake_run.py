@@ -211,6 +211,8 @@ def _cycles(rig: Rig, scene: Scene, every: int) -> CycleTable:
         time=np.arange(n) * CYCLE * every,
         state=("moving",) * (n - 1) + ("finished",),
         path_index=np.arange(n) * every,
+        leg=np.ones(n, dtype=np.int64),
+        stop=("",) * n,
         travelled=travelled,
         lateness=np.zeros(n),
         missing=np.zeros(n, dtype=np.int64),

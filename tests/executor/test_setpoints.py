@@ -39,7 +39,7 @@ def _made(name: str) -> tuple[Rig, Scene, SetpointTable]:
     scene = loaded.changed(start=waypoints[0], goal=waypoints[-1])
     path = rounded(waypoints, rig.motion.blend_tolerance, WEIGHT, always)
     cycle = rig.document.bus.cycle_ms / 1000.0
-    return rig, scene, build_table(rig, scene, path, time_law(path, rig.motion), cycle)
+    return rig, scene, build_table(rig, scene, [(path, time_law(path, rig.motion))], cycle)
 
 
 def _over_a_pulley(rig: Rig, cable: int, anchor: np.ndarray) -> float:

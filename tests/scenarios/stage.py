@@ -85,7 +85,13 @@ class Stage:
         """Arms and does the whole motion."""
         self.status = RunStatus(self.prepared, self.folder.path, self.board, simulated_time=True)
         recorder = Recorder(
-            self.prepared, self.folder, self.status, trigger=trigger, every=10, progress=progress
+            self.prepared,
+            self.folder,
+            self.status,
+            trigger=trigger,
+            every=10,
+            progress=progress,
+            announce=lambda _text: None,
         )
         return run_here(
             self.prepared,
@@ -94,6 +100,7 @@ class Stage:
             self.board,
             recorder,
             true_pose=None,
+            carry=self.rehearsal.carry,
             before_motion=before_motion,
         )
 
