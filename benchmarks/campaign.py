@@ -24,7 +24,8 @@ import numpy as np
 
 from cdpr.cli.cameras import SYNTHETIC
 from cdpr.cli.demo import RIG, configs
-from cdpr.cli.run import prepared_run, run_prepared
+from cdpr.cli.run import prepared_run
+from cdpr.cli.run_motion import run_prepared
 from cdpr.errors import CdprError
 from cdpr.plan import load_plan, save_plan
 from cdpr.rig import Rig, load_rig
