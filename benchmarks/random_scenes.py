@@ -19,9 +19,8 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from rich.progress import Progress
 
 from benchmarks.random_robots import Robot, random_robot, random_scene
 from benchmarks.second_opinion import second_opinion
+from cdpr.cli.workers import worker_pool
 from cdpr.errors import NoSolution
 from cdpr.poses import Pose, matrix_from_quaternion
 from cdpr.rig import Rig, rig_from_document
@@ -144,11 +144,11 @@ def run(seed: int, numbers: Sequence[int], budget: float, workers: int) -> Itera
     tasks: dict[int, list[int]] = {}
     for number in numbers:
         tasks.setdefault(number // SCENES_OF_A_ROBOT, []).append(number)
-    if workers == 1:
-        for robot, mine in tasks.items():
-            yield scenes_of(seed, robot, mine, budget)
-        return
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+    with worker_pool(workers, None) as pool:
+        if pool is None:
+            for robot, mine in tasks.items():
+                yield scenes_of(seed, robot, mine, budget)
+            return
         work = [pool.submit(scenes_of, seed, *task, budget) for task in tasks.items()]
         for done in as_completed(work):
             yield done.result()

@@ -16,7 +16,7 @@ import csv
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,11 @@ TWIST = 0.3
 
 @dataclass(frozen=True)
 class Cost:
-    """Processor time in one world, [µs]."""
+    """Processor time in one world, [µs].
+
+    `open_comparisons` are those of cables with each other and the platform that are not proved for
+    the whole workspace at once, so that every edge of a plan asks for them.
+    """
 
     size: int
     share_free: float
@@ -52,6 +56,7 @@ class Cost:
     any_edge_us: float
     world_us: float
     plan_us: float
+    open_comparisons: int
 
 
 def main() -> None:
@@ -71,10 +76,11 @@ def main() -> None:
     ]
     tables = {"obstacles": by_obstacles, "cables": by_cables}
     for name, costs in tables.items():
-        print(f"{name}: free edge, any edge, world, plan [µs]; share free")
+        print(f"{name}: free edge, any edge, world, plan [µs]; share free; open self comparisons")
         for c in costs:
             print(f"  {c.size:4d}  {c.free_edge_us:8.3f}  {c.any_edge_us:8.3f}"
-                  f"  {c.world_us:10.0f}  {c.plan_us:10.0f}  {c.share_free:6.2f}")  # fmt: skip
+                  f"  {c.world_us:10.0f}  {c.plan_us:10.0f}  {c.share_free:6.2f}"
+                  f"  {c.open_comparisons:4d}")  # fmt: skip
         for what in ("free_edge_us", "any_edge_us", "world_us", "plan_us"):
             print(f"  slope of {what}: {slope(costs, what):.2f}")
     if wishes.output:
@@ -101,7 +107,8 @@ def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats
     level = [Pose(position, rig.home.rotation) for position in ends]
     contestant = ours.Contestant(rig, scene.changed(start=level[0], goal=level[1]))
     plan = float(np.median([contestant.rounds_us(ROUNDS, seed) for seed in range(SEEDS)]))
-    return Cost(size, float(free.mean()), free_edge, any_edge, min(built) * 1e6, plan)
+    return Cost(size, float(free.mean()), free_edge, any_edge, min(built) * 1e6, plan,
+                contestant.open_comparisons)  # fmt: skip
 
 
 def _nearest(points: Array, wanted: Array) -> Array:
@@ -163,7 +170,7 @@ def write(folder: Path, tables: dict[str, list[Cost]]) -> None:
     for name, costs in tables.items():
         with (folder / f"growth_{name}.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            columns = ("share_free", "free_edge_us", "any_edge_us", "world_us", "plan_us")
+            columns = [entry.name for entry in fields(Cost)][1:]
             writer.writerow([name, *columns])
             writer.writerows([c.size, *(getattr(c, key) for key in columns)] for c in costs)
     labels = {

@@ -57,6 +57,12 @@ class Contestant:
         path = search.points[BEST, : search.counts[BEST, 0]].copy()
         return Result(first, tuple(lengths), _checks(search), path)
 
+    @property
+    def open_comparisons(self) -> int:
+        """Of cables with each other and the platform: those not proved over the whole workspace."""
+        robot = self._problem.robot
+        return len(robot.open_pairs) + len(robot.open_cables)
+
     def rounds_us(self, rounds: int, seed: int) -> float:
         """Processor time of so many rounds of the search, [µs]; not a number without a path."""
         search = new_search(self._start, self._goal, seed)
