@@ -84,14 +84,18 @@ def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool
         start: World frame, shape (3,), [m].
         end: Likewise.
     """
-    still = np.zeros(3)
+    pairs, rotation, still = len(robot.pairs), world.platform[:3], np.zeros(3)
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
-    rotation = world.platform[:3]
-    for pair in robot.open_pairs:
-        if not _clear(world, robot, pair, before, after, rotation, still):
+    # Most comparisons are decided over the whole edge.
+    ends, middle = np.empty((2, 3)), along(before, minus(after, before), 0.5)
+    ends[0], ends[1] = before, after
+    count = len(robot.open_pairs)
+    for k in range(count + len(robot.open_cables)):
+        which = robot.open_pairs[k] if k < count else pairs + robot.open_cables[k - count]
+        found = _compared(world, robot, which, rotation, ends, middle, 0.0)
+        if found == REFUTED:
             return False
-    for cable in robot.open_cables:
-        if not _clear(world, robot, len(robot.pairs) + cable, before, after, rotation, still):
+        if found != PROVED and not _clear(world, robot, which, before, after, rotation, still):
             return False
     return True
 
