@@ -10,39 +10,24 @@ program at the first places; each solution is put into the equations again.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import combinations, product
-from typing import Any
+from itertools import combinations
 
 import coal
-import daqp
 import numpy as np
 
+from benchmarks.coal_bodies import EXACT, Body, distance, geometries, thread
+from benchmarks.tension_opinion import tension_problem
 from cdpr.cables import cables_to
 from cdpr.clearance import PLATFORM, cable_name
-from cdpr.poses import Array, Pose
+from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
-from cdpr.shapes import Box, Capsule, ConvexHull, Cylinder, Shape, Sphere, TriangleMesh
 
 SPACING = 0.040
 CLOSEST = 20e-6
-EXACT = 2e-7
-"""How far coal's distances are trusted, [m]; those of cylinders are off by up to 1e-8."""
-THREAD = 1e-9
-"""Radius of the capsule that stands for a cable, [m]; part of what is trusted above."""
-GRAVITY = 9.80665
-_BALANCED = 1e-6
-"""What tensions may leave of the wrench, [N] and [N m]."""
-_RELEASED = 1e-4
-"""How far the program's tensions may miss their limits, [N]."""
 
-_REQUEST = coal.DistanceRequest()
-_REQUEST.gjk_tolerance, _REQUEST.gjk_max_iterations = 1e-9, 2000
-
-Body = tuple[Any, Any]
 Part = tuple[int, float, float]
 
 
@@ -76,7 +61,7 @@ def second_opinion(rig: Rig, scene: Scene, path: Array) -> Opinion:
     for pair in _pairs(rig, scene):
         _prove(robot, pair, places, found)
     for place in places.tolist():
-        problem = _tension_problem(rig, scene, robot.position(place))
+        problem = tension_problem(rig, scene, robot.position(place))
         if problem:
             found.problems.append(f"{problem} at {place * 1e3:.1f} mm")
             break
@@ -115,7 +100,7 @@ class _Pair:
 def _pairs(rig: Rig, scene: Scene) -> Iterator[_Pair]:
     count, thick = rig.cable_count, rig.cable_radius
     for obstacle in scene.obstacles:
-        for geometry in _geometries(obstacle.shape, obstacle.pose):
+        for geometry in geometries(obstacle.shape, obstacle.pose):
             for body in range(count + 1):
                 name = PLATFORM if body == count else cable_name(body)
                 needed = scene.obstacle_clearance + (0.0 if body == count else thick)
@@ -193,7 +178,7 @@ class _Robot:
             cables = cables_to(self.rig, self._arms + self.position(place))
             self._cables[place] = (np.array(cables.exits), np.array(cables.anchors))
         exits, anchors = self._cables[place]
-        return _thread(exits[number], anchors[number], at_exit, at_anchor)
+        return thread(exits[number], anchors[number], at_exit, at_anchor)
 
 
 def _prove(robot: _Robot, pair: _Pair, places: Array, found: Opinion) -> None:
@@ -230,97 +215,4 @@ def _prove(robot: _Robot, pair: _Pair, places: Array, found: Opinion) -> None:
 def _room(robot: _Robot, pair: _Pair, place: float) -> float:
     """Distance of the surfaces of a pair over what it needs, [m]; below 0 it is too little."""
     second = pair.fixed or robot.body(pair.second, place)
-    found = coal.distance(*robot.body(pair.first, place), *second, _REQUEST, coal.DistanceResult())
-    return float(found) - pair.needed
-
-
-def _thread(exit: Array, anchor: Array, at_exit: float, at_anchor: float) -> Body:
-    """A part of a straight cable; plain numbers, as this is done a thousand times a path."""
-    a, b, c = exit.tolist()
-    u, v, w = anchor.tolist()
-    whole = math.dist((a, b, c), (u, v, w))
-    x, y, z = (u - a) / whole, (v - b) / whole, (w - c) / whole
-    sign = math.copysign(1.0, z)
-    p = -1.0 / (sign + z)
-    q = x * y * p
-    frame = np.array(
-        [
-            [1.0 + sign * x * x * p, q, x],
-            [sign * q, sign + y * y * p, y],
-            [-sign * x, -y, z],
-        ]
-    )
-    length = whole - at_exit - at_anchor
-    middle = at_exit + length / 2.0
-    place = np.array([a + middle * x, b + middle * y, c + middle * z])
-    return coal.Capsule(THREAD, length), coal.Transform3s(frame, place)
-
-
-def _geometries(shape: Shape, pose: Pose) -> Iterator[Body]:
-    place = coal.Transform3s(np.array(pose.rotation), np.array(pose.position))
-    match shape:
-        case Box(half_size=half):
-            yield coal.Box(*(2.0 * half)), place
-        case Sphere(radius=radius):
-            yield coal.Sphere(radius), place
-        case Cylinder(radius=radius, length=length):
-            yield coal.Cylinder(radius, length), place
-        case Capsule(radius=radius, length=length):
-            yield coal.Capsule(radius, length), place
-        case ConvexHull():
-            cloud = coal.StdVec_Vec3s()
-            for point in shape.vertices:
-                cloud.append(np.array(point))
-            yield coal.Convex.convexHull(cloud, False, ""), place
-        case TriangleMesh():
-            for corners in shape.vertices[shape.triangles]:
-                yield _triangle(corners), place
-
-
-def _triangle(corners: Array) -> Any:
-    """A convex body with two sides; coal has no distances for its own triangles."""
-    points, sides = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    for corner in corners:
-        points.append(np.array(corner))
-    sides.append(coal.Triangle(0, 1, 2))
-    sides.append(coal.Triangle(0, 2, 1))
-    return coal.Convex(points, sides)
-
-
-def _tension_problem(rig: Rig, scene: Scene, position: Array) -> str:
-    """Empty where tensions hold weight, payload and every corner of the box of disturbances."""
-    rotation, load = np.array(scene.start.rotation), scene.load
-    arms = rig.anchors @ rotation.T
-    cables = cables_to(rig, arms + position)
-    pulls = cables.exits - cables.anchors
-    pulls = pulls / np.linalg.norm(pulls, axis=1)[:, None]
-    matrix = np.hstack([pulls, np.cross(arms, pulls)]).T
-    down = np.array([0.0, 0.0, -GRAVITY])
-    weight = np.zeros(6)
-    for mass, centre in (
-        (rig.mass, rig.centre_of_mass),
-        (load.payload_mass, load.payload_centre),
-    ):
-        weight += np.append(mass * down, np.cross(rotation @ centre, mass * down))
-    spread = np.concatenate([load.force, load.moment])
-    signs = [(-1.0, 1.0) if part > 0.0 else (0.0,) for part in spread]
-    low, high = (np.full(rig.cable_count, t) for t in (rig.min_tension, rig.max_tension))
-    for corner in product(*signs):
-        wanted = -(weight + np.array(corner) * spread)
-        if not _balanced(matrix, wanted, low, high):
-            return "no tensions hold the load"
-    return ""
-
-
-def _balanced(matrix: Array, wanted: Array, low: Array, high: Array) -> bool:
-    count = matrix.shape[1]
-    sense = np.zeros(count + 6, dtype=np.int32)
-    sense[count:] = 5  # equality
-    tensions, _, flag, _ = daqp.solve(
-        np.eye(count), -(low + high) / 2.0, np.ascontiguousarray(matrix),
-        np.concatenate([high, wanted]), np.concatenate([low, wanted]), sense,
-    )  # fmt: skip
-    if flag != 1:
-        return False
-    kept = (tensions >= low - _RELEASED) & (tensions <= high + _RELEASED)
-    return bool(kept.all() and np.abs(matrix @ tensions - wanted).max() <= _BALANCED)
+    return distance(robot.body(pair.first, place), second) - pair.needed
