@@ -111,7 +111,15 @@ def run_one(
         output = Path(place) / "run"
         name = SYNTHETIC if camera else None
         prepared = prepared_run(path, rig, quiet=True)
-        summary = run_prepared(prepared, output, name, fast=True, start=None, quiet=True)
+        summary = run_prepared(
+            prepared,
+            output,
+            name,
+            fast=True,
+            start=None,
+            without_real_time=False,
+            quiet=True,
+        )
         seconds = time.perf_counter() - begin
         rows = RunFolder.open(output).clearance()
         beyond = rows.planned_distance - rows.distance - rows.uncertainty

@@ -7,15 +7,14 @@ all its answers at the end. In real time a trigger that comes too early is dropp
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 
 from cdpr.errors import CdprError, Fault
 from cdpr.poses import Pose
 from executor.observer import Look, MakeObserver, Trigger
+from executor.spawning import interrupts_blocked
 
 #: How long the process may take to import its libraries and open its camera, [s].
 START_TIMEOUT = 60.0
@@ -52,14 +51,8 @@ class CameraProcess:
         self._process = context.Process(
             target=_serve, args=(make_observer, far_end), name="cdpr-camera", daemon=True
         )
-        # Ctrl-C reaches every process of the terminal; when to end is this process's decision, even
-        # while the other one still loads its libraries. A blocked signal stays blocked there.
-        resource_tracker.ensure_running()  # on its own first start it would unblock the signal
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with interrupts_blocked():
             self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         far_end.close()
         try:
             if not self._link.poll(START_TIMEOUT):

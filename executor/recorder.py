@@ -47,14 +47,18 @@ class Recorder:
         self._announcements = announcements(prepared.scene, prepared.checked.table.stands)
         self._announce = announce
         self._folder, self._status = folder, status
-        self._trigger, self._every, self._progress = trigger, every, progress
+        self._trigger, self._progress = trigger, progress
+        self.every = every
+        """Cycles from one picture to the next."""
         self._began: float | None = None
+        self.last = 0.0
+        """When the last cycle began, on the loop's clock, [s]."""
         self.asked: list[float] = []
         """When pictures were asked for, since the start of the run, [s]."""
 
     def wants_pose(self, cycle: int) -> bool:
         """Whether a picture will be asked for in this cycle."""
-        return self._trigger is not None and cycle % self._every == 0
+        return self._trigger is not None and cycle % self.every == 0
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
         """A cycle is over.
@@ -65,13 +69,14 @@ class Recorder:
         """
         if self._began is None:
             self._began = record.at
+        self.last = record.at
         self.log.add(record)
         self._status.take_cycle(record)
         if record.state in ON_PATH:
             for code, text in self._announcements.due(record.index):
                 self.take_event(LoopEvent(record.cycle, record.at, code, text))
                 self._announce(text)
-        if record.cycle % self._every:
+        if record.cycle % self.every:
             return
         self._progress(record.index)
         if self._trigger is not None:

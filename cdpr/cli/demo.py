@@ -49,7 +49,15 @@ def demo(
         save_plan(document, plan_path)
         prepared = prepared_run(plan_path, rig, quiet=False)
     show_prepared(prepared, simulated=True)
-    summary = run_prepared(prepared, folder, SYNTHETIC, fast=True, start=None, quiet=False)
+    summary = run_prepared(
+        prepared,
+        folder,
+        SYNTHETIC,
+        fast=True,
+        start=None,
+        without_real_time=False,
+        quiet=False,
+    )
     show_summary(summary, folder, as_json=False)
     out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
     raise typer.Exit(exit_code(summary))

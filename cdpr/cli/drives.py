@@ -3,37 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
+    from cdpr.rig_file import RigDocument
     from cdpr.scene import Load
-    from drivers.drive_group import DriveGroup
+    from executor.real_time_job import ReadyDrives
 
 #: python-can's interface inside one process; with it the drives are simulated here.
 IN_PROCESS = "virtual"
 
 
-@dataclass(frozen=True, slots=True)
-class Drives:
-    """Configured drives.
-
-    Attributes:
-        group: All of them.
-        true_pose: Where the simulated platform is; None on a real bus.
-        carry: Gives the simulated platform another load; on a real bus it happens by itself.
-    """
-
-    group: DriveGroup
-    true_pose: Callable[[], Pose] | None
-    carry: Callable[[Load], None]
-
-
 @contextmanager
-def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]:
+def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[ReadyDrives]:
     """Opens the bus and configures the drives; closes both at the end.
 
     Args:
@@ -49,6 +34,7 @@ def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]
     from cdpr.cli.output import err
     from drivers.bus import BusSettings, open_bus
     from drivers.drive_group import make_drive_group
+    from executor.real_time_job import ReadyDrives
 
     settings = BusSettings.of(rig)
     with ExitStack() as stack:
@@ -67,8 +53,17 @@ def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[Drives]
         stack.callback(group.close)
         for remark in group.configure():
             err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
-        yield Drives(group, true_pose, carry)
+        yield ReadyDrives(group, true_pose, carry)
 
 
 def _happens_by_itself(_load: Load) -> None:
     """What a real gripper takes or leaves is nothing to send."""
+
+
+def drives_of(
+    document: RigDocument, simulated_start: Pose, load: Load
+) -> AbstractContextManager[ReadyDrives]:
+    """`open_drives` for a process of its own: takes what can be sent there."""
+    from cdpr.rig import rig_from_document
+
+    return open_drives(rig_from_document(document), simulated_start, load)

@@ -38,6 +38,10 @@ def run(
         typer.Option(help="where the simulated platform stands: x y z (default: at the start)"),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")] = False,
+    without_real_time: Annotated[
+        bool,
+        typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> None:
     """Run a plan: prove it, make its set-points, arm the drives, move, measure, report.
@@ -67,7 +71,15 @@ def run(
         show_prepared(prepared, in_process)
     if not (in_process or yes):
         _ask_operator()
-    summary = run_prepared(prepared, output, camera_name, fast=fast, start=start, quiet=as_json)
+    summary = run_prepared(
+        prepared,
+        output,
+        camera_name,
+        fast=fast,
+        start=start,
+        without_real_time=without_real_time,
+        quiet=as_json,
+    )
     show_summary(summary, output, as_json)
     raise typer.Exit(exit_code(summary))
 

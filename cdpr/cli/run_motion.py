@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from executor.prepare import PreparedRun
     from executor.recorder import Recorder
     from executor.run_folder import RunFolder
-    from executor.wishes import WishBoard
+    from executor.shared_board import SharedBoard
+    from executor.wishes import OwnBoard
 
 
 #: Without a camera the progress is told this often, [Hz].
@@ -31,6 +32,7 @@ class _Job:
     camera_name: str | None
     fast: bool
     start: Pose | None
+    without_real_time: bool
     quiet: bool
 
 
@@ -41,6 +43,7 @@ def run_prepared(
     *,
     fast: bool,
     start: Pose | None,
+    without_real_time: bool,
     quiet: bool,
 ) -> dict[str, Any]:
     """Arms, moves, measures and writes the run folder; returns the run's summary.
@@ -53,6 +56,7 @@ def run_prepared(
         camera_name: From `choose_camera`.
         fast: Simulated time.
         start: Where the simulated platform stands; None at the plan's start.
+        without_real_time: Move drives on a bus even if real-time scheduling is denied.
         quiet: No progress.
     """
     from cdpr.cli.drives import IN_PROCESS
@@ -61,7 +65,7 @@ def run_prepared(
     from executor.run_folder import RunFolder
 
     folder = RunFolder.create(output)
-    job = _Job(prepared, folder, camera_name, fast, start, quiet)
+    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, quiet)
     moved = False
 
     def before_motion() -> None:
@@ -95,6 +99,7 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
     from executor.command_server import serving
     from executor.recorder import Recorder
     from executor.running import announced, stop_requests
+    from executor.shared_board import SharedBoard
     from executor.status import RunStatus
     from executor.wishes import OwnBoard
 
@@ -102,7 +107,7 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
     rate = prepared.rig.cameras[0].rate if job.camera_name else PROGRESS_RATE
     pictures = int(prepared.duration * rate)
-    board = OwnBoard()
+    board: OwnBoard | SharedBoard = OwnBoard() if job.fast else SharedBoard()
     status = RunStatus(prepared, job.folder.path, board, simulated_time=job.fast)
     camera_at = (prepared.rig, prepared.scene, job.camera_name, job.folder.path)
     with (
@@ -126,12 +131,19 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
 
 
 def _move(
-    job: _Job, board: WishBoard, recorder: Recorder, before_motion: Callable[[], None]
+    job: _Job,
+    board: OwnBoard | SharedBoard,
+    recorder: Recorder,
+    before_motion: Callable[[], None],
 ) -> Outcome:
-    """Arms the drives and runs the loop."""
+    """Arms the drives and runs the loop: here in simulated time, else in a process of its own."""
+    from executor.shared_board import SharedBoard
+
+    if isinstance(board, SharedBoard):
+        return _move_in_real_time(job, board, recorder, before_motion)
     from cdpr.cli.drives import open_drives
     from cdpr.errors import StoppedByOperator
-    from executor.clock import RealClock, SimulatedClock
+    from executor.clock import SimulatedClock
     from executor.execution import run_here
 
     def last_chance() -> None:
@@ -140,19 +152,48 @@ def _move(
         before_motion()
 
     prepared = job.prepared
-    cycle = prepared.checked.table.cycle
     start, load = job.start or prepared.scene.start, prepared.scene.load
     with open_drives(prepared.rig, start, load) as drives:
         return run_here(
             prepared,
             drives.group,
-            SimulatedClock(cycle) if job.fast else RealClock(cycle),
+            SimulatedClock(prepared.checked.table.cycle),
             board,
             recorder,
             true_pose=drives.true_pose,
             carry=drives.carry,
             before_motion=last_chance,
         )
+
+
+def _move_in_real_time(
+    job: _Job, board: SharedBoard, recorder: Recorder, before_motion: Callable[[], None]
+) -> Outcome:
+    from functools import partial
+
+    from cdpr.cli.drives import IN_PROCESS, drives_of
+    from cdpr.cli.output import err
+    from executor.real_time_process import run_in_real_time
+    from executor.records import LoopEvent
+
+    def armed(denied: str) -> None:
+        if denied:
+            recorder.take_event(LoopEvent(0, 0.0, "no_real_time", denied))
+            err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
+        before_motion()
+
+    prepared = job.prepared
+    simulated = prepared.rig.document.bus.interface == IN_PROCESS
+    start, load = job.start or prepared.scene.start, prepared.scene.load
+    return run_in_real_time(
+        prepared,
+        partial(drives_of, prepared.rig.document, start, load),
+        board,
+        recorder,
+        pose_every=recorder.every if simulated else 0,
+        need_real_time=not (simulated or job.without_real_time),
+        before_motion=armed,
+    )
 
 
 def _looks(camera: CameraProcess, recorder: Recorder, job: _Job) -> list[Look]:

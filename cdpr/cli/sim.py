@@ -36,6 +36,7 @@ def sim(
 
       cdpr run plan.json --rig configs/gachon_8_6.yaml --interface udp_multicast
       --channel 239.74.163.2 --no-camera -o runs/udp --yes
+      --without-real-time
     """
     from cdpr.cli.drives import IN_PROCESS
     from cdpr.cli.output import err, out

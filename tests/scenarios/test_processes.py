@@ -64,7 +64,19 @@ def over_udp(plan: Path, run: Path, port: int) -> tuple[int, dict[str, Any], str
         greeting = drives.stdout.readline()
         assert "8 simulated drives of gachon_8_6" in greeting, drives.communicate()
         code, out, err = finished(
-            *("run", plan, "--rig", RIG, "-o", run, *bus, "--no-camera", "--yes", "--json")
+            *(
+                "run",
+                plan,
+                "--rig",
+                RIG,
+                "-o",
+                run,
+                *bus,
+                "--no-camera",
+                "--yes",
+                "--json",
+                "--without-real-time",
+            )
         )
         assert err == "" or "remark" in err, err
         drives.send_signal(signal.SIGINT)

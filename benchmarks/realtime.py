@@ -1,0 +1,192 @@
+"""Lateness of the real-time process beside a plain `time.sleep` loop, idle and with all cores busy.
+
+    python benchmarks/realtime.py                       # 4 cases of 15 s: under 2 minutes
+    python benchmarks/realtime.py --seconds 120 --rates 100 250
+
+The real-time process is the one of `cdpr run`, with all it does in a cycle: wishes, gate,
+set-points, simulated drives and platform in the same process, replies, watch, status ring. The
+plain loop runs at the same time in a process of its own: a thread that sleeps with `time.sleep`
+until its next cycle, beside another that writes JSON fifty times a second, as a program does that
+logs and serves. Lateness is how long after its deadline a cycle begins.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from cdpr.cli.demo import RIG, configs
+from cdpr.cli.drives import drives_of
+from cdpr.plan import load_plan, save_plan
+from cdpr.poses import Array
+from cdpr.rig import Rig, load_rig, rig_from_document
+from cdpr.scene import load_scene
+from executor.prepare import PreparedRun, prepare
+from executor.real_time_process import run_in_real_time
+from executor.recorder import Recorder
+from executor.run_folder import RunFolder
+from executor.shared_board import SharedBoard
+from executor.status import RunStatus
+from planner.check import verify
+from planner.optimal.settings import OptimalSettings
+from planner.plan import make_plan
+
+ENVIRONMENT = "environment_3.yaml"
+
+
+def prepared_at(rate: float, folder: Path) -> PreparedRun:
+    """The third environment of the paper, a path of half a minute, with cycles at a rate [Hz]."""
+    rig, scene = load_rig(configs() / RIG), load_scene(configs() / ENVIRONMENT)
+    plan = folder / f"plan-{rate:g}.json"
+    save_plan(make_plan(rig, scene, OptimalSettings(seed=0)), plan)
+    return prepare(verify(load_plan(plan)), with_cycle(rig, 1000.0 / rate))
+
+
+def with_cycle(rig: Rig, cycle_ms: float) -> Rig:
+    """The same rig at another rate."""
+    bus = rig.document.bus.model_copy(update={"cycle_ms": cycle_ms})
+    return rig_from_document(rig.document.model_copy(update={"bus": bus}))
+
+
+def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Array:
+    """Of every cycle of a run that is stopped after a time, [ms]."""
+    board = SharedBoard()
+    run = RunFolder.create(folder)
+    status = RunStatus(prepared, folder, board, simulated_time=False)
+    cycle = prepared.checked.table.cycle
+
+    def watch_the_time(row: float) -> None:
+        if row * cycle >= seconds:
+            board.ask_stop()
+
+    recorder = Recorder(
+        prepared,
+        run,
+        status,
+        trigger=None,
+        every=10,
+        progress=watch_the_time,
+        announce=lambda _text: None,
+    )
+    start, load = prepared.scene.start, prepared.scene.load
+    outcome = run_in_real_time(
+        prepared,
+        partial(drives_of, prepared.rig.document, start, load),
+        board,
+        recorder,
+        pose_every=0,
+        need_real_time=False,
+        before_motion=lambda denied: print(f"({denied})") if denied else None,
+    )
+    print(f"    run ended: {outcome.state.value} {outcome.cause}")
+    lateness: Array = outcome.log.table().lateness * 1e3
+    return lateness
+
+
+def plain_loop(cycle: float, link: Connection) -> None:
+    """Another process: cycles by `time.sleep` in a thread until it is told to end."""
+    late: list[float] = []
+    over = threading.Event()
+
+    def cycles() -> None:
+        deadline = time.monotonic()
+        while not over.is_set():
+            deadline += cycle
+            time.sleep(max(0.0, deadline - time.monotonic()))
+            late.append(time.monotonic() - deadline)
+            if late[-1] > cycle:  # as the real loop: a late cycle delays the next ones
+                deadline = time.monotonic()
+
+    thread = threading.Thread(target=cycles)
+    thread.start()
+    document = {"drives": [{"position": k * 0.1, "state": "enabled"} for k in range(3000)]}
+    while not link.poll(0.02):
+        json.dumps(document)
+    over.set()
+    thread.join()
+    link.send(np.array(late) * 1e3)
+
+
+def burn() -> None:
+    """Keeps a core busy until it is killed."""
+    while True:
+        sum(range(100_000))
+
+
+@contextmanager
+def all_cores_busy(wanted: bool) -> Iterator[None]:
+    """As many busy processes as there are cores, or none."""
+    count = (os.cpu_count() or 1) if wanted else 0
+    context = multiprocessing.get_context("spawn")
+    hogs = [context.Process(target=burn, daemon=True) for _ in range(count)]
+    for hog in hogs:
+        hog.start()
+    try:
+        yield
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.join()
+
+
+def row(rate: float, load: str, loop: str, late: Array) -> str:
+    """One line of the table."""
+    p50, p99, p999 = np.percentile(late, [50.0, 99.0, 99.9])
+    return (
+        f"| {rate:g} | {load} | {loop} | {len(late)} | {p50:.3f} | {p99:.3f} | {p999:.3f}"
+        f" | {late.max():.3f} |"
+    )
+
+
+def measured(rate: float, busy: bool, seconds: float, folder: Path) -> list[str]:
+    """Both loops side by side."""
+    load = "all cores busy" if busy else "idle"
+    print(f"  {rate:g} Hz, {load} ...", flush=True)
+    context = multiprocessing.get_context("spawn")
+    link, far_end = context.Pipe()
+    plain = context.Process(target=plain_loop, args=(1.0 / rate, far_end), daemon=True)
+    prepared = prepared_at(rate, folder)
+    with all_cores_busy(busy):
+        plain.start()
+        ours = process_lateness(prepared, folder / f"{rate:g}-{busy}", seconds)
+        link.send(None)
+        theirs = link.recv()
+        plain.join()
+    return [
+        row(rate, load, "real-time process", ours),
+        row(rate, load, "thread with `time.sleep`", theirs),
+    ]
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=15.0, help="of motion, each case")
+    parser.add_argument("--rates", type=float, nargs="+", default=[100.0, 250.0], help="[Hz]")
+    wishes = parser.parse_args()
+    began = os.getloadavg()[0]
+    rows: list[str] = []
+    with TemporaryDirectory(prefix="cdpr-realtime-") as folder:
+        for rate in wishes.rates:
+            for busy in (False, True):
+                rows += measured(rate, busy, wishes.seconds, Path(folder))
+    print(f"\n{os.cpu_count()} cores, load average {began:.1f} before; lateness in ms\n")
+    print("| Hz | load | loop | cycles | p50 | p99 | p99.9 | max |")
+    print("|---|---|---|---|---|---|---|---|")
+    print("\n".join(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""The real-time process: one thread that opens the drives, arms them and runs the loop."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import suppress
+from multiprocessing.connection import Connection
+
+from cdpr.errors import CdprError, Fault, Refused
+from cdpr.poses import Pose
+from executor.clock import RealClock
+from executor.loop import Loop
+from executor.machine import ON_PATH
+from executor.real_time_job import (
+    CYCLE_SLOTS,
+    EVENT_SLOTS,
+    Armed,
+    Ended,
+    Failed,
+    Go,
+    Job,
+    ReadyDrives,
+)
+from executor.realtime import real_time
+from executor.records import CycleRecord, LoopEvent
+from executor.ring import Ring
+from executor.shared_board import Supervised
+from executor.wire import RecordWire, pack_event
+
+
+def serve(job: Job, link: Connection, supervisor: int) -> None:
+    """What the process does; it ends with the drives holding by themselves, whatever happens.
+
+    Args:
+        job: What to do.
+        link: To the supervisor.
+        supervisor: Number of its process.
+    """
+    supervised = Supervised(job.board, supervisor)
+    # Ctrl-C and a closed terminal are the supervisor's to decide on; it tells by the board.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: supervised.ask_stop())
+    try:
+        with job.make_drives() as drives:
+            _arm_and_run(job, drives, link, supervised)
+    except CdprError as error:
+        _say(link, Failed(error))
+    except Exception as error:
+        _say(link, Failed(Fault(f"the real-time process broke: {type(error).__name__}: {error}")))
+
+
+def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Supervised) -> None:
+    course = job.course()
+    cycles, events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
+    wire = RecordWire(course.rig.cable_count)
+
+    def true_pose(cycle: int) -> Pose | None:
+        wanted = job.pose_every and cycle % job.pose_every == 0
+        return drives.true_pose() if wanted and drives.true_pose else None
+
+    def on_cycle(record: CycleRecord) -> None:
+        if record.state in ON_PATH:
+            for load in job.loads.due(record.index):
+                drives.carry(load)
+        cycles.put(wire.pack(record, true_pose(record.cycle)))
+
+    def on_event(event: LoopEvent) -> None:
+        events.put(pack_event(event, events.largest_content))
+
+    with real_time() as denied:
+        if denied and job.need_real_time:
+            raise _no_real_time(denied)
+        loop = Loop(
+            course,
+            drives.group,
+            RealClock(course.cycle),
+            wishes=supervised.read,
+            on_cycle=on_cycle,
+            on_event=on_event,
+        )
+        loop.arm()
+        _say(link, Armed(denied))
+        if not _may_go(link):
+            return
+        state = loop.run()
+    _say(link, Ended(state, loop.cause))
+
+
+def _no_real_time(denied: str) -> Refused:
+    return Refused(
+        f"no real-time scheduling: {denied}",
+        where="arming",
+        why="without it other programs make cycles late, and late cycles stop the path",
+        next_step="allow it as named above, or pass --without-real-time if you accept that;"
+        " nothing was enabled",
+    )
+
+
+def _may_go(link: Connection) -> bool:
+    try:
+        return isinstance(link.recv(), Go)
+    except (EOFError, OSError):  # the supervisor changed its mind, or is gone
+        return False
+
+
+def _say(link: Connection, what: Armed | Ended | Failed) -> None:
+    with suppress(OSError):  # nobody is there to hear it; the drives hold all the same
+        link.send(what)

@@ -1,0 +1,198 @@
+"""The real-time process and its supervisor: either may die or hang, and the platform rests."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from cdpr.rig import rig_from_document
+from drivers.bus import BusSettings, open_bus
+from drivers.cia402.states import DriveState
+from executor.command_client import ask_all
+from executor.prepare import PreparedRun
+from executor.run_folder import RunFolder
+from executor.running import reached_runs
+from simulation.rehearsal import Rehearsal
+from tests.cli.plans import RIG
+from tests.scenarios.test_processes import finished, program, waited_for
+
+pytestmark = pytest.mark.slow
+
+AWAY_S = 20.0
+
+
+def real_time_process(supervisor: int) -> int:
+    """The child of a run that moves the drives."""
+    for listing in Path(f"/proc/{supervisor}/task").glob("*/children"):
+        for child in listing.read_text().split():
+            command = Path(f"/proc/{child}/cmdline").read_text()
+            if "spawn_main" in command:
+                return int(child)
+    raise AssertionError("the run has no real-time process")
+
+
+def gone(process: int) -> bool:
+    """Ended, also when nobody has waited for it yet."""
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return True
+    return state == "Z"
+
+
+def wait_until_gone(process: int) -> None:
+    for _ in range(round(AWAY_S / 0.01)):
+        if gone(process):
+            return
+        signal.sigtimedwait([], 0.01)
+    raise AssertionError(f"process {process} goes on")
+
+
+@contextmanager
+def drives_on(channel: str, prepared: PreparedRun) -> Iterator[Rehearsal]:
+    """Simulated drives on a bus between processes, in a thread of this one."""
+    bus_document = prepared.rig.document.bus.model_copy(
+        update={"interface": "udp_multicast", "channel": channel}
+    )
+    rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": bus_document}))
+    over = threading.Event()
+    with open_bus(BusSettings.of(rig)) as bus:
+        rehearsal = Rehearsal(rig, bus, prepared.scene.start, prepared.scene.load)
+        thread = threading.Thread(target=rehearsal.serve, args=(over.is_set,))
+        thread.start()
+        try:
+            yield rehearsal
+        finally:
+            over.set()
+            thread.join()
+
+
+@contextmanager
+def moving_over_udp(
+    prepared: PreparedRun, plan: Path, run: Path, number: int
+) -> Iterator[tuple[subprocess.Popen[str], Rehearsal]]:
+    """A run whose drives are in this process; it is under way."""
+    channel = f"239.74.163.22:{20000 + (os.getpid() * 7 + number) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    rest = ("-o", run, *bus, "--no-camera", "--yes", "--without-real-time")
+    with (
+        drives_on(channel, prepared) as rehearsal,
+        program("run", plan, "--rig", RIG, *rest) as process,
+    ):
+        waited_for(run / "events.jsonl", "moving", process)
+        yield process, rehearsal
+
+
+def told(command: str, percent: int | None = None) -> None:
+    """Said to the run from here: another terminal takes longer to start than the path lasts."""
+    with reached_runs() as runs:
+        (answer,) = ask_all(runs, command, percent)
+    assert answer.status is not None
+
+
+def all_hold(rehearsal: Rehearsal) -> bool:
+    return {drive.state for drive in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
+
+
+def test_the_death_of_the_supervisor_ends_in_a_stop_by_the_real_time_process(
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+) -> None:
+    with moving_over_udp(prepared, short_plan, tmp_path / "run", 1) as (process, rehearsal):
+        child = real_time_process(process.pid)
+        process.kill()
+        process.wait()
+        wait_until_gone(child)
+        assert all_hold(rehearsal)
+
+
+def test_the_death_of_the_real_time_process_is_told_and_the_drives_stop_by_themselves(
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    with moving_over_udp(prepared, short_plan, run, 2) as (process, rehearsal):
+        os.kill(real_time_process(process.pid), signal.SIGKILL)
+        out, err = process.communicate()
+        assert process.returncode == 1, (out, err)
+        assert all_hold(rehearsal)
+    assert "FAILED" in out
+    folder = RunFolder.open(run)
+    summary = folder.summary()
+    assert summary["final_state"] == "latched"
+    assert any("killed by signal 9" in reason for reason in summary["reasons"])
+    assert [event["code"] for event in summary["events"]][-1] == "real_time_lost"
+    assert len(folder.cycles()) == summary["cycles"] > 10
+
+
+def test_a_supervisor_that_hangs_is_noticed(
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    with moving_over_udp(prepared, short_plan, run, 3) as (process, rehearsal):
+        child = real_time_process(process.pid)
+        told("speed", 5)
+        process.send_signal(signal.SIGSTOP)
+        wait_until_gone(child)
+        assert all_hold(rehearsal)
+        code, out, _ = finished("stop", "--json")
+        assert code == 1
+        assert json.loads(out) == {"stopped_processes": [], "silent_processes": [process.pid]}
+        process.send_signal(signal.SIGCONT)
+        process.communicate()
+        assert process.returncode == 1
+    summary = RunFolder.open(run).summary()
+    assert summary["final_state"] == "latched"
+    assert any("silent for 2 s" in reason for reason in summary["reasons"])
+
+
+def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
+    short_plan: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    with program("run", short_plan, "--rig", RIG, "-o", run, "--no-camera") as moving:
+        waited_for(run / "events.jsonl", "moving", moving)
+        told("hold")
+        waited_for(run / "events.jsonl", "hold", moving)
+        code, out, err = finished("monitor", "--once", "--json")
+        status = json.loads(out)
+        assert (code, err) == (0, "")
+        assert status["state"] == "holding"
+        assert status["process"] == moving.pid
+        assert [event["code"] for event in status["events"]] == ["enabled", "moving", "hold"]
+        assert {d["state"] for d in status["drives"]} == {"operation enabled"}
+        code, out, err = finished("hold", "--json")
+        assert (code, err) == (0, "")
+        assert json.loads(out)["state"] == "holding"
+        code, out, err = finished("speed", "100")
+        assert (code, err) == (0, "")
+        assert "counts from `cdpr resume` on" in out
+        code, out, err = finished("resume")
+        assert (code, err) == (0, "")
+        assert f"process {moving.pid} was told to go on" in out
+        code, out, err = finished("monitor")
+        assert (code, err) == (0, ""), "it ends with the run"
+        assert "resume: going on along the path at 100%" in out
+        moving.communicate()
+        assert moving.returncode == 0
+    summary = RunFolder.open(run).summary()
+    assert summary["verdict"] == "PASSED"
+    codes = [event["code"] for event in summary["events"]]
+    assert codes == ["enabled", "moving", "hold", "resume", "held"]
+
+
+def test_the_real_time_process_has_one_thread(short_plan: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with program("run", short_plan, "--rig", RIG, "-o", run, "--no-camera") as moving:
+        waited_for(run / "events.jsonl", "moving", moving)
+        child = real_time_process(moving.pid)
+        assert len(list(Path(f"/proc/{child}/task").iterdir())) == 1
+        os.kill(child, signal.SIGTERM)
+        moving.communicate()
+        assert moving.returncode == 130, "asked to end, it stops along the path"
