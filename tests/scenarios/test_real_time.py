@@ -149,7 +149,11 @@ def test_a_supervisor_that_hangs_is_noticed(
         assert process.returncode == 1
     summary = RunFolder.open(run).summary()
     assert summary["final_state"] == "latched"
-    assert any("silent for 2 s" in reason for reason in summary["reasons"])
+    # A host so busy that the drives in this process do not answer in time ends the run before.
+    causes = (
+        ("silent for 2 s", "did not answer") if summary["lost_replies"] else ("silent for 2 s",)
+    )
+    assert any(cause in reason for reason in summary["reasons"] for cause in causes)
 
 
 def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
