@@ -120,13 +120,13 @@ def _check_kernel_interface(settings: BusSettings) -> None:
             f"there is no network interface {settings.channel!r}",
             where=f"bus {settings}",
             why=f"CAN interfaces here: {', '.join(there) or 'none'}",
-            next_step=_bring_up(settings),
+            next_step=bring_up(settings),
         )
     if not int((folder / "flags").read_text(), 16) & 1:  # IFF_UP
         raise HardwareMissing(
             f"the network interface {settings.channel} is down",
             where=f"bus {settings}",
-            next_step=_bring_up(settings),
+            next_step=bring_up(settings),
         )
     queue = int((folder / "tx_queue_len").read_text())
     if queue < MIN_TRANSMIT_QUEUE:
@@ -140,7 +140,8 @@ def _check_kernel_interface(settings: BusSettings) -> None:
         )
 
 
-def _bring_up(settings: BusSettings) -> str:
+def bring_up(settings: BusSettings) -> str:
+    """The command that makes a kernel CAN interface ready."""
     name = settings.channel or "can0"
     if name.startswith("vcan"):
         return (
@@ -155,7 +156,7 @@ def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
     number = getattr(cause, "errno", None)
     step = "check the adapter, its driver and the channel's name, then run `cdpr doctor`"
     if settings.interface == "socketcan":
-        step = _bring_up(settings)
+        step = bring_up(settings)
         if number == errno.EAFNOSUPPORT:
             step = "load the kernel's CAN support: sudo modprobe can_raw"
     elif settings.interface == "udp_multicast":

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from cdpr.cli.doctor_answer import Answer
+
+if TYPE_CHECKING:
+    from cdpr.rig import Rig
 
 PACKAGES = ("cdpr", "planner", "executor", "drivers", "tracking", "calibration", "simulation")
 LIBRARIES = {
@@ -28,42 +32,40 @@ LIBRARIES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """One thing that was looked at.
-
-    Attributes:
-        name: What.
-        good: Whether it is as a run needs it.
-        text: What was found.
-        fix: The next step where it is not good.
-    """
-
-    name: str
-    good: bool
-    text: str
-    fix: str = ""
-
-
 def doctor(
     rig: Annotated[
-        Path | None, typer.Argument(help="also look at this rig's bus", metavar="[RIG]")
+        Path | None,
+        typer.Argument(help="also look at this rig's bus and cameras", metavar="[RIG]"),
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="also take a picture with the camera of this index")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
     """Look whether this machine has what a run needs; with a rig file, whether its bus opens.
 
+    Each thing that is missing comes with the command that mends it. Nothing is sent on the bus.
+
     [dim]Examples:[/dim]
 
       cdpr doctor
 
-      cdpr doctor configs/gachon_8_6.yaml
+      cdpr doctor rig.yaml --camera 0
     """
     from cdpr.cli.output import out, show_json
+    from cdpr.errors import BadInput
+    from cdpr.rig import load_rig
 
+    if camera is not None and rig is None:
+        raise BadInput(
+            "a camera is looked at with the rig file that describes it",
+            where="--camera",
+            next_step="name the rig file too: cdpr doctor RIG --camera INDEX",
+        )
     answers = [python_version(), *own_packages(), *libraries(), *machine()]
     if rig is not None:
-        answers += rig_bus(rig)
+        the_rig = load_rig(rig)
+        answers += [*rig_bus(the_rig), *rig_cameras(the_rig, camera)]
     if as_json:
         keys = ("name", "good", "text", "fix")
         show_json([{key: getattr(answer, key) for key in keys} for answer in answers])
@@ -120,32 +122,66 @@ def libraries() -> list[Answer]:
 def machine() -> list[Answer]:
     """What real time and real buses need; only told, since a rehearsal needs none of it."""
     import os
-    import socket
+
+    from cdpr.cli.doctor_bus import kernel_support
 
     cores = os.cpu_count() or 1
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-        kernel = "SocketCAN is there"
-    except (AttributeError, OSError) as error:
-        kernel = f"no SocketCAN in this kernel ({error}); other interfaces work"
+    kernel = kernel_support()
+    text = kernel.text if kernel.good else f"{kernel.text}; other interfaces work"
     return [
         Answer("processors", cores >= 2, f"{cores}", "use a machine with two or more cores"),
-        Answer("kernel", True, kernel),
+        Answer("kernel", True, text),
     ]
 
 
-def rig_bus(path: Path) -> list[Answer]:
-    """Whether the bus of a rig file is fast enough and can be opened."""
+def rig_bus(rig: Rig) -> list[Answer]:
+    """Whether the bus of a rig is fast enough, is set up, and can be opened."""
+    from cdpr.cli.doctor_bus import kernel_bus
+    from cdpr.cli.doctor_real_time import real_time_permission
+    from cdpr.cli.drives import IN_PROCESS
     from cdpr.errors import CdprError
-    from cdpr.rig import load_rig
     from drivers.bus import BusSettings, open_bus
     from drivers.bus_load import check_bus_load
+    from drivers.socketcan import can_interfaces
 
-    rig = load_rig(path)
     settings = BusSettings.of(rig)
+    answers: list[Answer] = []
     try:
         load = check_bus_load(rig)
-        open_bus(settings).shutdown()
+        answers.append(Answer("bus load", True, f"{load:.0%} at worst"))
     except CdprError as error:
-        return [Answer(f"bus {settings}", False, error.what, error.next_step)]
-    return [Answer(f"bus {settings}", True, f"opens; load {load:.0%} at worst")]
+        answers.append(Answer("bus load", False, error.what, error.next_step))
+    if settings.interface == "socketcan":
+        try:
+            answers += kernel_bus(settings, can_interfaces())
+        except CdprError as error:
+            answers.append(Answer("interfaces", False, error.what, error.next_step))
+    try:
+        open_bus(settings).shutdown()
+        answers.append(Answer(f"bus {settings}", True, "opens"))
+    except CdprError as error:
+        answers.append(Answer(f"bus {settings}", False, error.what, error.next_step))
+    if settings.interface != IN_PROCESS:
+        answers += real_time_permission()
+    return answers
+
+
+def rig_cameras(rig: Rig, source: str | None) -> list[Answer]:
+    """Whether a camera opens and its pictures have the size that the rig file states."""
+    from cdpr.errors import CdprError
+
+    if not rig.cameras:
+        return [Answer("camera", source is None, "the rig file has none", "leave --camera out")]
+    camera = rig.cameras[0]
+    if source is None:
+        devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
+        text = f"not tried (--camera INDEX tries it); devices here: {devices or 'none'}"
+        return [Answer(f"camera {camera.name}", True, text)]
+    from drivers.cameras import LiveCamera
+
+    try:
+        LiveCamera(source, camera).close()
+    except CdprError as error:
+        return [Answer(f"camera {camera.name}", False, error.what, error.next_step)]
+    text = f"{source} opens and gives pictures of {camera.width} x {camera.height} px"
+    return [Answer(f"camera {camera.name}", True, text)]

@@ -1,0 +1,222 @@
+"""`cdpr doctor` says what is missing, each with the command that mends it."""
+
+from __future__ import annotations
+
+import json
+import resource
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cdpr.cli import doctor_bus
+from cdpr.cli.doctor_answer import Answer
+from cdpr.cli.doctor_bus import kernel_bus
+from cdpr.cli.doctor_real_time import memory_answer, priority_answer
+from drivers import cameras, socketcan
+from drivers.bus import BusSettings
+from drivers.socketcan import KernelInterface, can_interfaces, parse_interfaces
+from tests.cli.plans import RIG
+from tests.cli.program import call
+
+CAN0 = BusSettings("socketcan", "can0", 1_000_000)
+
+
+def link(**changes: Any) -> dict[str, Any]:
+    """What `ip -details -json link show` prints of a healthy interface."""
+    return {
+        "ifindex": 3,
+        "ifname": "can0",
+        "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"],
+        "mtu": 16,
+        "txqlen": 128,
+        "link_type": "can",
+        "linkinfo": {
+            "info_kind": "can",
+            "info_data": {
+                "state": "ERROR-ACTIVE",
+                "restart_ms": 0,
+                "bittiming": {"bitrate": 1000000, "sample_point": "0.750"},
+            },
+        },
+        **changes,
+    }
+
+
+def looked(**changes: Any) -> dict[str, Answer]:
+    """The answers for one interface, by name."""
+    found = parse_interfaces(json.dumps([link(**changes)]))
+    return {answer.name: answer for answer in kernel_bus(CAN0, found)}
+
+
+@pytest.fixture(autouse=True)
+def kernel_with_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests are about interfaces; this machine's kernel may have none."""
+    monkeypatch.setattr(doctor_bus, "kernel_support", lambda: Answer("kernel", True, "there"))
+
+
+def test_a_healthy_interface_has_nothing_to_mend() -> None:
+    answers = looked()
+    assert len(answers) == 4
+    assert all(answer.good for answer in answers.values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "found", "command"),
+    [
+        (
+            {"flags": ["NOARP", "ECHO"]},
+            "interface can0",
+            "down",
+            "sudo ip link set can0 up txqueuelen 128 type can bitrate 1000000",
+        ),
+        (
+            {"txqlen": 10},
+            "txqueuelen of can0",
+            "10 frames",
+            "sudo ip link set can0 txqueuelen 128",
+        ),
+        (
+            {"linkinfo": {"info_kind": "can", "info_data": {"bittiming": {"bitrate": 500000}}}},
+            "bit rate of can0",
+            "500000 bit/s; the rig file says 1000000",
+            "sudo ip link set can0 down && sudo ip link set can0 up txqueuelen 128 type can"
+            " bitrate 1000000",
+        ),
+        (
+            {"linkinfo": {"info_kind": "can", "info_data": {}}},
+            "bit rate of can0",
+            "not set; the rig file says 1000000",
+            "bitrate 1000000",
+        ),
+        (
+            {"linkinfo": {"info_kind": "can", "info_data": {"state": "BUS-OFF"}}},
+            "controller of can0",
+            "BUS-OFF",
+            "termination (60 ohm), then sudo ip link set can0 down && sudo ip link set can0 up",
+        ),
+    ],
+)
+def test_what_is_wrong_comes_with_its_command(
+    changes: dict[str, Any], name: str, found: str, command: str
+) -> None:
+    answer = looked(**changes)[name]
+    assert not answer.good
+    assert found in answer.text
+    assert command in answer.fix
+
+
+def test_a_missing_interface_names_those_that_are_there() -> None:
+    (answer,) = kernel_bus(CAN0, [KernelInterface("can1", "can", True, 128, 500_000, "")])
+    assert not answer.good
+    assert "can1" in answer.text
+    (virtual,) = kernel_bus(BusSettings("socketcan", "vcan0"), [])
+    assert "sudo ip link add dev vcan0 type vcan" in virtual.fix
+
+
+def test_a_virtual_interface_has_no_bit_rate_to_be_wrong() -> None:
+    vcan = link(ifname="can0", linkinfo={"info_kind": "vcan"})
+    answers = kernel_bus(CAN0, parse_interfaces(json.dumps([vcan])))
+    assert len(answers) == 2
+    assert all(answer.good for answer in answers)
+
+
+def test_other_interfaces_are_left_out() -> None:
+    lines = [{"ifname": "lo", "flags": ["LOOPBACK", "UP"], "link_type": "loopback"}, link()]
+    assert [found.name for found in parse_interfaces(json.dumps(lines))] == ["can0"]
+    assert parse_interfaces("") == ()
+
+
+def test_an_ip_that_says_something_else_is_told(tmp_path: Path) -> None:
+    program = tmp_path / "ip"
+    program.write_text("#!/bin/sh\necho no idea\n")
+    program.chmod(0o755)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path), prepend=":")
+        with pytest.raises(socketcan.HardwareMissing, match="did not list"):
+            can_interfaces()
+
+
+@pytest.mark.parametrize(
+    ("limit", "privileged", "good"),
+    [(0, False, False), (49, False, False), (50, False, True), (0, True, True)],
+)
+def test_real_time_priority(limit: int, privileged: bool, good: bool) -> None:
+    answer = priority_answer(limit, 50, privileged=privileged)
+    assert answer.good is good
+    assert "rtprio 50' | sudo tee -a /etc/security/limits.d/cdpr.conf" in answer.fix
+
+
+@pytest.mark.parametrize(
+    ("limit", "privileged", "good"),
+    [(65536, False, False), (resource.RLIM_INFINITY, False, True), (65536, True, True)],
+)
+def test_locked_memory(limit: int, privileged: bool, good: bool) -> None:
+    answer = memory_answer(limit, privileged=privileged)
+    assert answer.good is good
+    assert "memlock unlimited'" in answer.fix
+
+
+class FakeCapture:
+    """A camera of OpenCV with pictures of one size."""
+
+    size = (720, 1280)
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return True
+
+    def set(self, *_: object) -> None:
+        """Cameras take settings and do as they like."""
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        return True, np.zeros(self.size, dtype=np.uint8)
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+
+def camera_answer(*arguments: str) -> tuple[int, dict[str, Any]]:
+    answer = call("doctor", RIG, *arguments, "--json")
+    (camera,) = [one for one in json.loads(answer.out) if one["name"].startswith("camera")]
+    return answer.code, camera
+
+
+def test_a_camera_is_opened_and_its_pictures_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cameras, "_opened", lambda _source: FakeCapture())
+    code, camera = camera_answer("--camera", "0")
+    assert (code, camera["good"]) == (0, True)
+    assert "1280 x 720 px" in camera["text"]
+    monkeypatch.setattr(FakeCapture, "size", (480, 640))
+    code, camera = camera_answer("--camera", "0")
+    assert (code, camera["good"]) == (4, False)
+    assert "640 x 480 px" in camera["text"]
+
+
+def test_a_camera_that_is_not_there_is_missing_and_one_not_named_is_not_tried() -> None:
+    code, camera = camera_answer("--camera", "97")
+    assert (code, camera["good"]) == (4, False)
+    code, camera = camera_answer()
+    assert (code, camera["good"]) == (0, True)
+    assert "not tried" in camera["text"]
+
+
+def test_a_camera_needs_the_rig_that_describes_it() -> None:
+    answer = call("doctor", "--camera", "0")
+    assert answer.code == 2
+    assert "cdpr doctor RIG --camera INDEX" in answer.said
+
+
+def test_a_bus_too_slow_and_an_interface_missing_are_both_told(tmp_path: Path) -> None:
+    text = RIG.read_text().replace("interface: virtual", "interface: socketcan")
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(
+        text.replace("channel: cdpr", "channel: can77").replace("cycle_ms: 10", "cycle_ms: 1")
+    )
+    answer = call("doctor", rig, "--json")
+    assert answer.code == 4
+    told = {one["name"]: one for one in json.loads(answer.out)}
+    assert not told["bus load"]["good"]
+    assert "4 or more" in told["bus load"]["fix"]
+    assert not told["interface can77"]["good"]
+    assert "real-time priority" in told
