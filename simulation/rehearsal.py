@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import can
@@ -13,6 +14,7 @@ from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 from cdpr.scene import Load
 from drivers.bus import take, transmit
+from drivers.bus_faults import BusDown
 from drivers.cia402.frames import (
     HEARTBEAT_BASE,
     MASTER_NODE,
@@ -145,7 +147,8 @@ class Rehearsal:
 
         As in a real drive, time is locked to SYNC: one cycle passes from one to the next, however
         they jitter, and more only while none comes. When this process is held up, the drives' time
-        stands still: they do not blame the master for it.
+        stands still: they do not blame the master for it. While the interface is down they hear and
+        reach nobody, as with their cable pulled, and go on when it is up again.
 
         Args:
             stop_requested: Asked every few milliseconds; true ends it.
@@ -176,7 +179,7 @@ class Rehearsal:
         last = told = clock()
         passed = 0.0  # of the drives' time since the last SYNC
         while not stop_requested():
-            message = take(self._bus, IDLE_WAIT)
+            message = self._heard()
             now = clock()
             if message is None:
                 idle = min(now - last, self._cycle)
@@ -190,6 +193,14 @@ class Rehearsal:
                 self._advance(self._cycle - passed)
                 passed, last = 0.0, now
             self._handle(message)
+
+    def _heard(self) -> can.Message | None:
+        """The next frame; none while the interface is down."""
+        try:
+            return take(self._bus, IDLE_WAIT)
+        except BusDown:
+            time.sleep(IDLE_WAIT)  # the kernel tells it at once, and time must pass all the same
+            return None
 
     def _routes(self) -> dict[int, Callable[[Frame], None]]:
         """What to do with each identifier."""
@@ -242,6 +253,7 @@ class Rehearsal:
 
     def _send(self, can_id: int, data: Frame) -> None:
         """On the bus, and to the other drives, which sit on the same end of it."""
-        transmit(self._bus, can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        with suppress(BusDown):  # nobody is reached
+            transmit(self._bus, can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         if can_id > HEARTBEAT_BASE:
             self._on_heartbeat(can_id - HEARTBEAT_BASE, data)
