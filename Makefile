@@ -12,7 +12,7 @@ PACKAGES := cdpr planner executor drivers tracking calibration simulation
 unexport PYTHONPATH PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint docs schema clean distclean
+.PHONY: help install demo test hil hil-subset lint docs schema clean distclean
 
 help:  ## Show this help
 	@echo "cdpr: plan, prove, run and measure paths of cable-driven parallel robots"
@@ -49,6 +49,13 @@ demo: install  ## Plan, prove, run and report the paper's first environment on s
 
 test: install  ## Run the whole test suite on two cores
 	"$(BIN)/python" -m pytest -n 2
+
+hil: install  ## Run the tests that need a CAN bus of the kernel, here or in a virtual machine
+	@"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_3.yaml -o "$(VENV)/hil-plan.json" --force --json >/dev/null
+	CDPR_HIL_PLAN="$$PWD/$(VENV)/hil-plan.json" "$(BIN)/python" tools/hil/run.py
+
+hil-subset: install  # those of them that CI has the time for
+	"$(BIN)/python" tools/hil/run.py --limit-s 360 -m "hil and not slow"
 
 lint: install  ## Check style, types, import contracts, and that the docs build without a warning
 	"$(BIN)/python" -m ruff check

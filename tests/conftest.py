@@ -50,6 +50,16 @@ def _command(child: int) -> str:
     return " ".join(words).strip() or "just started, or ended and not waited for"
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Tests that need a kernel CAN bus run only when they are asked for: `make hil`."""
+    if "hil" in config.option.markexpr:
+        return
+    needing = [item for item in items if item.get_closest_marker("hil")]
+    if needing:
+        config.hook.pytest_deselected(items=needing)
+        items[:] = [item for item in items if item not in needing]
+
+
 @pytest.fixture(autouse=True)
 def nothing_left_running() -> Iterator[None]:
     """Fails a test that leaves a thread or a child process behind."""

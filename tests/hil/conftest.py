@@ -1,0 +1,222 @@
+"""A kernel CAN bus, a trace of all that goes over it, and programs in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from cdpr.cli import main
+from drivers.bus import BusSettings, open_bus
+from drivers.cia402.frames import SYNC_ID
+from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.states import DriveState, state_of
+from tests.cli.plans import RIG, write_short_plan
+
+NODES = range(1, 9)
+
+# What the programs import inside their functions: once here, before they are forked, since an
+# import takes long where instructions are counted.
+for module in (
+    *("cdpr.cli.run_motion", "cdpr.cli.run_summary", "cdpr.cli.sim", "executor.prepare"),
+    *("executor.run", "executor.report.page", "simulation.rehearsal", "matplotlib.figure"),
+    *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_agg", "cv2", "mcap.writer"),
+    *("scipy.optimize", "drivers.cia402.group"),
+):
+    import_module(module)
+ENDS_WITHIN_S = 120.0
+LISTENS_FOR_S = 60.0
+
+
+@pytest.fixture(scope="session")
+def channel() -> str:
+    """The interface that tools/hil made."""
+    name = os.environ.get("CDPR_HIL_CHANNEL")
+    if not name:
+        pytest.fail("no kernel CAN bus; next: run these tests with `make hil`", pytrace=False)
+    return name
+
+
+@pytest.fixture(scope="session")
+def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where traces are kept."""
+    folder = os.environ.get("CDPR_HIL_ARTEFACTS")
+    return Path(folder) if folder else tmp_path_factory.mktemp("artefacts")
+
+
+@pytest.fixture(scope="session")
+def short_plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """58 mm, about 3 s."""
+    return write_short_plan(tmp_path_factory.mktemp("plan") / "plan.json")
+
+
+@pytest.fixture(autouse=True)
+def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+
+
+@pytest.fixture
+def trace(request: pytest.FixtureRequest, channel: str, artefacts: Path) -> Iterator[Path]:
+    """What candump hears while the test runs."""
+    path = artefacts / f"{request.node.name}.log"
+    with (
+        path.open("w") as file,
+        subprocess.Popen(["candump", "-L", channel], stdout=file) as candump,
+    ):
+        yield path
+        candump.terminate()
+
+
+@pytest.fixture
+def figures(request: pytest.FixtureRequest, artefacts: Path) -> Callable[[str], None]:
+    """Writes down what was measured."""
+
+    def tell(text: str) -> None:
+        with (artefacts / "figures.txt").open("a") as file:
+            file.write(f"{request.node.name}: {text}\n")
+
+    return tell
+
+
+class Program:
+    """`cdpr ARGUMENTS` in a process group of its own, as from another terminal."""
+
+    def __init__(self, said: Path, arguments: Sequence[str | Path]) -> None:
+        self.said = said
+        said.touch()
+        words = ["cdpr", *map(str, arguments)]
+        # Forked: to import everything once more takes a minute where instructions are counted.
+        self._process = multiprocessing.get_context("fork").Process(target=_run, args=(words, said))
+        self._process.start()
+
+    def send(self, number: signal.Signals) -> None:
+        """A signal to the whole group."""
+        assert self._process.pid is not None
+        os.killpg(self._process.pid, number)
+
+    def ended(self) -> int:
+        """Its exit code, once it has ended."""
+        self._process.join(ENDS_WITHIN_S)
+        assert self._process.exitcode is not None, self.said.read_text()
+        return self._process.exitcode
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.is_alive()
+
+    def close(self) -> None:
+        if self.is_running:
+            self.send(signal.SIGKILL)
+        self._process.join()
+        self._process.close()
+
+
+def _run(words: list[str], said: Path) -> None:
+    os.setpgid(0, 0)
+    descriptor = os.open(said, os.O_WRONLY | os.O_APPEND)
+    for stream in (1, 2):
+        os.dup2(descriptor, stream)
+    sys.argv = words
+    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
+    main()
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Simulated drives in one process, and what a test does to them from another.
+
+    Attributes:
+        channel: The interface.
+        plan: A plan from where the platform hangs.
+        folder: For run folders.
+        drives: `cdpr sim`.
+        ear: A listener on the bus.
+    """
+
+    channel: str
+    plan: Path
+    folder: Path
+    drives: Program
+    ear: can.BusABC
+
+    def run(self, name: str = "run") -> Program:
+        """Starts `cdpr run`."""
+        return Program(
+            self.folder / f"{name}.txt",
+            (
+                *("run", self.plan, "--rig", RIG, "-o", self.folder / name, "--no-camera"),
+                *("--interface", "socketcan", "--channel", self.channel, "--yes", "--json"),
+            ),
+        )
+
+    def summary(self, name: str = "run") -> dict[str, Any]:
+        """What a run left behind."""
+        found: dict[str, Any] = json.loads((self.folder / name / "summary.json").read_text())
+        return found
+
+    def wait_for_cycles(self, count: int, running: Program) -> None:
+        """Until the master has sent so many SYNCs from now."""
+        while self.ear.recv(0.0) is not None:
+            pass
+        while count:
+            message = self.ear.recv(LISTENS_FOR_S)
+            assert message is not None, running.said.read_text()
+            count -= message.arbitration_id == SYNC_ID
+
+    def wait_for_motion(self, running: Program) -> None:
+        """Until the run has told that it moves along the path."""
+        events = self.folder / "run" / "events.jsonl"
+        while not (events.is_file() and '"moving"' in events.read_text()):
+            assert running.is_running, running.said.read_text()
+            self.wait_for_cycles(5, running)
+
+    def read(self, index: int) -> list[int]:
+        """An object of every drive, as any CANopen tool reads it."""
+        with open_bus(BusSettings("socketcan", self.channel)) as bus:
+            network = SetupNetwork(bus, None, NODES)
+            data = [network.client(node).read(index, 0, "object") for node in NODES]
+        return [int.from_bytes(value, "little", signed=True) for value in data]
+
+    def states(self) -> set[DriveState]:
+        return {state_of(word & 0xFFFF) for word in self.read(0x6041)}
+
+    def positions(self) -> list[int]:
+        return self.read(0x6064)
+
+
+@contextmanager
+def _drives(channel: str, plan: Path, folder: Path) -> Iterator[Rig]:
+    bus = ("--interface", "socketcan", "--channel", channel)
+    drives = Program(folder / "drives.txt", ("sim", RIG, *bus, "--plan", plan))
+    try:
+        with open_bus(BusSettings("socketcan", channel)) as ear:
+            greeting = ear.recv(LISTENS_FOR_S)  # the boot-up message of the first drive
+            assert greeting is not None, drives.said.read_text()
+            yield Rig(channel, plan, folder, drives, ear)
+        assert drives.is_running, drives.said.read_text()
+        drives.send(signal.SIGINT)
+        assert drives.ended() == 0, drives.said.read_text()
+    finally:
+        drives.close()
+
+
+@pytest.fixture
+def drives_at(channel: str, trace: Path, tmp_path: Path) -> Callable[[Path], Any]:
+    """Starts the drives of the rig where a plan begins; the trace runs already."""
+    return lambda plan: _drives(channel, plan, tmp_path)
