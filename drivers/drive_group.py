@@ -125,8 +125,11 @@ class DriveGroup(Protocol):
         """Targets last sent, shape (m,), [counts]; motion after ENABLING starts from them."""
         ...
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self, *, to_reset: bool = False) -> tuple[str, ...]:
         """Sets every drive up and reads every setting back.
+
+        Args:
+            to_reset: Also takes drives in fault, which are going to be reset.
 
         Returns:
             Remarks for the operator: what drives cannot do although a run would use it.

@@ -18,13 +18,16 @@ IN_PROCESS = "virtual"
 
 
 @contextmanager
-def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[ReadyDrives]:
+def open_drives(
+    rig: Rig, simulated_start: Pose, load: Load, *, to_reset: bool = False
+) -> Iterator[ReadyDrives]:
     """Opens the bus and configures the drives; closes both at the end.
 
     Args:
         rig: The robot and its bus.
         simulated_start: Where the platform stands when the drives are simulated here.
         load: What it carries then.
+        to_reset: Also takes drives in fault, which are going to be reset.
 
     Raises:
         BadInput: python-can has no such interface.
@@ -51,7 +54,7 @@ def open_drives(rig: Rig, simulated_start: Pose, load: Load) -> Iterator[ReadyDr
             pump, true_pose, carry = rehearsal.pump, lambda: rehearsal.pose, rehearsal.carry
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)
-        for remark in group.configure():
+        for remark in group.configure(to_reset=to_reset):
             err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
         yield ReadyDrives(group, true_pose, carry)
 

@@ -57,7 +57,7 @@ def run(
     """
     from cdpr.cli.cameras import choose_camera
     from cdpr.cli.drives import IN_PROCESS
-    from cdpr.cli.run_motion import run_prepared
+    from cdpr.cli.run_motion import require_released, run_prepared
     from cdpr.cli.run_summary import show_prepared, show_summary
     from executor.run_folder import RunFolder
 
@@ -66,11 +66,12 @@ def run(
     camera_name = choose_camera(the_rig, camera, no_camera, in_process)
     start = _simulated_start(simulated_start_mm, in_process, fast)
     RunFolder.require_free(output)
+    require_released(the_rig)
     prepared = prepared_run(plan, the_rig, quiet=as_json)
     if not as_json:
         show_prepared(prepared, in_process)
     if not (in_process or yes):
-        _ask_operator()
+        ask_operator("Move the platform now?", "nothing was moved")
     summary = run_prepared(
         prepared,
         output,
@@ -84,8 +85,12 @@ def run(
     raise typer.Exit(exit_code(summary))
 
 
-def _ask_operator() -> None:
-    """A real bus moves only after a yes; silence is none.
+def ask_operator(question: str, otherwise: str) -> None:
+    """Goes on only after a yes; silence is none.
+
+    Args:
+        question: Shown to whoever sits there.
+        otherwise: What a no leaves, such as ``nothing was moved``.
 
     Raises:
         StoppedByOperator: The answer was no.
@@ -95,19 +100,17 @@ def _ask_operator() -> None:
 
     from cdpr.errors import BadInput, StoppedByOperator
 
-    print("Move the platform now? [y/N] ", end="", file=sys.stderr, flush=True)
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     answer = sys.stdin.readline()
     if not answer:
         print(file=sys.stderr)
         raise BadInput(
-            "nobody answered whether the platform may move",
+            f"nobody answered: {question}",
             where="standard input",
-            next_step="run it in a terminal, or pass --yes; nothing was moved",
+            next_step=f"run it in a terminal, or pass --yes; {otherwise}",
         )
     if answer.strip().lower() not in ("y", "yes"):
-        raise StoppedByOperator(
-            "nothing was moved", next_step="run it again when the platform may move"
-        )
+        raise StoppedByOperator(otherwise, next_step="run it again when the answer is yes")
 
 
 def rig_on_bus(path: Path, interface: str | None, channel: str | None) -> Rig:

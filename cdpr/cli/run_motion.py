@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
+    from cdpr.rig import Rig
     from executor.camera_process import CameraProcess
     from executor.execution import Outcome
+    from executor.latch import Latch
     from executor.observer import Look
     from executor.prepare import PreparedRun
     from executor.recorder import Recorder
@@ -34,6 +36,28 @@ class _Job:
     start: Pose | None
     without_real_time: bool
     quiet: bool
+    latch: Latch | None
+
+
+def latch_of(rig: Rig) -> Latch | None:
+    """The latch of a rig's bus; drives that are simulated in a run's process end with it."""
+    from cdpr.cli.drives import IN_PROCESS
+    from drivers.bus import BusSettings
+    from executor.latch import Latch
+
+    settings = BusSettings.of(rig)
+    return None if settings.interface == IN_PROCESS else Latch(settings)
+
+
+def require_released(rig: Rig) -> None:
+    """Nothing moves on a bus on which a fault is latched.
+
+    Raises:
+        Refused: One is; with its cause.
+    """
+    latch = latch_of(rig)
+    if latch is not None:
+        latch.require_released()
 
 
 def run_prepared(
@@ -65,11 +89,14 @@ def run_prepared(
     from executor.run_folder import RunFolder
 
     folder = RunFolder.create(output)
-    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, quiet)
+    latch = latch_of(prepared.rig)
+    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, quiet, latch)
     moved = False
 
     def before_motion() -> None:
         nonlocal moved
+        if latch is not None:
+            latch.engage(prepared.rig.name, output)
         moved = True
 
     try:
@@ -127,6 +154,8 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
                 announce=lambda text: None if job.quiet else err.print(text, markup=False),
             )
             outcome = _move(job, board, recorder, before_motion)
+        if job.latch is not None:
+            job.latch.settle(prepared.rig.name, outcome, job.folder.path)
         return outcome, _looks(camera, recorder, job) if camera else []
 
 

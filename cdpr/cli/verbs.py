@@ -15,6 +15,7 @@ from cdpr.cli.monitor import monitor
 from cdpr.cli.operate import hold, resume, speed
 from cdpr.cli.plan import plan
 from cdpr.cli.report import report
+from cdpr.cli.reset import reset
 from cdpr.cli.run import run
 from cdpr.cli.sim import sim
 from cdpr.cli.stop import stop
@@ -32,6 +33,7 @@ VERBS = (
     resume,
     speed,
     monitor,
+    reset,
     track,
     sim,
     report,

@@ -27,8 +27,16 @@ from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 
 
-def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> tuple[str, ...]:
+def configure_drives(
+    rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool
+) -> tuple[str, ...]:
     """Writes and reads back every object of every drive, then starts their process data.
+
+    Args:
+        rig: The robot; its winches name the nodes.
+        bus: An open bus.
+        pump: As for `drivers.drive_group.make_drive_group`.
+        to_reset: Also takes drives in fault, which are going to be reset.
 
     Returns:
         Remarks: what drives cannot do although a run would use it.
@@ -49,7 +57,7 @@ def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> tuple[str,
     _refuse_duplicates(network)
     entries = []
     for drive, node in enumerate(nodes):
-        _check_idle(network, node)
+        _check_idle(network, node, to_reset)
         network.command(NmtCommand.PRE_OPERATIONAL, node)
         _write_all(network, node, settings[drive])
         entries.append(_watch_heartbeats(network, node, rig, drive))
@@ -118,16 +126,16 @@ def _expect(network: SetupNetwork, node: int, expectations: Sequence[Expectation
             )
 
 
-def _check_idle(network: SetupNetwork, node: int) -> None:
+def _check_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
     """A drive that is enabled belongs to somebody; one that holds in quick stop may be taken."""
     data = network.client(node).read(0x6041, 0, "status word")
     state = state_of(int.from_bytes(data, "little"))
-    if state in FAULTED:
+    if state in FAULTED and not to_reset:
         raise Refused(
             f"drive {node} is in fault",
             where=f"drive {node}, object 6041h:00 status word",
             why="it stopped itself; its own display or tool tells the cause",
-            next_step="remove the cause and clear the fault at the drive, then start again",
+            next_step="remove the cause, then `cdpr reset RIG`",
             values={"node": node},
         )
     if state is DriveState.OPERATION_ENABLED:

@@ -96,7 +96,7 @@ class Cia402Group:
         """Targets last sent, shape (m,), [counts]."""
         return np.array(self._targets, dtype=np.int64)
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self, *, to_reset: bool = False) -> tuple[str, ...]:
         """Sets every drive up and reads every setting back; see `DriveGroup.configure`."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused(
@@ -106,7 +106,7 @@ class Cia402Group:
             )
         self._state = GroupState.OFFLINE
         self._reset_memory()
-        remarks = configure_drives(self._rig, self._bus, self._pump)
+        remarks = configure_drives(self._rig, self._bus, self._pump, to_reset=to_reset)
         self._state = GroupState.CONFIGURED
         return remarks
 

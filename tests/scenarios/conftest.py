@@ -21,10 +21,11 @@ from tests.cli.plans import CONFIGS, HALL, RIG, straight_plan, write_short_plan
 def own_announcements(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`cdpr stop` of a test reaches the runs of that test alone."""
+    """`cdpr stop` of a test reaches the runs of that test alone; its faults latch nothing else."""
     temporary = tmp_path_factory.mktemp("tmp")
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(temporary))
+    monkeypatch.setenv("XDG_STATE_HOME", str(temporary / "state"))
     monkeypatch.setattr(tempfile, "tempdir", None)
 
 

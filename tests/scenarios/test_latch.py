@@ -1,0 +1,165 @@
+"""The latch of a bus: what ended badly, or not at all, prevents motion until it is reset."""
+
+from __future__ import annotations
+
+import json
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from cdpr.errors import Refused
+from drivers.bus import BusSettings
+from drivers.cia402.states import DriveState
+from executor.execution import Outcome
+from executor.latch import Latch
+from executor.machine import State
+from executor.prepare import PreparedRun
+from executor.run_log import RunLog
+from executor.running import announced
+from tests.cli.plans import RIG
+from tests.cli.program import call
+from tests.scenarios.test_real_time import drives_on, moving_over_udp, wait_until_gone
+from tests.scenarios.test_real_time import real_time_process as process_of
+
+BUS = BusSettings("socketcan", "can0")
+
+
+def outcome(prepared: PreparedRun, state: State, cause: str = "") -> Outcome:
+    log = RunLog(prepared.rig, prepared.scene, prepared.checked)
+    return Outcome(state, cause, log, datetime.now(UTC))
+
+
+def test_a_run_engages_it_and_only_a_good_end_releases_it(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    latch = Latch(BUS)
+    latch.require_released()
+    for state in (State.FINISHED, State.STOPPED):
+        latch.engage("rig", tmp_path)
+        assert Latch(BUS).read() is not None
+        latch.settle("rig", outcome(prepared, state), tmp_path)
+        latch.require_released()
+    latch.engage("rig", tmp_path)
+    latch.settle("rig", outcome(prepared, State.LATCHED, "cable 6 is slack"), tmp_path)
+    with pytest.raises(Refused, match="cable 6 is slack") as caught:
+        Latch(BUS).require_released()
+    assert "cdpr reset" in caught.value.next_step
+    with pytest.raises(Refused, match="cable 6 is slack"):
+        Latch(BUS).engage("rig", tmp_path)
+    Latch(BUS).release()
+    latch.require_released()
+
+
+def test_a_run_that_never_came_to_its_end_is_a_fault(tmp_path: Path) -> None:
+    Latch(BUS).engage("rig", tmp_path)
+    with pytest.raises(Refused, match="did not come to its end"):
+        Latch(BUS).require_released()
+
+
+def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
+    Latch(BUS).engage("rig", tmp_path)
+    with announced(), pytest.raises(Refused, match=f"process {os.getpid()}.*under way"):
+        Latch(BUS).require_released()
+
+
+def test_each_bus_has_its_own(tmp_path: Path) -> None:
+    Latch(BUS).engage("rig", tmp_path)
+    Latch(BusSettings("socketcan", "can1")).require_released()
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"bus": 1}', "\x00"])
+def test_a_latch_file_that_cannot_be_read_counts_as_engaged(tmp_path: Path, content: str) -> None:
+    latch = Latch(BUS)
+    latch.engage("rig", tmp_path)
+    latch.path.write_text(content)
+    with pytest.raises(Refused, match="cannot be read"):
+        latch.require_released()
+
+
+def test_without_a_place_for_the_latch_nothing_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    with pytest.raises(Refused, match="latch cannot be"):
+        Latch(BUS).engage("rig", tmp_path)
+
+
+def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Path) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41999")
+    Latch(BusSettings("udp_multicast", "239.74.163.23:41999")).engage("rig", tmp_path)
+    run = tmp_path / "run"
+    answer = call("run", short_plan, "--rig", RIG, "-o", run, *bus, "--no-camera", "--yes")
+    assert answer.code == 3
+    assert "a fault is latched" in answer.err
+    assert not run.exists()
+
+
+def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41998")
+    latch = Latch(BusSettings("udp_multicast", "239.74.163.23:41998"))
+    latch.engage("rig", tmp_path)
+    for answers, code in (("n\n", 130), ("", 2)):
+        assert call("reset", RIG, *bus, answers=answers).code == code
+        assert latch.read() is not None
+    assert call("reset", RIG, "--interface", "virtual").code == 2
+
+
+def test_reset_of_drives_that_do_not_answer_leaves_it_engaged(tmp_path: Path) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41997")
+    latch = Latch(BusSettings("udp_multicast", "239.74.163.23:41997"))
+    latch.engage("rig", tmp_path)
+    assert call("reset", RIG, *bus, "--yes").code == 4
+    assert latch.read() is not None
+
+
+@pytest.mark.slow
+def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    channel = f"239.74.163.23:{20000 + (os.getpid() * 11) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    latch = Latch(BusSettings("udp_multicast", channel))
+    latch.engage("rig", tmp_path)
+    with drives_on(channel, prepared) as rehearsal:
+        stood = [drive.motor.position for drive in rehearsal.drives]
+        rehearsal.drives[2].fail(0x2310)
+        assert rehearsal.drives[2].state is DriveState.FAULT
+        answer = call("reset", RIG, *bus, "--yes", "--json")
+        assert answer.code == 0, answer
+        told = json.loads(answer.out)
+        assert told["released"] is True
+        assert "fault" not in told["drives"]
+        assert DriveState.FAULT not in {drive.state for drive in rehearsal.drives}
+        assert [drive.motor.position for drive in rehearsal.drives] == stood
+    latch.require_released()
+
+
+@pytest.mark.slow
+def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_stands(
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+) -> None:
+    with moving_over_udp(prepared, short_plan, tmp_path / "run", 5) as (process, rehearsal):
+        arguments = list(map(str, process.args))  # type: ignore[union-attr, arg-type]
+        channel = arguments[arguments.index("--channel") + 1]
+        child = process_of(process.pid)
+        process.kill()
+        process.wait()
+        wait_until_gone(child)
+        stood = [drive.motor.position for drive in rehearsal.drives]
+        bus = ("--interface", "udp_multicast", "--channel", channel)
+        rest = ("--no-camera", "--yes", "--without-real-time")
+        again = call("run", short_plan, "--rig", RIG, "-o", tmp_path / "again", *bus, *rest)
+        assert again.code == 3
+        assert "did not come to its end" in again.err
+        answer = call("reset", RIG, *bus, "--yes")
+        assert answer.code == 0, answer
+        assert "did not come to its end" in answer.out
+        assert {drive.state for drive in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
+        again = call("run", short_plan, "--rig", RIG, "-o", tmp_path / "again", *bus, *rest)
+        assert again.code == 3
+        assert "not at the start of the plan" in again.err
+        assert [drive.motor.position for drive in rehearsal.drives] == stood
+        assert not (tmp_path / "again").exists()
