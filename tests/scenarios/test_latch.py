@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,18 +13,30 @@ import pytest
 from cdpr.errors import Refused
 from drivers.bus import BusSettings
 from drivers.cia402.states import DriveState
+from executor.command_client import ask_all
 from executor.execution import Outcome
 from executor.latch import Latch
 from executor.machine import State
 from executor.prepare import PreparedRun
 from executor.run_log import RunLog
-from executor.running import announced
+from executor.running import announced, reached_runs
 from tests.cli.plans import RIG
 from tests.cli.program import call
 from tests.scenarios.test_real_time import drives_on, moving_over_udp, wait_until_gone
 from tests.scenarios.test_real_time import real_time_process as process_of
 
 BUS = BusSettings("socketcan", "can0")
+
+
+def wait_until_beyond(path_mm: float) -> None:
+    """Until the run has come so far along its path, or ended."""
+    while True:
+        with reached_runs() as runs:
+            (answer,) = ask_all(runs, "status")
+        assert answer.status is not None
+        if (answer.status["path_mm"] or 0.0) > path_mm:
+            return
+        signal.sigtimedwait([], 0.01)
 
 
 def outcome(prepared: PreparedRun, state: State, cause: str = "") -> Outcome:
@@ -145,6 +158,7 @@ def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_sta
         arguments = list(map(str, process.args))  # type: ignore[union-attr, arg-type]
         channel = arguments[arguments.index("--channel") + 1]
         child = process_of(process.pid)
+        wait_until_beyond(10.0)
         process.kill()
         process.wait()
         wait_until_gone(child)
