@@ -16,6 +16,7 @@ from cdpr.document_types import (
 )
 from cdpr.rig_file import RigDocument
 from cdpr.scene_file import SceneDocument
+from cdpr.stop_file import StopDocument
 
 
 class ReadingsDocument(Document):
@@ -133,6 +134,7 @@ class PlanDocument(Document):
     ]
     waypoints: Annotated[list[PoseDocument], Field(min_length=2)]
     stops: list[StopMarkDocument] = []
+    done: list[StopDocument] = []
     raw_path: Annotated[list[PoseDocument], Field(min_length=2)]
     tree: TreeDocument
     statistics: StatisticsDocument

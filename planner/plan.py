@@ -16,6 +16,7 @@ from cdpr.plan_file import PlanDocument
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
+from cdpr.stop_file import StopDocument
 from planner.check import check_path
 from planner.check_report import CheckReport
 from planner.cost import KinematicCost
@@ -36,6 +37,7 @@ def make_plan(
     clock: Callable[[], float] = time.perf_counter,
     *,
     rounds: Sequence[int] = (),
+    done: Sequence[StopDocument] = (),
 ) -> PlanDocument:
     """Plans a path from the scene's start through its stops to its goal.
 
@@ -51,6 +53,7 @@ def make_plan(
         progress: Told how the search goes on.
         clock: Seconds, for the planning time and the budget.
         rounds: Of each leg, in place of those in the settings.
+        done: Stops that a run before visited; the plan only remembers them.
 
     Returns:
         The plan, sealed with its hash, which has passed `planner.check.check_path`.
@@ -91,6 +94,7 @@ def make_plan(
                 {"name": stop.name, "waypoint": waypoint}
                 for stop, waypoint in zip(scene.stops, way.stops, strict=True)
             ],
+            "done": list(done),
             "raw_path": [PoseDocument.of(space.pose(point)) for point in route.raw],
             "tree": _tree(space, route),
             "statistics": {

@@ -43,7 +43,7 @@ def demo(
     rig = load_rig(configs() / RIG)
     scene = load_scene(configs() / f"environment_{environment}.yaml")
     document = planned(rig, scene, OptimalSettings(seed=seed), True)
-    show_facts("plan", sentences_of(document)[:-1])
+    show_facts("plan", sentences_of(document))
     with TemporaryDirectory(prefix="cdpr-demo-") as temporary:
         plan_path = Path(temporary) / "plan.json"
         save_plan(document, plan_path)

@@ -13,12 +13,14 @@ from cdpr.cli.plan_options import (
     CostName,
     CostOption,
     FreeRotationOption,
+    FromRunOption,
     IterationsOption,
     LongestOption,
     ModeOption,
     PlannerName,
     PlannerOption,
     RoundsOption,
+    ViaOption,
     WeightOption,
     optimal_settings,
     paper_settings,
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from cdpr.plan_file import PlanDocument
     from cdpr.rig import Rig
     from cdpr.scene import Scene
+    from cdpr.stop_file import StopDocument
     from planner.way import Settings
 
 _LONG = 1000.0
@@ -72,6 +75,8 @@ def plan(
     goal_mm: Annotated[
         tuple[float, float, float] | None, typer.Option(help="goal instead of the scene's: x y z")
     ] = None,
+    via_mm: ViaOption = None,
+    from_run: FromRunOption = None,
     failure_rate: FailureRateOption = FailureRateName.streak,
     focus: FocusOption = FocusName.last_failed,
     cone_draw: ConeDrawOption = ConeDrawName.radius,
@@ -92,15 +97,29 @@ def plan(
 
       cdpr plan configs/gachon_8_6.yaml configs/environment_2.yaml -o plan.json
       --planner adaptive --mode paper --seed 7
+
+      cdpr plan configs/gachon_8_6.yaml configs/pick_and_place.yaml -o rest.json
+      --from-run runs/stopped
     """
+    from cdpr.cli.from_run import require_room, scene_after
     from cdpr.cli.output import show_facts, show_json
+    from cdpr.cli.stops import by_way_of
+    from cdpr.errors import BadInput
     from cdpr.plan import save_plan
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
     from planner.paper.readings import Readings
 
     the_rig = load_rig(rig)
+    if from_run is not None and start_mm is not None:
+        raise BadInput("--from-run and --start-mm both say where to begin", next_step="give one")
     the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
+    done: Sequence[StopDocument] = ()
+    begun: list[tuple[str, str]] = []
+    if from_run is not None:
+        the_scene, done, begun = scene_after(the_scene, the_rig, from_run)
+        require_room(the_scene, the_rig)
+    the_scene = by_way_of(the_scene, via_mm or [])
     check_output(output, force)
     readings = Readings(
         failure_rate=failure_rate.value,
@@ -146,12 +165,13 @@ def plan(
         )
         settings = paper_settings(planner, seed, cost, mode, max_iterations, readings)
     of_legs = rounds if rounds is not None and len(rounds) > 1 else []
-    document = planned(the_rig, the_scene, settings, not as_json, of_legs)
+    document = planned(the_rig, the_scene, settings, not as_json, of_legs, done)
     save_plan(document, output)
     if as_json:
         show_json({"plan": str(output), **facts_of(document)})
     else:
-        show_facts(f"plan {output}", sentences_of(document))
+        next_step = f"cdpr check {output}, then cdpr run {output} --rig {rig} -o RUNDIR"
+        show_facts(f"plan {output}", [*begun, *sentences_of(document), ("next", next_step)])
 
 
 def planned(
@@ -160,17 +180,19 @@ def planned(
     settings: Settings,
     shown: bool,
     rounds: Sequence[int] = (),
+    visited: Sequence[StopDocument] = (),
 ) -> PlanDocument:
     """A plan, made with a bar where the search is long, and a word where it must be compiled."""
+    from functools import partial
+
     from cdpr.cli.output import err, progress_bar, spinner
     from planner.plan import make_plan
     from planner.settings import PlannerSettings
 
+    make = partial(make_plan, rig, scene, settings, rounds=rounds, done=visited)
     if isinstance(settings, PlannerSettings):
         with progress_bar("planning", settings.max_iterations, shown) as advance:
-            return make_plan(
-                rig, scene, settings, progress=lambda done, _most, _distance: advance(done)
-            )
+            return make(progress=lambda done, _most, _distance: advance(done))
     from planner import optimal, turning
     from planner.optimal.compilation import is_compiled, note_compiled
     from planner.turning.settings import TurningSettings
@@ -183,16 +205,10 @@ def planned(
     total = scale * (settings.rounds or settings.budget)
     if compiled and total >= _LONG:
         with progress_bar(f"planning, {unit}", total, shown) as advance:
-            document = make_plan(
-                rig,
-                scene,
-                settings,
-                progress=lambda done, _most, _cost: advance(scale * done),
-                rounds=rounds,
-            )
+            document = make(progress=lambda done, _most, _cost: advance(scale * done))
     else:
         with spinner("planning" if compiled else "compiling", shown):
-            document = make_plan(rig, scene, settings, rounds=rounds)
+            document = make()
     note_compiled(kernels)
     return document
 
@@ -277,7 +293,6 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
         ("tension", f"{quality.min_tension_n:.1f} to {quality.max_tension_n:.1f} N"),
         ("kinematic cost", f"{quality.mean_kinematic_cost:.3f} on average"),
         ("search", _search_sentence(document)),
-        ("next", "cdpr check, then cdpr run"),
     ]
     return facts
 

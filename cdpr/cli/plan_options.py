@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -66,6 +67,14 @@ LongestOption = Annotated[
 FreeRotationOption = Annotated[
     bool,
     typer.Option("--free-rotation", help="optimal: turn as well, within the scene's limits"),
+]
+ViaOption = Annotated[
+    list[str] | None,
+    typer.Option(help="way-pose before the scene's stops; again for more", metavar="X,Y,Z"),
+]
+FromRunOption = Annotated[
+    Path | None,
+    typer.Option(help="begin where this run ended, with the stops left", metavar="RUNDIR"),
 ]
 ModeOption = Annotated[
     ModeName | None,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -19,3 +21,27 @@ def stop_facts(scene: Scene) -> list[tuple[str, str]]:
         dwell = f" {stop.dwell:g} s" if stop.dwell > 0.0 else ""
         told.append(f"{stop.name} ({stop.kind}{dwell}{load})")
     return [("by way of", ", ".join(told))] if told else []
+
+
+def by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
+    """The scene with level way-poses before its own stops, given as ``x,y,z``.
+
+    Raises:
+        BadInput: A way-pose cannot be read.
+    """
+    from cdpr.errors import BadInput
+    from cdpr.stop_file import StopDocument
+
+    ways = []
+    for number, text in enumerate(via_mm, start=1):
+        try:
+            x, y, z = (float(part) for part in text.split(","))
+        except ValueError:
+            raise BadInput(
+                f"--via-mm {text}: needs three numbers with commas between",
+                next_step="write --via-mm 0,40,430",
+            ) from None
+        if not all(map(math.isfinite, (x, y, z))):
+            raise BadInput(f"--via-mm {text}: needs finite numbers", next_step="mend it")
+        ways.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
+    return scene.changed(stops=[*ways, *scene.document.stops]) if ways else scene

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.poses import Array
+from cdpr.poses import Array, Pose
 from drivers.bus import BusSettings, open_bus
 from drivers.cia402.states import DriveState
 from drivers.drive_group import DriveGroup, make_drive_group
@@ -109,11 +109,13 @@ class Stage:
 
 
 @contextmanager
-def staged(prepared: PreparedRun, path: Path, script: Callable[[Stage], None]) -> Iterator[Stage]:
-    """Drives on a virtual bus of their own, configured, with the platform at the plan's start."""
+def staged(
+    prepared: PreparedRun, path: Path, script: Callable[[Stage], None], start: Pose | None = None
+) -> Iterator[Stage]:
+    """Drives on a virtual bus of their own, configured; the platform stands at the start."""
     settings = BusSettings("virtual", f"scenario-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
-        rehearsal = Rehearsal(prepared.rig, far, prepared.scene.start, prepared.scene.load)
+        rehearsal = Rehearsal(prepared.rig, far, start or prepared.scene.start, prepared.scene.load)
         group = make_drive_group(prepared.rig, near, rehearsal.pump)
         group.configure()
         yield Stage(prepared, rehearsal, group, RunFolder.create(path), script)
