@@ -26,6 +26,7 @@ DRAWS = 10
 _LARGEST, _SMALLEST = 0.060, 2e-4
 """Sizes of changes, [m]."""
 _MOST_REPEATS, _ON = 6, 1.5
+_ROUND_OFF = 1e-12
 _POSE_PRICE = 2e-4
 """What a pose more must save, as part of the path: each is a corner that is run more slowly."""
 
@@ -56,22 +57,24 @@ def polish(problem: Problem, path: Array, count: int, draws: Array, tallies: Int
         kind = draw[0]
         if count < 3:  # a single move is the shortest way
             break
-        if kind < 0.35:
+        if kind < 0.30:
             count = _cut(problem, path, count, draw, new, tallies)
-        elif kind < 0.75:
-            count = _moved(problem, path, count, draw, new, tallies)
+        elif kind < 0.60 or (kind < 0.78 and count < 4):
+            count = _moved(problem, path, count, 1, draw, new, tallies)
+        elif kind < 0.78:
+            count = _moved(problem, path, count, 2, draw, new, tallies)
         elif kind < 0.88:
             count = _drawn(problem, path, count, draw, new, tallies)
         elif kind < 0.95:
             first = int(draw[1] * (count - 2))
             last = first + 2 + int(draw[2] ** 2 * (count - 2 - first))
             last = min(last, count - 1)
-            count = _replaced(problem, path, count, first, last, new, 0, tallies)
+            count = _replaced(problem, path, count, first, last, new, 0, False, tallies)
         else:
             first = int(draw[1] * (count - 1))
             put_between(path[first], path[first + 1], draw[2], new[0])
             _shift(problem, draw, _size(draw), new[0])
-            count = _replaced(problem, path, count, first, first + 1, new, 1, tallies)
+            count = _replaced(problem, path, count, first, first + 1, new, 1, False, tallies)
     return count
 
 
@@ -94,20 +97,30 @@ def _cut(
         back, on = back * near, on * near
     put_between(path[first + 1], path[first], back, new[0])
     put_between(path[second], path[second + 1], on, new[1])
-    return _replaced(problem, path, count, first, second + 1, new, 2, tallies)
+    return _replaced(problem, path, count, first, second + 1, new, 2, True, tallies)
 
 
 @kernel
 def _moved(
-    problem: Problem, path: Array, count: int, draw: Array, new: Array, tallies: Integers
+    problem: Problem,
+    path: Array,
+    count: int,
+    number: int,
+    draw: Array,
+    new: Array,
+    tallies: Integers,
 ) -> int:
-    """A pose is moved and turned; where that was better, on by ever more the same way."""
-    k, size = 1 + int(draw[1] * (count - 2)), _size(draw)
+    """One pose, or two in turn alike, are moved; where that was better, on ever more the same way.
+
+    Two are moved where the move between them touches something.
+    """
+    k, size = int(draw[1] * (count - 1 - number)), _size(draw)
     for _ in range(_MOST_REPEATS):
-        new[0] = path[k]
-        _shift(problem, draw, size, new[0])
+        for i in range(number):
+            new[i] = path[k + 1 + i]
+            _shift(problem, draw, size, new[i])
         before = path_length(problem, path, count)
-        count = _replaced(problem, path, count, k - 1, k + 1, new, 1, tallies)
+        count = _replaced(problem, path, count, k, k + 1 + number, new, number, False, tallies)
         if path_length(problem, path, count) >= before:
             break
         size *= _ON
@@ -129,7 +142,7 @@ def _drawn(
     put_between(path[k], new[1], 1.0 if draw[2] < 0.2 else draw[3], new[0])
     if draw[4] < 0.5:
         new[0, :3] = path[k, :3]
-    return _replaced(problem, path, count, k - 1, k + 1, new, 1, tallies)
+    return _replaced(problem, path, count, k - 1, k + 1, new, 1, False, tallies)
 
 
 @kernel
@@ -161,11 +174,21 @@ def _replaced(
     last: int,
     new: Array,
     number: int,
+    ends_known: bool,
     tallies: Integers,
 ) -> int:
-    """Puts poses in place of those between two, if that is shorter and allowed.
+    """Puts none, one or two poses in place of those between two, if that is shorter and allowed.
 
-    Two new poses lie on the moves that they end, which are known to be allowed.
+    Args:
+        problem: Where.
+        path: Changed in place.
+        count: Poses of it.
+        first: Number of the pose before those that go.
+        last: Number of the pose after them.
+        new: What comes in their place, shape (2, 7).
+        number: How many of these.
+        ends_known: Whether the first and the last new move are parts of present moves.
+        tallies: See `move_allowed`.
 
     Returns:
         The number of poses then.
@@ -173,27 +196,20 @@ def _replaced(
     added = number - (last - first - 1)
     if count + added > len(path):
         return count
-    radian, saved = problem.radian, 0.0
+    saved = -_POSE_PRICE * path_length(problem, path, count) * added
     for i in range(first, last):
-        saved += move_length(path[i], path[i + 1], radian)
-    price = _POSE_PRICE * path_length(problem, path, count) * added
-    before, after = path[first], path[last]
-    if number == 0:
-        saved -= move_length(before, after, radian)
-        if not saved > price or not move_allowed(problem, before, after, tallies):
-            return count
-    elif number == 1:
-        saved -= move_length(before, new[0], radian) + move_length(new[0], after, radian)
-        if not saved > max(price, 1e-12):
-            return count
-        if not move_allowed(problem, before, new[0], tallies):
-            return count
-        if not move_allowed(problem, new[0], after, tallies):
-            return count
-    else:
-        saved -= move_length(before, new[0], radian) + move_length(new[0], new[1], radian)
-        saved -= move_length(new[1], after, radian)
-        if not saved > max(price, 1e-12) or not move_allowed(problem, new[0], new[1], tallies):
+        saved += move_length(path[i], path[i + 1], problem.radian)
+    corners = np.empty((4, 7))
+    corners[0], corners[number + 1] = path[first], path[last]
+    corners[1 : number + 1] = new[:number]
+    for i in range(number + 1):
+        saved -= move_length(corners[i], corners[i + 1], problem.radian)
+    if not saved > _ROUND_OFF:
+        return count
+    for i in range(number + 1):
+        if ends_known and i != 1:
+            continue
+        if not move_allowed(problem, corners[i], corners[i + 1], tallies):
             return count
     _make_room(path, count, last, added)
     for i in range(number):

@@ -19,11 +19,11 @@ from planner.turning.moves import move_length
 from planner.turning.polish import MOST_POSES, path_length, polish
 from planner.turning.problem import Problem
 
-_KEPT = 4
+_KEPT = 6
 _SAMPLES, _TRIALS = 50, 40
-_ANOTHER_EVERY = 10
+_ANOTHER_EVERY = 30
 """After the first rounds, one in so many begins with a new path."""
-_TO_THE_BEST = 0.7
+_TO_THE_BEST = 0.5
 
 
 @dataclass(slots=True, eq=False)
