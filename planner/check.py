@@ -8,7 +8,9 @@ sampled along the path, and between samples bounded by how fast it can change (`
 * self clearance: with level point exits no faster than the motion, else by a stated multiple;
 * capacity margin: by the sum of what each cable's wrench can change at its largest tension.
 
-Tensions and cable speeds are those at the samples, at most 5 mm apart.
+Tensions and cable speeds are those at the samples, at most 5 mm apart; that there are tensions
+within the limits everywhere between is what the capacity margin proves. Where the platform turns,
+the scene's rotation limits are compared in closed form.
 """
 
 from __future__ import annotations

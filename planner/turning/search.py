@@ -42,7 +42,6 @@ class Search:
         rounds: Done so far.
         tallies: Moves asked about, by what forbids them; see `planner.turning.problem`.
         first: The very first path, shape (k, 7); empty without one.
-        nodes: In the trees that found paths, and in the present ones.
     """
 
     def __init__(self, problem: Problem, start: Array, goal: Array, seed: int) -> None:
@@ -51,7 +50,6 @@ class Search:
         self.rounds = 0
         self.tallies = np.zeros(6, dtype=np.int64)
         self.first: Array = np.zeros((0, 7))
-        self.nodes = 0
         self._ends = np.stack([start, goal])
         self._random = np.random.default_rng(seed)
         self._kept: list[_Kept] = []
@@ -125,7 +123,6 @@ class Search:
         )
         if count == 0:
             return None
-        self.nodes += int(self._grown[0] + self._grown[1])
         self._grown[:] = 0
         if not len(self.first):
             self.first = poses[:count].copy()
