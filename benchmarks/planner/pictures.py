@@ -96,3 +96,34 @@ def growth_figure(panels: Sequence[tuple[str, str, dict[str, list[tuple[int, flo
         axes.grid(alpha=0.25, which="both")
         axes.legend(frameon=False, fontsize=8)
     return figure
+
+
+def pareto_figure(points: Sequence[dict[str, Any]], claim: float) -> Figure:
+    """Change of the average kinematic cost over that of the length, a panel each environment."""
+    from matplotlib.figure import Figure
+
+    environments = sorted({point["environment"] for point in points})
+    boxes = list(dict.fromkeys(point["box"] for point in points))
+    figure = Figure(figsize=(4.4 * len(environments), 4.2), layout="constrained")
+    panels = figure.subplots(1, len(environments), squeeze=False, sharey=True)[0]
+    for axes, environment in zip(panels, environments, strict=True):
+        for number, box in enumerate(boxes):
+            mine = [p for p in points if (p["environment"], p["box"]) == (environment, box)]
+            front = sorted((p for p in mine if p["made_by"] == "reference"),
+                           key=lambda p: p["length_mm"])  # fmt: skip
+            own = [p for p in mine if p["made_by"] != "reference"]
+            colour, label = f"C{number}", f"{box} box"
+            _percent(axes, front, "o-", color=colour, label=f"{label}: best known")
+            _percent(axes, own, "*", color=colour, markersize=13, label=f"{label}: cdpr plan")
+        axes.axhline(-claim, color="0.4", linestyle="--", linewidth=1.0, label="the paper's claim")
+        axes.set_title(f"environment {environment}", loc="left", weight="bold")
+        axes.set_xlabel("longer than the shortest path [%]")
+        axes.grid(alpha=0.25)
+    panels[0].set_ylabel("average kinematic cost [%]")
+    panels[0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _percent(axes: Any, points: Sequence[dict[str, Any]], style: str, **options: Any) -> None:
+    across, up = ([p[key] for p in points] for key in ("longer_percent", "average_percent"))
+    axes.plot(across, up, style, **({"markersize": 4} | options))

@@ -81,8 +81,8 @@ def lattice_path(
                     other = (i * shape[1] + j) * shape[2] + k
                     if parent[other] != _OPEN:
                         continue
-                    to = _point(problem, other, stride, shape, ends)
-                    there = _weight_at(problem, other, stride, shape)
+                    number = _numbers(problem, i, j, k, stride)
+                    to, there = _place(problem, number), _weight_at(problem, number)
                     factor = (1.0 + spread * uniform(state)) * (weight + there) / 2.0
                     total = so_far + factor * norm(minus(to, at))
                     ahead = total + least * norm(minus(goal, to))
@@ -103,10 +103,9 @@ def _weight(problem: Problem, at: Vector) -> float:
 
 
 @kernel
-def _weight_at(problem: Problem, node: int, stride: int, shape: Shape) -> float:
-    """What a metre costs at a lattice point."""
-    i, j, k = _numbers(problem, node, stride, shape)
-    kinematic = problem.terms[KINEMATIC] * problem.kinematic[i, j, k]
+def _weight_at(problem: Problem, number: Shape) -> float:
+    """What a metre costs at a point of the grid."""
+    kinematic = problem.terms[KINEMATIC] * problem.kinematic[number]
     return problem.terms[LENGTH] + kinematic  # type: ignore[no-any-return]
 
 
@@ -121,10 +120,8 @@ def _shape(values: Array, stride: int) -> Shape:
 
 
 @kernel
-def _numbers(problem: Problem, node: int, stride: int, shape: Shape) -> Shape:
+def _numbers(problem: Problem, i: int, j: int, k: int, stride: int) -> Shape:
     """The grid numbers of a lattice point."""
-    k, rest = node % shape[2], node // shape[2]
-    i, j = rest // shape[1], rest % shape[1]
     last = problem.kinematic.shape
     return (
         min(i * stride, last[0] - 1),
@@ -134,17 +131,22 @@ def _numbers(problem: Problem, node: int, stride: int, shape: Shape) -> Shape:
 
 
 @kernel
+def _place(problem: Problem, number: Shape) -> Vector:
+    grid = problem.grid
+    return (
+        grid[0, 0] + number[0] * grid[1, 0],
+        grid[0, 1] + number[1] * grid[1, 1],
+        grid[0, 2] + number[2] * grid[1, 2],
+    )
+
+
+@kernel
 def _point(problem: Problem, node: int, stride: int, shape: Shape, ends: Array) -> Vector:
     size = shape[0] * shape[1] * shape[2]
     if node >= size:
         return row_of(ends[node - size])
-    i, j, k = _numbers(problem, node, stride, shape)
-    grid = problem.grid
-    return (
-        grid[0, 0] + i * grid[1, 0],
-        grid[0, 1] + j * grid[1, 1],
-        grid[0, 2] + k * grid[1, 2],
-    )
+    k, rest = node % shape[2], node // shape[2]
+    return _place(problem, _numbers(problem, rest // shape[1], rest % shape[1], k, stride))
 
 
 @kernel

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from cdpr.poses import Array
-from planner.optimal.polyline import Polyline, measure
+from planner.optimal.polyline import measure, polyline_of
 from planner.optimal.preparation import set_weights
 from planner.optimal.problem import Problem
 from planner.optimal.rounds import measure_again
@@ -30,7 +30,6 @@ class LengthLimit:
 
     Attributes:
         path: The best path found that is short enough, shape (k, 3), [m]; None without one.
-        shortest: Length of the shortest path seen, [m].
     """
 
     def __init__(self, settings: OptimalSettings) -> None:
@@ -40,7 +39,6 @@ class LengthLimit:
         self._rounds = 0
         self._least = math.inf
         self.path: Array | None = None
-        self.shortest = math.inf
 
     def after_round(self, problem: Problem, search: Search) -> None:
         """Looks at the best path, and changes λ when it is time to."""
@@ -48,7 +46,6 @@ class LengthLimit:
             return
         path = search.points[BEST, : search.counts[BEST, 0]].copy()
         length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-        self.shortest = min(self.shortest, length)
         short_enough = length <= self._settings.longest
         if short_enough:
             self._keep(problem, path)
@@ -59,10 +56,7 @@ class LengthLimit:
     def _keep(self, problem: Problem, path: Array) -> None:
         """Keeps a path if it is the best by the objective alone."""
         set_weights(problem, self._settings.weights)
-        points = np.zeros((len(path), 3))
-        points[:] = path
-        line = Polyline(points, np.zeros((len(path), 3)), np.array([len(path), 0]))
-        cost = float(measure(problem, line))
+        cost = float(measure(problem, polyline_of(path)))
         if cost < self._least:
             self._least, self.path = cost, path
         self._set(problem)

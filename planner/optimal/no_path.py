@@ -13,7 +13,7 @@ from cdpr.scene import Scene
 from planner.exact.checks import edge_problem
 from planner.exact.edge import edge_clearance
 from planner.optimal.problem import Problem
-from planner.optimal.search import Search
+from planner.optimal.search import BEST, Search
 from planner.optimal.separation import is_separated
 from planner.optimal.settings import OptimalSettings
 from planner.paper.limits import REASONS
@@ -38,8 +38,8 @@ def no_path(
         "seed": float(settings.seed),
     }
     where = f"scene {scene.name}"
-    if search.totals[4] > 0:
-        return _too_long(where, settings, values)
+    if search.costs[BEST] < np.inf:
+        return _too_long(where, search, settings, values)
     gap = _gap(search)
     values["best_distance_mm"] = gap * 1e3
     if is_separated(problem.world, search.ends[0], search.ends[1]):
@@ -66,15 +66,20 @@ def no_path(
     )
 
 
-def _too_long(where: str, settings: OptimalSettings, values: dict[str, float | str]) -> NoSolution:
+def _too_long(
+    where: str, search: Search, settings: OptimalSettings, values: dict[str, float | str]
+) -> NoSolution:
     limit = settings.longest * 1e3
+    path = search.points[BEST, : search.counts[BEST, 0]]
+    found = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) * 1e3
+    straight = float(np.linalg.norm(search.ends[1] - search.ends[0])) * 1e3
     return NoSolution(
         f"no path of at most {limit:.1f} mm was found",
         where=where,
-        why="the paths found are longer",
+        why=f"the path found has {found:.1f} mm, and the straight way {straight:.1f} mm",
         next_step="allow a longer path, or raise --budget-ms; `--cost length` tells how short"
         " paths can be",
-        values={**values, "longest_mm": limit},
+        values={**values, "longest_mm": limit, "found_mm": found},
     )
 
 
@@ -106,7 +111,7 @@ def _in_the_way(rig: Rig, scene: Scene, problem: Problem, search: Search) -> str
     if not reasons:
         return "no edge from start or goal was refused"
     listed = ", ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
-    text = f"{_TRIED} edges from start and goal were refused for: {listed}"
+    text = f"of {_TRIED} edges tried from start and goal were refused for: {listed}"
     if pairs:
         named = ", ".join(f"{pair} ({count})" for pair, count in pairs.most_common(3))
         text += f"; most often in the way: {named}"

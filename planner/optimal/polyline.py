@@ -70,11 +70,9 @@ class Polyline(NamedTuple):
     counts: Integers
 
 
-def empty_polyline() -> Polyline:
-    """A polyline without vertices."""
-    return Polyline(
-        np.zeros((MOST_VERTICES, 3)), np.zeros((MOST_VERTICES, 3)), np.zeros(2, dtype=np.int64)
-    )
+def polyline_of(points: Array) -> Polyline:
+    """A polyline of vertices, shape (k, 3), [m], not measured and with no room for more."""
+    return Polyline(points.copy(), np.zeros((len(points), 3)), np.array([len(points), 0]))
 
 
 @kernel

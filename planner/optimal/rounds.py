@@ -33,7 +33,7 @@ _TRIALS, _SLOW_TRIALS = 400, 100
 _SAMPLES = 1000
 _COARSE, _MIDDLE = 4, 2
 _SPREAD = 1.0
-_FINE, _FINE_FOR_LENGTH = 5, 9
+_FINE, _FINE_FOR_LENGTH = 1, 9
 """Which of the first paths comes from all points of the grid; it takes longest where the cost is
 not the length, and finds the narrow ways that matter then."""
 _ANOTHER_EVERY = 8

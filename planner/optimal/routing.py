@@ -15,9 +15,10 @@ from cdpr.scene import Scene
 from planner.cost import KinematicCost
 from planner.optimal.length_limit import LengthLimit
 from planner.optimal.no_path import no_path
+from planner.optimal.polyline import measure, polyline_of
 from planner.optimal.preparation import problem_of
 from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, Problem
-from planner.optimal.rounds import advance
+from planner.optimal.rounds import advance, measure_again
 from planner.optimal.search import BEST, Search, new_search
 from planner.optimal.settings import OptimalSettings, Weights
 from planner.route import Progress, Route
@@ -77,7 +78,7 @@ def optimal_route(
     problem = problem_of(rig, scene, settings.weights, kinematic)
     start, goal = np.array(scene.start.position), np.array(scene.goal.position)
     search = new_search(start, goal, settings.seed)
-    advance(problem, search, 0)  # compiled code is made, or loaded, when it is first called
+    _load(problem, search)
     prepared = clock()
     path = _improved(problem, search, settings, prepared, progress, clock)
     if path is None:
@@ -92,6 +93,13 @@ def optimal_route(
         edge_checks=int(search.totals[2] + search.grown[2] + search.counts[:, 1].sum()),
     )
     return OptimalRoute(route, route.iterations, prepared - began, clock() - prepared)
+
+
+def _load(problem: Problem, search: Search) -> None:
+    """Calls what the rounds call: machine code is made, or loaded, when it is called first."""
+    advance(problem, search, 0)
+    measure_again(problem, search)
+    measure(problem, polyline_of(search.ends))
 
 
 def _improved(
