@@ -115,4 +115,4 @@ def test_a_limit_below_the_shortest_path_is_told(gachon, ready_scene) -> None:
     with pytest.raises(NoSolution, match=r"no path of at most 600\.0 mm was found") as nothing:
         make_plan(gachon, ready_scene("environment_1"), settings)
     assert "the straight way 518.8 mm" in str(nothing.value)
-    assert 628.0 < nothing.value.values["found_mm"] < 900.0
+    assert nothing.value.values["found_mm"] > 600.0
