@@ -271,6 +271,7 @@ def facts_of(document: PlanDocument) -> dict[str, Any]:
 
 def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
     """What a plan is, for people."""
+    from cdpr.cli.rotation_facts import rotation_facts
     from cdpr.cli.stops import stop_facts
     from cdpr.scene import scene_from_document
 
@@ -284,6 +285,7 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
             f" {quality.raw_length_mm:.1f} mm before post-processing)",
         ),
     ]
+    facts += rotation_facts(document)
     near = quality.obstacle_clearance
     if near is not None:
         facts.append(("clearance", f"{near.distance_mm:.2f} mm, {near.first} to {near.second}"))

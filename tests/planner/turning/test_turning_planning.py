@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cdpr.cli.plan import plan as plan_verb
+from cdpr.cli.plan import sentences_of
 from cdpr.cli.plan_options import CostName
 from cdpr.errors import BadInput, InvalidFile, NoSolution
 from cdpr.plan import load_plan, plan_from_document, save_plan
@@ -50,6 +51,10 @@ def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> 
         assert judge.fault(start, end, 40) == ""
     assert document.quality.length_mm < 800.0
     assert document.planner.name == "turning"
+    told = dict(sentences_of(document))["rotation"]
+    tilt = float(told.removeprefix("tilted up to ").split("°")[0])
+    assert 6.0 <= tilt <= 8.0
+    assert "turned up to" in told
     assert document.planner.rounds == [60]
 
 
@@ -90,6 +95,8 @@ def test_where_nothing_is_in_the_way_the_single_move_is_the_path() -> None:
     scene = turning("environment_1", 8.0, 2.0, goal=goal, obstacles=[])
     route = turning_route(GACHON, scene, ROUNDS)
     assert route.rounds == 1
+    level = make_plan(GACHON, scene.changed(goal=Pose.level([0.06, 0.04, 0.43])), ROUNDS)
+    assert "rotation" not in dict(sentences_of(level))
     assert len(route.route.path) == 2
 
 
