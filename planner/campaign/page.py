@@ -37,11 +37,12 @@ _QUANTITIES = {
     "clearance_mm": "true smallest clearance [mm]",
 }
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 80rem; margin: 2rem auto; padding: 0 1rem;
   color: #20242b; background: #fff; }
 table { border-collapse: collapse; margin: 1rem 0; font-size: 13px; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid #dde1e7; text-align: left; }
 td + td { font-variant-numeric: tabular-nums; }
+p { max-width: 62rem; }
 img { max-width: 100%; }
 th { vertical-align: bottom; }
 .wide { overflow-x: auto; }
