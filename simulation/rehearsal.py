@@ -181,18 +181,18 @@ class Rehearsal:
         while not stop_requested():
             message = self._heard()
             now = clock()
-            if message is None:
-                idle = min(now - last, self._cycle)
-                self._advance(idle)
-                passed, last = passed + idle, now
-                if on_status is not None and now - told >= status_period:
-                    told = now
-                    on_status(self.status())
-                continue
-            if message.arbitration_id == SYNC_ID:
+            if message is not None and message.arbitration_id == SYNC_ID:
                 self._advance(self._cycle - passed)
                 passed, last = 0.0, now
-            self._handle(message)
+            else:  # time passes whatever else is said on the bus
+                waited = min(now - last, self._cycle)
+                self._advance(waited)
+                passed, last = passed + waited, now
+            if message is not None:
+                self._handle(message)
+            elif on_status is not None and now - told >= status_period:
+                told = now
+                on_status(self.status())
 
     def _heard(self) -> can.Message | None:
         """The next frame; none while the interface is down."""

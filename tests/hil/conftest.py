@@ -147,6 +147,7 @@ class Rig:
         folder: For run folders.
         drives: `cdpr sim`.
         ear: A listener on the bus.
+        started: Every run that was started.
     """
 
     channel: str
@@ -154,16 +155,16 @@ class Rig:
     folder: Path
     drives: Program
     ear: can.BusABC
+    started: list[Program]
 
     def run(self, name: str = "run") -> Program:
         """Starts `cdpr run`."""
-        return Program(
-            self.folder / f"{name}.txt",
-            (
-                *("run", self.plan, "--rig", RIG, "-o", self.folder / name, "--no-camera"),
-                *("--interface", "socketcan", "--channel", self.channel, "--yes", "--json"),
-            ),
+        words = (
+            *("run", self.plan, "--rig", RIG, "-o", self.folder / name, "--no-camera"),
+            *("--interface", "socketcan", "--channel", self.channel, "--yes", "--json"),
         )
+        self.started.append(Program(self.folder / f"{name}.txt", words))
+        return self.started[-1]
 
     def summary(self, name: str = "run") -> dict[str, Any]:
         """What a run left behind."""
@@ -204,16 +205,18 @@ class Rig:
 def _drives(channel: str, plan: Path, folder: Path) -> Iterator[Rig]:
     bus = ("--interface", "socketcan", "--channel", channel)
     drives = Program(folder / "drives.txt", ("sim", RIG, *bus, "--plan", plan))
+    started: list[Program] = []
     try:
         with open_bus(BusSettings("socketcan", channel)) as ear:
             greeting = ear.recv(LISTENS_FOR_S)  # the boot-up message of the first drive
             assert greeting is not None, drives.said.read_text()
-            yield Rig(channel, plan, folder, drives, ear)
+            yield Rig(channel, plan, folder, drives, ear, started)
         assert drives.is_running, drives.said.read_text()
         drives.send(signal.SIGINT)
         assert drives.ended() == 0, drives.said.read_text()
     finally:
-        drives.close()
+        for program in (*started, drives):
+            program.close()
 
 
 @pytest.fixture

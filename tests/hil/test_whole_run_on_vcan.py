@@ -54,7 +54,6 @@ def whole_run(drives_at: Callable[[Path], Any], plan: Path, trace: Path, tell: T
     with drives_at(plan) as rig:
         running = rig.run()
         code = running.ended()
-        running.close()
         assert code == 0, running.said.read_text()
         summary = rig.summary()
         assert rig.states() == {DriveState.QUICK_STOP_ACTIVE}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import threading
 from collections.abc import Iterator
 
+import can
 import numpy as np
 import pytest
 
@@ -146,6 +148,39 @@ def test_served_drives_stop_by_themselves_when_the_master_is_gone(
     assert told[0].states == (DriveState.OPERATION_ENABLED,) * 8
     assert told[-1].states == (DriveState.QUICK_STOP_ACTIVE,) * 8
     assert told[-1].pose.distance_to(rig.home) < 1e-5
+
+
+def test_other_frames_on_the_bus_do_not_hold_the_time_outs_up(
+    rig: Rig, channel: BusSettings
+) -> None:
+    """A tool that reads objects all the time must not keep a dead master's drives moving."""
+    stop = threading.Event()
+    with open_bus(channel) as master, open_bus(channel) as bus:
+        rehearsal = Rehearsal(rig, bus, rig.home)
+        group = make_drive_group(rig, master, rehearsal.pump)
+        enabled(rig, group, rehearsal)
+        for _ in range(100):  # the bus is never idle
+            master.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+        clock = ManualTime(stop, readings=50, step=0.001)
+        rehearsal.serve(stop.is_set, clock=clock)
+        assert {d.state for d in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
+
+
+@pytest.mark.parametrize("happens", ["hearing", "sending"])
+def test_an_interface_that_goes_down_is_silence_to_served_drives(
+    rig: Rig, channel: BusSettings, monkeypatch: pytest.MonkeyPatch, happens: str
+) -> None:
+    def down(*_: object) -> None:
+        raise can.CanOperationError("Network is down", errno.ENETDOWN)
+
+    stop = threading.Event()
+    with open_bus(channel) as master, open_bus(channel) as bus:
+        rehearsal = Rehearsal(rig, bus, rig.home)
+        group = make_drive_group(rig, master, rehearsal.pump)
+        enabled(rig, group, rehearsal)
+        monkeypatch.setattr(bus, "recv" if happens == "hearing" else "send", down)
+        rehearsal.serve(stop.is_set, clock=ManualTime(stop, readings=20, step=0.005))
+        assert {d.state for d in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
 
 
 def test_serving_ends_quietly_on_an_interrupt_from_the_keyboard(
