@@ -38,7 +38,7 @@ def demo(
     from executor.run_folder import RunFolder
     from planner.optimal.settings import OptimalSettings
 
-    folder = output or _free_folder()
+    folder = output or free_folder("demo")
     RunFolder.require_free(folder)
     rig = load_rig(configs() / RIG)
     scene = load_scene(configs() / f"environment_{environment}.yaml")
@@ -72,8 +72,8 @@ def configs() -> Path:
     return inside if inside.is_dir() else package.parent / "configs"
 
 
-def _free_folder() -> Path:
-    """``runs/demo``, or with the first free number; makes ``runs`` where it is missing."""
+def free_folder(name: str) -> Path:
+    """``runs/NAME``, or with the first free number; makes ``runs`` where it is missing."""
     from itertools import count
 
     from cdpr.errors import BadInput
@@ -88,5 +88,5 @@ def _free_folder() -> Path:
             why=error.strerror or str(error),
             next_step="change to a folder that you may write to, or name one with -o",
         ) from None
-    names = (runs / ("demo" if n == 1 else f"demo-{n}") for n in count(1))
+    names = (runs / (name if n == 1 else f"{name}-{n}") for n in count(1))
     return next(path for path in names if not path.exists())

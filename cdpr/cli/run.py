@@ -124,12 +124,13 @@ def rig_on_bus(path: Path, interface: str | None, channel: str | None) -> Rig:
     return rig_from_document(document.model_copy(update={"bus": bus}))
 
 
-def _simulated_start(
-    start_mm: tuple[float, float, float] | None, in_process: bool, fast: bool
-) -> Pose | None:
-    from cdpr.document_types import millimetres
+def require_own_time(fast: bool, in_process: bool) -> None:
+    """Only drives that are simulated in this process can go faster than time.
+
+    Raises:
+        BadInput: Others were to.
+    """
     from cdpr.errors import BadInput
-    from cdpr.poses import Pose
 
     if fast and not in_process:
         raise BadInput(
@@ -138,6 +139,16 @@ def _simulated_start(
             why="time on a real bus cannot be made faster",
             next_step="leave --fast out, or use the interface 'virtual'",
         )
+
+
+def _simulated_start(
+    start_mm: tuple[float, float, float] | None, in_process: bool, fast: bool
+) -> Pose | None:
+    from cdpr.document_types import millimetres
+    from cdpr.errors import BadInput
+    from cdpr.poses import Pose
+
+    require_own_time(fast, in_process)
     if start_mm is None:
         return None
     if not in_process:

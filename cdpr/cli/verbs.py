@@ -11,6 +11,7 @@ from cdpr.cli import bench
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
+from cdpr.cli.jog import jog
 from cdpr.cli.monitor import monitor
 from cdpr.cli.operate import hold, resume, speed
 from cdpr.cli.plan import plan
@@ -34,6 +35,7 @@ VERBS = (
     speed,
     monitor,
     reset,
+    jog,
     track,
     sim,
     report,

@@ -1,0 +1,197 @@
+"""`cdpr jog`: moves the platform a little, straight, slowly, from where it stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from cdpr.plan_file import PlanDocument
+    from cdpr.poses import Pose
+    from cdpr.rig import Rig
+    from cdpr.scene import Scene
+
+#: A jog is no longer than this, [mm], and no faster than that, [mm/s].
+LONGEST_MM, FASTEST_MM_S = 50.0, 20.0
+
+
+def jog(
+    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    by_mm: Annotated[
+        tuple[float, float, float], typer.Option("--by-mm", help="how far: x y z, at most 50 mm")
+    ],
+    scene: Annotated[
+        Path | None, typer.Option(help="what is in the way, and what the platform carries")
+    ] = None,
+    no_scene: Annotated[
+        bool, typer.Option("--no-scene", help="jog although nobody says what is in the way")
+    ] = False,
+    clearance_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
+    ] = None,
+    speed_mm_s: Annotated[
+        float, typer.Option(min=0.1, max=FASTEST_MM_S, help="at most the rig's own speed")
+    ] = 5.0,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="run folder to make (default: runs/jog, runs/jog-2 …)"),
+    ] = None,
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the rig file's")
+    ] = None,
+    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")] = False,
+    without_real_time: Annotated[
+        bool,
+        typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
+) -> None:
+    """Move the platform straight by a few millimetres, slowly, from where it stands.
+
+    A jog is a run: planned, proved, checked and gated like any other, and it can be stopped, held
+    and watched. With the interface 'virtual' the simulated platform hangs at home.
+
+    [dim]Example:[/dim]
+
+      cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
+    """
+    from cdpr.cli.demo import free_folder
+    from cdpr.cli.drives import IN_PROCESS
+    from cdpr.cli.run import ask_operator, exit_code, prepared_run, require_own_time, rig_on_bus
+    from cdpr.cli.run_motion import require_released, run_prepared
+    from cdpr.cli.run_summary import show_prepared, show_summary
+    from cdpr.plan import save_plan
+    from executor.run_folder import RunFolder
+
+    the_rig = _slow(rig_on_bus(rig, interface, channel), speed_mm_s)
+    in_process = the_rig.document.bus.interface == IN_PROCESS
+    require_own_time(fast, in_process)
+    _require_short(by_mm)
+    the_scene = _scene(scene, no_scene, clearance_mm, the_rig)
+    folder = output or free_folder("jog")
+    RunFolder.require_free(folder)
+    require_released(the_rig)
+    start = the_rig.home if in_process else _where_it_stands(the_rig, the_scene)
+    document = _straight(the_rig, the_scene, start, by_mm, not as_json)
+    with TemporaryDirectory(prefix="cdpr-jog-") as temporary:
+        plan = Path(temporary) / "plan.json"
+        save_plan(document, plan)
+        prepared = prepared_run(plan, the_rig, quiet=as_json)
+    if not as_json:
+        show_prepared(prepared, in_process)
+    if not (in_process or yes):
+        ask_operator("Move the platform now?", "nothing was moved")
+    summary = run_prepared(
+        prepared,
+        folder,
+        None,
+        fast=fast,
+        start=start,
+        without_real_time=without_real_time,
+        quiet=as_json,
+    )
+    show_summary(summary, folder, as_json)
+    raise typer.Exit(exit_code(summary))
+
+
+def _slow(rig: Rig, speed_mm_s: float) -> Rig:
+    """The same rig with a lower speed; plans do not rest on it."""
+    from cdpr.rig import rig_from_document
+
+    document = rig.document
+    slower = min(speed_mm_s, document.motion.speed_mm_s)
+    motion = document.motion.model_copy(update={"speed_mm_s": slower})
+    return rig_from_document(document.model_copy(update={"motion": motion}))
+
+
+def _require_short(by_mm: tuple[float, float, float]) -> None:
+    import math
+
+    from cdpr.errors import BadInput, Refused
+
+    length = math.hypot(*by_mm)
+    if not 0.0 < length < math.inf:
+        raise BadInput(
+            "that is no way to go", where="--by-mm", next_step="give x y z in mm, not all 0"
+        )
+    if length > LONGEST_MM:
+        raise Refused(
+            f"a jog of {length:.1f} mm is longer than {LONGEST_MM:g} mm",
+            where="--by-mm",
+            why="a longer way is planned around what is in it",
+            next_step="jog less far, or plan a path from here with `cdpr plan --start-mm`",
+        )
+
+
+def _scene(path: Path | None, without: bool, clearance_mm: float | None, rig: Rig) -> Scene:
+    """What is around; nothing only when somebody says so."""
+    from cdpr.document_types import PoseDocument
+    from cdpr.errors import BadInput
+    from cdpr.scene import load_scene, scene_from_document
+    from cdpr.scene_file import SceneDocument
+
+    if (path is None) != without:
+        raise BadInput(
+            "say what is in the way: either --scene SCENE or --no-scene",
+            where="--scene",
+            next_step="pass --scene with the file, or --no-scene if there is nothing to hit",
+        )
+    if path is None:
+        home = PoseDocument.of(rig.home)
+        document = SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
+        scene = scene_from_document(document)
+    else:
+        scene = load_scene(path).changed(stops=())
+    clearance = None if clearance_mm is None else clearance_mm / 1000.0
+    return scene.changed(clearance=clearance)
+
+
+def _where_it_stands(rig: Rig, scene: Scene) -> Pose:
+    """Asks the drives; none of them is enabled for it."""
+    import numpy as np
+
+    from cdpr.cli.drives import open_drives
+    from executor.standing_pose import standing_pose
+
+    with open_drives(rig, rig.home, scene.load) as drives:
+        positions = drives.group.read_positions().positions
+    return standing_pose(rig, np.array(positions, dtype=np.float64), scene.load)
+
+
+def _straight(
+    rig: Rig, scene: Scene, start: Pose, by_mm: tuple[float, float, float], shown: bool
+) -> PlanDocument:
+    """A plan that goes straight there.
+
+    Raises:
+        CdprError: Start or goal cannot be used.
+        Refused: Something is in the straight way.
+    """
+    import math
+
+    from cdpr.cli.plan import planned
+    from cdpr.document_types import millimetres
+    from cdpr.errors import Refused
+    from cdpr.poses import Pose
+    from planner.optimal.settings import OptimalSettings
+
+    goal = Pose(start.position + millimetres(list(by_mm)), start.rotation)
+    way = scene.changed(start=start, goal=goal)
+    document = planned(rig, way, OptimalSettings(seed=0, rounds=1), shown)
+    straight = math.hypot(*by_mm)
+    if document.quality.length_mm > straight + 0.01:
+        raise Refused(
+            f"the straight way of {straight:.1f} mm is not free; the way around is"
+            f" {document.quality.length_mm:.1f} mm",
+            where="--by-mm",
+            why="cables or platform would come too near to something on the straight way",
+            next_step="jog another way, or plan a path with `cdpr plan --start-mm`",
+        )
+    return document

@@ -1,0 +1,65 @@
+"""Where the platform stands, found again from the drive positions that hold it there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdpr.cables import cables_at
+from cdpr.errors import CdprError
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+from cdpr.rig import Rig, load_rig
+from cdpr.scene import load_from_document
+from cdpr.scene_file import LoadDocument
+from cdpr.statics.working import working_tensions
+from cdpr.winches import WinchMap
+from executor.standing_pose import standing_pose
+from tests.cli.plans import HALL, RIG
+
+LOAD = load_from_document(LoadDocument())
+PAPER, HALL_RIG = load_rig(RIG), load_rig(HALL)
+shares = st.tuples(*[st.floats(0.2, 0.8)] * 3)
+turns = st.tuples(*[st.floats(-0.03, 0.03)] * 3)
+
+
+def planned_counts(rig: Rig, pose: Pose) -> Array:
+    """As the set-point table makes them."""
+    winches = WinchMap(rig)
+    tensions = working_tensions(rig, pose, LOAD).tensions
+    return np.rint(winches.counts(winches.unstrained(cables_at(rig, pose).lengths, tensions)))
+
+
+@pytest.mark.parametrize("rig", [PAPER, HALL_RIG], ids=["paper", "hall"])
+@given(share=shares, turn=turns)
+@settings(max_examples=15)
+def test_a_pose_is_found_again_from_its_drive_positions(rig, share, turn):
+    place = rig.workspace_lower + np.array(share) * (rig.workspace_upper - rig.workspace_lower)
+    pose = Pose(place, matrix_from_rotation_vector(np.array(turn)))
+    try:
+        counts = planned_counts(rig, pose)
+    except CdprError:  # the cables cannot hold this one
+        return
+    found = standing_pose(rig, counts, LOAD)
+    assert found.distance_to(pose) < 2e-5
+    assert found.angle_to(pose) < 2e-4
+
+
+def test_home_is_where_all_drives_are_at_home():
+    home = np.array([winch.home_counts for winch in PAPER.winches], dtype=np.float64)
+    assert standing_pose(PAPER, home, LOAD).distance_to(PAPER.home) < 1e-6
+
+
+@pytest.mark.parametrize("cable", range(8))
+def test_positions_of_a_drive_that_lost_its_reference_fit_no_pose(cable):
+    counts = planned_counts(PAPER, PAPER.home)
+    counts[cable] += 0.1 * PAPER.winches[cable].counts_per_metre
+    with pytest.raises(CdprError, match=r"fit no pose|no pose fits|cannot"):
+        standing_pose(PAPER, counts, LOAD)
+
+
+def test_a_pose_outside_the_workspace_is_refused():
+    outside = Pose.level(PAPER.workspace_upper + np.array([0.005, 0.0, -0.1]))
+    with pytest.raises(CdprError, match="fit no pose of the workspace"):
+        standing_pose(PAPER, planned_counts(PAPER, outside), LOAD)

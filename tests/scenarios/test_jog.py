@@ -1,0 +1,89 @@
+"""Jogging: a short, slow, straight run from where the platform stands, denied by default."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpr.rig import load_rig
+from drivers.cia402.states import DriveState
+from executor.prepare import PreparedRun
+from executor.run_folder import RunFolder
+from tests.cli.plans import RIG
+from tests.cli.program import call, one_message
+from tests.scenarios.test_real_time import drives_on
+
+WAY = ("--by-mm", "6", "0", "8")
+
+
+def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: Path) -> None:
+    run = tmp_path / "jog"
+    answer = call("jog", RIG, *WAY, "--no-scene", "--fast", "-o", run, "--json")
+    assert answer.code == 0, answer
+    summary = json.loads(answer.out)
+    assert summary["verdict"] == "PASSED"
+    assert summary["path_length_mm"] == pytest.approx(10.0, abs=1e-6)
+    folder = RunFolder.open(run)
+    assert folder.rig().motion.speed == pytest.approx(0.005)
+    cycles = folder.cycles()
+    speeds = np.linalg.norm(np.diff(cycles.planned, axis=0), axis=1) / 0.01
+    assert speeds.max() <= 0.005 * (1 + 1e-6)
+    goal = load_rig(RIG).home.position + np.array([0.006, 0.0, 0.008])
+    assert cycles.encoder[-1] == pytest.approx(goal, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "part"),
+    [
+        (("--by-mm", "30", "30", "30", "--no-scene"), 3, "longer than 50 mm"),
+        (("--by-mm", "0", "0", "0", "--no-scene"), 2, "no way to go"),
+        (("--by-mm", "nan", "0", "0", "--no-scene"), 2, "no way to go"),
+        (WAY, 2, "say what is in the way"),
+        ((*WAY, "--no-scene", "--scene", "scene.yaml"), 2, "say what is in the way"),
+        ((*WAY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
+    ],
+)
+def test_what_is_not_clearly_allowed_is_denied(
+    tmp_path: Path, options: tuple[str, ...], code: int, part: str
+) -> None:
+    run = tmp_path / "jog"
+    one_message(call("jog", RIG, *options, "-o", run), code, part)
+    assert not run.exists()
+
+
+def test_a_jog_into_an_obstacle_is_denied(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "schema_version: 1\nname: plate\nclearance: {obstacle_mm: 10, self_mm: 5}\n"
+        "start: {position_mm: [0, 0, 300]}\ngoal: {position_mm: [0, 0, 310]}\n"
+        "obstacles:\n"
+        "  - {name: plate, box: {size_mm: [60, 60, 10]}, position_mm: [0, 0, 540]}\n"
+    )
+    run = tmp_path / "jog"
+    answer = call("jog", RIG, "--by-mm", "0", "0", "20", "--scene", scene, "--fast", "-o", run)
+    assert answer.code in (1, 2, 3), answer
+    assert "plate" in answer.said
+    assert not run.exists()
+    away = call("jog", RIG, "--by-mm", "0", "0", "-10", "--scene", scene, "--fast", "-o", run)
+    assert away.code == 0, away
+
+
+@pytest.mark.slow
+def test_on_a_bus_it_begins_where_the_drives_stand_and_is_not_home(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    channel = f"239.74.163.24:{20000 + (os.getpid() * 13) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
+    with drives_on(channel, prepared) as rehearsal:
+        for number in (1, 2):
+            before = rehearsal.pose.position
+            run = tmp_path / f"jog-{number}"
+            answer = call("jog", RIG, "--by-mm", "5", "0", "0", "--no-scene", *bus, "-o", run)
+            assert answer.code == 0, answer
+            moved = rehearsal.pose.position - before
+            assert moved == pytest.approx([0.005, 0.0, 0.0], abs=5e-5)
+            assert {drive.state for drive in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
