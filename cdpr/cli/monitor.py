@@ -156,7 +156,7 @@ def _view(status: dict[str, Any]) -> Group:
         f"  {status['rig']} on {status['bus']}  process {status['process']}  {status['folder']}",
     )
     drives = Table("drive", "state", box=None, padding=(0, 2), header_style="dim")
-    for name in ("position [counts]", "off [counts]", "tension [N]"):
+    for name in ("position, counts", "off, counts", "tension, N"):
         drives.add_column(name, justify="right")
     for drive in status["drives"]:
         drives.add_row(
@@ -168,6 +168,7 @@ def _view(status: dict[str, Any]) -> Group:
         )
     events = Table(box=None, show_header=False, padding=(0, 2))
     for event in status["events"]:
-        events.add_row(f"{event['time_s']:.2f} s", event["code"], event["text"])
-    bar = ProgressBar(total=status["rows"], completed=status["row"] or 0.0, width=60)
+        events.add_row(f"{event['time_s']:.2f} s", event["code"], Text(event["text"]))
+    bar = Table.grid()
+    bar.add_row(ProgressBar(total=status["rows"], completed=status["row"] or 0.0, width=60))
     return Group(title, Text(_head(status)), bar, drives, events)
