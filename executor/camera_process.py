@@ -20,6 +20,18 @@ from executor.spawning import interrupts_blocked
 START_TIMEOUT = 60.0
 
 
+#: So many pictures without a pose mean that the camera looks elsewhere or the light is gone.
+BLIND_PICTURES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class _Progress:
+    """So many pictures were measured, so many of them gave a pose."""
+
+    measured: int
+    seen: int
+
+
 @dataclass(frozen=True, slots=True)
 class _Failure:
     """An error of the camera's process, as it travels to the parent."""
@@ -44,6 +56,7 @@ class CameraProcess:
         self.dropped = 0
         self.triggered = 0
         self._measured = 0
+        self._seen = 0
         self._may_wait = may_wait
         self._closed = False
         context = multiprocessing.get_context("spawn")
@@ -62,6 +75,11 @@ class CameraProcess:
             self.close()
             raise
 
+    @property
+    def sees_nothing(self) -> bool:
+        """So many pictures were measured, and none gave a pose."""
+        return self._measured >= BLIND_PICTURES and self._seen == 0
+
     def trigger(self, time: float, asked: float, true_pose: Pose | None) -> None:
         """Asks for a picture now.
 
@@ -75,8 +93,8 @@ class CameraProcess:
         """
         while self._link.poll():
             answer = self._receive()
-            if isinstance(answer, int):
-                self._measured = answer
+            if isinstance(answer, _Progress):
+                self._measured, self._seen = answer.measured, answer.seen
         if not self._may_wait and self._measured < self.triggered:
             self.dropped += 1
             return
@@ -95,7 +113,7 @@ class CameraProcess:
                 answer = self._receive()
                 if isinstance(answer, list):
                     return answer
-                progress(float(answer))
+                progress(float(answer.measured))
         finally:
             self.close()
 
@@ -118,7 +136,7 @@ class CameraProcess:
             while True:
                 self._receive()
 
-    def _receive(self) -> list[Look] | int:
+    def _receive(self) -> list[Look] | _Progress:
         try:
             answer = self._link.recv()
         except (EOFError, ConnectionResetError):
@@ -132,11 +150,13 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
     """The process: a picture a trigger, then all answers at once."""
     try:
         with make_observer() as observer:
-            link.send(0)
-            looks = []
+            link.send(_Progress(0, 0))
+            looks: list[Look] = []
+            seen = 0
             while (trigger := link.recv()) is not None:
                 looks.append(observer.look(trigger))
-                link.send(len(looks))
+                seen += looks[-1].pose is not None
+                link.send(_Progress(len(looks), seen))
             link.send(looks)
     except EOFError:
         return  # the parent is gone

@@ -125,6 +125,7 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
     from cdpr.cli.output import err, progress_bar
     from executor.command_server import serving
     from executor.recorder import Recorder
+    from executor.records import LoopEvent
     from executor.running import announced, stop_requests
     from executor.shared_board import SharedBoard
     from executor.status import RunStatus
@@ -144,11 +145,21 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
         open_camera(*camera_at, pictures, job.fast) as camera,
     ):
         with progress_bar("moving", rows, not job.quiet) as advance:
+            told: list[str] = []
+
+            def picture(time: float, asked: float, true_pose: Pose | None) -> None:
+                assert camera is not None
+                camera.trigger(time, asked, true_pose)
+                if camera.sees_nothing and not told:
+                    told.append("the camera saw no tags so far: is it where the rig file says?")
+                    recorder.take_event(LoopEvent(0, asked, "camera_sees_nothing", told[0]))
+                    err.print(f"[yellow]remark[/] {told[0]}", soft_wrap=True)
+
             recorder = Recorder(
                 prepared,
                 job.folder,
                 status,
-                trigger=camera.trigger if camera else None,
+                trigger=picture if camera else None,
                 every=max(1, round(1.0 / (rate * cycle))),
                 progress=advance,
                 announce=lambda text: None if job.quiet else err.print(text, markup=False),
