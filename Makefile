@@ -55,7 +55,7 @@ hil: install  ## Run the tests that need a CAN bus of the kernel, here or in a v
 	CDPR_HIL_PLAN="$$PWD/$(VENV)/hil-plan.json" "$(BIN)/python" tools/hil/run.py
 
 hil-subset: install  # those of them that CI has the time for
-	"$(BIN)/python" tools/hil/run.py --limit-s 360 -m "hil and not slow"
+	"$(BIN)/python" tools/hil/run.py --limit-s 600 -m "hil and not slow"
 
 lint: install  ## Check style, types, import contracts, and that the docs build without a warning
 	"$(BIN)/python" -m ruff check

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -37,7 +37,8 @@ for module in (
     *("scipy.optimize", "drivers.cia402.group"),
 ):
     import_module(module)
-ENDS_WITHIN_S = 120.0
+ENDS_WITHIN_S = 400.0
+AHEAD_OF_ALL = 80
 LISTENS_FOR_S = 60.0
 
 
@@ -67,6 +68,7 @@ def short_plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
 
 
@@ -114,6 +116,17 @@ class Program:
         self._process.join(ENDS_WITHIN_S)
         assert self._process.exitcode is not None, self.said.read_text()
         return self._process.exitcode
+
+    def put_ahead(self) -> None:
+        """Lets it run before everything else: drives are computers of their own.
+
+        With one processor for all, the kernel's work on a master that was killed would hold them
+        up. Where this is not allowed there are more processors.
+        """
+        assert self._process.pid is not None
+        with suppress(PermissionError):
+            priority = os.sched_param(AHEAD_OF_ALL)
+            os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, priority)
 
     @property
     def is_running(self) -> bool:
@@ -186,6 +199,7 @@ class Rig:
         while not (events.is_file() and '"moving"' in events.read_text()):
             assert running.is_running, running.said.read_text()
             self.wait_for_cycles(5, running)
+        self.drives.put_ahead()
 
     def read(self, index: int) -> list[int]:
         """An object of every drive, as any CANopen tool reads it."""

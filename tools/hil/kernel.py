@@ -65,7 +65,7 @@ def _apt(*command: str, folder: Path | None = None) -> str:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
     except FileNotFoundError as error:
         raise VmFailed(
-            f"{command[0]} is missing: the VM takes its kernel from Debian's or Ubuntu's packages;"
+            f"{command[0]} is missing: the virtual machine takes its kernel from Debian's packages;"
             " next: run on a machine whose kernel has vcan (sudo modprobe vcan)"
         ) from error
     except subprocess.CalledProcessError as error:
