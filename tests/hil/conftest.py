@@ -39,6 +39,7 @@ for module in (
     import_module(module)
 ENDS_WITHIN_S = 400.0
 AHEAD_OF_ALL = 80
+TRACE_BUFFER_BYTES = 2**27  # candump waits behind the programs that it listens to
 LISTENS_FOR_S = 60.0
 
 
@@ -78,7 +79,9 @@ def trace(request: pytest.FixtureRequest, channel: str, artefacts: Path) -> Iter
     path = artefacts / f"{request.node.name}.log"
     with (
         path.open("w") as file,
-        subprocess.Popen(["candump", "-L", channel], stdout=file) as candump,
+        subprocess.Popen(
+            ["candump", "-L", "-r", str(TRACE_BUFFER_BYTES), channel], stdout=file
+        ) as candump,
     ):
         yield path
         candump.terminate()
