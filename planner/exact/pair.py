@@ -28,7 +28,7 @@ from planner.exact.fields import (
 from planner.exact.hulls import hulls_apart, hulls_distance
 from planner.exact.pieces import BOX, MESH, ROUND
 from planner.exact.segment_box import segment_box_squared
-from planner.exact.triangle_box import triangle_box_squared
+from planner.exact.triangle_box import triangle_box_apart, triangle_box_squared
 from planner.exact.triangle_point import triangle_point_squared
 from planner.exact.triangle_segment import triangle_segment_squared
 from planner.exact.vectors import Vector, minus, plus, row, turned
@@ -42,7 +42,16 @@ def cable_apart(
 ) -> bool:
     """Whether the triangle of an exit and two anchors is ``needed`` [m] from a piece's surface."""
     kind = world.spans[piece, 0]
-    if kind in (BOX, ROUND):
+    if kind == BOX:
+        origin = centre(world, piece)
+        return triangle_box_apart(
+            in_frame(world, piece, minus(exit, origin)),
+            in_frame(world, piece, minus(b, origin)),
+            in_frame(world, piece, minus(c, origin)),
+            box_half(world, piece),
+            needed + ball(world, piece),
+        )
+    if kind == ROUND:
         return cable_squared(world, piece, exit, b, c) >= (needed + ball(world, piece)) ** 2
     swept = np.empty((3, 3))
     swept[0], swept[1], swept[2] = exit, b, c

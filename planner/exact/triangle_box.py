@@ -33,12 +33,16 @@ def triangle_box_squared(a: Vector, b: Vector, c: Vector, half: Vector) -> float
 
 @kernel
 def triangle_box_apart(a: Vector, b: Vector, c: Vector, half: Vector, needed: float) -> bool:
-    """Whether triangle and box are at least ``needed`` apart, [m]."""
+    """Whether triangle and box are at least ``needed`` apart, [m].
+
+    The side of c and a comes first: where a search asks for a way to somewhere, it is the cable at
+    its end, which most often is the one in the way.
+    """
     squared = needed * needed
     return (
-        segment_box_squared(b, c, half) >= squared
+        segment_box_squared(c, a, half) >= squared
+        and segment_box_squared(b, c, half) >= squared
         and segment_box_squared(a, b, half) >= squared
-        and segment_box_squared(c, a, half) >= squared
         and _face_box_squared(a, b, c, half) >= squared
     )
 
