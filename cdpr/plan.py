@@ -86,6 +86,7 @@ def load_plan(path: Path) -> Plan:
     except ValidationError as error:
         raise InvalidFile(str(path), problems_of(error, PlanDocument, {}), ANEW) from None
     _check_hash("hash", document.hash, _digest(data), path)
+    _check_whole(document, path)
     plan = plan_from_document(document)
     _check_hash("rig_hash", document.rig_hash, plan.rig.plan_hash, path)
     _check_hash("scene_hash", document.scene_hash, plan.scene.hash, path)
@@ -145,6 +146,17 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _digest(data: dict[str, Any]) -> str:
     return content_hash({key: value for key, value in data.items() if key != "hash"})
+
+
+def _check_whole(document: PlanDocument, path: Path) -> None:
+    """Nothing was filled in: a copy of the plan in a run folder would not be the same file."""
+    if document.hash != _digest(document.model_dump(mode="json")):
+        raise BadInput(
+            "the plan lacks keys that this program writes",
+            where=str(path),
+            why="it was made by another version of the program",
+            next_step=ANEW,
+        )
 
 
 def _check_hash(key: str, stated: str, actual: str, path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cdpr.poses import Array
-from drivers.drive_group import CycleStatus, DriveGroup, GroupState
+from drivers.drive_group import WHOLE_BUS, CycleStatus, DriveGroup, GroupState
 from executor.clock import Clock
 from executor.course import Course
 from executor.safety.gate import Purpose, Request, Verdict, examine
@@ -121,11 +121,15 @@ class Exchange:
             following_errors=errors.tolist(),
             tensions=(np.asarray(status.torques) / 1000.0 * self._rated).tolist(),
             missing=[bool(m) for m in status.missing],
-            faults=[f"node {node}: {text}" for node, text in status.faults],
+            faults=[_named(node, text) for node, text in status.faults],
             lateness=lateness,
         )
         self._watch, findings = self._watch.look(seen)
         return findings
+
+
+def _named(node: int, text: str) -> str:
+    return text if node == WHOLE_BUS else f"node {node}: {text}"
 
 
 def _largest(errors: Array) -> float:

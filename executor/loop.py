@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cdpr.errors import Refused
+from cdpr.errors import CdprError, Refused
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
 from executor.arming import require_at_start, require_capabilities, require_unchanged
 from executor.clock import Clock
@@ -89,6 +89,8 @@ class Loop:
             self.machine.on(Event.ENABLE)
             while self.machine.state in _ACTIVE:
                 self._one_step()
+        except CdprError as error:
+            self._fault(error.code, error.what)
         except Exception as error:
             self._fault("broken", f"the loop broke: {type(error).__name__}: {error}")
             self._tell("traceback", traceback.format_exc())

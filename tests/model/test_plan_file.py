@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdpr.document_types import PoseDocument
+from cdpr.documents import content_hash
 from cdpr.errors import BadInput, CdprError, InvalidFile
 from cdpr.plan import load_plan, plan_from_document, save_plan, sealed
 from cdpr.plan_file import PlanDocument
@@ -180,6 +181,13 @@ def test_a_plan_with_a_key_less_or_more_is_refused(
     else:
         del holder_of(data, path)[path[-1]]
     refused(json.dumps(data), tmp_path_factory.mktemp("keys"))
+
+
+def test_a_plan_of_a_version_that_knew_less_is_refused(tmp_path: Path) -> None:
+    """Its own hash is right; a run folder's copy, with what was filled in, would have another."""
+    data = {key: value for key, value in DATA.items() if key not in ("hash", "done")}
+    data["hash"] = content_hash(data)
+    assert "another version" in refused(json.dumps(data), tmp_path).why
 
 
 @pytest.mark.parametrize("key", ["waypoints", "raw_path"])

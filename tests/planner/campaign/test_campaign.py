@@ -236,7 +236,7 @@ class Reader(HTMLParser):
     def handle_starttag(self, tag, attrs) -> None:
         if tag == "img":
             self.pictures.append(dict(attrs)["src"])
-        elif tag != "meta":
+        elif tag not in ("meta", "br"):
             self.open.append(tag)
 
     def handle_endtag(self, tag) -> None:
