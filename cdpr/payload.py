@@ -46,7 +46,7 @@ class Payload:
         away = [
             abs(a - b) for a, b in zip(centre_mm or self.centre_mm, self.centre_mm, strict=True)
         ]
-        if max(away) > 1e-3:
+        if max(away) > SAME_PLACE_MM:
             x, y, z = self.centre_mm
             raise ValueError(
                 f"puts down all that is carried, and its centre is at [{x:g}, {y:g}, {z:g}] mm"

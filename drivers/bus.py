@@ -33,6 +33,24 @@ MIN_TRANSMIT_QUEUE = 64
 INTERFACES = Path("/sys/class/net")
 
 
+class SentFrame(can.Message):
+    """A classic frame that nobody changes once it is made.
+
+    So copies may share its data; python-can's virtual bus makes one for every listener, and whole
+    ones would take as long as all else that a simulated drive does.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, can_id: int, data: bytes | bytearray) -> None:
+        """Holds data for an 11-bit identifier."""
+        super().__init__(arbitration_id=can_id, data=data, is_extended_id=False)
+
+    def __deepcopy__(self, memo: object) -> can.Message:
+        """A message of its own with the same data."""
+        return self.__copy__()
+
+
 @dataclass(frozen=True, slots=True)
 class BusSettings:
     """How a bus is opened.

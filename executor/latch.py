@@ -97,7 +97,10 @@ class Latch:
 
     def release(self) -> None:
         """Drives may be moved again."""
-        self.path.unlink(missing_ok=True)
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._not_kept(error.strerror or str(error)) from None
 
     def _latched(self, rig: str, cause: str, folder: Path) -> Latched:
         now = datetime.now(UTC).isoformat(timespec="seconds")

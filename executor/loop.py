@@ -60,6 +60,7 @@ class Loop:
         self._exchange = Exchange(course, group, clock)
         self._feed = Feed(len(course), course.cycle, course.rig.motion)
         self._cycle = 0
+        self._taken_over = False
         self._told: set[tuple[str, int]] = set()
         self._listener_error = ""
         self.cause = ""
@@ -124,6 +125,7 @@ class Loop:
         if not verdict.allowed:
             self._fault("gate_denied", f"the drives hold elsewhere: {verdict.reason}")
             return
+        self._taken_over = True
         self.machine.on(Event.ENABLED)
         self._tell("enabled", "all drives are enabled and hold")
 
@@ -155,7 +157,8 @@ class Loop:
     def _secure(self) -> None:
         """Settles, then lets the drives hold by themselves, and waits until they say so."""
         was_enabled = self._group.state is GroupState.ENABLED
-        for _ in range(SETTLING if was_enabled else 0):
+        # Before they were taken over, drives hold targets of their own: no set-point may move them.
+        for _ in range(SETTLING if was_enabled and self._taken_over else 0):
             self._send(Purpose.HOLD, self._exchange.resting_targets)
             if self.machine.state is not State.SECURING:
                 return

@@ -27,6 +27,10 @@ from executor.ring import Ring
 from executor.shared_board import Supervised
 from executor.wire import RecordWire, pack_event
 
+_FROM_A_TERMINAL = (
+    signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU
+)  # fmt: skip
+
 
 def serve(job: Job, link: Connection, supervisor: int) -> None:
     """What the process does; it ends with the drives holding by themselves, whatever happens.
@@ -37,8 +41,9 @@ def serve(job: Job, link: Connection, supervisor: int) -> None:
         supervisor: Number of its process.
     """
     supervised = Supervised(job.board, supervisor)
-    # Ctrl-C and a closed terminal are the supervisor's to decide on; it tells by the board.
-    for number in (signal.SIGINT, signal.SIGHUP):
+    # What a terminal sends is the supervisor's to decide on; it tells by the board, and where it is
+    # suspended or killed its silence does.
+    for number in _FROM_A_TERMINAL:
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: supervised.ask_stop())
     try:

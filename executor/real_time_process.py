@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from multiprocessing.connection import wait
@@ -118,7 +119,8 @@ class _Process:
     def supervise(self, recorder: Recorder) -> tuple[State, str]:
         """Says go, and takes in what happens until the motion is over."""
         self._board.beat()
-        self._link.send(Go())
+        with suppress(OSError):  # it died since it was armed, which is told below
+            self._link.send(Go())
         said: object = None
         over = False
         while not over:

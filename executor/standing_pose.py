@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpr.errors import Refused
+from cdpr.errors import Fault, Refused
 from cdpr.kinematics import forward_kinematics
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
@@ -40,6 +40,13 @@ def standing_pose(rig: Rig, counts: Array, load: Load) -> Pose:
         found = forward_kinematics(rig, winches.strained(unstrained, tensions), before)
         if found.pose.distance_to(before) < _SETTLED:
             break
+    else:
+        raise Fault(
+            "the pose of the platform could not be told from the drives' positions",
+            where="drive positions",
+            why="the search for it did not settle",
+            next_step="report it with the rig file and the positions; nothing has moved",
+        )
     place = found.pose.position
     inside = np.all((rig.workspace_lower <= place) & (place <= rig.workspace_upper))
     if not (inside and found.worst <= rig.motion.start_tolerance):

@@ -123,10 +123,7 @@ def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
         raw=_end_to_end([route.raw for route in routes]),
         nodes=np.concatenate([route.nodes for route in routes]),
         parents=np.concatenate(
-            [
-                np.where(r.parents < 0, -1, r.parents + n)
-                for r, n in zip(routes, before, strict=True)
-            ]
+            [_later(route.parents, n) for route, n in zip(routes, before, strict=True)]
         ),
         iterations=sum(route.iterations for route in routes),
         edge_checks=sum(route.edge_checks for route in routes),

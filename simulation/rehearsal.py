@@ -13,7 +13,7 @@ import numpy as np
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 from cdpr.scene import Load
-from drivers.bus import take, transmit
+from drivers.bus import SentFrame, take, transmit
 from drivers.bus_faults import BusDown
 from drivers.cia402.frames import (
     HEARTBEAT_BASE,
@@ -254,6 +254,6 @@ class Rehearsal:
     def _send(self, can_id: int, data: Frame) -> None:
         """On the bus, and to the other drives, which sit on the same end of it."""
         with suppress(BusDown):  # nobody is reached
-            transmit(self._bus, can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            transmit(self._bus, SentFrame(can_id, data))
         if can_id > HEARTBEAT_BASE:
             self._on_heartbeat(can_id - HEARTBEAT_BASE, data)

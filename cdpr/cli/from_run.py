@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from executor.run_end import RunEnd
 
 
+SAME_PLACE_M, SAME_WAY_RAD = 1e-3, 1e-3
+"""Nearer to the goal than this, and turned from it by less, there is nothing left to do."""
+
+
 def scene_after(
     scene: Scene, rig: Rig, folder: Path
 ) -> tuple[Scene, tuple[StopDocument, ...], list[tuple[str, str]]]:
@@ -32,13 +36,18 @@ def scene_after(
     end = run_end(opened)
     after, done = continued(scene, end)
     left = len(after.stops)
-    if end.finished and not left and after.start.distance_to(after.goal) <= 1e-3:
+    if end.finished and not left and _is_there(after):
         raise BadInput(
             "the run ended at the scene's goal: nothing is left to do",
             where=str(folder),
             next_step="give another scene, or another goal with --goal-mm",
         )
     return after, done, _facts(end, folder, len(done), left)
+
+
+def _is_there(scene: Scene) -> bool:
+    start, goal = scene.start, scene.goal
+    return start.distance_to(goal) <= SAME_PLACE_M and start.angle_to(goal) <= SAME_WAY_RAD
 
 
 def require_room(scene: Scene, rig: Rig) -> None:

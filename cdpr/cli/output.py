@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from contextlib import contextmanager, suppress
+from typing import IO, Any, cast
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+
+
+class _Remarks:
+    """Standard error; that nobody reads it any more must not end a run that moves."""
+
+    def write(self, text: str) -> int:
+        """Writes, if anybody is there."""
+        with suppress(OSError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Likewise."""
+        with suppress(OSError):
+            sys.stderr.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        """All else is as with standard error itself."""
+        return getattr(sys.stderr, name)
+
+
+err = Console(file=cast(IO[str], _Remarks()), highlight=False)
 
 
 def show_json(document: Any) -> None:
@@ -28,11 +51,13 @@ def show_facts(title: str, facts: list[tuple[str, str]]) -> None:
         lines = [f"  {name:<{width}}  {value}" for name, value in facts]
         typer.echo("\n".join([title, *lines]))
         return
-    table = Table(title=title, show_header=False, box=None, title_justify="left", padding=(0, 2))
+    table = Table(
+        title=escape(title), show_header=False, box=None, title_justify="left", padding=(0, 2)
+    )
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in facts:
-        table.add_row(name, value)
+        table.add_row(escape(name), escape(value))
     out.print(table)
 
 

@@ -107,16 +107,20 @@ def run_prepared(
         if not moved:
             folder.discard()
     interface = prepared.rig.document.bus.interface
-    with spinner("writing the run folder and its report", not quiet):
-        return conclude(
-            prepared,
-            outcome,
-            folder,
-            looks,
-            interface=interface,
-            simulated=interface == IN_PROCESS,
-            fast=fast,
-        )
+    try:
+        with spinner("writing the run folder and its report", not quiet):
+            return conclude(
+                prepared,
+                outcome,
+                folder,
+                looks,
+                interface=interface,
+                simulated=interface == IN_PROCESS,
+                fast=fast,
+            )
+    finally:  # whatever became of the record, the bus is as the motion left it
+        if latch is not None:
+            latch.settle(prepared.rig.name, outcome, folder.path)
 
 
 def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcome, list[Look]]:
@@ -165,8 +169,6 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
                 announce=lambda text: None if job.quiet else err.print(text, markup=False),
             )
             outcome = _move(job, board, recorder, before_motion)
-        if job.latch is not None:
-            job.latch.settle(prepared.rig.name, outcome, job.folder.path)
         return outcome, _looks(camera, recorder, job) if camera else []
 
 

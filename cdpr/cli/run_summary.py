@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.markup import escape
+
 from cdpr.cli.output import out, show_facts, show_json
 from cdpr.cli.stops import stop_facts
 
@@ -43,7 +45,8 @@ def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
         show_json({"run": str(folder), **summary})
         return
     colour = COLOURS[summary["verdict"]]
-    out.print(f"[bold {colour}]{summary['verdict']}[/] {summary['sentence']}", soft_wrap=True)
+    sentence = escape(summary["sentence"])
+    out.print(f"[bold {colour}]{summary['verdict']}[/] {sentence}", soft_wrap=True)
     for reason in summary["reasons"]:
-        out.print(f"  {reason}", soft_wrap=True)
-    out.print(f"report: {folder / 'report.html'}", soft_wrap=True)
+        out.print(f"  {reason}", markup=False, soft_wrap=True)
+    out.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)

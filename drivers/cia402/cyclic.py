@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import can
 
-from drivers.bus import bus_name, hears_itself, lost_frames, take, transmit
+from drivers.bus import SentFrame, bus_name, hears_itself, lost_frames, take, transmit
 from drivers.bus_faults import BusFault, ForeignMaster, ReceiveOverflow
 from drivers.cia402.frames import (
     HEARTBEAT_BASE,
@@ -154,4 +154,4 @@ class CyclicBus:
 
 
 def _frame(can_id: int, data: bytes) -> can.Message:
-    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+    return SentFrame(can_id, data)

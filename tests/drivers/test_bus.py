@@ -11,7 +11,7 @@ from cdpr.errors import BadInput, HardwareMissing, Refused
 from cdpr.rig import Rig, rig_from_document
 from cdpr.rig_file import RigDocument
 from drivers import bus as bus_module
-from drivers.bus import BusSettings, open_bus
+from drivers.bus import BusSettings, SentFrame, open_bus
 from drivers.bus_load import bus_load, check_bus_load, cycle_bits, heartbeat_cycles
 
 
@@ -124,3 +124,20 @@ def test_a_bus_that_no_cycle_helps_needs_more_bits(rig: Rig) -> None:
 @pytest.mark.parametrize("cycle_ms", [1, 3, 4, 10, 30, 100])
 def test_heartbeats_come_several_times_within_their_time_out(cycle_ms: int) -> None:
     assert heartbeat_cycles(cycle_ms / 1000.0) * cycle_ms <= max(30, cycle_ms)
+
+
+def test_a_sent_frame_arrives_whole_at_every_listener_and_stays_as_it_was() -> None:
+    frame = SentFrame(0x201, bytes(range(8)))
+    with (
+        can.Bus(interface="virtual", channel="sent-frame") as sender,
+        can.Bus(interface="virtual", channel="sent-frame") as one,
+        can.Bus(interface="virtual", channel="sent-frame") as other,
+    ):
+        sender.send(frame)
+        heard = [bus.recv(1.0) for bus in (one, other)]
+    for message in heard:
+        assert message is not None
+        assert (message.arbitration_id, bytes(message.data)) == (0x201, bytes(range(8)))
+        assert (message.dlc, message.is_extended_id, message.is_rx) == (8, False, True)
+        assert message is not frame
+    assert (frame.timestamp, frame.channel) == (0.0, None)

@@ -35,8 +35,11 @@ def main() -> int:
     artefacts = options.artefacts.resolve()
     if artefacts.is_relative_to(ROOT):
         parser.error(f"--artefacts {artefacts} is inside the repository; name another folder")
-    shutil.rmtree(artefacts, ignore_errors=True)
-    artefacts.mkdir(parents=True)
+    if artefacts == _cache() / "last":
+        shutil.rmtree(artefacts, ignore_errors=True)
+    elif artefacts.exists() and any(artefacts.iterdir()):
+        parser.error(f"--artefacts {artefacts} holds something already; name an empty folder")
+    artefacts.mkdir(parents=True, exist_ok=True)
     tests = [*TESTS, *(rest or ["-m", "hil"])]
     try:
         _require_tools()
