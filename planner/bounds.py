@@ -63,9 +63,7 @@ def smallest_along(
     proved = smallest
     while len(low):
         bounds = (low_values + high_values - slope * (high - low)) / 2.0
-        target = smallest - tolerance
-        if smallest >= required:
-            target = max(target, required)
+        target = to_be_proved(smallest, required, tolerance)
         final = (bounds >= target) | (high - low < SHORTEST)
         if samples > MOST_SAMPLES:
             final[:] = True
@@ -84,6 +82,12 @@ def smallest_along(
         low_values = np.concatenate([low_values, values])
         high_values = np.concatenate([values, high_values])
     return Smallest(smallest, at, min(proved, smallest), samples)
+
+
+def to_be_proved(smallest: float, required: float, tolerance: float) -> float:
+    """What the rest of a path must be shown to reach, beside its smallest sample."""
+    target = smallest - tolerance
+    return max(target, required) if smallest >= required else target
 
 
 def _known(values: Array) -> Array:

@@ -17,6 +17,7 @@ from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from cdpr.stop_file import StopDocument
+from planner.anytime import AnytimeSettings
 from planner.check import check_path
 from planner.check_report import CheckReport
 from planner.cost import KinematicCost
@@ -111,7 +112,7 @@ def make_plan(
 
 def _planner(settings: Settings, way: Way) -> dict[str, Any]:
     if isinstance(settings, TurningSettings):
-        return _turning_planner(settings, way)
+        return {"name": "turning", **_effort(settings, way)}
     if isinstance(settings, OptimalSettings):
         return _optimal_planner(settings, way)
     return {
@@ -127,15 +128,6 @@ def _planner(settings: Settings, way: Way) -> dict[str, Any]:
     }
 
 
-def _turning_planner(settings: TurningSettings, way: Way) -> dict[str, Any]:
-    return {
-        "name": "turning",
-        "seed": settings.seed,
-        "rounds": list(way.rounds),
-        "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
-    }
-
-
 def _optimal_planner(settings: OptimalSettings, way: Way) -> dict[str, Any]:
     weights, longest = settings.weights, settings.longest
     return {
@@ -146,10 +138,16 @@ def _optimal_planner(settings: OptimalSettings, way: Way) -> dict[str, Any]:
             "clearance": weights.clearance,
             "capacity": weights.capacity,
         },
+        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
+        **_effort(settings, way),
+    }
+
+
+def _effort(settings: AnytimeSettings, way: Way) -> dict[str, Any]:
+    return {
         "seed": settings.seed,
         "rounds": list(way.rounds),
         "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
-        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
     }
 
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 from cdpr.clearance import ClearanceModel
 from cdpr.errors import Fault
 from cdpr.poses import Pose
-from planner.bounds import MOST_SAMPLES, SHORTEST, Smallest
+from planner.bounds import MOST_SAMPLES, SHORTEST, Smallest, to_be_proved
 from planner.track import Track
 
 FIRST = 0.040
@@ -41,9 +41,7 @@ def smallest_over_stretches(
     samples, proved = len(places), smallest
     while waiting:
         low, high = waiting.pop()
-        target = smallest - tolerance
-        if smallest >= required:
-            target = max(target, required)
+        target = to_be_proved(smallest, required, tolerance)
         middle = (low + high) / 2.0
         pose = track.pose(middle)
         bound = model.at_least(pose, track.positions(low, high), target)

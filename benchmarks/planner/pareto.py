@@ -84,7 +84,7 @@ def _front(rig: Rig, box: str, environment: int) -> list[Point]:
         path = reference_of(asked, price * (unit if price >= 0.0 else least), 1.0, [path], LIGHT)
         paths.append((price, path))
     made = [_point(asked, box, environment, "reference", *pair, shortest) for pair in paths]
-    plan = make_plan(rig, asked.scene, OptimalSettings(OBJECTIVES["kinematic"]))
+    plan = make_plan(rig, asked.scene, OptimalSettings(weights=OBJECTIVES["kinematic"]))
     own = np.array([pose.position_mm for pose in plan.waypoints]) / 1e3
     return [*made, _point(asked, box, environment, "cdpr plan", 0.0, own, shortest)]
 

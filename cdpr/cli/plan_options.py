@@ -100,17 +100,12 @@ def optimal_settings(
     """
     from planner.optimal.settings import OBJECTIVES, OptimalSettings
 
-    if budget_ms is not None and rounds:
-        raise BadInput("--budget-ms and --rounds both say how long to go on", next_step="give one")
     if weights and cost is not None:
         raise BadInput("--cost and --weight both say what to optimise", next_step="give one")
-    options: dict[str, Any] = {} if budget_ms is None else {"budget": budget_ms / 1000.0}
     return OptimalSettings(
         weights=_weights(weights) if weights else OBJECTIVES[(cost or CostName.length).value],
-        seed=seed,
-        rounds=rounds[0] if rounds else None,
         longest=math.inf if longest_mm is None else longest_mm / 1000.0,
-        **options,
+        **_effort(seed, budget_ms, rounds),
     )
 
 
@@ -122,10 +117,14 @@ def turning_settings(seed: int, budget_ms: float | None, rounds: list[int]) -> T
     """
     from planner.turning.settings import TurningSettings
 
+    return TurningSettings(**_effort(seed, budget_ms, rounds))
+
+
+def _effort(seed: int, budget_ms: float | None, rounds: list[int]) -> dict[str, Any]:
     if budget_ms is not None and rounds:
         raise BadInput("--budget-ms and --rounds both say how long to go on", next_step="give one")
     options: dict[str, Any] = {} if budget_ms is None else {"budget": budget_ms / 1000.0}
-    return TurningSettings(seed=seed, rounds=rounds[0] if rounds else None, **options)
+    return {"seed": seed, "rounds": rounds[0] if rounds else None, **options}
 
 
 def refuse_with_rotation(options: dict[str, bool]) -> None:

@@ -26,6 +26,8 @@ WORKSPACE: Final = 1
 OBSTACLE: Final = 2
 SELF: Final = 3
 WRENCH: Final = 4
+REASONS: Final = ("", "workspace", "obstacle clearance", "self clearance", "wrench feasibility")
+"""Why edges are refused, in words, by these numbers."""
 
 
 @kernel

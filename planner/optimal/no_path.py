@@ -10,13 +10,12 @@ from cdpr.clearance import PLATFORM, cable_name
 from cdpr.errors import NoSolution
 from cdpr.rig import Rig
 from cdpr.scene import Scene
-from planner.exact.checks import edge_problem
+from planner.exact.checks import REASONS, edge_problem
 from planner.exact.edge import edge_clearance
 from planner.optimal.problem import Problem
 from planner.optimal.search import BEST, Search
 from planner.optimal.separation import is_separated
 from planner.optimal.settings import OptimalSettings
-from planner.paper.limits import REASONS
 
 _TRIED = 300
 
@@ -52,12 +51,8 @@ def no_path(
             next_step="ask for less clearance, or move the goal or an obstacle",
             values={**values, "proved": "yes"},
         )
-    spent = f"{search.totals[0]} rounds" + (
-        f" of the {settings.budget * 1e3:g} ms budget" if settings.rounds is None else ""
-    )
     return NoSolution(
-        f"no path after {spent}; what start and goal reach comes within {gap * 1e3:.1f} mm"
-        " of each other",
+        settings.not_found(int(search.totals[0]), gap),
         where=where,
         why=f"it is not proved that there is none; {_in_the_way(rig, scene, problem, search)}",
         next_step="raise --budget-ms, ask for less clearance, try another seed, or move the goal"

@@ -12,6 +12,7 @@ import numpy as np
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
+from planner.anytime import LEAST_ROUNDS
 from planner.cost import KinematicCost
 from planner.optimal.length_limit import LengthLimit
 from planner.optimal.no_path import no_path
@@ -25,8 +26,6 @@ from planner.route import Progress, Route
 
 Clock = Callable[[], float]
 
-LEAST_ROUNDS = 12
-"""Done whatever the clock says, so that a busy machine finds a path, too."""
 LEAST_WITH_PROOFS = 2
 """Likewise from where wrenches have to be proved on every edge, which takes long."""
 LEAST_WITH_LIMIT = 80
@@ -122,26 +121,16 @@ def _improved(
         spent = clock() - began
         if progress is not None and spent - told >= _TELL_EVERY:
             told = spent
-            _tell(progress, settings, search, spent)
+            settings.tell(progress, int(search.totals[0]), spent, float(search.costs[BEST]))
     return limit.path if limit is not None else best_path(search)
 
 
 def _is_over(problem: Problem, settings: OptimalSettings, search: Search, spent: float) -> bool:
     rounds, begun = int(search.totals[0]), int(search.totals[5])
-    if settings.rounds is not None:
-        return rounds >= settings.rounds
     least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_WITH_LIMIT
     if problem.terms[LEAST_MARGIN] == ASK_PROOF:
         least = LEAST_WITH_PROOFS
-    return rounds - begun >= least and spent >= settings.budget
-
-
-def _tell(progress: Progress, settings: OptimalSettings, search: Search, spent: float) -> None:
-    cost = float(search.costs[BEST])
-    if settings.rounds is not None:
-        progress(float(search.totals[0]), float(settings.rounds), cost)
-    else:
-        progress(min(spent, settings.budget), settings.budget, cost)
+    return settings.is_over(rounds, spent, begun + least)
 
 
 def _least(search: Search, settings: OptimalSettings) -> float:

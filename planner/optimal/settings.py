@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, fields
 
 from cdpr.errors import BadInput
+from planner.anytime import AnytimeSettings
 
 _TIE = 0.02
 """Cost of a metre beside an objective that leaves most of the path open: 1 mm of clearance is worth
@@ -58,22 +59,16 @@ OBJECTIVES = {
 """What the objectives that have a name make small."""
 
 
-@dataclass(frozen=True, slots=True)
-class OptimalSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptimalSettings(AnytimeSettings):
     """Settings of the search.
 
     Attributes:
         weights: What is made small.
-        seed: Of the random numbers.
-        budget: How long paths are sought and improved, [s]; what is prepared before is not in it.
-        rounds: Instead of the budget, for the same path again: exactly so many rounds.
         longest: Longest path allowed, [m]; infinite for any.
     """
 
     weights: Weights = field(default_factory=lambda: OBJECTIVES["length"])
-    seed: int = 0
-    budget: float = 0.050
-    rounds: int | None = None
     longest: float = math.inf
 
     def __post_init__(self) -> None:
@@ -82,11 +77,6 @@ class OptimalSettings:
         Raises:
             BadInput: The seed is negative, or a limit is not positive.
         """
-        if self.seed < 0:
-            raise BadInput(f"the seed must not be negative, it is {self.seed}")
-        if not 0.0 < self.budget < math.inf:
-            raise BadInput(f"the budget must be above 0 ms, it is {self.budget * 1e3:g} ms")
-        if self.rounds is not None and self.rounds < 1:
-            raise BadInput(f"there must be at least one round, not {self.rounds}")
+        AnytimeSettings.__post_init__(self)  # super() knows no class that was made with slots
         if not self.longest > 0.0:
             raise BadInput(f"the longest path must be above 0 mm, not {self.longest * 1e3:g} mm")

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from planner.exact.checks import FREE
+from planner.exact.checks import FREE, REASONS
 from planner.exact.compiled import kernel
 from planner.paper.cost_field import CostField, edge_cost
-from planner.paper.limits import REASONS, Limits, problem
+from planner.paper.limits import Limits, problem
 from planner.paper.sampling import backward, forward, goal_bias, near_way
 from planner.paper.tallies import Tallies, failure_rate, focus_node, tell
 from planner.paper.tree import Tree, add, move, nearest, squared_distance, way_to, within

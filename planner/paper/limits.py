@@ -19,9 +19,6 @@ from planner.settings import MARGIN_RESERVE
 
 Array = NDArray[np.float64]
 
-REASONS = ("", "workspace", "obstacle clearance", "self clearance", "wrench feasibility")
-"""Why edges are refused, by what `problem` returns."""
-
 
 class Limits(NamedTuple):
     """What edges of one rig at one orientation in one scene must keep; see `ExactChecks`."""

@@ -12,7 +12,7 @@ from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from planner.cost import KinematicCost
-from planner.exact.checks import FREE, OBSTACLE, ExactChecks
+from planner.exact.checks import FREE, OBSTACLE, REASONS, ExactChecks
 from planner.paper.cost_field import kinematic_field, length_field
 from planner.paper.growth import (
     CHECKS,
@@ -29,7 +29,7 @@ from planner.paper.growth import (
     new_search,
     try_straight,
 )
-from planner.paper.limits import REASONS, exact_checks, limits_of
+from planner.paper.limits import exact_checks, limits_of
 from planner.paper.readings import FAILURE_RATES, FOCUSES
 from planner.paper.shortcut import shortcut
 from planner.paper.tallies import new_tallies

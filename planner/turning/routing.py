@@ -13,9 +13,9 @@ from cdpr.rig import Rig
 from cdpr.scene import Scene
 from cdpr.statics.dexterity import rms_anchor_radius
 from planner.exact.capacity import build_load
+from planner.exact.checks import REASONS
 from planner.exact.self_edge import build_robot
 from planner.exact.world import build_world
-from planner.paper.limits import REASONS
 from planner.route import Progress, Route
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 from planner.space import PoseSpace
@@ -25,8 +25,6 @@ from planner.turning.settings import TurningSettings
 
 Clock = Callable[[], float]
 
-LEAST_ROUNDS = 12
-"""Done whatever the clock says, so that a busy machine finds a path, too."""
 _TELL_EVERY = 20
 _ROTATION_ROUND_OFF = 5e-8
 """Added to the rotation limits, [rad]: half of what the check leaves for round-off in files."""
@@ -104,10 +102,7 @@ def turning_route(
         search.advance()
         spent = clock() - began
         if progress is not None and search.rounds % _TELL_EVERY == 0:
-            if settings.rounds is not None:
-                progress(search.rounds, settings.rounds, search.cost)
-            else:
-                progress(min(spent, settings.budget), settings.budget, search.cost)
+            settings.tell(progress, search.rounds, spent, search.cost)
     path = search.path
     if path is None:
         raise _no_path(scene, search, settings)
@@ -123,11 +118,8 @@ def turning_route(
 
 
 def _is_over(settings: TurningSettings, search: Search, spent: float) -> bool:
-    if search.cost <= search.shortest * (1.0 + 1e-12):
-        return True
-    if settings.rounds is not None:
-        return search.rounds >= settings.rounds
-    return search.rounds >= LEAST_ROUNDS and spent >= settings.budget
+    shortest_possible = search.cost <= search.shortest * (1.0 + 1e-12)
+    return shortest_possible or settings.is_over(search.rounds, spent)
 
 
 def _no_path(scene: Scene, search: Search, settings: TurningSettings) -> NoSolution:
@@ -139,12 +131,8 @@ def _no_path(scene: Scene, search: Search, settings: TurningSettings) -> NoSolut
     ]
     listed = ", ".join(f"{name} ({count})" for count, name in sorted(refused, reverse=True))
     gap = search.gap()
-    spent = f"{search.rounds} rounds" + (
-        f" of the {settings.budget * 1e3:g} ms budget" if settings.rounds is None else ""
-    )
     return NoSolution(
-        f"no path after {spent}; what start and goal reach comes within {gap * 1e3:.1f} mm"
-        " of each other",
+        settings.not_found(search.rounds, gap),
         where=f"scene {scene.name}",
         why=f"it is not proved that there is none; moves were refused for: {listed}",
         next_step="raise --budget-ms, ask for less clearance, allow more in rotation_limits, try"

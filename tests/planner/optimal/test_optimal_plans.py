@@ -10,8 +10,8 @@ import pytest
 
 from cdpr.errors import BadInput
 from cdpr.plan import load_plan, plan_from_document, save_plan
+from planner.anytime import LEAST_ROUNDS
 from planner.check import verify
-from planner.optimal.routing import LEAST_ROUNDS
 from planner.optimal.settings import OBJECTIVES, OptimalSettings, Weights
 from planner.plan import make_plan
 from planner.settings import CLEARANCE_RESERVE
@@ -21,7 +21,9 @@ SHORTEST = {1: 628.5, 2: 661.0, 3: 813.5}
 
 
 def planned(rig, scene, name="length", rounds=60, **options):
-    document = make_plan(rig, scene, OptimalSettings(OBJECTIVES[name], rounds=rounds, **options))
+    document = make_plan(
+        rig, scene, OptimalSettings(weights=OBJECTIVES[name], rounds=rounds, **options)
+    )
     verify(plan_from_document(document))
     return document
 
@@ -73,7 +75,9 @@ def test_capacity_makes_a_way_round_where_the_straight_one_is_weak(gachon, scene
 
 def test_a_weighted_sum_lies_between_its_parts(gachon, ready_scene, by_objective) -> None:
     weights = Weights(length=0.35, kinematic=1.0)
-    document = make_plan(gachon, ready_scene("environment_2"), OptimalSettings(weights, rounds=80))
+    document = make_plan(
+        gachon, ready_scene("environment_2"), OptimalSettings(weights=weights, rounds=80)
+    )
     short, smooth = by_objective["length"], by_objective["kinematic"]
     assert short.quality.length_mm <= document.quality.length_mm <= smooth.quality.length_mm
     assert integral(smooth) <= 1.001 * integral(document)
@@ -144,7 +148,7 @@ def test_longer_limits_give_lower_integrals_and_every_limit_is_kept(gachon, read
 
 def test_a_limited_plan_is_found_again_by_its_rounds(gachon, ready_scene) -> None:
     scene, ticks = ready_scene("environment_2"), count()
-    settings = OptimalSettings(OBJECTIVES["kinematic"], budget=1.0, longest=0.72)
+    settings = OptimalSettings(weights=OBJECTIVES["kinematic"], budget=1.0, longest=0.72)
     by_time = make_plan(gachon, scene, settings, clock=lambda: 0.01 * next(ticks))
     again = planned(gachon, scene, "kinematic", by_time.planner.rounds[0], longest=0.72)
     assert again.waypoints == by_time.waypoints

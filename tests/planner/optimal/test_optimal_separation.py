@@ -111,7 +111,7 @@ def test_a_search_that_ends_too_early_says_that_nothing_is_proved(
 
 
 def test_a_limit_below_the_shortest_path_is_told(gachon, ready_scene) -> None:
-    settings = OptimalSettings(OBJECTIVES["kinematic"], rounds=20, longest=0.6)
+    settings = OptimalSettings(weights=OBJECTIVES["kinematic"], rounds=20, longest=0.6)
     with pytest.raises(NoSolution, match=r"no path of at most 600\.0 mm was found") as nothing:
         make_plan(gachon, ready_scene("environment_1"), settings)
     assert "the straight way 518.8 mm" in str(nothing.value)
