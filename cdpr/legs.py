@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from cdpr.document_types import PoseDocument
 from cdpr.scene import Scene, load_from_document
-from cdpr.stop_file import payloads
+from cdpr.scene_stops import payloads
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from cdpr.document_types import (
 )
 from cdpr.rig_file import RigDocument
 from cdpr.scene_file import SceneDocument
-from cdpr.stop_file import StopDocument
+from cdpr.scene_stops import StopDocument
 
 
 class ReadingsDocument(Document):

@@ -27,6 +27,7 @@ from cdpr.scene_file import (
     SceneDocument,
     SphereDocument,
 )
+from cdpr.scene_stops import StopDocument
 from cdpr.shapes import (
     Box,
     Capsule,
@@ -38,7 +39,6 @@ from cdpr.shapes import (
     convex_hull,
     read_only_indices,
 )
-from cdpr.stop_file import StopDocument
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,7 @@ from cdpr.document_types import (
 )
 from cdpr.payload import Payload
 from cdpr.rotation_limits import RotationLimits
-from cdpr.stop_file import StopDocument, misfits, overdrawn
+from cdpr.scene_stops import StopDocument, misfits, overdrawn
 
 SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
 

@@ -20,6 +20,9 @@ from drivers.bus_faults import bus_fault
 UDP_DEFAULT_GROUP = "239.74.163.2"
 """python-can's own IPv4 group. Source: python-can, interfaces/udp_multicast."""
 
+UDP_DEFAULT_PORT = 43113
+"""python-can's own. Source: python-can, interfaces/udp_multicast."""
+
 RECEIVE_BUFFER_BYTES = 4 * 2**20
 """A socket of the default size drops the newest frames after 278 without a word."""
 
@@ -70,6 +73,15 @@ class BusSettings:
         """The bus of a rig file."""
         bus = rig.document.bus
         return cls(bus.interface, bus.channel, bus.bitrate)
+
+    @property
+    def canonical(self) -> str:
+        """The same text for every spelling of one bus: what a channel leaves out is filled in."""
+        interface, channel = self.interface.strip().lower(), self.channel.strip()
+        if interface == "udp_multicast":
+            options = _udp_options(self)
+            channel = f"{options['channel']}:{options.get('port', UDP_DEFAULT_PORT)}"
+        return f"{interface} {channel}"
 
     def __str__(self) -> str:
         """Interface and channel, as messages name the bus."""

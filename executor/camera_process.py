@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
@@ -147,20 +148,38 @@ class CameraProcess:
 
 
 def _serve(make_observer: MakeObserver, link: Connection) -> None:
-    """The process: a picture a trigger, then all answers at once."""
+    """The process: a picture a trigger, then all answers at once; it ends with its parent."""
+    with suppress(_NobodyThere):
+        try:
+            with make_observer() as observer:
+                _say(link, _Progress(0, 0))
+                looks: list[Look] = []
+                seen = 0
+                while (trigger := _next_trigger(link)) is not None:
+                    looks.append(observer.look(trigger))
+                    seen += looks[-1].pose is not None
+                    _say(link, _Progress(len(looks), seen))
+                _say(link, looks)
+        except CdprError as error:
+            _say(link, _Failure(error))
+        except Exception as error:
+            what = f"the camera's process failed: {type(error).__name__}: {error}"
+            _say(link, _Failure(what))
+
+
+class _NobodyThere(BaseException):
+    """The parent is gone; there is nothing left to do, and nobody to tell."""
+
+
+def _say(link: Connection, what: list[Look] | _Progress | _Failure) -> None:
     try:
-        with make_observer() as observer:
-            link.send(_Progress(0, 0))
-            looks: list[Look] = []
-            seen = 0
-            while (trigger := link.recv()) is not None:
-                looks.append(observer.look(trigger))
-                seen += looks[-1].pose is not None
-                link.send(_Progress(len(looks), seen))
-            link.send(looks)
-    except EOFError:
-        return  # the parent is gone
-    except CdprError as error:
-        link.send(_Failure(error))
-    except Exception as error:
-        link.send(_Failure(f"the camera's process failed: {type(error).__name__}: {error}"))
+        link.send(what)
+    except OSError:
+        raise _NobodyThere from None
+
+
+def _next_trigger(link: Connection) -> Trigger | None:
+    try:
+        return link.recv()  # type: ignore[no-any-return]  # what our own parent sends
+    except (EOFError, OSError):
+        raise _NobodyThere from None

@@ -23,11 +23,15 @@ class Answer:
 
     Attributes:
         process: Its number.
-        status: See `executor.status`; None when it did not answer.
+        status: See `executor.status`; None when it did not tell.
+        what: Why it did not tell, in its own words; nothing when it was silent.
+        ended: It is gone, so that nothing more will be heard of it.
     """
 
     process: int
     status: dict[str, Any] | None
+    what: str = ""
+    ended: bool = False
 
 
 def ask_all(runs: Sequence[Reached], command: str, percent: int | None = None) -> list[Answer]:
@@ -35,8 +39,8 @@ def ask_all(runs: Sequence[Reached], command: str, percent: int | None = None) -
     line = make_line(command, percent)
     told = [_told(run, line) for run in runs]
     return [
-        Answer(run.process, _status(run) if heard else None)
-        for run, heard in zip(runs, told, strict=True)
+        _heard(run) if taken else Answer(run.process, None, ended=True)
+        for run, taken in zip(runs, told, strict=True)
     ]
 
 
@@ -49,14 +53,21 @@ def _told(run: Reached, line: bytes) -> bool:
     return True
 
 
-def _status(run: Reached) -> dict[str, Any] | None:
-    """What it answers; None when it ends or hangs."""
+def _heard(run: Reached) -> Answer:
+    """What it answers; a run that hangs is told apart from one that ended."""
     try:
         answer = json.loads(_line(run.link))
-    except (OSError, ValueError):
-        return None
+    except TimeoutError:
+        return Answer(run.process, None)
+    except OSError:
+        return Answer(run.process, None, ended=True)
+    except ValueError as error:
+        return Answer(run.process, None, f"its answer cannot be read: {error}")
     status = answer.get("status") if isinstance(answer, dict) else None
-    return status if isinstance(status, dict) else None
+    if isinstance(status, dict):
+        return Answer(run.process, status)
+    what = answer.get("what") if isinstance(answer, dict) else None
+    return Answer(run.process, None, str(what or "its answer says nothing"))
 
 
 def _line(link: socket.socket) -> bytes:
@@ -102,13 +113,26 @@ def no_run(verb: str) -> Fault:
         where=f"cdpr {verb}",
         why="it ended already, or another user started it",
         next_step="press the emergency stop if something moves; a run of another user is"
-        " reached by that user or by root",
+        f" reached by that user, or by `sudo cdpr {verb}`",
     )
 
 
-def no_answer(verb: str, processes: Sequence[int]) -> Fault:
-    """A run listens and does not answer."""
-    numbers = ", ".join(map(str, processes))
+def no_answer(verb: str, answers: Sequence[Answer]) -> Fault:
+    """Runs that were told something and do not say how they stand."""
+    numbers = ", ".join(str(answer.process) for answer in answers)
+    words = [answer.what for answer in answers if answer.what]
+    if words:
+        return Fault(
+            f"process {numbers} did not do it, or cannot tell: {'; '.join(words)}",
+            where=f"cdpr {verb}",
+            next_step="press the emergency stop if something moves that must not",
+        )
+    if all(answer.ended for answer in answers):
+        return Fault(
+            f"process {numbers} ended before it could be told",
+            where=f"cdpr {verb}",
+            next_step="see what its run folder says; press the emergency stop if something moves",
+        )
     return Fault(
         f"process {numbers} did not answer within {ANSWER_TIMEOUT:g} s",
         where=f"cdpr {verb}",

@@ -10,8 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from executor.commands import answer_to
-from executor.status import RunStatus
+from executor.commands import Told, answer_to
 from executor.wishes import WishBoard
 
 #: A question is a line no longer than this, [bytes].
@@ -21,9 +20,7 @@ MOST_CLIENTS = 16
 
 
 @contextmanager
-def serving(
-    listeners: Sequence[socket.socket], board: WishBoard, status: RunStatus
-) -> Iterator[None]:
+def serving(listeners: Sequence[socket.socket], board: WishBoard, status: Told) -> Iterator[None]:
     """Answers every question on the sockets while the block runs.
 
     Args:
@@ -49,7 +46,7 @@ class _Server:
         listeners: Sequence[socket.socket],
         woken: socket.socket,
         board: WishBoard,
-        status: RunStatus,
+        status: Told,
     ) -> None:
         self._board, self._status, self._woken = board, status, woken
         self._selector = selectors.DefaultSelector()
@@ -60,22 +57,33 @@ class _Server:
             self._selector.register(listener, selectors.EVENT_READ, "listener")
 
     def run(self) -> None:
-        """Until the other end of ``woken`` is closed."""
+        """Until the other end of ``woken`` is closed.
+
+        A run that could not be stopped from elsewhere any more is stopped.
+        """
         try:
-            while True:
-                ready = [(key.fileobj, key.data) for key, _ in self._selector.select()]
-                for place, kind in ready:
-                    if place is self._woken:
-                        return
-                    assert isinstance(place, socket.socket)
-                    if kind == "listener":
-                        self._welcome(place)
-                    else:
-                        self._listen(place)
+            while self._serve_the_ready():
+                pass
+        except BaseException:
+            self._board.ask_stop()
+            raise
         finally:
             for client in list(self._begun):
                 self._let_go(client)
             self._selector.close()
+
+    def _serve_the_ready(self) -> bool:
+        """Waits for those that want something, and serves them; False when all is over."""
+        ready = [(key.fileobj, key.data) for key, _ in self._selector.select()]
+        for place, kind in ready:
+            if place is self._woken:
+                return False
+            assert isinstance(place, socket.socket)
+            if kind == "listener":
+                self._welcome(place)
+            else:
+                self._listen(place)
+        return True
 
     def _welcome(self, listener: socket.socket) -> None:
         try:

@@ -8,11 +8,10 @@ otherwise ``what``, a sentence.
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from executor.status import RunStatus
 from executor.wishes import FASTEST, SLOWEST, WishBoard
 
 
@@ -60,13 +59,30 @@ def make_line(command: str, percent: int | None = None) -> bytes:
     return json.dumps(question).encode() + b"\n"
 
 
-def answer_to(line: bytes, board: WishBoard, status: RunStatus) -> bytes:
-    """Does what a line asks for; the answer as it is sent."""
+class Told(Protocol):
+    """What can say how it stands, from any thread."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """See `executor.status`."""
+        ...
+
+
+def answer_to(line: bytes, board: WishBoard, status: Told) -> bytes:
+    """Does what a line asks for; the answer as it is sent.
+
+    A command counts even where the run then cannot tell how it stands.
+    """
     try:
         _put_up(parse_command(line), board)
-        answer: dict[str, Any] = {"ok": True, "status": status.as_dict()}
+        return _line({"ok": True, "status": status.as_dict()})
     except NotACommand as error:
-        answer = {"ok": False, "what": f"not a command: {error}"}
+        return _line({"ok": False, "what": f"not a command: {error}"})
+    except Exception as error:
+        what = f"the run cannot tell how it stands: {type(error).__name__}: {error}"
+        return _line({"ok": False, "what": what})
+
+
+def _line(answer: dict[str, Any]) -> bytes:
     return json.dumps(answer, allow_nan=False).encode() + b"\n"
 
 

@@ -1,15 +1,17 @@
 """The latch of a bus: while it is engaged nothing moves the drives there, in no process.
 
-It is a file in the user's state folder. It is engaged before anything moves and released when the
-motion ended well; a fault leaves it engaged with its cause, and a program that died or a computer
-that lost power leaves it engaged too. Only `cdpr reset` releases it then.
+It is a file in this computer's state folder (`executor.state_folder`). It is engaged before
+anything moves and released when the motion ended well; a fault leaves it engaged with its cause,
+and a program that died or a computer that lost power leaves it engaged too. Only `cdpr reset`
+releases it then.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +21,7 @@ from cdpr.errors import CdprError, Refused
 from drivers.bus import BusSettings
 from executor.execution import Outcome
 from executor.machine import State
+from executor.state_folder import state_file
 
 _CUT_SHORT = "a run did not come to its end: its program was killed, or the computer stopped"
 
@@ -50,8 +53,7 @@ class Latch:
     def __init__(self, settings: BusSettings) -> None:
         """Looks at nothing yet."""
         self._bus = str(settings)
-        name = re.sub(r"[^A-Za-z0-9.]+", "-", self._bus)
-        self.path = _state_folder() / f"latched-{name}.json"
+        self.path = state_file("latched", settings)
 
     def read(self) -> Latched | None:
         """Why it is engaged; None when it is not. A file that cannot be read counts as engaged."""
@@ -73,8 +75,53 @@ class Latch:
         if latched is not None:
             raise self._refusal(latched)
 
-    def engage(self, rig: str, folder: Path) -> None:
+    def require_no_run(self) -> None:
+        """No run is under way on this bus; its mark is not a fault.
+
+        Raises:
+            Refused: One is.
+        """
+        latched = self.read()
+        if latched is not None and _runs(latched.process):
+            raise self._refusal(latched)
+
+    @contextmanager
+    def held_for_reset(self, rig: str, shown: Latched | None) -> Iterator[None]:
+        """Keeps runs off the bus while the block resets its drives; then it is released.
+
+        When the block fails, the latch is as it was.
+
+        Args:
+            rig: Name of the rig.
+            shown: What the operator was shown and said yes to.
+
+        Raises:
+            Refused: It is not what is latched now.
+        """
+        if shown is None:
+            self.engage(rig, self.path.parent, "a reset did not come to its end")
+        elif self.read() != shown:
+            raise Refused(
+                "what is latched changed since it was shown",
+                where=f"bus {self._bus}",
+                why="somebody else reset this bus, or ran it",
+                next_step="look at it again: `cdpr reset RIG`; nothing was reset",
+            )
+        try:
+            yield
+        except BaseException:
+            if shown is None:
+                self.release()
+            raise
+        self.release()
+
+    def engage(self, rig: str, folder: Path, cause: str = _CUT_SHORT) -> None:
         """A run is about to move; if it does not come to its end, this is what tells of it.
+
+        Args:
+            rig: Name of the rig.
+            folder: Where the record of the run is.
+            cause: What is told then.
 
         Raises:
             Refused: It is engaged already, or cannot be.
@@ -86,7 +133,7 @@ class Latch:
             raise self._refusal(self.read()) from None
         except OSError as error:
             raise self._not_kept(error.strerror or str(error)) from None
-        self._write(self._latched(rig, _CUT_SHORT, folder))
+        self._write(self._latched(rig, cause, folder))
 
     def settle(self, rig: str, outcome: Outcome, folder: Path) -> None:
         """The motion is over: released when it ended well, else engaged with its cause."""
@@ -141,13 +188,8 @@ class Latch:
             "the latch cannot be written, so a fault would be forgotten",
             where=str(self.path),
             why=why,
-            next_step="make the folder writable, or set XDG_STATE_HOME to one that is",
+            next_step="make the folder writable for those who run the rig",
         )
-
-
-def _state_folder() -> Path:
-    base = os.environ.get("XDG_STATE_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "state") / "cdpr"
 
 
 def _runs(process: int) -> bool:

@@ -8,10 +8,22 @@ import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 #: Above ordinary programs, below the kernel's own threads.
 PRIORITY = 50
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+CAP_IPC_LOCK = 14
+CAP_SYS_NICE = 23
+"""Source: linux/capability.h."""
+
+
+def has_capability(number: int) -> bool:
+    """Whether the kernel grants this process a privilege (linux/capability.h) now."""
+    lines = Path("/proc/self/status").read_bytes().splitlines()
+    granted = next(line.split()[1] for line in lines if line.startswith(b"CapEff:"))
+    return bool(int(granted, 16) >> number & 1)
 
 
 @contextmanager
@@ -48,10 +60,8 @@ def _enter() -> str:
 
 def _lock_memory() -> bool:
     # A lock within a small limit would make later allocations fail instead of being slow.
-    if (
-        os.geteuid() != 0
-        and resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY
-    ):
+    unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    if not (unlimited or has_capability(CAP_IPC_LOCK)):
         return False
     libc = ctypes.CDLL(None, use_errno=True)
     return int(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE)) == 0

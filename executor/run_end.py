@@ -12,7 +12,7 @@ from cdpr.payload import Payload
 from cdpr.poses import Pose
 from cdpr.rig import Rig
 from cdpr.scene import Scene
-from cdpr.stop_file import StopDocument, payloads
+from cdpr.scene_stops import StopDocument, payloads
 from cdpr.winches import WinchMap
 from executor.cycle_table import CycleTable
 from executor.run_folder import RunFolder

@@ -3,7 +3,8 @@
 A run listens on a socket named after its process in the user's run-time folders; a socket on which
 nobody listens was left by a process that is gone. It is announced in every folder that another
 terminal may look into, and only in folders that nobody else can write to: a folder in /tmp that
-another user made could hold links to this user's files, or sockets of somebody else.
+another user made could hold links to this user's files, or sockets of somebody else. Root reaches
+the runs of all users, each in a folder that is that user's alone.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import socket
 import stat
 import struct
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -28,42 +29,53 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ENDING = ".sock"
 
 
-def _candidates() -> list[Path]:
+@dataclass(frozen=True, slots=True)
+class _Folder:
+    """An open folder that only one user can write to."""
+
+    descriptor: int
+    owner: int
+
+
+def _own_places() -> list[Path]:
     """The user's run-time folder, where the system has one, and one below the temporary folder."""
     base = os.environ.get("XDG_RUNTIME_DIR")
     folders = [Path(base) / "cdpr"] if base else []
     return [*folders, Path(tempfile.gettempdir()) / f"cdpr-{os.getuid()}"]
 
 
-def _opened(folder: Path) -> int | None:
-    """The folder as a file descriptor if it is there, this user's, and closed to all others."""
+def _reached_places() -> list[Path]:
+    """Where runs are looked for: root, who may stop whatever runs here, looks at all users'."""
+    own = _own_places()
+    if os.getuid() != 0:
+        return own
+    others = [*Path("/run/user").glob("*/cdpr"), *Path(tempfile.gettempdir()).glob("cdpr-*")]
+    return [*own, *sorted(path for path in others if path not in own)]
+
+
+def _opened(path: Path) -> _Folder | None:
+    """The folder if it is there and closed to all but its owner: this user, or for root anybody."""
     try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:  # not there, a link, or not ours to read
         return None
     status = os.fstat(descriptor)
-    if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+    is_ours = os.getuid() in (0, status.st_uid)
+    if not is_ours or stat.S_IMODE(status.st_mode) & 0o077:
         os.close(descriptor)
         return None
-    return descriptor
+    return _Folder(descriptor, status.st_uid)
 
 
 @contextlib.contextmanager
-def _folders(*, make: bool) -> Iterator[list[int]]:
-    """Descriptors of all usable folders."""
-    opened: list[int] = []
+def _open_folders(paths: Sequence[Path]) -> Iterator[list[_Folder]]:
+    """All usable ones of these folders."""
+    opened = [folder for path in paths if (folder := _opened(path)) is not None]
     try:
-        for folder in _candidates():
-            if make:
-                with contextlib.suppress(OSError):  # there already, or its parent is read-only
-                    folder.mkdir(mode=0o700)
-            descriptor = _opened(folder)
-            if descriptor is not None:
-                opened.append(descriptor)
         yield opened
     finally:
-        for descriptor in opened:
-            os.close(descriptor)
+        for folder in opened:
+            os.close(folder.descriptor)
 
 
 @contextlib.contextmanager
@@ -76,11 +88,16 @@ def announced() -> Iterator[list[socket.socket]]:
     Raises:
         Refused: There is no folder for it that only this user can write to.
     """
-    with _folders(make=True) as folders, contextlib.ExitStack() as announcements:
+    places = _own_places()
+    for place in places:
+        with contextlib.suppress(OSError):  # there already, or its parent is read-only
+            place.mkdir(mode=0o700)
+    with _open_folders(places) as opened, contextlib.ExitStack() as announcements:
+        folders = [folder.descriptor for folder in opened if folder.owner == os.getuid()]
         if not folders:
             raise Refused(
                 "`cdpr stop` could not reach this run",
-                where=" or ".join(map(str, _candidates())),
+                where=" or ".join(map(str, places)),
                 why="no such folder belongs to this user alone; another user may have made it",
                 next_step="remove it or close it to others (chmod 700), or set XDG_RUNTIME_DIR",
             )
@@ -132,13 +149,17 @@ class Reached:
 
 @contextlib.contextmanager
 def reached_runs() -> Iterator[list[Reached]]:
-    """Connections to all runs of this user that are under way, in the order of their numbers."""
+    """Connections to all runs that are under way, in the order of their numbers.
+
+    Those of this user; for root those of all users.
+    """
     runs: dict[int, Reached] = {}
     with contextlib.ExitStack() as links:
-        with _folders(make=False) as folders:
+        with _open_folders(_reached_places()) as folders:
             for folder in folders:
-                for name in sorted(n for n in os.listdir(folder) if n.endswith(_ENDING)):
-                    run = _reached(folder, name)
+                names = os.listdir(folder.descriptor)
+                for name in sorted(n for n in names if n.endswith(_ENDING)):
+                    run = _reached(folder.descriptor, name, folder.owner)
                     if run is None:
                         continue
                     links.callback(run.link.close)
@@ -146,8 +167,8 @@ def reached_runs() -> Iterator[list[Reached]]:
         yield [runs[number] for number in sorted(runs)]
 
 
-def _reached(folder: int, name: str) -> Reached | None:
-    """The run behind a name; a name behind which nobody listens is removed."""
+def _reached(folder: int, name: str, owner: int) -> Reached | None:
+    """The folder owner's run behind a name; a name behind which nobody listens is removed."""
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISSOCK(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
             return None
@@ -163,7 +184,7 @@ def _reached(folder: int, name: str) -> Reached | None:
         return None
     credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     process, user, _ = struct.unpack("3i", credentials)
-    if user != os.getuid():
+    if user != owner:
         link.close()
         return None
     return Reached(process, link)

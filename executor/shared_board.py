@@ -43,6 +43,10 @@ class SharedBoard:
         """See `WishBoard`."""
         return _read(self.memory)
 
+    def close(self) -> None:
+        """Lets go of the memory; who still has it open keeps it."""
+        self.memory.close()
+
     def beat(self) -> None:
         """A sign of life."""
         self._beats += 1

@@ -16,7 +16,7 @@ from cdpr.plan_file import PlanDocument
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.scene import Scene
-from cdpr.stop_file import StopDocument
+from cdpr.scene_stops import StopDocument
 from planner.anytime import AnytimeSettings
 from planner.check import check_path
 from planner.check_report import CheckReport

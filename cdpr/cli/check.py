@@ -31,7 +31,7 @@ def check(
     """
     from cdpr.cli.output import out, show_facts, show_json, spinner
     from cdpr.cli.plan_for_rig import require_same_rig
-    from cdpr.cli.stops import stop_facts
+    from cdpr.cli.stop_facts import stop_facts
     from cdpr.plan import load_plan
     from cdpr.rig import load_rig
     from planner.check import check_path

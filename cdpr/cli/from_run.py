@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cdpr.rig import Rig
     from cdpr.scene import Scene
-    from cdpr.stop_file import StopDocument
+    from cdpr.scene_stops import StopDocument
     from executor.run_end import RunEnd
 
 

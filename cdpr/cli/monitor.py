@@ -55,18 +55,24 @@ def monitor(
 
 
 def _looks(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
-    """How the run stands, again and again, on one connection; until it ends."""
+    """How the run stands, again and again, on one connection; until it ends.
+
+    Raises:
+        Fault: It is still there and does not say how it stands.
+    """
     import time
 
-    from executor.command_client import ask_all, the_one
+    from executor.command_client import ask_all, no_answer, the_one
     from executor.running import reached_runs
 
     with reached_runs() as runs:
         run = the_one(runs, process, "monitor")
         while True:
             (answer,) = ask_all([run], "status")
-            if answer.status is None:
+            if answer.ended:
                 return
+            if answer.status is None:
+                raise no_answer("monitor", [answer])
             yield answer.status
             time.sleep(1.0 / rate)
 

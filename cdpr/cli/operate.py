@@ -76,5 +76,5 @@ def told(verb: str, process: int | None, percent: int | None = None) -> dict[str
     with reached_runs() as runs:
         (answer,) = ask_all([the_one(runs, process, verb)], verb, percent)
     if answer.status is None:
-        raise no_answer(verb, [answer.process])
+        raise no_answer(verb, [answer])
     return answer.status

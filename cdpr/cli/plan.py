@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from cdpr.plan_file import PlanDocument
     from cdpr.rig import Rig
     from cdpr.scene import Scene
-    from cdpr.stop_file import StopDocument
+    from cdpr.scene_stops import StopDocument
     from planner.way import Settings
 
 _LONG = 1000.0
@@ -103,7 +103,7 @@ def plan(
     """
     from cdpr.cli.from_run import require_room, scene_after
     from cdpr.cli.output import show_facts, show_json
-    from cdpr.cli.stops import by_way_of
+    from cdpr.cli.stop_facts import by_way_of
     from cdpr.errors import BadInput
     from cdpr.plan import save_plan
     from cdpr.rig import load_rig
@@ -272,7 +272,7 @@ def facts_of(document: PlanDocument) -> dict[str, Any]:
 def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
     """What a plan is, for people."""
     from cdpr.cli.rotation_facts import rotation_facts
-    from cdpr.cli.stops import stop_facts
+    from cdpr.cli.stop_facts import stop_facts
     from cdpr.scene import scene_from_document
 
     quality = document.quality

@@ -9,7 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from cdpr.rig import Rig
-    from executor.latch import Latch, Latched
+    from drivers.drive_group import CycleStatus
 
 #: Cycles in which a drive leaves its fault, and the others are seen to hold.
 SETTLING_CYCLES = 30
@@ -42,14 +42,14 @@ def reset(
     _require_bus(the_rig)
     latch = Latch(BusSettings.of(the_rig))
     latched = latch.read()
-    _require_nobody_moves(latch, latched)
+    latch.require_no_run()
     if not as_json:
         cause = f"latched since {latched.since}: {latched.cause}" if latched else "no fault latched"
         out.print(f"bus {BusSettings.of(the_rig)}: {cause}", soft_wrap=True, markup=False)
     if not yes:
         ask_operator("Is the cause gone and the platform safe?", "nothing was reset")
-    states = _drives_reset(the_rig)
-    latch.release()
+    with latch.held_for_reset(the_rig.name, latched):
+        states = _drives_reset(the_rig)
     if as_json:
         cause_before = latched.cause if latched else None
         show_json({"released": latched is not None, "cause": cause_before, "drives": states})
@@ -71,19 +71,6 @@ def _require_bus(rig: Rig) -> None:
         )
 
 
-def _require_nobody_moves(latch: Latch, latched: Latched | None) -> None:
-    """A run under way has its own process; its mark is not a fault.
-
-    Raises:
-        Refused: It is still there.
-    """
-    from executor.running import reached_runs
-
-    with reached_runs() as runs:
-        if latched is not None and latched.process in {run.process for run in runs}:
-            latch.require_released()
-
-
 def _drives_reset(rig: Rig) -> list[str]:
     """Sets the drives up, resets those in fault; their states afterwards.
 
@@ -91,11 +78,12 @@ def _drives_reset(rig: Rig) -> list[str]:
         CdprError: A drive does not answer, may not be reset now, or stays in fault.
     """
     from cdpr.cli.drives import open_drives
-    from cdpr.errors import Fault
+    from cdpr.errors import Fault, HardwareMissing
     from cdpr.scene import load_from_document
     from cdpr.scene_file import LoadDocument
     from drivers.drive_group import GroupCommand, GroupState, drive_states
     from executor.clock import RealClock
+    from executor.safety.watch import MISSING_CYCLES
 
     clock = RealClock(rig.document.bus.cycle_ms / 1000.0)
     with open_drives(rig, rig.home, load_from_document(LoadDocument()), to_reset=True) as drives:
@@ -103,10 +91,12 @@ def _drives_reset(rig: Rig) -> list[str]:
         status = group.read_positions()
         if status.state is GroupState.FAULT:
             group.command(GroupCommand.RESET_FAULT)
+        silent = [0] * rig.cable_count
         for _ in range(SETTLING_CYCLES):
             clock.next_cycle()
             group.send_cycle(status.positions.tolist())
             status = group.receive(clock.time_left())
+            silent = _counted(silent, status)
         if status.state is GroupState.FAULT:
             raise Fault(
                 "; ".join(text for _, text in status.faults),
@@ -114,4 +104,22 @@ def _drives_reset(rig: Rig) -> list[str]:
                 why="the cause is still there",
                 next_step="remove it, then reset again; the latch stays engaged",
             )
+        gone = [w.node_id for w, n in zip(rig.winches, silent, strict=True) if n >= MISSING_CYCLES]
+        if gone:
+            raise HardwareMissing(
+                f"drive {', '.join(map(str, gone))} fell silent while the drives settled",
+                where="reset",
+                why="it lost power or the bus since it was set up",
+                next_step="check power and wiring, then reset again; the latch stays engaged",
+            )
         return list(drive_states(status.status_words.tolist()))
+
+
+def _counted(silent: list[int], status: CycleStatus) -> list[int]:
+    """Cycles in a row without an answer of each drive; what was too many stays too many."""
+    from executor.safety.watch import MISSING_CYCLES
+
+    return [
+        n + 1 if missing else (n if n >= MISSING_CYCLES else 0)
+        for n, missing in zip(silent, status.missing.tolist(), strict=True)
+    ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 
 from cdpr.cli.output import out, show_facts, show_json
-from cdpr.cli.stops import stop_facts
+from cdpr.cli.stop_facts import stop_facts
 
 if TYPE_CHECKING:
     from executor.prepare import PreparedRun

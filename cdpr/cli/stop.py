@@ -25,9 +25,9 @@ def stop(
     with reached_runs() as runs:
         answers = ask_all(runs, "stop")
     stopped = [answer.process for answer in answers if answer.status is not None]
-    silent = [answer.process for answer in answers if answer.status is None]
+    silent = [answer for answer in answers if answer.status is None]
     if as_json:
-        show_json({"stopped_processes": stopped, "silent_processes": silent})
+        show_json({"stopped_processes": stopped, "silent_processes": [a.process for a in silent]})
         raise typer.Exit(0 if stopped and not silent else 1)
     if not answers:
         raise no_run("stop")

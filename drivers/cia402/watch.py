@@ -17,9 +17,6 @@ from drivers.cia402.reply_check import ReplyCheck
 from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.cia402.texts import emergency_text
 
-MISSED_REPLIES = 3
-"""Replies in a row that a drive under power must not miss."""
-
 
 class DriveWatch:
     """The last word of every drive: replies, emergencies, heartbeats."""
@@ -33,7 +30,6 @@ class DriveWatch:
         self.torques = [0] * count
         self.states = [DriveState.NOT_READY] * count
         self.answered = [False] * count
-        self.missed = [0] * count
         self.restarted: set[int] = set()
         self._wrong_lengths = 0
         self._check = ReplyCheck(nodes, max_steps)
@@ -52,10 +48,6 @@ class DriveWatch:
     def end_cycle(self) -> None:
         """Counts the replies that did not come, or could not be believed."""
         self._check.end_cycle()
-        self.missed = [
-            0 if answered else missed + 1
-            for answered, missed in zip(self.answered, self.missed, strict=True)
-        ]
 
     def forget_positions(self) -> None:
         """The drives may have been moved since: their next positions are believed as they come."""
@@ -114,16 +106,17 @@ class DriveWatch:
     def state_faults(self, *, powered: bool) -> list[tuple[int, str]]:
         """What is wrong with the drives as they stand, by node.
 
+        How often a drive may be silent is the executor's to say (`executor.safety.watch`).
+
         Args:
-            powered: The group is under power or on its way there; silence is a fault then.
+            powered: The group is under power or on its way there; replies that cannot be believed
+                are a fault then.
         """
         found: list[tuple[int, str]] = []
-        for node, state, missed in zip(self.nodes, self.states, self.missed, strict=True):
+        for node, state in zip(self.nodes, self.states, strict=True):
             if state in FAULTED:
                 cause = self._emergencies.get(node, "it sent no reason")
                 found.append((node, f"drive {node} is in {state.value}: {cause}"))
-            if powered and missed >= MISSED_REPLIES:
-                found.append((node, f"drive {node} does not answer"))
         return found + (self._check.faults() if powered else [])
 
     def forget_emergencies(self) -> None:

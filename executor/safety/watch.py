@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
+#: Missing replies in a row that are one too many.
+MISSING_CYCLES = 2
+
 
 class Reaction(IntEnum):
     """What a finding asks for; of several the larger one is done."""
@@ -49,7 +52,7 @@ class WatchLimits:
     min_tension: float
     max_tension: float
     slack_cycles: int = 5
-    missing_cycles: int = 2
+    missing_cycles: int = MISSING_CYCLES
     late_periods: float = 2.0
 
 

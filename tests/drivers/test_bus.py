@@ -68,6 +68,21 @@ def test_a_udp_port_that_is_none_is_refused(port: str) -> None:
         open_bus(BusSettings("udp_multicast", f"239.74.163.2:{port}"))
 
 
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (("udp_multicast", ""), ("udp_multicast", "239.74.163.2:43113")),
+        (("udp_multicast", "239.74.163.2"), ("udp_multicast", "239.74.163.2:43113")),
+        (("socketcan", "can0"), ("socketcan", " can0")),
+    ],
+)
+def test_a_bus_is_known_however_its_name_is_spelled(
+    one: tuple[str, str], other: tuple[str, str]
+) -> None:
+    assert BusSettings(*one).canonical == BusSettings(*other).canonical
+    assert BusSettings(*one).canonical != BusSettings(one[0], "239.74.163.9:43113").canonical
+
+
 def test_buses_of_one_virtual_channel_hear_each_other() -> None:
     settings = BusSettings("virtual", "hear-each-other")
     with open_bus(settings) as one, open_bus(settings) as other:

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cdpr.errors import BadInput, Fault
-from executor.command_client import ask_all, the_one
+from executor.command_client import ask_all, no_answer, the_one
 from executor.command_server import LONGEST_QUESTION, MOST_CLIENTS, serving
 from executor.commands import NotACommand, answer_to, make_line, parse_command
 from executor.running import Reached, announced, reached_runs
@@ -159,26 +159,65 @@ def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
                 link.close()
 
 
-def test_a_run_that_ends_or_hangs_is_told_as_such(monkeypatch):
+def test_a_run_that_ends_is_told_apart_from_one_that_hangs(monkeypatch):
     monkeypatch.setattr("executor.command_client.ANSWER_TIMEOUT", 0.05)
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        assert ask_all([Reached(7, ours)], "stop")[0].status is None, "it hangs"
+        (hanging,) = ask_all([Reached(7, ours)], "stop")
+        assert (hanging.status, hanging.ended) == (None, False)
         assert theirs.recv(100) == make_line("stop")
     ours, theirs = socket.socketpair()
     theirs.close()
     with ours:
-        assert ask_all([Reached(7, ours)], "stop")[0].status is None, "it ended"
+        (ended,) = ask_all([Reached(7, ours)], "stop")
+        assert (ended.status, ended.ended) == (None, True)
+    assert "did not answer" in no_answer("stop", [hanging]).what
+    assert "ended" in no_answer("stop", [ended]).what
 
 
-@pytest.mark.parametrize("said", [b"no json\n", b"[]\n", b'{"ok": false}\n', b'{"status": 3}\n'])
-def test_an_answer_that_is_none_counts_as_silence(said):
+@pytest.mark.parametrize(
+    ("said", "what"),
+    [
+        (b"no json\n", "cannot be read"),
+        (b"[]\n", "says nothing"),
+        (b'{"ok": false}\n', "says nothing"),
+        (b'{"ok": false, "what": "not a command: no"}\n', "not a command: no"),
+        (b'{"status": 3}\n', "says nothing"),
+    ],
+)
+def test_a_run_that_refuses_is_quoted(said, what):
     ours, theirs = socket.socketpair()
     with ours, theirs:
         thread = threading.Thread(target=lambda: (theirs.recv(100), theirs.sendall(said)))
         thread.start()
-        assert ask_all([Reached(7, ours)], "status")[0].status is None
+        (answer,) = ask_all([Reached(7, ours)], "status")
         thread.join()
+    assert (answer.status, answer.ended) == (None, False)
+    assert what in answer.what
+    assert what in no_answer("hold", [answer]).what
+
+
+def test_a_command_counts_although_the_run_cannot_tell_how_it_stands():
+    class Broken:
+        def as_dict(self) -> dict[str, Any]:
+            raise RuntimeError("half a status")
+
+    board = OwnBoard()
+    answer = json.loads(answer_to(make_line("hold"), board, Broken()))
+    assert answer["ok"] is False
+    assert "half a status" in answer["what"]
+    assert board.read() == Wishes(hold=True)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_run_that_could_not_be_stopped_from_elsewhere_any_more_is_stopped(monkeypatch, board):
+    def break_down(*_: object) -> None:
+        raise RuntimeError("unforeseen")
+
+    monkeypatch.setattr("executor.command_server.answer_to", break_down)
+    with reached_runs() as runs:
+        assert ask_all(runs, "status")[0].ended
+    assert board.read().stop
 
 
 def test_which_run_is_meant_must_be_clear():

@@ -112,6 +112,31 @@ def test_a_run_that_ended_leaves_nothing(folders):
     assert _reached() == []
 
 
+NOBODY = 65534
+#: Like `RUN`, of another user from there on where all that it needs is loaded.
+FOREIGN = RUN.replace("board = ", f"import os\nos.setgid({NOBODY})\nos.setuid({NOBODY})\nboard = ")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may act for two users")
+def test_root_reaches_the_runs_of_other_users(monkeypatch):
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(sys.modules[__name__], "RUN", FOREIGN)
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        Path(folder).chmod(0o777)
+        monkeypatch.setenv("TMPDIR", folder)
+        monkeypatch.setattr(tempfile, "tempdir", None)
+        with _run() as process:
+            assert _reached() == [process.pid]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may act for two users")
+def test_a_user_is_not_reached_through_a_folder_of_another(folders):
+    with announced():
+        for folder in folders:
+            os.chown(folder, NOBODY, NOBODY)
+        assert _reached() == []
+
+
 def test_names_of_other_things_are_left_alone(folders):
     folders[0].mkdir(mode=0o700)
     for name in ("12.sock", "notes.txt", "x.sock"):

@@ -16,7 +16,7 @@ from cdpr.legs import legs_of
 from cdpr.payload import Payload
 from cdpr.plan import load_plan, sealed
 from cdpr.scene import load_scene
-from cdpr.stop_file import StopDocument, payloads
+from cdpr.scene_stops import StopDocument, payloads
 from tests.model.rig_builds import CONFIGS, scene_data, scene_of
 from tests.model.test_plan_file import DOCUMENT
 

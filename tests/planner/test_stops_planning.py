@@ -13,8 +13,8 @@ from cdpr.payload import Payload
 from cdpr.plan import load_plan, plan_from_document, save_plan
 from cdpr.poses import Pose, interpolate
 from cdpr.scene import Load
+from cdpr.scene_stops import StopDocument
 from cdpr.statics.working import working_tensions
-from cdpr.stop_file import StopDocument
 from planner.check import check_path, verify
 from planner.optimal.settings import OptimalSettings
 from planner.plan import make_plan

@@ -82,6 +82,38 @@ def test_each_bus_has_its_own(tmp_path: Path) -> None:
     Latch(BusSettings("socketcan", "can1")).require_released()
 
 
+def test_all_users_share_it_where_an_administrator_made_a_folder_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    monkeypatch.setattr("executor.state_folder.SHARED", shared)
+    Latch(BUS).engage("rig", tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
+    with pytest.raises(Refused, match="did not come to its end"):
+        Latch(BUS).require_released()
+    assert Latch(BUS).path.parent == shared
+
+
+def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
+    tmp_path: Path,
+) -> None:
+    latch = Latch(BUS)
+    with pytest.raises(Refused, match="a reset did not"), latch.held_for_reset("rig", None):
+        Latch(BUS).engage("rig", tmp_path)
+    latch.require_released()
+    latch.engage("rig", tmp_path, "cable 3 is slack")
+    shown = latch.read()
+    with pytest.raises(KeyError), latch.held_for_reset("rig", shown):
+        raise KeyError
+    assert latch.read() == shown
+    with latch.held_for_reset("rig", shown):
+        pass
+    latch.require_released()
+    with pytest.raises(Refused, match="changed since"), latch.held_for_reset("rig", shown):
+        pytest.fail("somebody else released it: the operator said yes to something else")
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"bus": 1}', "\x00"])
 def test_a_latch_file_that_cannot_be_read_counts_as_engaged(tmp_path: Path, content: str) -> None:
     latch = Latch(BUS)
@@ -148,6 +180,28 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
         assert DriveState.FAULT not in {drive.state for drive in rehearsal.drives}
         assert [drive.motor.position for drive in rehearsal.drives] == stood
     latch.require_released()
+
+
+@pytest.mark.slow
+def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    channel = f"239.74.163.23:{20000 + (os.getpid() * 17) % 20000}"
+    latch = Latch(BusSettings("udp_multicast", channel))
+    latch.engage("rig", tmp_path)
+    with drives_on(channel, prepared) as rehearsal:
+        answered = rehearsal.drives[4].on_sync
+
+        def falls_silent() -> None:
+            answered()
+            rehearsal.drives[4].silent = rehearsal.cycles > 10
+
+        rehearsal.drives[4].on_sync = falls_silent  # type: ignore[method-assign]
+        bus = ("--interface", "udp_multicast", "--channel", channel)
+        answer = call("reset", RIG, *bus, "--yes")
+    assert answer.code == 4, answer
+    assert "drive 5 fell silent" in answer.err
+    assert latch.read() is not None
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ def by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
         BadInput: A way-pose cannot be read.
     """
     from cdpr.errors import BadInput
-    from cdpr.stop_file import StopDocument
+    from cdpr.scene_stops import StopDocument
 
     ways = []
     for number, text in enumerate(via_mm, start=1):
