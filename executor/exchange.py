@@ -11,7 +11,8 @@ from drivers.drive_group import WHOLE_BUS, CycleStatus, DriveGroup, GroupState
 from executor.clock import Clock
 from executor.course import Course
 from executor.safety.gate import Purpose, Request, Verdict, examine
-from executor.safety.limits import gate_limits, watch_limits
+from executor.safety.limits import gate_limits, least_steps, watch_limits
+from executor.safety.stuck import StuckWatch
 from executor.safety.watch import Finding, Observation, Watch
 
 
@@ -52,6 +53,7 @@ class Exchange:
         self._rated = np.array([w.torque_constant for w in rig.winches])
         self._limits = gate_limits(rig, course.setpoints, course.cycle)
         self._watch = Watch.fresh(watch_limits(rig), rig.cable_count)
+        self._stuck = StuckWatch.fresh(least_steps(rig))
         self.armed = False
         self.latched = False
         self.targets: tuple[int, ...] | None = None
@@ -116,16 +118,20 @@ class Exchange:
         return np.where(status.missing, np.nan, errors)
 
     def _look(self, status: CycleStatus, errors: Array, lateness: float) -> tuple[Finding, ...]:
+        following, missing = status.state is GroupState.ENABLED, status.missing.tolist()
         seen = Observation(
-            following=status.state is GroupState.ENABLED,
+            following=following,
             following_errors=errors.tolist(),
             tensions=(np.asarray(status.torques) / 1000.0 * self._rated).tolist(),
-            missing=[bool(m) for m in status.missing],
+            missing=missing,
             faults=[_named(node, text) for node, text in status.faults],
             lateness=lateness,
         )
         self._watch, findings = self._watch.look(seen)
-        return findings
+        self._stuck, stuck = self._stuck.look(
+            following, status.positions.tolist(), status.demands.tolist(), missing
+        )
+        return (*findings, *stuck)
 
 
 def _named(node: int, text: str) -> str:

@@ -95,6 +95,8 @@ class Rehearsal:
             for winch, counts in zip(rig.winches, self._counts, strict=True)
         )
         self._handlers = self._routes()
+        self._cyclic = {SYNC_ID, *(RPDO1_BASE + drive.node for drive in self.drives)}
+        self._begun = False
 
     @property
     def pose(self) -> Pose:
@@ -118,14 +120,18 @@ class Rehearsal:
         self.plant.carry(load)
 
     def pump(self) -> None:
-        """Works off every frame that waits, and answers; each SYNC lets one cycle pass.
+        """Works off every frame that waits, and answers; each cycle of the master lets one pass.
+
+        A cycle begins with the first of its set-points, or with its SYNC where none came.
 
         Raises:
             Fault: The bus failed, or the platform has no equilibrium.
         """
         while (message := take(self._bus, 0.0)) is not None:
-            if message.arbitration_id == SYNC_ID:
+            if message.arbitration_id in self._cyclic and not self._begun:
                 self._advance(self._cycle)
+                self._begun = True
+            self._begun = self._begun and message.arbitration_id != SYNC_ID
             self._handle(message)
 
     def advance(self, seconds: float) -> None:

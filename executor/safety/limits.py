@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,11 @@ from executor.safety.watch import WatchLimits
 #: A cable is slack below this share of the least planned tension. Plans run at the least tension
 #: itself (in 6 % of the paper rig's box), and a whole count is worth 1.7 N there: not yet slack.
 SLACK_SHARE = 0.5
+#: Below this share of it a cable carries nothing: it is torn, or hangs loose.
+LOOSE_SHARE = 0.1
+#: Steps of set-points below this share of the largest following error say nothing about a drive
+#: that stands still: it may rest on its own friction.
+LEAST_STEP_SHARE = 0.01
 #: Above this share of the largest planned tension a cable is overloaded; torque is read in ‰.
 OVERLOAD_SHARE = 1.02
 
@@ -25,8 +32,17 @@ def watch_limits(rig: Rig) -> WatchLimits:
     """When the watch speaks up."""
     low, high = tension_limits(rig)
     return WatchLimits(
-        following_error=rig.motion.following_error, min_tension=low, max_tension=high
+        following_error=rig.motion.following_error,
+        min_tension=low,
+        max_tension=high,
+        no_tension=LOOSE_SHARE * rig.min_tension,
     )
+
+
+def least_steps(rig: Rig) -> tuple[int, ...]:
+    """Steps of set-points that a drive must follow at once, one a drive, [counts]."""
+    least = LEAST_STEP_SHARE * rig.motion.following_error
+    return tuple(max(2, math.ceil(least * abs(w.counts_per_metre))) for w in rig.winches)
 
 
 def gate_limits(rig: Rig, setpoints: NDArray[np.int32], cycle: float) -> Limits:

@@ -43,15 +43,19 @@ class WatchLimits:
         following_error: Cable length, [m].
         min_tension: Slack below this, [N].
         max_tension: Over-tension above this, [N].
+        no_tension: Below this a cable is torn or hangs loose, [N].
         slack_cycles: Cycles of slack or over-tension that are one too many.
+        loose_cycles: Cycles without tension that are one too many.
         missing_cycles: Missing replies in a row that are one too many.
-        late_periods: Lateness, in cycles, above which the path stops.
+        late_periods: Lateness, in cycles, from which on the path stops.
     """
 
     following_error: float
     min_tension: float
     max_tension: float
+    no_tension: float
     slack_cycles: int = 5
+    loose_cycles: int = 3
     missing_cycles: int = MISSING_CYCLES
     late_periods: float = 2.0
 
@@ -85,13 +89,14 @@ class Watch:
     limits: WatchLimits
     missing: tuple[int, ...]
     slack: tuple[int, ...]
+    loose: tuple[int, ...]
     over: tuple[int, ...]
 
     @classmethod
     def fresh(cls, limits: WatchLimits, drives: int) -> Watch:
         """A watch that has seen nothing."""
         zeros = (0,) * drives
-        return cls(limits, zeros, zeros, zeros)
+        return cls(limits, zeros, zeros, zeros, zeros)
 
     def look(self, seen: Observation) -> tuple[Watch, tuple[Finding, ...]]:
         """Takes in one cycle.
@@ -105,12 +110,14 @@ class Watch:
             raise ValueError(f"the watch was shown {counts} entries for {len(self.missing)} drives")
         # "Not at least" and "not at most", so that a tension that is no number counts as wrong.
         slack = [seen.following and not t >= limits.min_tension for t in seen.tensions]
+        loose = [seen.following and not t >= limits.no_tension for t in seen.tensions]
         over = [seen.following and not t <= limits.max_tension for t in seen.tensions]
         # A drive that did not answer says nothing new about its tension.
         watch = Watch(
             limits,
             _counted(self.missing, seen.missing, [False] * len(seen.missing)),
             _counted(self.slack, slack, seen.missing),
+            _counted(self.loose, loose, seen.missing),
             _counted(self.over, over, seen.missing),
         )
         return watch, (
@@ -151,7 +158,10 @@ class Watch:
         found = []
         for drive, tension in enumerate(seen.tensions):
             text = f"cable {drive + 1} carries {tension:.1f} N,"
-            if self.slack[drive] >= self.limits.slack_cycles:
+            if self.loose[drive] >= self.limits.loose_cycles:
+                loose = f"{text} no tension: it is torn or hangs loose"
+                found.append(Finding(Reaction.QUICK_STOP, "cable_loose", loose, drive + 1))
+            elif self.slack[drive] >= self.limits.slack_cycles:
                 slack = f"{text} less than {self.limits.min_tension:.1f} N: it may be slack"
                 found.append(Finding(Reaction.PATH_STOP, "slack", slack, drive + 1))
             if self.over[drive] >= self.limits.slack_cycles:
@@ -161,9 +171,9 @@ class Watch:
 
     def _lateness(self, seen: Observation) -> list[Finding]:
         text = f"a cycle began {seen.lateness:.1f} cycles late"
-        if not seen.lateness <= self.limits.late_periods:  # also when it is no number
+        if not seen.lateness < self.limits.late_periods:  # also when it is no number
             return [Finding(Reaction.PATH_STOP, "late", text)]
-        if seen.lateness > 1.0:
+        if seen.lateness >= 1.0:
             return [Finding(Reaction.NOTE, "late", text)]
         return []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -74,17 +75,26 @@ def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def trace(request: pytest.FixtureRequest, channel: str, artefacts: Path) -> Iterator[Path]:
-    """What candump hears while the test runs."""
-    path = artefacts / f"{request.node.name}.log"
+def trace(
+    request: pytest.FixtureRequest, channel: str, artefacts: Path, tmp_path: Path
+) -> Iterator[Path]:
+    """What candump hears while the test runs; kept afterwards.
+
+    It is not written where it is kept: a virtual machine loses time waiting for a file of the host.
+    """
+    path = tmp_path / "trace.log"
     with (
         path.open("w") as file,
         subprocess.Popen(
             ["candump", "-L", "-r", str(TRACE_BUFFER_BYTES), channel], stdout=file
         ) as candump,
     ):
-        yield path
-        candump.terminate()
+        try:
+            yield path
+        finally:
+            candump.terminate()
+            candump.wait()
+            shutil.copyfile(path, artefacts / f"{request.node.name}.log")
 
 
 @pytest.fixture

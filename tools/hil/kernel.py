@@ -7,6 +7,7 @@ beside busybox and `guest_init`.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import lzma
 import re
@@ -38,9 +39,8 @@ def boot_files(cache: Path) -> tuple[Path, Path]:
     if not BUSYBOX.is_file():
         raise VmFailed("busybox is missing; next: sudo apt-get install busybox-static")
     package = _package_name()
-    parts = (GUEST_INIT, Path(__file__))
-    newest = max(int(part.stat().st_mtime) for part in parts)
-    folder = cache / f"{package}-{newest}"
+    parts = GUEST_INIT.read_bytes() + Path(__file__).read_bytes()
+    folder = cache / f"{package}-{hashlib.sha256(parts).hexdigest()[:12]}"
     kernel, initramfs = folder / "vmlinuz", folder / "initramfs"
     if not initramfs.is_file():
         making = cache / f"{folder.name}.part"

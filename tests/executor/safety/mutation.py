@@ -24,7 +24,12 @@ import pytest
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
-MODULES = {"gate": "test_gate.py", "watch": "test_watch.py"}
+MODULES = {
+    "gate": "test_gate.py",
+    "watch": "test_watch.py",
+    "stuck": "test_stuck.py",
+    "limits": "test_limits.py",
+}
 PATIENCE_S = 60
 WANTED = 0.95
 COMPARED = {

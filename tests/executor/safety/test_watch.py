@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from executor.safety.watch import Finding, Observation, Reaction, Watch, WatchLimits
 
 NAN = float("nan")
-LIMITS = WatchLimits(following_error=0.002, min_tension=5.0, max_tension=100.0)
+LIMITS = WatchLimits(following_error=0.002, min_tension=5.0, max_tension=100.0, no_tension=0.5)
 FINE = Observation(
     following=True,
     following_errors=(0.0, 0.0, 0.0),
@@ -53,6 +53,7 @@ def test_the_larger_reaction_has_the_larger_number():
 
 def test_limits_have_the_values_of_the_stop_rules():
     assert (LIMITS.slack_cycles, LIMITS.missing_cycles, LIMITS.late_periods) == (5, 2, 2.0)
+    assert LIMITS.loose_cycles == 3
 
 
 def test_one_lost_reply_is_noted_and_two_in_a_row_stop():
@@ -135,7 +136,7 @@ def test_a_drive_that_did_not_answer_is_not_judged_by_its_old_position(drive):
 @each_drive
 @pytest.mark.parametrize(
     ("tension", "code"),
-    [(4.99, "slack"), (-3.0, "slack"), (0.0, "slack"), (100.01, "over_tension")],
+    [(4.99, "slack"), (0.5, "slack"), (100.01, "over_tension")],
 )
 def test_five_cycles_of_wrong_tension_in_a_row_stop_along_the_path(drive, tension, code):
     wrong = _with("tensions", drive, tension)
@@ -144,6 +145,7 @@ def test_five_cycles_of_wrong_tension_in_a_row_stop_along_the_path(drive, tensio
     assert _codes(*[wrong] * 6) == [(code, Reaction.PATH_STOP)]
     assert _codes(*[wrong] * 4, FINE, *[wrong] * 4) == []
     (found,) = _look(*[wrong] * 5)
+    assert found.drive == drive + 1
     assert found.text.startswith(f"cable {drive + 1} carries {tension:.1f} N, ")
     ending = {
         "slack": "less than 5.0 N: it may be slack",
@@ -153,15 +155,30 @@ def test_five_cycles_of_wrong_tension_in_a_row_stop_along_the_path(drive, tensio
 
 
 @each_drive
+@pytest.mark.parametrize("tension", [0.49, 0.0, -3.0])
+def test_three_cycles_without_tension_in_a_row_are_a_quick_stop(drive, tension):
+    none = _with("tensions", drive, tension)
+    assert _codes(*[none] * 2) == []
+    assert _codes(*[none] * 3) == [("cable_loose", Reaction.QUICK_STOP)]
+    assert _codes(*[none] * 9) == [("cable_loose", Reaction.QUICK_STOP)]
+    assert _codes(*[none] * 2, FINE, *[none] * 2) == []
+    (found,) = _look(*[none] * 3)
+    assert found.drive == drive + 1
+    assert found.text == (
+        f"cable {drive + 1} carries {tension:.1f} N, no tension: it is torn or hangs loose"
+    )
+
+
+@each_drive
 @pytest.mark.parametrize("tension", [5.0, 100.0])
 def test_the_limits_of_tension_themselves_are_allowed(drive, tension):
     assert _look(*[_with("tensions", drive, tension)] * 9) == ()
 
 
 @each_drive
-def test_a_tension_that_is_no_number_is_slack_and_over_tension(drive):
+def test_a_tension_that_is_no_number_is_none_and_too_much(drive):
     assert _codes(*[_with("tensions", drive, NAN)] * 5) == [
-        ("slack", Reaction.PATH_STOP),
+        ("cable_loose", Reaction.QUICK_STOP),
         ("over_tension", Reaction.PATH_STOP),
     ]
 
@@ -174,12 +191,12 @@ def test_wrong_tensions_of_different_cables_do_not_add_up(drive):
 
 
 def test_slack_and_over_tension_are_counted_apart():
-    low, high = _with("tensions", 0, 0.0), _with("tensions", 0, 200.0)
+    low, high = _with("tensions", 0, 2.0), _with("tensions", 0, 200.0)
     assert _look(*[low, high] * 5) == ()
 
 
 def test_a_silent_drive_neither_resets_nor_adds_to_its_count_of_slack():
-    low = _with("tensions", 1, 0.0)
+    low = _with("tensions", 1, 2.0)
     silent_low = replace(low, missing=(False, True, False))
     silent_fine = replace(FINE, missing=(False, True, False))
     assert [c for c, _ in _codes(*[low] * 4, silent_low)] == ["reply_lost"]
@@ -187,6 +204,9 @@ def test_a_silent_drive_neither_resets_nor_adds_to_its_count_of_slack():
     assert _codes(*[low] * 4, silent_fine, low) == [("slack", Reaction.PATH_STOP)]
     high = _with("tensions", 1, 200.0)
     assert _codes(*[high] * 4, silent_fine, high) == [("over_tension", Reaction.PATH_STOP)]
+    none = _with("tensions", 1, 0.0)
+    assert [c for c, _ in _codes(*[none] * 2, silent_fine)] == ["reply_lost"]
+    assert _codes(*[none] * 2, silent_fine, none) == [("cable_loose", Reaction.QUICK_STOP)]
 
 
 @pytest.mark.parametrize("field", ["following_errors", "tensions"])
@@ -199,19 +219,19 @@ def test_drives_that_do_not_follow_are_not_judged_by_errors_and_tensions(field):
 
 
 def test_slack_before_the_drives_follow_does_not_count():
-    low = _with("tensions", 0, 0.0)
-    resting = replace(low, following=False)
-    assert _look(*[low] * 4, resting, *[low] * 4) == ()
+    low, none = _with("tensions", 0, 2.0), _with("tensions", 0, 0.0)
+    assert _look(*[low] * 4, replace(low, following=False), *[low] * 4) == ()
+    assert _look(*[none] * 2, replace(none, following=False), *[none] * 2) == ()
 
 
 @pytest.mark.parametrize(
     ("lateness", "reaction"),
     [
         (0.0, None),
-        (1.0, None),
-        (1.001, Reaction.NOTE),
-        (2.0, Reaction.NOTE),
-        (2.001, Reaction.PATH_STOP),
+        (0.999, None),
+        (1.0, Reaction.NOTE),
+        (1.999, Reaction.NOTE),
+        (2.0, Reaction.PATH_STOP),
         (1e9, Reaction.PATH_STOP),
         (NAN, Reaction.PATH_STOP),
     ],
@@ -232,12 +252,12 @@ def test_everything_is_told_at_once_gravest_first():
     seen = Observation(
         following=True,
         following_errors=(0.0, 0.1, 0.0),
-        tensions=(20.0, 20.0, 0.0),
+        tensions=(20.0, 20.0, 2.0),
         missing=(True, False, False),
         faults=("node 1: hot",),
         lateness=3.0,
     )
-    low = _with("tensions", 2, 0.0)
+    low = _with("tensions", 2, 2.0)
     assert [code for code, _ in _codes(*[low] * 4, seen)] == [
         "drive_fault",
         "reply_lost",
@@ -258,25 +278,29 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
 
 @given(
     cycles=st.lists(
-        st.tuples(st.booleans(), st.sampled_from([0.0, 20.0, 200.0]), st.booleans()), max_size=30
+        st.tuples(st.booleans(), st.sampled_from([0.0, 2.0, 20.0, 200.0]), st.booleans()),
+        max_size=30,
     )
 )
 def test_counts_are_runs_of_what_was_seen(cycles):
     """Against counting by hand, for one drive."""
     watch = Watch.fresh(LIMITS, 1)
-    missing = slack = over = 0
+    missing = slack = loose = over = 0
     for following, tension, lost in cycles:
         seen = Observation(following, (0.0,), (tension,), (lost,), (), 0.0)
         watch, found = watch.look(seen)
         missing = missing + 1 if lost else 0
         if not lost:
             slack = slack + 1 if following and tension < 5.0 else 0
+            loose = loose + 1 if following and tension < 0.5 else 0
             over = over + 1 if following and tension > 100.0 else 0
-        assert (watch.missing, watch.slack, watch.over) == ((missing,), (slack,), (over,))
+        assert (watch.missing, watch.slack) == ((missing,), (slack,))
+        assert (watch.loose, watch.over) == ((loose,), (over,))
         wanted = {
             "drive_silent": missing >= 2,
             "reply_lost": missing == 1,
-            "slack": slack >= 5,
+            "slack": slack >= 5 and loose < 3,
+            "cable_loose": loose >= 3,
             "over_tension": over >= 5,
         }
         assert {f.code for f in found} == {code for code, due in wanted.items() if due}

@@ -1,0 +1,194 @@
+"""A bus that loses, delays, repeats and spoils frames, by rules; for tests of what depends on it.
+
+It stands between one end of a bus and whoever uses that end. Nothing in it is random by itself:
+rules that draw take a generator.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+import time
+from collections.abc import Callable, Container, Iterable
+
+import can
+
+from drivers.bus_load import frame_bits
+
+Arrivals = Iterable[tuple[float, can.Message]]
+"""What becomes of a frame: frames and how much later than it each of them comes, [s]."""
+
+Rule = Callable[[can.Message], Arrivals]
+
+_Box = list[tuple[float, int, can.Message]]
+
+BUS_OFF = can.Message(
+    arbitration_id=0x040, data=bytes(8), is_error_frame=True, is_extended_id=False
+)
+"""What a controller that left the bus tells its own side. Source: linux/can/error.h."""
+
+
+class FaultBus(can.BusABC):
+    """One end of a bus, with rules for each direction.
+
+    Attributes:
+        incoming: For frames that come in; each rule sees what the ones before it let through.
+        outgoing: For frames that go out.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        ahead: float = 0.0,
+        bitrate: float | None = None,
+    ) -> None:
+        """Takes an open bus, which stays the caller's; without rules nothing happens to frames.
+
+        Args:
+            bus: The end that is used.
+            clock: Seconds; simulated time where the bus is.
+            ahead: Frames that arrive within this time from now have arrived, [s]: in simulated
+                time, in which all of a cycle happens at its beginning, nearly a cycle.
+            bitrate: With it every frame takes its time on the wire, and of those that wait the
+                lowest identifier is next, [bit/s]. Both directions share the wire.
+        """
+        super().__init__(channel="")
+        self.channel_info = f"{bus.channel_info} with faults"
+        self.incoming: list[Rule] = []
+        self.outgoing: list[Rule] = []
+        self._bus, self._clock, self._ahead = bus, clock, ahead
+        self.bitrate = bitrate
+        self._number = 0
+        self._free_at = 0.0
+        self._waiting: list[tuple[int, int, float, _Box, can.Message]] = []
+        self._came: _Box = []
+        self._goes: _Box = []
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Sends a frame, or what the rules make of it."""
+        self._enter(msg, self.outgoing, self._goes)
+        self._pass_on()
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame that came through the rules; None when there is none within the time."""
+        self._pass_on()
+        wait = timeout
+        while not self._has_come():
+            message = self._bus.recv(wait)
+            if message is None:
+                self._pass_on()
+                break
+            self._enter(message, self.incoming, self._came)
+            self._pass_on()
+            wait = 0.0
+        return heapq.heappop(self._came)[2] if self._has_come() else None
+
+    def say(self, message: can.Message) -> None:
+        """Puts a frame on the bus that no rule touches, as another device would."""
+        self._bus.send(message)
+
+    def fileno(self) -> int:
+        """Of the bus underneath."""
+        return self._bus.fileno()
+
+    def shutdown(self) -> None:
+        """Forgets what is on its way; the bus underneath stays open."""
+        self._waiting.clear()
+        self._came.clear()
+        self._goes.clear()
+        super().shutdown()
+
+    @property
+    def _now(self) -> float:
+        return self._clock() + self._ahead
+
+    def _has_come(self) -> bool:
+        return bool(self._came) and self._came[0][0] <= self._now
+
+    def _enter(self, message: can.Message, rules: list[Rule], box: _Box) -> None:
+        began = self._clock()
+        arrivals: list[tuple[float, can.Message]] = [(0.0, message)]
+        for rule in rules:
+            arrivals = [(late + more, new) for late, old in arrivals for more, new in rule(old)]
+        for late, new in arrivals:
+            self._number += 1
+            if self.bitrate is None:
+                heapq.heappush(box, (began + late, self._number, new))
+            else:
+                entry = (new.arbitration_id, self._number, began + late, box, new)
+                heapq.heappush(self._waiting, entry)
+
+    def _arbitrate(self) -> None:
+        """Gives the wire to the lowest identifier that waits, as long as there is time."""
+        while self.bitrate is not None and self._waiting:
+            begin = max(self._free_at, min(entry[2] for entry in self._waiting))
+            if begin > self._now:
+                return
+            entry = min(entry for entry in self._waiting if entry[2] <= begin)
+            self._waiting.remove(entry)
+            _, number, _, box, message = entry
+            self._free_at = begin + frame_bits(len(message.data)) / self.bitrate
+            heapq.heappush(box, (self._free_at, number, message))
+
+    def _pass_on(self) -> None:
+        """Sends what has had its time."""
+        self._arbitrate()
+        while self._goes and self._goes[0][0] <= self._now:
+            self._bus.send(heapq.heappop(self._goes)[2])
+
+
+def lose(ids: Container[int], share: float = 1.0, dice: random.Random | None = None) -> Rule:
+    """Loses frames of some identifiers: all of them, or a share by the dice."""
+
+    def rule(message: can.Message) -> Arrivals:
+        lost = message.arbitration_id in ids and (dice is None or dice.random() < share)
+        return [] if lost else [(0.0, message)]
+
+    return rule
+
+
+def lose_next(ids: Container[int], count: int) -> Rule:
+    """Loses the next frames of some identifiers, and then no more."""
+    left = count
+
+    def rule(message: can.Message) -> Arrivals:
+        nonlocal left
+        if left and message.arbitration_id in ids:
+            left -= 1
+            return []
+        return [(0.0, message)]
+
+    return rule
+
+
+def delay(ids: Container[int], seconds: float) -> Rule:
+    """Lets frames of some identifiers come later."""
+    return lambda message: [(seconds if message.arbitration_id in ids else 0.0, message)]
+
+
+def repeat(ids: Container[int], seconds: float = 0.0) -> Rule:
+    """Frames of some identifiers come twice, the second time so much later."""
+
+    def rule(message: can.Message) -> Arrivals:
+        again = [(seconds, message)] if message.arbitration_id in ids else []
+        return [(0.0, message), *again]
+
+    return rule
+
+
+def spoil(ids: Container[int], change: Callable[[bytes], bytes], count: int | None = None) -> Rule:
+    """Changes the data of frames of some identifiers: of the next few, or of all."""
+    left = count
+
+    def rule(message: can.Message) -> Arrivals:
+        nonlocal left
+        if left == 0 or message.arbitration_id not in ids:
+            return [(0.0, message)]
+        left = None if left is None else left - 1
+        data = change(bytes(message.data))
+        number = message.arbitration_id
+        return [(0.0, can.Message(arbitration_id=number, data=data, is_extended_id=False))]
+
+    return rule

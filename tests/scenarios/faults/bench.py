@@ -1,0 +1,317 @@
+"""A run on simulated drives behind a bus with faults, in simulated time or in real time.
+
+In simulated time executor and drives share a thread (python-can's `virtual`). In real time the
+executor is a process of its own, which can be killed and suspended (`udp_multicast`, `socketcan`).
+"""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import json
+import os
+import signal
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import can
+
+from cdpr.rig import Rig, rig_from_document
+from drivers.bus import BusSettings, open_bus
+from drivers.drive_group import make_drive_group
+from executor.machine import State
+from executor.prepare import PreparedRun
+from executor.recorder import Recorder
+from executor.run_folder import RunEvent, RunFolder
+from executor.status import RunStatus
+from executor.wishes import OwnBoard
+from simulation.drive import SimulatedDrive
+from simulation.fault_bus import FaultBus, lose
+from tests.scenarios.faults.masters import Masters, gone
+from tests.scenarios.faults.samples import Limits, Stopped, WatchedRehearsal, stopped, violations
+from tests.scenarios.stage import Stage
+
+_CHANNELS = itertools.count()
+FINE = 0.001
+CRUISING = 150
+EVERY_ID = range(0x800)
+ENDS_WITHIN_S = 60.0
+
+Script = Callable[["Bench"], object]
+
+
+class Killed(BaseException):
+    """The executor is dead from here on."""
+
+
+class Bench(ABC):
+    """One run.
+
+    Attributes:
+        prepared: What is run.
+        rehearsal: Drives and platform.
+        line: The drives' end of the bus.
+        folder: The run folder.
+        since: When the fault happened, on the drives' clock; None before.
+        fault_cycle: SYNCs from the beginning until the fault.
+        lost: Drives that were broken on purpose, from 0.
+        missed_start: See `samples.violations`.
+    """
+
+    prepared: PreparedRun
+    rehearsal: WatchedRehearsal
+    line: FaultBus
+    folder: RunFolder
+
+    def __init__(self) -> None:
+        self.since: float | None = None
+        self.fault_cycle = CRUISING
+        self.lost: frozenset[int] = frozenset()
+        self.missed_start = False
+
+    @property
+    def drives(self) -> tuple[SimulatedDrive, ...]:
+        return self.rehearsal.drives
+
+    @property
+    def cycle(self) -> int:
+        """SYNCs so far."""
+        return self.rehearsal.cycles
+
+    def happens(self) -> None:
+        """From now on the time to the stop counts."""
+        if self.since is None:
+            self.since = self.rehearsal.now
+
+    def breaks(self, *drives: int) -> None:
+        """These drives fail, from 0; the others have to stop."""
+        self.happens()
+        self.lost |= set(drives)
+
+    def stop(self) -> Stopped:
+        """How the drives stopped since the fault."""
+        assert self.since is not None, "the fault never happened"
+        return stopped(self.rehearsal, self.prepared.rig, self.since, self.lost)
+
+    def violations(self, mixed_cycles: float = 4.0, rows: float = 1.0) -> list[str]:
+        """See `samples.violations`."""
+        limits = Limits.of(self.prepared, mixed_cycles, rows)
+        return violations(self.rehearsal, limits, lost=self.lost, missed_start=self.missed_start)
+
+    def events(self) -> list[RunEvent]:
+        return self.folder.events()
+
+    def codes(self) -> list[str]:
+        return [event.code for event in self.events()]
+
+    @abstractmethod
+    def kill(self) -> None:
+        """`kill -9` of the executor."""
+
+    @abstractmethod
+    def ask_stop(self) -> None:
+        """The operator wants to stop."""
+
+    @abstractmethod
+    def run(self) -> State | None:
+        """Arms and moves to the end; None when the executor was killed."""
+
+
+class SimulatedBench(Bench):
+    """Executor and drives in one thread; time passes with SYNC."""
+
+    def __init__(self, stage: Stage, line: FaultBus) -> None:
+        super().__init__()
+        self.stage, self.line = stage, line
+        self.prepared, self.folder = stage.prepared, stage.folder
+        assert isinstance(stage.rehearsal, WatchedRehearsal)
+        self.rehearsal = stage.rehearsal
+        self.cause = ""
+        self.killed = False
+
+    def kill(self) -> None:
+        self.happens()
+        self.line.incoming.append(lose(EVERY_ID))
+        self.killed = True
+        raise Killed
+
+    def ask_stop(self) -> None:
+        self.stage.board.ask_stop()
+
+    def late(self, cycles: float) -> None:
+        """The cycle that is about to begin is late; the drives' time passes all the same."""
+        self.pass_time(cycles * self.prepared.checked.table.cycle)
+        self.stage.lateness = cycles
+
+    def pass_time(self, seconds: float) -> None:
+        """Without a SYNC."""
+        for _ in range(round(seconds / FINE)):
+            self.rehearsal.advance(FINE)
+
+    def run(self) -> State | None:
+        try:
+            outcome = self.stage.run()
+        except Killed:
+            self.pass_time(0.3)
+            return None
+        self.cause = outcome.cause
+        self.pass_time(0.3)
+        self.rehearsal.pump()
+        return outcome.state
+
+
+@contextmanager
+def simulated(
+    prepared: PreparedRun, path: Path, script: Script, *, bitrate: float | None = None
+) -> Iterator[SimulatedBench]:
+    """A bench in simulated time; the script is asked at every cycle, from 0 after arming."""
+    settings = BusSettings("virtual", f"fault-{next(_CHANNELS)}")
+    with open_bus(settings) as near, open_bus(settings) as far:
+        now = 0.0
+        with FaultBus(far, lambda: now, ahead=0.95 * prepared.checked.table.cycle) as line:
+            scene = prepared.scene
+            rehearsal = WatchedRehearsal(prepared.rig, line, scene.start, scene.load)
+            group = make_drive_group(prepared.rig, near, rehearsal.pump)
+            group.configure()
+            line.bitrate = bitrate
+
+            def per_cycle(stage: Stage) -> None:
+                nonlocal now
+                now = (stage.cycle + 1) * prepared.checked.table.cycle
+                script(bench)
+
+            stage = Stage(prepared, rehearsal, group, RunFolder.create(path), per_cycle)
+            bench = SimulatedBench(stage, line)
+            yield bench
+            group.close()
+
+
+class LiveBench(Bench):
+    """The executor in a process of its own, the drives in a thread of this one; real time."""
+
+    def __init__(
+        self,
+        prepared: PreparedRun,
+        folder: RunFolder,
+        settings: BusSettings,
+        masters: Masters,
+        line: FaultBus,
+        rehearsal: WatchedRehearsal,
+    ) -> None:
+        super().__init__()
+        self.prepared, self.folder, self.line, self.rehearsal = prepared, folder, line, rehearsal
+        self._settings, self._masters = settings, masters
+        self.process = 0
+        self.outcome: dict[str, Any] = {}
+
+    def kill(self) -> None:
+        self.happens()
+        os.kill(self.process, signal.SIGKILL)
+
+    def suspend(self) -> None:
+        """The executor hangs."""
+        self.happens()
+        os.kill(self.process, signal.SIGSTOP)
+
+    def ask_stop(self) -> None:
+        os.kill(self.process, signal.SIGTERM)
+
+    def run(self) -> State | None:
+        over = threading.Event()
+        drives = threading.Thread(target=self.rehearsal.serve_until, args=(over,))
+        with _ahead_of_others():  # both threads: one waits for the other's lock
+            drives.start()
+            try:
+                self.process = self._masters.start(self._settings, self.folder.path)
+                self._wait()
+            finally:
+                if self.process and not gone(self.process):
+                    os.kill(self.process, signal.SIGKILL)
+                over.set()
+                drives.join()
+        told = self.folder.path / "outcome.json"
+        if not told.is_file():
+            return None
+        self.outcome = json.loads(told.read_text())
+        return State(self.outcome["state"])
+
+    def _wait(self) -> None:
+        for _ in range(round(ENDS_WITHIN_S / 0.02)):
+            if gone(self.process):
+                break
+            signal.sigtimedwait([], 0.02)
+        signal.sigtimedwait([], 0.3)  # the drives have their own time-outs
+
+
+@contextmanager
+def _ahead_of_others() -> Iterator[None]:
+    """A real drive answers whatever else this computer does, and collects no garbage."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(60))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameter)
+        gc.enable()
+        gc.unfreeze()
+
+
+@contextmanager
+def live(
+    prepared: PreparedRun, path: Path, script: Script, settings: BusSettings, masters: Masters
+) -> Iterator[LiveBench]:
+    """A bench in real time; the script is asked at every SYNC."""
+    document = prepared.rig.document.bus.model_copy(
+        update={"interface": settings.interface, "channel": settings.channel}
+    )
+    rig: Rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": document}))
+    with open_bus(settings) as bus, FaultBus(bus) as line:
+        rehearsal = WatchedRehearsal(rig, line, prepared.scene.start, prepared.scene.load)
+        folder = RunFolder.create(path)
+        bench = LiveBench(prepared, folder, settings, masters, line, rehearsal)
+        rehearsal.on_cycle = lambda: _asked(script, bench)
+        yield bench
+
+
+def _asked(script: Script, bench: LiveBench) -> None:
+    with suppress(Killed):
+        script(bench)
+
+
+def once(happens: Callable[[Any], object]) -> Script:
+    """A script with one thing in it, at the cycle of the fault."""
+    done = False
+
+    def script(bench: Bench) -> None:
+        nonlocal done
+        if not done and bench.cycle >= bench.fault_cycle:
+            done = True
+            happens(bench)
+
+    return script
+
+
+def recorder_for(prepared: PreparedRun, folder: RunFolder, board: OwnBoard) -> Recorder:
+    """Writes events as they happen, and keeps the cycles."""
+    return Recorder(
+        prepared,
+        folder,
+        RunStatus(prepared, folder.path, board, simulated_time=False),
+        trigger=None,
+        every=10,
+        progress=lambda _row: None,
+        announce=lambda _text: None,
+    )
+
+
+def a_message(can_id: int, data: bytes = b"", *, error: bool = False) -> can.Message:
+    """Somebody else's frame."""
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_error_frame=error)

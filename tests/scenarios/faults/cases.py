@@ -1,0 +1,380 @@
+"""The fault table: what is done to a run that moves, and how soon, and how, it must stop."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.cia402.frames import (
+    HEARTBEAT_BASE,
+    MASTER_NODE,
+    RPDO1_BASE,
+    SYNC_ID,
+    TPDO1_BASE,
+    make_reply,
+    make_set_point,
+    parse_reply,
+)
+from drivers.cia402.states import ControlWord, DriveState
+from executor.machine import State
+from simulation.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
+from tests.scenarios.faults.bench import (
+    EVERY_ID,
+    Bench,
+    Script,
+    SimulatedBench,
+    a_message,
+    once,
+)
+
+NODES = range(1, 9)
+REPLIES = frozenset(TPDO1_BASE + node for node in NODES)
+REPLY_4, SET_POINT_4 = {TPDO1_BASE + 4}, {RPDO1_BASE + 4}
+E_STOP_OPEN = 0x5441
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One line of the table.
+
+    Attributes:
+        script: Makes what is done, new for every run.
+        ends: How the run ends; None when its process is dead.
+        within: Cycles from the fault until no drive follows set-points; None where it goes on.
+        words: In the cause that is told.
+        spread: Cycles from the first drive that stops to the last one.
+        mixed: Cycles in which some drives may be enabled and others not.
+        rows: Rows of the table that targets may lie apart; more only where frames are taken from a
+            drive, which stays where it was for so many cycles.
+        live: It can also be done to an executor in another process, in real time.
+        bitrate: Frames take their time on the wire, [bit/s].
+    """
+
+    script: Callable[[], Script]
+    ends: State | None = State.LATCHED
+    within: float | None = 4.0
+    words: tuple[str, ...] = ()
+    spread: float = 1.0
+    mixed: float = 4.0
+    rows: float = 1.0
+    live: bool = True
+    bitrate: float | None = None
+
+
+def then(happens: Callable[[Bench], object]) -> Callable[[], Script]:
+    """At one moment of the run."""
+
+    def timed(bench: Bench) -> None:
+        bench.happens()
+        happens(bench)
+
+    return lambda: once(timed)
+
+
+def broken(*drives: int, by: Callable[[Bench], object]) -> Callable[[], Script]:
+    """At one moment drives break; the others have to stop."""
+
+    def timed(bench: Bench) -> None:
+        bench.breaks(*drives)
+        by(bench)
+
+    return lambda: once(timed)
+
+
+def from_then_on(each: Callable[[Bench], object]) -> Callable[[], Script]:
+    """In every cycle until the end."""
+
+    def script(bench: Bench) -> None:
+        if bench.cycle >= bench.fault_cycle:
+            bench.happens()
+            each(bench)
+
+    return lambda: script
+
+
+def late(cycles: float) -> Callable[[], Script]:
+    def happens(bench: Bench) -> None:
+        assert isinstance(bench, SimulatedBench)
+        bench.late(cycles)
+
+    return then(happens)
+
+
+def incoming(rule: Callable[[], object]) -> Callable[[], Script]:
+    """To the drives."""
+    return then(lambda bench: bench.line.incoming.append(rule()))  # type: ignore[arg-type]
+
+
+def outgoing(rule: Callable[[], object]) -> Callable[[], Script]:
+    """From the drives."""
+    return then(lambda bench: bench.line.outgoing.append(rule()))  # type: ignore[arg-type]
+
+
+def silence(bench: Bench) -> None:
+    bench.drives[3].silent = True
+
+
+def everything_dies(bench: Bench) -> None:
+    for drive in bench.drives:
+        drive.silent = True
+
+
+def without_sync_watch(bench: Bench) -> None:
+    """As drives that watch heartbeats alone; one falls silent together with the master."""
+    for drive in bench.drives:
+        drive.objects[0x1006, 0] = 0
+        drive.objects[0x1400, 5] = 0
+    bench.drives[3].silent = True
+    bench.kill()
+
+
+def bus_off(bench: Bench) -> None:
+    bench.line.incoming.append(lose(EVERY_ID))
+    bench.line.outgoing.append(lose(EVERY_ID))
+    bench.line.say(BUS_OFF)
+
+
+def passive(bench: Bench) -> None:
+    bench.line.say(a_message(0x004, b"\0\x20" + bytes(6), error=True))
+
+
+def comes(can_id: int, data: bytes = b"") -> Callable[[Bench], object]:
+    return lambda bench: bench.line.say(a_message(can_id, data))
+
+
+def another_set_point(bench: Bench) -> None:
+    """It asks for nothing new: what two masters want is not the question."""
+    target = round(bench.drives[3]._target)
+    data = make_set_point(ControlWord.ENABLE_OPERATION, target)
+    bench.line.say(a_message(RPDO1_BASE + 4, data))
+
+
+def shifted(counts: int) -> Callable[[bytes], bytes]:
+    def change(data: bytes) -> bytes:
+        reply = parse_reply(data)
+        assert reply is not None
+        return make_reply(reply.status_word, reply.position + counts, reply.torque)
+
+    return change
+
+
+def mirrored(data: bytes) -> bytes:
+    reply = parse_reply(data)
+    assert reply is not None
+    return make_reply(reply.status_word, -reply.position, reply.torque)
+
+
+def frozen() -> Callable[[bytes], bytes]:
+    kept: list[int] = []
+
+    def change(data: bytes) -> bytes:
+        reply = parse_reply(data)
+        assert reply is not None
+        kept.append(reply.position)
+        return make_reply(reply.status_word, kept[0], reply.torque)
+
+    return change
+
+
+def jam(bench: Bench) -> None:
+    bench.drives[1].motor.jammed = True
+
+
+def jam_seen_by_the_drive(bench: Bench) -> None:
+    """The drive's own window is so narrow that it speaks first."""
+    per_metre = bench.prepared.rig.winches[1].counts_per_metre
+    bench.drives[1].objects[0x6065, 0] = round(abs(per_metre) * 1e-5)
+    jam(bench)
+
+
+def slip(bench: Bench) -> None:
+    """3 mm run off a drum that then sticks; the drive's own watch is off."""
+    per_metre = bench.prepared.rig.winches[1].counts_per_metre
+    bench.drives[1].objects[0x6065, 0] = 0xFFFFFFFF
+    bench.drives[1].motor.position += 0.003 * per_metre
+    jam(bench)
+
+
+def feels(share: float) -> Callable[[Bench], object]:
+    """The motor of cable 6 feels another load."""
+
+    def happens(bench: Bench) -> None:
+        bench.rehearsal._per_newton[5] *= share
+
+    return happens
+
+
+def at_torque_limit(bench: Bench) -> None:
+    bench.drives[1].objects[0x6072, 0] = 1
+
+
+def emergency_stop(bench: Bench) -> None:
+    for drive in bench.drives:
+        drive._emergency(E_STOP_OPEN)
+        drive._power_off(DriveState.SWITCH_ON_DISABLED)
+
+
+def deaf_drives(share: float, seed: int) -> Callable[[], Script]:
+    """Each drive misses SYNC by itself now and then."""
+
+    def make() -> Script:
+        dice = random.Random(seed)
+
+        def script(bench: Bench) -> None:
+            if bench.cycle >= bench.fault_cycle:
+                bench.happens()
+                bench.rehearsal.deaf = {i for i in range(8) if dice.random() < share}
+
+        return script
+
+    return make
+
+
+def hangs(bench: Bench) -> None:
+    """Nothing of the executor reaches the drives for 200 ms; it goes on as if nothing had been."""
+    assert isinstance(bench, SimulatedBench)
+    bench.late(20.0)
+
+
+def lost_syncs(share: float, seed: int) -> Callable[[], Script]:
+    return incoming(lambda: lose({SYNC_ID}, share, random.Random(seed)))
+
+
+def babble(bench: Bench) -> None:
+    """A device sends the most urgent identifier as often as 95 % of the bus allows."""
+    for _ in range(70):
+        bench.line.send(a_message(0x001, bytes(8)))
+
+
+PATH_STOP = 60.0
+"""Cycles that slowing down along the path and settling take."""
+
+
+def goes_on(script: Callable[[], Script], *, live: bool = True) -> Fault:
+    """It is counted, and the run finishes."""
+    return Fault(script, ends=State.FINISHED, within=None, live=live)
+
+
+TABLE: dict[str, Fault] = {
+    "F1 kill -9": Fault(then(lambda bench: bench.kill()), ends=None, within=5.0),
+    "F2 the executor hangs": Fault(then(hangs), words=("SYNC missed",), live=False),
+    "F4 a cycle late by 1 T": goes_on(late(1.0), live=False),
+    "F4 a cycle late by 2 T": Fault(
+        late(2.0), within=PATH_STOP, words=("2.0 cycles late",), live=False
+    ),
+    "F4 a cycle late by 3 T": Fault(late(3.0), words=("SYNC missed",), live=False),
+    "F4 a cycle late by 5 T": Fault(late(5.0), words=("SYNC missed",), live=False),
+    "F4 a cycle late by 10 T": Fault(late(10.0), words=("SYNC missed",), live=False),
+    "F5 one set-point lost": goes_on(incoming(lambda: lose_next(SET_POINT_4, 1))),
+    "F5 three set-points lost": Fault(
+        incoming(lambda: lose_next(SET_POINT_4, 3)), words=("drive 4",), rows=3.0
+    ),
+    "F6 0.1 % of SYNC lost": goes_on(lost_syncs(0.001, 5)),
+    "F6 20 % of SYNC lost": Fault(lost_syncs(0.2, 5), within=PATH_STOP, words=("did not answer",)),
+    "F6 drives miss 0.1 % of SYNC": goes_on(deaf_drives(0.001, 6)),
+    "F6 drives miss 20 % of SYNC": Fault(
+        deaf_drives(0.2, 6), within=PATH_STOP, words=("did not answer",), rows=2.0
+    ),
+    "F7 a drive falls silent": Fault(broken(3, by=silence), words=("drive 4 did not answer",)),
+    "F7 a drive and the master fall silent": Fault(
+        broken(3, by=without_sync_watch), ends=None, within=11.0, mixed=12.0, spread=4.0
+    ),
+    "F8 a drive in fault": Fault(
+        broken(2, by=lambda bench: bench.drives[2].fail(0x2310)), within=3.0, words=("drive 3",)
+    ),
+    "F9 a drive starts anew": Fault(
+        broken(0, by=lambda bench: bench.drives[0].power_on()),
+        within=3.0,
+        words=("drive 1 restarted",),
+    ),
+    "F10 bus-off": Fault(then(bus_off), words=("bus-off",), within=5.0),
+    "F10 error-passive": Fault(then(passive), words=("error-passive",)),
+    "F11 replies held up for 200 ms": Fault(
+        outgoing(lambda: delay(REPLIES, 0.2)), words=("did not answer",)
+    ),
+    "F12 one short reply": goes_on(outgoing(lambda: spoil(REPLY_4, lambda d: d[:2], 1))),
+    "F12 two short replies": Fault(
+        outgoing(lambda: spoil(REPLY_4, lambda d: d[:2], 2)), words=("drive 4", "2 bytes")
+    ),
+    "F12 one position spike": goes_on(outgoing(lambda: spoil(REPLY_4, shifted(99999), 1))),
+    "F12 two position spikes": Fault(
+        outgoing(lambda: spoil(REPLY_4, shifted(99999), 2)), words=("drive 4", "jumped")
+    ),
+    "F12 sign flipped": Fault(
+        outgoing(lambda: spoil(REPLY_4, mirrored)), words=("drive 4", "jumped")
+    ),
+    "F12 a frozen position": Fault(
+        outgoing(lambda: spoil(REPLY_4, frozen())), words=("drive 4 stood still",)
+    ),
+    "F12 a short set-point": Fault(
+        incoming(lambda: spoil(SET_POINT_4, lambda d: d[:7], 1)), words=("drive 4", "length")
+    ),
+    "F13 replies come twice": Fault(
+        outgoing(lambda: repeat(REPLY_4)), words=("drive 4 answers twice",), within=5.0
+    ),
+    "F13 old replies": Fault(
+        outgoing(lambda: delay(REPLY_4, 0.02)), words=("drive 4 did not answer",)
+    ),
+    "F13 another SYNC": Fault(then(comes(SYNC_ID)), words=("another program sends SYNC",)),
+    "F13 another master's set-point": Fault(
+        then(another_set_point), words=("another program sends set-points",)
+    ),
+    "F13 another master's heartbeat": Fault(
+        then(comes(HEARTBEAT_BASE + MASTER_NODE, b"\x05")), words=("master's heartbeat",)
+    ),
+    "F17 a winch jams": Fault(broken(1, by=jam), words=("drive 2 stood still",)),
+    "F17 a winch jams, its drive tells": Fault(
+        broken(1, by=jam_seen_by_the_drive), words=("drive 2", "following error")
+    ),
+    "F17 a winch slips, its drive sleeps": Fault(
+        broken(1, by=slip), within=3.0, words=("cable 2", "allowed 2.00 mm")
+    ),
+    "F18 a cable slackens": Fault(then(feels(0.05)), within=PATH_STOP, words=("cable 6", "slack")),
+    "F18 a cable is overloaded": Fault(
+        then(feels(6.0)), within=PATH_STOP, words=("cable 6", "more than 102.0 N")
+    ),
+    "F18 a winch at its torque limit": Fault(
+        broken(1, by=at_torque_limit), words=("drive 2 stood still",)
+    ),
+    "F19 a cable breaks": Fault(then(feels(0.0)), within=5.0, words=("cable 6", "no tension")),
+    "F20 the operator stops": Fault(
+        then(lambda bench: bench.ask_stop()),
+        ends=State.STOPPED,
+        within=PATH_STOP,
+        words=("stop requested",),
+    ),
+    "F21 all drives vanish": Fault(
+        broken(*range(8), by=everything_dies), words=("did not answer",)
+    ),
+    "F26 emergency stop": Fault(
+        broken(*range(8), by=emergency_stop), words=("emergency stop",), within=3.0
+    ),
+    "F27 a device babbles": Fault(
+        from_then_on(babble), words=("did not answer",), within=8.0, bitrate=1e6, live=False
+    ),
+}
+
+
+def complaints(
+    fault: Fault, bench: Bench, ended: State | None, cause: str, cycle: float
+) -> list[str]:
+    """What was not as the table says; ``cycle`` in [s]."""
+    found = bench.violations(fault.mixed, fault.rows)
+    if ended is not fault.ends:
+        found.append(f"the run ended {ended}, not {fault.ends}")
+    found += [f"{word!r} is not in {cause!r}" for word in fault.words if word not in cause]
+    if fault.within is None or len(bench.lost) == len(bench.drives):
+        return found
+    stop = bench.stop()
+    if stop.time > fault.within * cycle + 1e-6:
+        found.append(f"the last drive stopped after {1e3 * stop.time:.1f} ms")
+    if stop.spread > fault.spread * cycle + 1e-6:
+        found.append(f"the drives stopped within {1e3 * stop.spread:.1f} ms of each other")
+    return found
+
+
+def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
+    """This computer held the simulated drives up, before or while the fault happened."""
+    silent = "drive 1 did not answer" in cause and not any(word in cause for word in fault.words)
+    return bench.since is None or silent or "cycles late; stopped" in cause

@@ -1,0 +1,67 @@
+"""One executor that moves drives over a bus in real time, and writes down how it ended."""
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from cdpr.documents import write_atomic
+from cdpr.errors import CdprError
+from cdpr.rig import rig_from_document
+from drivers.bus import BusSettings, open_bus
+from drivers.drive_group import make_drive_group
+from executor.clock import RealClock
+from executor.execution import run_here
+from executor.prepare import PreparedRun
+from executor.realtime import real_time
+from executor.run_folder import RunFolder
+from executor.wishes import OwnBoard
+from tests.scenarios.faults.bench import recorder_for
+
+
+def run(prepared: PreparedRun, settings: BusSettings, path: Path) -> None:
+    """Arms and moves; SIGTERM is the wish to stop."""
+    board = OwnBoard()
+    signal.signal(signal.SIGTERM, lambda *_: board.ask_stop())
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    try:
+        told = _moved(prepared, settings, path, board)
+    except CdprError as error:
+        told = {"state": "ready", "cause": str(error), "cycles": 0, "worst_late": 0.0, "lost": 0}
+    write_atomic(path / "outcome.json", json.dumps(told))
+
+
+def _moved(
+    prepared: PreparedRun, settings: BusSettings, path: Path, board: OwnBoard
+) -> dict[str, Any]:
+    document = prepared.rig.document.bus.model_copy(
+        update={"interface": settings.interface, "channel": settings.channel}
+    )
+    rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": document}))
+    prepared = replace(prepared, rig=rig)
+    folder = RunFolder(path)
+    recorder = recorder_for(prepared, folder, board)
+    with open_bus(settings) as bus, real_time():
+        group = make_drive_group(rig, bus)
+        group.configure()
+        outcome = run_here(
+            prepared,
+            group,
+            RealClock(prepared.checked.table.cycle),
+            board,
+            recorder,
+            true_pose=None,
+            carry=lambda _load: None,
+            before_motion=lambda: None,
+        )
+    table = recorder.log.table()
+    return {
+        "state": outcome.state.value,
+        "cause": outcome.cause,
+        "cycles": len(recorder.log),
+        "worst_late": float(table.lateness.max()),
+        "lost": int(table.missing.sum()),
+    }
