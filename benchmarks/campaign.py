@@ -23,8 +23,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from cdpr.cli.cameras import SYNTHETIC
+from cdpr.cli.carry_out import prepared_run
 from cdpr.cli.demo import RIG, configs
-from cdpr.cli.run import prepared_run
 from cdpr.cli.run_motion import run_prepared
 from cdpr.errors import CdprError
 from cdpr.plan import load_plan, save_plan
@@ -110,7 +110,7 @@ def run_one(
     with TemporaryDirectory(prefix="cdpr-campaign-") as place:
         output = Path(place) / "run"
         name = SYNTHETIC if camera else None
-        prepared = prepared_run(path, rig, quiet=True)
+        prepared = prepared_run(load_plan(path), rig, quiet=True)
         summary = run_prepared(
             prepared,
             output,

@@ -23,6 +23,9 @@ UDP_DEFAULT_GROUP = "239.74.163.2"
 UDP_DEFAULT_PORT = 43113
 """python-can's own. Source: python-can, interfaces/udp_multicast."""
 
+IN_PROCESS = "virtual"
+"""python-can's interface inside one process; on it the drives are simulated in a run's own."""
+
 RECEIVE_BUFFER_BYTES = 4 * 2**20
 """A socket of the default size drops the newest frames after 278 without a word."""
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from cdpr.documents import write_atomic
 from cdpr.errors import CdprError, Refused
 from drivers.bus import BusSettings
-from executor.execution import Outcome
 from executor.machine import State
 from executor.state_folder import state_file
 
@@ -135,12 +134,12 @@ class Latch:
             raise self._not_kept(error.strerror or str(error)) from None
         self._write(self._latched(rig, cause, folder))
 
-    def settle(self, rig: str, outcome: Outcome, folder: Path) -> None:
+    def settle(self, rig: str, state: State, cause: str, folder: Path) -> None:
         """The motion is over: released when it ended well, else engaged with its cause."""
-        if outcome.state in (State.FINISHED, State.STOPPED):
+        if state in (State.FINISHED, State.STOPPED):
             self.release()
         else:
-            self._write(self._latched(rig, outcome.cause, folder))
+            self._write(self._latched(rig, cause, folder))
 
     def release(self) -> None:
         """Drives may be moved again."""

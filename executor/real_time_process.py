@@ -13,6 +13,7 @@ from multiprocessing.connection import wait
 from cdpr.errors import CdprError, Fault, StoppedByOperator
 from executor.announcing import load_changes
 from executor.course import course_of
+from executor.custody import Custody
 from executor.execution import Outcome
 from executor.machine import State
 from executor.prepare import PreparedRun
@@ -63,9 +64,12 @@ def run_in_real_time(
             motion.
 
     Raises:
-        CdprError: The process could not arm the drives, for the reason told; nothing was enabled.
+        CdprError: The bus is latched, or the process could not arm the drives, for the reason told;
+            nothing was enabled.
         StoppedByOperator: The operator wanted to stop before anything moved.
     """
+    custody = Custody(prepared.rig)
+    custody.require_free()
     course = course_of(prepared.checked)
     job = Job.of(
         course,
@@ -77,9 +81,16 @@ def run_in_real_time(
     )
     process = _Process(job, board)
     try:
-        before_motion(process.armed())
+        denied = process.armed()
+        custody.begin(recorder.folder.path)
+        try:
+            before_motion(denied)
+        except BaseException:
+            custody.prevented()
+            raise
         started = datetime.now(UTC)
         state, cause = process.supervise(recorder)
+        custody.end(state, cause, recorder.folder.path)
         return Outcome(state, cause, recorder.log, started)
     finally:
         process.close()

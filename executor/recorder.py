@@ -46,7 +46,9 @@ class Recorder:
         self.log = RunLog(prepared.rig, prepared.scene, prepared.checked)
         self._announcements = announcements(prepared.scene, prepared.checked.table.stands)
         self._announce = announce
-        self._folder, self._status = folder, status
+        self.folder = folder
+        """Where events are written."""
+        self._status = status
         self._trigger, self._progress = trigger, progress
         self.every = every
         """Cycles from one picture to the next."""
@@ -92,4 +94,4 @@ class Recorder:
         time = 0.0 if self._began is None else event.at - self._began
         told = RunEvent(round(time, 6), event.code, event.text)
         self._status.take_event(told)
-        self._folder.append_event(told)
+        self.folder.append_event(told)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -27,12 +26,10 @@ def demo(
       cdpr demo --environment 3
     """
     from cdpr.cli.cameras import SYNTHETIC
+    from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.output import out, show_facts
     from cdpr.cli.plan import planned, sentences_of
-    from cdpr.cli.run import exit_code, prepared_run
-    from cdpr.cli.run_motion import run_prepared
-    from cdpr.cli.run_summary import show_prepared, show_summary
-    from cdpr.plan import save_plan
+    from cdpr.plan import plan_from_document
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
     from executor.run_folder import RunFolder
@@ -44,23 +41,10 @@ def demo(
     scene = load_scene(configs() / f"environment_{environment}.yaml")
     document = planned(rig, scene, OptimalSettings(seed=seed), True)
     show_facts("plan", sentences_of(document))
-    with TemporaryDirectory(prefix="cdpr-demo-") as temporary:
-        plan_path = Path(temporary) / "plan.json"
-        save_plan(document, plan_path)
-        prepared = prepared_run(plan_path, rig, quiet=False)
-    show_prepared(prepared, simulated=True)
-    summary = run_prepared(
-        prepared,
-        folder,
-        SYNTHETIC,
-        fast=True,
-        start=None,
-        without_real_time=False,
-        quiet=False,
-    )
-    show_summary(summary, folder, as_json=False)
+    prepared = prepared_run(plan_from_document(document), rig, quiet=False)
+    code = carry_out(prepared, folder, SYNTHETIC, fast=True)
     out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
-    raise typer.Exit(exit_code(summary))
+    raise typer.Exit(code)
 
 
 def configs() -> Path:

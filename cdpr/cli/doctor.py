@@ -138,9 +138,8 @@ def rig_bus(rig: Rig) -> list[Answer]:
     """Whether the bus of a rig is fast enough, is set up, and can be opened."""
     from cdpr.cli.doctor_bus import kernel_bus
     from cdpr.cli.doctor_real_time import real_time_permission
-    from cdpr.cli.drives import IN_PROCESS
     from cdpr.errors import CdprError
-    from drivers.bus import BusSettings, open_bus
+    from drivers.bus import IN_PROCESS, BusSettings, open_bus
     from drivers.bus_load import check_bus_load
     from drivers.socketcan import can_interfaces
 

@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from cdpr.scene import Load
     from executor.real_time_job import ReadyDrives
 
-#: python-can's interface inside one process; with it the drives are simulated here.
-IN_PROCESS = "virtual"
-
 
 @contextmanager
 def open_drives(
@@ -35,7 +32,7 @@ def open_drives(
         Refused: The bus is too slow, or a drive does not keep a setting.
     """
     from cdpr.cli.output import err
-    from drivers.bus import BusSettings, open_bus
+    from drivers.bus import IN_PROCESS, BusSettings, open_bus
     from drivers.drive_group import make_drive_group
     from executor.real_time_job import ReadyDrives
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -62,12 +61,12 @@ def jog(
 
       cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
     """
+    from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.demo import free_folder
-    from cdpr.cli.drives import IN_PROCESS
-    from cdpr.cli.run import ask_operator, exit_code, prepared_run, require_own_time, rig_on_bus
-    from cdpr.cli.run_motion import require_released, run_prepared
-    from cdpr.cli.run_summary import show_prepared, show_summary
-    from cdpr.plan import save_plan
+    from cdpr.cli.run import require_own_time, rig_on_bus
+    from cdpr.plan import plan_from_document
+    from drivers.bus import IN_PROCESS
+    from executor.custody import Custody
     from executor.run_folder import RunFolder
 
     the_rig = _slow(rig_on_bus(rig, interface, channel), speed_mm_s)
@@ -77,28 +76,20 @@ def jog(
     the_scene = _scene(scene, no_scene, clearance_mm, the_rig)
     folder = output or free_folder("jog")
     RunFolder.require_free(folder)
-    require_released(the_rig)
+    Custody(the_rig).require_free()
     start = the_rig.home if in_process else _where_it_stands(the_rig, the_scene)
     document = _straight(the_rig, the_scene, start, by_mm, not as_json)
-    with TemporaryDirectory(prefix="cdpr-jog-") as temporary:
-        plan = Path(temporary) / "plan.json"
-        save_plan(document, plan)
-        prepared = prepared_run(plan, the_rig, quiet=as_json)
-    if not as_json:
-        show_prepared(prepared, in_process)
-    if not (in_process or yes):
-        ask_operator("Move the platform now?", "nothing was moved")
-    summary = run_prepared(
-        prepared,
+    code = carry_out(
+        prepared_run(plan_from_document(document), the_rig, quiet=as_json),
         folder,
         None,
         fast=fast,
         start=start,
+        yes=yes,
         without_real_time=without_real_time,
-        quiet=as_json,
+        as_json=as_json,
     )
-    show_summary(summary, folder, as_json)
-    raise typer.Exit(exit_code(summary))
+    raise typer.Exit(code)
 
 
 def _slow(rig: Rig, speed_mm_s: float) -> Rig:

@@ -33,8 +33,9 @@ def reset(
 
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
+    from cdpr.cli.carry_out import ask_operator
     from cdpr.cli.output import out, show_json
-    from cdpr.cli.run import ask_operator, rig_on_bus
+    from cdpr.cli.run import rig_on_bus
     from drivers.bus import BusSettings
     from executor.latch import Latch
 
@@ -59,8 +60,8 @@ def reset(
 
 
 def _require_bus(rig: Rig) -> None:
-    from cdpr.cli.drives import IN_PROCESS
     from cdpr.errors import BadInput
+    from drivers.bus import IN_PROCESS
 
     if rig.document.bus.interface == IN_PROCESS:
         raise BadInput(

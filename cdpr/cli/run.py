@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
-    from executor.prepare import PreparedRun
 
 
 def run(
@@ -56,9 +55,11 @@ def run(
       cdpr run plan.json --rig rig.yaml -o runs/second --camera 0
     """
     from cdpr.cli.cameras import choose_camera
-    from cdpr.cli.drives import IN_PROCESS
-    from cdpr.cli.run_motion import require_released, run_prepared
-    from cdpr.cli.run_summary import show_prepared, show_summary
+    from cdpr.cli.carry_out import carry_out, prepared_run
+    from cdpr.cli.plan_for_rig import require_same_rig
+    from cdpr.plan import load_plan
+    from drivers.bus import IN_PROCESS
+    from executor.custody import Custody
     from executor.run_folder import RunFolder
 
     the_rig = rig_on_bus(rig, interface, channel)
@@ -66,51 +67,20 @@ def run(
     camera_name = choose_camera(the_rig, camera, no_camera, in_process)
     start = _simulated_start(simulated_start_mm, in_process, fast)
     RunFolder.require_free(output)
-    require_released(the_rig)
-    prepared = prepared_run(plan, the_rig, quiet=as_json)
-    if not as_json:
-        show_prepared(prepared, in_process)
-    if not (in_process or yes):
-        ask_operator("Move the platform now?", "nothing was moved")
-    summary = run_prepared(
-        prepared,
+    Custody(the_rig).require_free()
+    the_plan = load_plan(plan)
+    require_same_rig(the_plan, the_rig, plan)
+    code = carry_out(
+        prepared_run(the_plan, the_rig, quiet=as_json),
         output,
         camera_name,
         fast=fast,
         start=start,
+        yes=yes,
         without_real_time=without_real_time,
-        quiet=as_json,
+        as_json=as_json,
     )
-    show_summary(summary, output, as_json)
-    raise typer.Exit(exit_code(summary))
-
-
-def ask_operator(question: str, otherwise: str) -> None:
-    """Goes on only after a yes; silence is none.
-
-    Args:
-        question: Shown to whoever sits there.
-        otherwise: What a no leaves, such as ``nothing was moved``.
-
-    Raises:
-        StoppedByOperator: The answer was no.
-        BadInput: There is nobody to ask.
-    """
-    import sys
-
-    from cdpr.errors import BadInput, StoppedByOperator
-
-    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    answer = sys.stdin.readline()
-    if not answer:
-        print(file=sys.stderr)
-        raise BadInput(
-            f"nobody answered: {question}",
-            where="standard input",
-            next_step=f"run it in a terminal, or pass --yes; {otherwise}",
-        )
-    if answer.strip().lower() not in ("y", "yes"):
-        raise StoppedByOperator(otherwise, next_step="run it again when the answer is yes")
+    raise typer.Exit(code)
 
 
 def rig_on_bus(path: Path, interface: str | None, channel: str | None) -> Rig:
@@ -158,29 +128,3 @@ def _simulated_start(
             next_step="leave it out, or use the interface 'virtual'",
         )
     return Pose.level(millimetres(list(start_mm)))
-
-
-def prepared_run(plan: Path, rig: Rig, *, quiet: bool) -> PreparedRun:
-    """The checked set-points of a plan file, for a rig.
-
-    Raises:
-        BadInput: The plan cannot be read, or is for another rig.
-        Refused: The plan, or the curve it would be run on, does not pass the checks.
-    """
-    from cdpr.cli.output import spinner
-    from cdpr.cli.plan_for_rig import require_same_rig
-    from cdpr.plan import load_plan
-    from executor.prepare import prepare
-    from planner.check import verify
-
-    the_plan = load_plan(plan)
-    require_same_rig(the_plan, rig, plan)
-    with spinner("checking the plan and its set-points", not quiet):
-        return prepare(verify(the_plan, rig), rig)
-
-
-def exit_code(summary: dict[str, Any]) -> int:
-    """0 for a run that passed, 130 when the operator stopped it, 1 otherwise."""
-    if summary["passed"]:
-        return 0
-    return 130 if summary["verdict"] == "STOPPED" else 1

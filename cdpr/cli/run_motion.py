@@ -1,4 +1,4 @@
-"""The moving part of `cdpr run` and `cdpr demo`: arms, moves, measures, writes the run folder."""
+"""The moving part of `cdpr run`, `jog` and `demo`: arms, moves, measures, writes the run folder."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
-    from cdpr.rig import Rig
     from executor.camera_process import CameraProcess
     from executor.execution import Outcome
-    from executor.latch import Latch
     from executor.observer import Look
     from executor.prepare import PreparedRun
     from executor.recorder import Recorder
@@ -36,28 +34,6 @@ class _Job:
     start: Pose | None
     without_real_time: bool
     quiet: bool
-    latch: Latch | None
-
-
-def latch_of(rig: Rig) -> Latch | None:
-    """The latch of a rig's bus; drives that are simulated in a run's process end with it."""
-    from cdpr.cli.drives import IN_PROCESS
-    from drivers.bus import BusSettings
-    from executor.latch import Latch
-
-    settings = BusSettings.of(rig)
-    return None if settings.interface == IN_PROCESS else Latch(settings)
-
-
-def require_released(rig: Rig) -> None:
-    """Nothing moves on a bus on which a fault is latched.
-
-    Raises:
-        Refused: One is; with its cause.
-    """
-    latch = latch_of(rig)
-    if latch is not None:
-        latch.require_released()
 
 
 def run_prepared(
@@ -83,20 +59,17 @@ def run_prepared(
         without_real_time: Move drives on a bus even if real-time scheduling is denied.
         quiet: No progress.
     """
-    from cdpr.cli.drives import IN_PROCESS
     from cdpr.cli.output import spinner
+    from drivers.bus import IN_PROCESS
     from executor.run import conclude
     from executor.run_folder import RunFolder
 
     folder = RunFolder.create(output)
-    latch = latch_of(prepared.rig)
-    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, quiet, latch)
+    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, quiet)
     moved = False
 
     def before_motion() -> None:
         nonlocal moved
-        if latch is not None:
-            latch.engage(prepared.rig.name, output)
         moved = True
 
     try:
@@ -107,24 +80,22 @@ def run_prepared(
         if not moved:
             folder.discard()
     interface = prepared.rig.document.bus.interface
-    try:
-        with spinner("writing the run folder and its report", not quiet):
-            return conclude(
-                prepared,
-                outcome,
-                folder,
-                looks,
-                interface=interface,
-                simulated=interface == IN_PROCESS,
-                fast=fast,
-            )
-    finally:  # whatever became of the record, the bus is as the motion left it
-        if latch is not None:
-            latch.settle(prepared.rig.name, outcome, folder.path)
+    with spinner("writing the run folder and its report", not quiet):
+        return conclude(
+            prepared,
+            outcome,
+            folder,
+            looks,
+            interface=interface,
+            simulated=interface == IN_PROCESS,
+            fast=fast,
+        )
 
 
 def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcome, list[Look]]:
     """The motion and its pictures; `cdpr stop` and its like reach the run all the time."""
+    from contextlib import ExitStack
+
     from cdpr.cli.cameras import open_camera
     from cdpr.cli.output import err, progress_bar
     from executor.command_server import serving
@@ -143,11 +114,14 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
     status = RunStatus(prepared, job.folder.path, board, simulated_time=job.fast)
     camera_at = (prepared.rig, prepared.scene, job.camera_name, job.folder.path)
     with (
+        ExitStack() as stack,
         stop_requests(board),
         announced() as listeners,
         serving(listeners, board, status),
         open_camera(*camera_at, pictures, job.fast) as camera,
     ):
+        if isinstance(board, SharedBoard):
+            stack.callback(board.close)
         with progress_bar("moving", rows, not job.quiet) as advance:
             told: list[str] = []
 
@@ -213,8 +187,9 @@ def _move_in_real_time(
 ) -> Outcome:
     from functools import partial
 
-    from cdpr.cli.drives import IN_PROCESS, drives_of
+    from cdpr.cli.drives import drives_of
     from cdpr.cli.output import err
+    from drivers.bus import IN_PROCESS
     from executor.real_time_process import run_in_real_time
     from executor.records import LoopEvent
 

@@ -164,9 +164,13 @@ def _source(
 
 def _rendered_times(rig: Rig, camera: Camera, plan: Path) -> list[tuple[float, Pose]]:
     """Times and poses at which the synthetic camera looks: those of a run of the plan."""
-    from cdpr.cli.run import prepared_run
+    from cdpr.cli.carry_out import prepared_run
+    from cdpr.cli.plan_for_rig import require_same_rig
+    from cdpr.plan import load_plan
 
-    table = prepared_run(plan, rig, quiet=True).checked.table
+    the_plan = load_plan(plan)
+    require_same_rig(the_plan, rig, plan)
+    table = prepared_run(the_plan, rig, quiet=True).checked.table
     poses = table.poses()
     every = max(1, round(1.0 / (camera.rate * table.cycle)))
     return [(row * table.cycle, poses[row]) for row in range(0, len(table), every)]

@@ -32,7 +32,13 @@ NODES = range(1, 9)
 # What the programs import inside their functions: once here, before they are forked, since an
 # import takes long where instructions are counted.
 for module in (
-    *("cdpr.cli.run_motion", "cdpr.cli.run_summary", "cdpr.cli.sim", "executor.prepare"),
+    *(
+        "cdpr.cli.carry_out",
+        "cdpr.cli.run_motion",
+        "cdpr.cli.run_summary",
+        "cdpr.cli.sim",
+        "executor.prepare",
+    ),
     *("executor.run", "executor.report.page", "simulation.rehearsal", "matplotlib.figure"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_agg", "cv2", "mcap.writer"),
     *("scipy.optimize", "drivers.cia402.group"),
