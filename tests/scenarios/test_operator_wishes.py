@@ -139,7 +139,7 @@ def test_a_fault_while_holding_is_latched(prepared: PreparedRun, tmp_path: Path)
     stage, outcome = run(prepared, tmp_path, c150=HOLD, c250=tear, c400=RESUME)
     assert outcome.state is State.LATCHED
     assert "torn" in outcome.cause
-    assert states(outcome)[-2:] == ["holding", "securing"]
+    assert states(outcome)[-2:] == ["holding", "latched"]
     assert {drive.state for drive in stage.drives} == {DriveState.QUICK_STOP_ACTIVE}
 
 
