@@ -39,7 +39,8 @@ from cdpr.scene_file import SceneDocument
 from planner.check import check_path
 from planner.cost import KinematicCost
 from planner.optimal.routing import optimal_route
-from planner.optimal.settings import OBJECTIVES, OptimalSettings
+from planner.optimal.settings import OptimalSettings
+from planner.weights import OBJECTIVES
 
 SCENES_OF_A_ROBOT = 50
 NO_ROOM, PLANNED, NOT_FOUND, SEPARATED = "no room", "planned", "not found", "proved separated"

@@ -40,23 +40,14 @@ class WeightsDocument(Document):
 
 
 class OptimalPlannerDocument(Document):
-    """How the path was searched for by the default planner."""
+    """How the path was searched for by the default planner; ``turning`` with `--free-rotation`."""
 
-    name: Literal["optimal"]
+    name: Literal["optimal", "turning"]
     weights: WeightsDocument
     seed: Annotated[int, Field(ge=0)]
     rounds: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)]
     budget_ms: Positive | None
     longest_mm: Positive | None
-
-
-class TurningPlannerDocument(Document):
-    """How the path was searched for where the platform was free to turn."""
-
-    name: Literal["turning"]
-    seed: Annotated[int, Field(ge=0)]
-    rounds: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)]
-    budget_ms: Positive | None
 
 
 class PlannerDocument(Document):
@@ -129,7 +120,7 @@ class PlanDocument(Document):
     rig: RigDocument
     scene: SceneDocument
     planner: Annotated[
-        PlannerDocument | OptimalPlannerDocument | TurningPlannerDocument,
+        PlannerDocument | OptimalPlannerDocument,
         Field(discriminator="name"),
     ]
     waypoints: Annotated[list[PoseDocument], Field(min_length=2)]

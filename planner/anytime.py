@@ -1,12 +1,13 @@
-"""Searches that go on improving: how long they may, by a budget of time or a number of rounds."""
+"""Searches that go on improving: what they are to make small, and how long they may go on."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from cdpr.errors import BadInput
+from cdpr.errors import BadInput, NoSolution
 from planner.route import Progress
+from planner.weights import OBJECTIVES, Weights
 
 LEAST_ROUNDS = 12
 """Done whatever the clock says, so that a busy machine finds a path, too."""
@@ -17,11 +18,15 @@ class AnytimeSettings:
     """What every search in rounds is told.
 
     Attributes:
+        weights: What is made small.
+        longest: Longest path allowed, [m]; infinite for any.
         seed: Of the random numbers.
         budget: How long paths are sought and improved, [s]; what is prepared before is not in it.
         rounds: Instead of the budget, for the same path again: exactly so many rounds.
     """
 
+    weights: Weights = field(default_factory=lambda: OBJECTIVES["length"])
+    longest: float = math.inf
     seed: int = 0
     budget: float = 0.050
     rounds: int | None = None
@@ -38,6 +43,8 @@ class AnytimeSettings:
             raise BadInput(f"the budget must be above 0 ms, it is {self.budget * 1e3:g} ms")
         if self.rounds is not None and self.rounds < 1:
             raise BadInput(f"there must be at least one round, not {self.rounds}")
+        if not self.longest > 0.0:
+            raise BadInput(f"the longest path must be above 0 mm, not {self.longest * 1e3:g} mm")
 
     def is_over(self, rounds: int, spent: float, least: int = LEAST_ROUNDS) -> bool:
         """Whether a search may end after so many rounds and seconds; ``least`` for the clock."""
@@ -58,4 +65,18 @@ class AnytimeSettings:
         return (
             f"no path after {rounds} rounds{of_budget}; what start and goal reach comes within"
             f" {gap * 1e3:.1f} mm of each other"
+        )
+
+    def too_long(
+        self, where: str, found: float, straight: float, values: dict[str, float | str]
+    ) -> NoSolution:
+        """The error where no path is short enough; the best path's length and the least, [m]."""
+        limit, length = self.longest * 1e3, found * 1e3
+        return NoSolution(
+            f"no path of at most {limit:.1f} mm was found",
+            where=where,
+            why=f"the path found has {length:.1f} mm, and the straight way {straight * 1e3:.1f} mm",
+            next_step="allow a longer path, or raise --budget-ms; `--cost length` tells how short"
+            " paths can be",
+            values={**values, "longest_mm": limit, "found_mm": length},
         )

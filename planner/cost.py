@@ -68,7 +68,7 @@ class KinematicCost:
         self.lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
         points = self.lattice.points(np.arange(self.lattice.count))
         condition, inverse = self._indices(points, rotation)
-        self._extremes = [(float(v.min()), float(v.max())) for v in (condition, inverse)]
+        self.extremes = [(float(v.min()), float(v.max())) for v in (condition, inverse)]
         self.values = self._scaled(condition, inverse)
 
     def at(self, positions: Array) -> Array:
@@ -128,7 +128,7 @@ class KinematicCost:
     def _scaled(self, condition: Array, inverse: Array) -> Array:
         scaled = [
             (v - low) / (high - low) if high > low else np.zeros_like(v)
-            for v, (low, high) in zip((condition, inverse), self._extremes, strict=True)
+            for v, (low, high) in zip((condition, inverse), self.extremes, strict=True)
         ]
         total: Array = scaled[0] + scaled[1]
         return total

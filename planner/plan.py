@@ -111,10 +111,8 @@ def make_plan(
 
 
 def _planner(settings: Settings, way: Way) -> dict[str, Any]:
-    if isinstance(settings, TurningSettings):
-        return {"name": "turning", **_effort(settings, way)}
-    if isinstance(settings, OptimalSettings):
-        return _optimal_planner(settings, way)
+    if isinstance(settings, AnytimeSettings):
+        return _improving_planner(settings, way)
     return {
         "name": settings.sampler,
         "cost": settings.cost,
@@ -128,26 +126,20 @@ def _planner(settings: Settings, way: Way) -> dict[str, Any]:
     }
 
 
-def _optimal_planner(settings: OptimalSettings, way: Way) -> dict[str, Any]:
+def _improving_planner(settings: AnytimeSettings, way: Way) -> dict[str, Any]:
     weights, longest = settings.weights, settings.longest
     return {
-        "name": "optimal",
+        "name": "turning" if isinstance(settings, TurningSettings) else "optimal",
         "weights": {
             "length": weights.length,
             "kinematic": weights.kinematic,
             "clearance": weights.clearance,
             "capacity": weights.capacity,
         },
-        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
-        **_effort(settings, way),
-    }
-
-
-def _effort(settings: AnytimeSettings, way: Way) -> dict[str, Any]:
-    return {
         "seed": settings.seed,
         "rounds": list(way.rounds),
         "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
+        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
     }
 
 

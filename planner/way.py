@@ -72,7 +72,7 @@ def way_through(
                 found.append(optimal_route(rig, leg.scene, own, kinematic, progress, clock))
                 routes.append(found[-1].route)
             elif isinstance(own, TurningSettings):
-                found.append(turning_route(rig, leg.scene, own, progress, clock))
+                found.append(turning_route(rig, leg.scene, own, kinematic, progress, clock))
                 routes.append(found[-1].route)
             else:
                 routes.append(paper_route(rig, leg.scene, own, kinematic, progress))
@@ -98,7 +98,7 @@ def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> S
         if rounds:
             raise BadInput("the paper's planners know no rounds", next_step="leave them out")
         return [settings] * count
-    if count > 1 and isinstance(settings, OptimalSettings) and settings.longest < np.inf:
+    if count > 1 and settings.longest < np.inf:
         raise BadInput(
             "a longest path cannot be asked for in a scene with stops",
             why="each leg is planned for itself, and none knows what the others need",

@@ -35,7 +35,7 @@ from planner.optimal.problem import Problem
 from planner.optimal.rounds import advance
 from planner.optimal.routing import best_path
 from planner.optimal.search import new_search
-from planner.optimal.settings import OBJECTIVES, Weights
+from planner.weights import OBJECTIVES, Weights
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 KNOWN_MM = {1: 628.5, 2: 661.0, 3: 813.5}

@@ -19,7 +19,7 @@ from planner.optimal.problem import Problem
 from planner.optimal.random import State
 from planner.optimal.rounds import advance
 from planner.optimal.search import BEST, Search, new_search
-from planner.optimal.settings import Weights
+from planner.weights import Weights
 
 NAME = "optimal"
 Array = NDArray[np.float64]

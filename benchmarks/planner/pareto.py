@@ -29,8 +29,9 @@ from cdpr.rig import Rig, load_rig
 from cdpr.scene import load_scene
 from planner.campaign.boxes import OWN, SHARES, WIDE, box_text, with_box
 from planner.check import check_path
-from planner.optimal.settings import OBJECTIVES, OptimalSettings
+from planner.optimal.settings import OptimalSettings
 from planner.plan import make_plan
+from planner.weights import OBJECTIVES
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CLAIM = 18.2

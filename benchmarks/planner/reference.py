@@ -26,7 +26,7 @@ from planner.optimal.problem import KINEMATIC, LENGTH, UNIT, VERTEX, Problem
 from planner.optimal.random import seeded
 from planner.optimal.rounds import advance
 from planner.optimal.search import BEST, new_search
-from planner.optimal.settings import Weights
+from planner.weights import Weights
 
 DENSE = 0.008
 """Between points of the dense graph, [m]."""

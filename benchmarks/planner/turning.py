@@ -18,6 +18,7 @@ from cdpr.poses import Array
 from cdpr.rig import Rig, load_rig
 from cdpr.scene import Scene, load_scene, scene_from_document
 from cdpr.scene_file import SceneDocument
+from planner.cost import KinematicCost
 from planner.exact.moving_edge import turning_edge_free
 from planner.exact.self_edge import self_turning_edge_free
 from planner.exact.turning_held import turning_edge_held
@@ -26,6 +27,7 @@ from planner.turning.moves import matrix_of, put_turned, turn_between
 from planner.turning.problem import Problem, move_allowed
 from planner.turning.routing import turning_problem
 from planner.turning.search import Search
+from planner.weights import OBJECTIVES
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 WAY, ANGLE = 0.040, np.radians(2.0)
@@ -125,7 +127,8 @@ def main() -> None:
     ready = load_rig(CONFIGS / "gachon_8_6.yaml"), load_scene(CONFIGS / "turn.yaml")
     for rig, scene in (ready, hall()):
         print(f"{rig.name}, {scene.name}")
-        problem = turning_problem(rig, scene)
+        kinematic = KinematicCost(rig, scene.start.rotation)
+        problem = turning_problem(rig, scene, OBJECTIVES["length"], kinematic)
         edges(problem)
         searches(rig, scene, problem, seeds)
 

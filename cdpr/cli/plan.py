@@ -10,7 +10,6 @@ import typer
 
 from cdpr.cli.plan_options import (
     BudgetOption,
-    CostName,
     CostOption,
     FreeRotationOption,
     FromRunOption,
@@ -25,8 +24,6 @@ from cdpr.cli.plan_options import (
     optimal_settings,
     paper_settings,
     refuse,
-    refuse_with_rotation,
-    turning_settings,
 )
 from cdpr.cli.readings import (
     ConeDrawName,
@@ -139,19 +136,9 @@ def plan(
                 "readings of the paper": readings != Readings(),
             },
         )
-        if free_rotation:
-            refuse_with_rotation(
-                {
-                    f"--cost {cost}": cost not in (None, CostName.length),
-                    "--weight": bool(weight),
-                    "--longest-mm": longest_mm is not None,
-                }
-            )
-            settings = turning_settings(seed, budget_ms, rounds or [])
-        else:
-            settings = optimal_settings(
-                seed, cost, weight or [], budget_ms, rounds or [], longest_mm
-            )
+        settings = optimal_settings(
+            free_rotation, seed, cost, weight or [], budget_ms, rounds or [], longest_mm
+        )
     else:
         refuse(
             planner,

@@ -12,10 +12,11 @@ import typer
 from cdpr.errors import BadInput
 
 if TYPE_CHECKING:
-    from planner.optimal.settings import OptimalSettings, Weights
+    from planner.optimal.settings import OptimalSettings
     from planner.paper.readings import Readings
     from planner.settings import PlannerSettings
     from planner.turning.settings import TurningSettings
+    from planner.weights import Weights
 
 
 class PlannerName(StrEnum):
@@ -86,64 +87,39 @@ IterationsOption = Annotated[
 
 
 def optimal_settings(
+    free_rotation: bool,
     seed: int,
     cost: CostName | None,
     weights: list[str],
     budget_ms: float | None,
     rounds: list[int],
     longest_mm: float | None,
-) -> OptimalSettings:
+) -> OptimalSettings | TurningSettings:
     """The settings of the planner we recommend.
 
     Raises:
         BadInput: Options contradict each other, or a weight cannot be read.
     """
-    from planner.optimal.settings import OBJECTIVES, OptimalSettings
+    from planner.optimal.settings import OptimalSettings
+    from planner.turning.settings import TurningSettings
+    from planner.weights import OBJECTIVES
 
     if weights and cost is not None:
         raise BadInput("--cost and --weight both say what to optimise", next_step="give one")
-    return OptimalSettings(
-        weights=_weights(weights) if weights else OBJECTIVES[(cost or CostName.length).value],
-        longest=math.inf if longest_mm is None else longest_mm / 1000.0,
-        **_effort(seed, budget_ms, rounds),
-    )
-
-
-def turning_settings(seed: int, budget_ms: float | None, rounds: list[int]) -> TurningSettings:
-    """The settings of the planner we recommend with the platform free to turn.
-
-    Raises:
-        BadInput: Options contradict each other.
-    """
-    from planner.turning.settings import TurningSettings
-
-    return TurningSettings(**_effort(seed, budget_ms, rounds))
-
-
-def _effort(seed: int, budget_ms: float | None, rounds: list[int]) -> dict[str, Any]:
     if budget_ms is not None and rounds:
         raise BadInput("--budget-ms and --rounds both say how long to go on", next_step="give one")
     options: dict[str, Any] = {} if budget_ms is None else {"budget": budget_ms / 1000.0}
-    return {"seed": seed, "rounds": rounds[0] if rounds else None, **options}
-
-
-def refuse_with_rotation(options: dict[str, bool]) -> None:
-    """Refuses options that were given but that `--free-rotation` would not heed.
-
-    Raises:
-        BadInput: Names them.
-    """
-    given = [name for name, is_given in options.items() if is_given]
-    if given:
-        raise BadInput(
-            f"--free-rotation knows no {', '.join(given)}",
-            why="it makes the way short, with the turning in it, and nothing else yet",
-            next_step="leave one of them out",
-        )
+    return (TurningSettings if free_rotation else OptimalSettings)(
+        weights=_weights(weights) if weights else OBJECTIVES[(cost or CostName.length).value],
+        longest=math.inf if longest_mm is None else longest_mm / 1000.0,
+        seed=seed,
+        rounds=rounds[0] if rounds else None,
+        **options,
+    )
 
 
 def _weights(given: list[str]) -> Weights:
-    from planner.optimal.settings import Weights
+    from planner.weights import Weights
 
     names = [name.value for name in CostName]
     read: dict[str, float] = {}

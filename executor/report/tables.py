@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cdpr.legs import legs_of
-from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument, TurningPlannerDocument
+from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument
 from executor.report.markup import known, list_table, table
 from executor.report.run_data import RunData
 
@@ -74,13 +74,7 @@ def _plan(run: RunData) -> list[tuple[str, str]]:
 
 def _search(run: RunData) -> list[tuple[str, str]]:
     planner, statistics = run.plan.document.planner, run.plan.document.statistics
-    match planner:
-        case OptimalPlannerDocument():
-            rows = _improving(planner)
-        case TurningPlannerDocument():
-            rows = [("Planner", "optimal, free to turn"), ("Seed", str(planner.seed))]
-        case _:
-            rows = _tree(planner)
+    rows = _improving(planner) if isinstance(planner, OptimalPlannerDocument) else _tree(planner)
     return [
         *rows,
         ("Nodes", str(statistics.nodes)),
@@ -93,7 +87,8 @@ def _search(run: RunData) -> list[tuple[str, str]]:
 def _improving(planner: OptimalPlannerDocument) -> list[tuple[str, str]]:
     weights = planner.weights.model_dump()
     asked = ", ".join(f"{name} {weight:g}" for name, weight in weights.items() if weight > 0.0)
-    rows = [("Planner", planner.name), ("Weights", asked), ("Seed", str(planner.seed))]
+    name = "optimal, free to turn" if planner.name == "turning" else planner.name
+    rows = [("Planner", name), ("Weights", asked), ("Seed", str(planner.seed))]
     if planner.longest_mm is not None:
         rows.append(("Longest path allowed", f"{planner.longest_mm:g} mm"))
     return rows

@@ -38,7 +38,10 @@ def no_path(
     }
     where = f"scene {scene.name}"
     if search.costs[BEST] < np.inf:
-        return _too_long(where, search, settings, values)
+        found = search.points[BEST, : search.counts[BEST, 0]]
+        length = float(np.linalg.norm(np.diff(found, axis=0), axis=1).sum())
+        straight = float(np.linalg.norm(search.ends[1] - search.ends[0]))
+        return settings.too_long(where, length, straight, values)
     gap = _gap(search)
     values["best_distance_mm"] = gap * 1e3
     if is_separated(problem.world, search.ends[0], search.ends[1]):
@@ -58,23 +61,6 @@ def no_path(
         next_step="raise --budget-ms, ask for less clearance, try another seed, or move the goal"
         " or an obstacle",
         values=values,
-    )
-
-
-def _too_long(
-    where: str, search: Search, settings: OptimalSettings, values: dict[str, float | str]
-) -> NoSolution:
-    limit = settings.longest * 1e3
-    path = search.points[BEST, : search.counts[BEST, 0]]
-    found = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) * 1e3
-    straight = float(np.linalg.norm(search.ends[1] - search.ends[0])) * 1e3
-    return NoSolution(
-        f"no path of at most {limit:.1f} mm was found",
-        where=where,
-        why=f"the path found has {found:.1f} mm, and the straight way {straight:.1f} mm",
-        next_step="allow a longer path, or raise --budget-ms; `--cost length` tells how short"
-        " paths can be",
-        values={**values, "longest_mm": limit, "found_mm": found},
     )
 
 

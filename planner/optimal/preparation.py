@@ -16,9 +16,9 @@ from planner.exact.self_edge import build_robot
 from planner.exact.world import build_world
 from planner.lattice import Lattice, corners_and_weights
 from planner.optimal.problem import LEAST_MARGIN, NO_MARGIN, UNIT, Problem
-from planner.optimal.settings import Weights
 from planner.optimal.stored import stored
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+from planner.weights import Weights
 
 _CELLS = (16, 16, 16)
 _FEW = 64

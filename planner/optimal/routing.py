@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,22 +14,20 @@ from cdpr.rig import Rig
 from cdpr.scene import Scene
 from planner.anytime import LEAST_ROUNDS
 from planner.cost import KinematicCost
-from planner.optimal.length_limit import LengthLimit
+from planner.length_limit import LEAST_ROUNDS_WITH_LIMIT, LengthLimit
 from planner.optimal.no_path import no_path
 from planner.optimal.polyline import measure, polyline_of
-from planner.optimal.preparation import problem_of
-from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, Problem
+from planner.optimal.preparation import problem_of, set_weights
+from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, UNIT, Problem
 from planner.optimal.rounds import advance, measure_again
 from planner.optimal.search import BEST, Search, new_search
-from planner.optimal.settings import OptimalSettings, Weights
+from planner.optimal.settings import OptimalSettings
 from planner.route import Progress, Route
 
 Clock = Callable[[], float]
 
 LEAST_WITH_PROOFS = 2
 """Likewise from where wrenches have to be proved on every edge, which takes long."""
-LEAST_WITH_LIMIT = 80
-"""Likewise where a longest path is asked for, whose price is found in steps of some rounds."""
 _TELL_EVERY = 0.1
 """Between calls of a progress, [s]."""
 
@@ -110,12 +108,14 @@ def _improved(
     clock: Clock,
 ) -> Array | None:
     """Does rounds until the budget is spent, or nothing can be better."""
-    limit = LengthLimit(settings) if settings.longest < math.inf else None
+    limit = None
+    if settings.longest < math.inf:
+        limit = LengthLimit(settings.longest, problem.terms[UNIT])
     spent, told = 0.0, 0.0
     while not _is_over(problem, settings, search, spent):
         cost = advance(problem, search, 1)
         if limit is not None:
-            limit.after_round(problem, search)
+            _limited(problem, search, settings, limit)
         elif cost <= _least(search, settings):
             break
         spent = clock() - began
@@ -125,9 +125,28 @@ def _improved(
     return limit.path if limit is not None else best_path(search)
 
 
+def _limited(
+    problem: Problem, search: Search, settings: OptimalSettings, limit: LengthLimit
+) -> None:
+    """Tells the limit what the best path is, and asks by the price that it sets."""
+    path, weights = best_path(search), settings.weights
+    if path is None:
+        return
+
+    def cost() -> float:
+        set_weights(problem, weights)
+        return float(measure(problem, polyline_of(path)))
+
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    changed = limit.after_round(path, length, cost)
+    set_weights(problem, replace(weights, length=weights.length + limit.price))
+    if changed:
+        measure_again(problem, search)
+
+
 def _is_over(problem: Problem, settings: OptimalSettings, search: Search, spent: float) -> bool:
     rounds, begun = int(search.totals[0]), int(search.totals[5])
-    least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_WITH_LIMIT
+    least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_ROUNDS_WITH_LIMIT
     if problem.terms[LEAST_MARGIN] == ASK_PROOF:
         least = LEAST_WITH_PROOFS
     return settings.is_over(rounds, spent, begun + least)
@@ -136,7 +155,7 @@ def _is_over(problem: Problem, settings: OptimalSettings, search: Search, spent:
 def _least(search: Search, settings: OptimalSettings) -> float:
     """The cost that nothing is below; only known where the length alone counts."""
     weights = settings.weights
-    if weights.length == 0.0 or weights != Weights(length=weights.length):
+    if not weights.is_length:
         return -math.inf
     straight = float(np.linalg.norm(search.ends[1] - search.ends[0]))
     return weights.length * straight * (1.0 + 1e-12)

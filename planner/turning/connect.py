@@ -136,7 +136,7 @@ def _extended(
 @kernel
 def _nearest(problem: Problem, trees: Array, tree: int, count: int, wanted: Array) -> int:
     best, least = 0, np.inf
-    scale = 8.0 * problem.radian * problem.radian  # an angle squared is nearly 8 (1 - |q · q'|)
+    scale = 8.0 * problem.objective.radian**2  # an angle squared is nearly 8 (1 - |q · q'|)
     for i in range(count):
         node, squared, cosine = trees[tree, i], 0.0, 0.0
         for axis in range(3):

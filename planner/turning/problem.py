@@ -14,6 +14,7 @@ from planner.exact.fields import World
 from planner.exact.self_region import Robot
 from planner.turning.limits import rotations_kept
 from planner.turning.moves import matrix_of, turn_between
+from planner.turning.objective import Objective
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -35,7 +36,7 @@ class Problem(NamedTuple):
         reserve: Smallest capacity margin, [N].
         tilt: Largest tilt, [rad].
         turn: Largest turn about the vertical, [rad].
-        radian: Metres that a radian of turning counts as.
+        objective: What is made small.
     """
 
     world: World
@@ -44,7 +45,7 @@ class Problem(NamedTuple):
     reserve: float
     tilt: float
     turn: float
-    radian: float
+    objective: Objective
 
 
 @kernel

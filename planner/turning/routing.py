@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cdpr.errors import BadInput, NoSolution
 from cdpr.rig import Rig
 from cdpr.scene import Scene
-from cdpr.statics.dexterity import rms_anchor_radius
+from planner.anytime import LEAST_ROUNDS
+from planner.cost import KinematicCost
 from planner.exact.capacity import build_load
 from planner.exact.checks import REASONS
 from planner.exact.self_edge import build_robot
 from planner.exact.world import build_world
+from planner.length_limit import LEAST_ROUNDS_WITH_LIMIT, LengthLimit
 from planner.route import Progress, Route
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 from planner.space import PoseSpace
+from planner.turning.objective import build_objective
 from planner.turning.problem import Problem
 from planner.turning.search import Search
 from planner.turning.settings import TurningSettings
+from planner.weights import Weights
 
 Clock = Callable[[], float]
 
@@ -45,7 +50,7 @@ class TurningRoute:
     search_time: float
 
 
-def turning_problem(rig: Rig, scene: Scene) -> Problem:
+def turning_problem(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCost) -> Problem:
     """The problem of a scene, with the reserves that `planner.settings` documents.
 
     Raises:
@@ -68,7 +73,7 @@ def turning_problem(rig: Rig, scene: Scene) -> Problem:
         reserve=MARGIN_RESERVE * rig.max_tension,
         tilt=limits.tilt + _ROTATION_ROUND_OFF,
         turn=limits.turn + _ROTATION_ROUND_OFF,
-        radian=float(rms_anchor_radius(rig.anchors)),
+        objective=build_objective(weights, kinematic),
     )
 
 
@@ -76,6 +81,7 @@ def turning_route(
     rig: Rig,
     scene: Scene,
     settings: TurningSettings,
+    kinematic: KinematicCost,
     progress: Progress | None = None,
     clock: Clock = time.perf_counter,
 ) -> TurningRoute:
@@ -84,26 +90,32 @@ def turning_route(
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load, rotation limits, start and goal.
-        settings: Seed and budget.
+        settings: Objective, seed and budget.
+        kinematic: The cost of poses at the start's orientation, which gives its scaling.
         progress: Told time spent [s] and the budget, or rounds, and the cost.
         clock: Seconds; decides when a budget is spent.
 
     Raises:
         BadInput: The scene has no rotation limits.
-        NoSolution: No path was found.
+        NoSolution: No path was found, or none is short enough.
     """
-    problem = turning_problem(rig, scene)
+    problem = turning_problem(rig, scene, settings.weights, kinematic)
     space = PoseSpace(rig)
     start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
-    Search(problem, start, goal, settings.seed).advance()  # makes or loads compiled code
+    _load(Search(problem, start, goal, settings.seed), settings.weights)
     search, began = Search(problem, start, goal, settings.seed), clock()
+    limit = None
+    if settings.longest < math.inf:
+        limit = LengthLimit(settings.longest, _unit(settings.weights, kinematic))
     spent = 0.0
     while not _is_over(settings, search, spent):
         search.advance()
+        if limit is not None:
+            _tell_limit(limit, search, settings.weights)
         spent = clock() - began
         if progress is not None and search.rounds % _TELL_EVERY == 0:
             settings.tell(progress, search.rounds, spent, search.cost)
-    path = search.path
+    path = search.path if limit is None else limit.path
     if path is None:
         raise _no_path(scene, search, settings)
     route = Route(
@@ -117,9 +129,31 @@ def turning_route(
     return TurningRoute(route, search.rounds, clock() - began)
 
 
+def _load(search: Search, weights: Weights) -> None:
+    """Calls what the rounds call: machine code is made, or loaded, when it is called first."""
+    search.advance()
+    search.cost_by(weights)
+
+
+def _unit(weights: Weights, kinematic: KinematicCost) -> float:
+    """What a metre of a usual path costs."""
+    return weights.length + weights.kinematic * float(kinematic.values.mean())
+
+
+def _tell_limit(limit: LengthLimit, search: Search, weights: Weights) -> None:
+    """Tells the limit what the best path is, and asks by the price that it sets."""
+    path = search.path
+    if path is None:
+        return
+    if limit.after_round(path, search.length, lambda: search.cost_by(weights)):
+        search.weigh(replace(weights, length=weights.length + limit.price))
+
+
 def _is_over(settings: TurningSettings, search: Search, spent: float) -> bool:
-    shortest_possible = search.cost <= search.shortest * (1.0 + 1e-12)
-    return shortest_possible or settings.is_over(search.rounds, spent)
+    if settings.weights.is_length and search.cost <= search.shortest * (1.0 + 1e-12):
+        return True
+    least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_ROUNDS_WITH_LIMIT
+    return settings.is_over(search.rounds, spent, least)
 
 
 def _no_path(scene: Scene, search: Search, settings: TurningSettings) -> NoSolution:
@@ -131,15 +165,18 @@ def _no_path(scene: Scene, search: Search, settings: TurningSettings) -> NoSolut
     ]
     listed = ", ".join(f"{name} ({count})" for count, name in sorted(refused, reverse=True))
     gap = search.gap()
+    values: dict[str, float | str] = {
+        "rounds": float(search.rounds),
+        "seed": float(settings.seed),
+        "best_distance_mm": gap * 1e3,
+    }
+    if search.path is not None:
+        return settings.too_long(f"scene {scene.name}", search.length, search.shortest, values)
     return NoSolution(
         settings.not_found(search.rounds, gap),
         where=f"scene {scene.name}",
         why=f"it is not proved that there is none; moves were refused for: {listed}",
         next_step="raise --budget-ms, ask for less clearance, allow more in rotation_limits, try"
         " another seed, or move the goal or an obstacle",
-        values={
-            "rounds": float(search.rounds),
-            "seed": float(settings.seed),
-            "best_distance_mm": gap * 1e3,
-        },
+        values=values,
     )

@@ -15,9 +15,12 @@ from cdpr.poses import Array
 from planner.turning import connect as connecting
 from planner.turning import polish as polishing
 from planner.turning.connect import connect
+from planner.turning.line import Line, copied, line_length, measure, new_line
 from planner.turning.moves import move_length
-from planner.turning.polish import MOST_POSES, path_length, polish
+from planner.turning.objective import set_weights
+from planner.turning.polish import polish
 from planner.turning.problem import Problem
+from planner.weights import Weights
 
 _KEPT = 6
 _SAMPLES, _TRIALS = 50, 40
@@ -28,10 +31,9 @@ _TO_THE_BEST = 0.5
 
 @dataclass(slots=True, eq=False)
 class _Kept:
-    """A path under improvement: poses, shape (MOST_POSES, 7), how many, and the cost, [m]."""
+    """A path under improvement, and what it costs."""
 
-    poses: Array
-    count: int
+    line: Line
     cost: float
 
 
@@ -53,27 +55,52 @@ class Search:
         self._ends = np.stack([start, goal])
         self._random = np.random.default_rng(seed)
         self._kept: list[_Kept] = []
+        self._best: _Kept | None = None
         self._trees = np.zeros((2, connecting.NODES, 7))
         self._parents = np.zeros((2, connecting.NODES), dtype=np.int64)
         self._grown = np.zeros(3, dtype=np.int64)
 
     @property
     def cost(self) -> float:
-        """Length of the best path, turning counted, [m]; infinite without one."""
-        return min((kept.cost for kept in self._kept), default=math.inf)
+        """What the best path costs; infinite without one."""
+        return math.inf if self._best is None else self._best.cost
 
     @property
     def path(self) -> Array | None:
         """The best path, shape (k, 7); None without one."""
-        if not self._kept:
+        if self._best is None:
             return None
-        best = min(self._kept, key=lambda kept: kept.cost)
-        return best.poses[: best.count].copy()
+        line = self._best.line
+        return line.poses[: line.counts[0]].copy()
+
+    @property
+    def length(self) -> float:
+        """Length of the best path, turning counted, [m]; infinite without one."""
+        if self._best is None:
+            return math.inf
+        return float(line_length(self.problem, self._best.line))
 
     @property
     def shortest(self) -> float:
         """Length that no path is below, [m]."""
-        return float(move_length(self._ends[0], self._ends[1], self.problem.radian))
+        return float(move_length(self._ends[0], self._ends[1], self.problem.objective.radian))
+
+    def weigh(self, weights: Weights) -> None:
+        """Changes what is made small."""
+        set_weights(self.problem.objective, weights)
+        for kept in (*self._kept, *filter(None, [self._best])):
+            kept.cost = float(measure(self.problem, kept.line))
+        for kept in self._kept:
+            self._note(kept)
+
+    def cost_by(self, weights: Weights) -> float:
+        """What the best path costs by other weights; infinite without one."""
+        if self._best is None:
+            return math.inf
+        objective = self.problem.objective
+        problem = self.problem._replace(objective=objective._replace(weights=np.zeros(4)))
+        set_weights(problem.objective, weights)
+        return float(measure(problem, copied(self._best.line)))
 
     def gap(self) -> float:
         """Smallest distance of positions in the two trees, [m]."""
@@ -90,8 +117,13 @@ class Search:
         if kept is None:
             return
         draws = self._random.random((_TRIALS, polishing.DRAWS))
-        kept.count = polish(self.problem, kept.poses, kept.count, draws, self.tallies)
-        kept.cost = float(path_length(self.problem, kept.poses, kept.count))
+        kept.cost = float(polish(self.problem, kept.line, draws, self.tallies))
+        self._note(kept)
+
+    def _note(self, kept: _Kept) -> None:
+        """Keeps a copy of the best: leaving poses out may make those under work a little worse."""
+        if kept.cost < self.cost:
+            self._best = _Kept(copied(kept.line), kept.cost)
 
     def _chosen(self, begun: int) -> _Kept | None:
         """Which path to work on; a new one now and then."""
@@ -109,7 +141,7 @@ class Search:
         return self._kept[int(self._random.random() * len(self._kept))]
 
     def _begun(self) -> _Kept | None:
-        poses = np.zeros((MOST_POSES, 7))
+        line = new_line()
         draws = self._random.random((_SAMPLES, connecting.DRAWS))
         count = connect(
             self.problem,
@@ -119,11 +151,12 @@ class Search:
             self._parents,
             self._grown,
             self.tallies,
-            poses,
+            line.poses,
         )
         if count == 0:
             return None
         self._grown[:] = 0
         if not len(self.first):
-            self.first = poses[:count].copy()
-        return _Kept(poses, count, float(path_length(self.problem, poses, count)))
+            self.first = line.poses[:count].copy()
+        line.counts[0] = count
+        return _Kept(line, float(measure(self.problem, line)))

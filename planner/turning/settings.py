@@ -1,4 +1,4 @@
-"""What the search of poses is told: the seed and how long it may go on."""
+"""What the search is told that may turn the platform."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from planner.anytime import AnytimeSettings
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TurningSettings(AnytimeSettings):
-    """Settings of the search; moves that turn take longer to decide, so its budget is larger."""
+    """Settings of the search that may turn the platform; its moves take longer to decide."""
 
     budget: float = 0.500

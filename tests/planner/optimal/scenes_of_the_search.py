@@ -17,7 +17,7 @@ from planner.optimal.preparation import problem_of
 from planner.optimal.problem import Problem
 from planner.optimal.rounds import advance
 from planner.optimal.search import BEST, Search, new_search
-from planner.optimal.settings import Weights
+from planner.weights import Weights
 from tests.planner.exact.sampled_oracle import random_scene
 
 KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull")

@@ -13,7 +13,7 @@ from planner.optimal.grid import interpolated
 from planner.optimal.lattice_path import lattice_path
 from planner.optimal.problem import edge_allowed
 from planner.optimal.random import seeded
-from planner.optimal.settings import OBJECTIVES
+from planner.weights import OBJECTIVES
 from tests.planner.optimal.scenes_of_the_search import ends_of, problem
 
 STRIDE = 4

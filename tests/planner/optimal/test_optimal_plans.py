@@ -12,9 +12,10 @@ from cdpr.errors import BadInput
 from cdpr.plan import load_plan, plan_from_document, save_plan
 from planner.anytime import LEAST_ROUNDS
 from planner.check import verify
-from planner.optimal.settings import OBJECTIVES, OptimalSettings, Weights
+from planner.optimal.settings import OptimalSettings
 from planner.plan import make_plan
 from planner.settings import CLEARANCE_RESERVE
+from planner.weights import OBJECTIVES, Weights
 
 SHORTEST = {1: 628.5, 2: 661.0, 3: 813.5}
 """Source: polished shortest lengths at 10 mm, [mm]."""

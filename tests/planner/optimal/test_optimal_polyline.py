@@ -14,7 +14,7 @@ from planner.optimal.polish import polish
 from planner.optimal.polyline import Change, cost_of, measure, replace
 from planner.optimal.problem import CAPACITY, CLEARANCE, VERTEX, edge_allowed, edge_cost
 from planner.optimal.random import seeded
-from planner.optimal.settings import OBJECTIVES, Weights
+from planner.weights import OBJECTIVES, Weights
 from tests.planner.optimal.scenes_of_the_search import ends_of, polyline, problem, searched
 
 MIXED = Weights(length=1.0, kinematic=0.5, clearance=0.5, capacity=1e-3)

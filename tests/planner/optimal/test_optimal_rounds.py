@@ -18,8 +18,8 @@ from planner.feasibility import capacity_margins
 from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, NO_MARGIN
 from planner.optimal.rounds import advance
 from planner.optimal.search import BEST, KEPT, new_search
-from planner.optimal.settings import OBJECTIVES
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+from planner.weights import OBJECTIVES
 from tests.planner.exact.sampled_oracle import CoalScene
 from tests.planner.optimal.scenes_of_the_search import (
     best_points,

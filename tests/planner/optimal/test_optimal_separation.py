@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from cdpr.errors import NoSolution
 from planner.optimal.separation import FINENESSES, flood_reaches, is_separated
-from planner.optimal.settings import OBJECTIVES, OptimalSettings
+from planner.optimal.settings import OptimalSettings
 from planner.plan import make_plan
+from planner.weights import OBJECTIVES
 from tests.planner.optimal.scenes_of_the_search import (
     best_points,
     ends_of,

@@ -11,9 +11,8 @@ from cdpr.scene import Scene, scene_from_document
 from cdpr.scene_file import RotationLimitsDocument
 from planner.turning.moves import put_between
 from planner.turning.problem import Problem, move_allowed
-from planner.turning.routing import turning_problem
 from tests.planner.exact.sampled_oracle import random_scene
-from tests.planner.turning.turning_scenes import GACHON, HALL, Judge, random_pose, row
+from tests.planner.turning.turning_scenes import GACHON, HALL, Judge, problem_of, random_pose, row
 
 SCENES, MOVES, SAMPLES = 24, 30, 15
 
@@ -52,7 +51,7 @@ def test_no_allowed_move_violates_anything_anywhere(rig: Rig) -> None:
     looked_at, touching = 0, 0
     for _ in range(SCENES):
         scene = with_limits(random_scene(rng, rig, int(rng.integers(1, 3))))
-        problem, judge = turning_problem(rig, scene), Judge(rig, scene)
+        problem, judge = problem_of(rig, scene), Judge(rig, scene)
         for _ in range(MOVES):
             start, end = row(random_pose(rng, rig, scene)), row(random_pose(rng, rig, scene))
             if not move_allowed(problem, start, start, tallies):

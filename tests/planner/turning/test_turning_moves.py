@@ -14,8 +14,15 @@ from cdpr.rotation_limits import RotationLimits, largest_rotations
 from planner.turning.limits import rotations_kept
 from planner.turning.moves import matrix_of, move_length, put_between, turn_between
 from planner.turning.problem import ROTATION, move_allowed
-from planner.turning.routing import turning_problem
-from tests.planner.turning.turning_scenes import GACHON, HALL, Judge, random_pose, row, turning
+from tests.planner.turning.turning_scenes import (
+    GACHON,
+    HALL,
+    Judge,
+    problem_of,
+    random_pose,
+    row,
+    turning,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -69,7 +76,7 @@ def test_no_move_is_allowed_that_an_independent_judge_refuses(
     rig: Rig, name: str, tilt_deg: float, turn_deg: float
 ) -> None:
     scene = turning(name, tilt_deg, turn_deg)
-    problem, judge = turning_problem(rig, scene), Judge(rig, scene)
+    problem, judge = problem_of(rig, scene), Judge(rig, scene)
     rng = np.random.default_rng(31)
     tallies = np.zeros(6, dtype=np.int64)
     allowed, wrongly_refused, refused = 0, 0, 0

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from cdpr.cli.plan import plan as plan_verb
 from cdpr.cli.plan import sentences_of
-from cdpr.cli.plan_options import CostName
 from cdpr.errors import BadInput, InvalidFile, NoSolution
 from cdpr.plan import load_plan, plan_from_document, save_plan
 from cdpr.plan_file import PlanDocument
@@ -18,8 +18,9 @@ from cdpr.rig import Rig
 from cdpr.scene import Scene, load_scene
 from cdpr.statics.dexterity import rms_anchor_radius
 from planner.check import check_path, verify
+from planner.cost import KinematicCost
 from planner.plan import make_plan
-from planner.turning.routing import turning_route
+from planner.turning.routing import TurningRoute, turning_route
 from planner.turning.settings import TurningSettings
 from tests.planner.turning.turning_scenes import (
     CONFIGS,
@@ -32,6 +33,14 @@ from tests.planner.turning.turning_scenes import (
 
 ROUNDS = TurningSettings(rounds=60)
 RAMP = load_scene(CONFIGS / "turn.yaml")
+
+
+def routed(
+    scene: Scene, settings: TurningSettings, clock: Callable[[], float] = time.perf_counter
+) -> TurningRoute:
+    return turning_route(
+        GACHON, scene, settings, KinematicCost(GACHON, scene.start.rotation), clock=clock
+    )
 
 
 def proved(rig: Rig, scene: Scene, settings: TurningSettings) -> PlanDocument:
@@ -59,23 +68,20 @@ def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> 
 
 
 def test_the_same_seed_and_rounds_give_the_same_path_and_others_another() -> None:
-    first, again = (turning_route(GACHON, RAMP, ROUNDS).route for _ in range(2))
+    first, again = (routed(RAMP, ROUNDS).route for _ in range(2))
     assert first.path.tolist() == again.path.tolist()
     assert first.edge_checks == again.edge_checks
-    other = turning_route(GACHON, RAMP, TurningSettings(seed=1, rounds=60)).route
+    other = routed(RAMP, TurningSettings(seed=1, rounds=60)).route
     assert other.path.tolist() != first.path.tolist()
 
 
 def test_more_rounds_are_never_worse_and_a_plan_with_a_budget_tells_them() -> None:
     ticks = itertools.count()
     settings = TurningSettings(budget=0.040)
-    found = turning_route(GACHON, RAMP, settings, clock=lambda: 1e-3 * next(ticks))
-    again = turning_route(GACHON, RAMP, TurningSettings(rounds=found.rounds))
+    found = routed(RAMP, settings, clock=lambda: 1e-3 * next(ticks))
+    again = routed(RAMP, TurningSettings(rounds=found.rounds))
     assert again.route.path.tolist() == found.route.path.tolist()
-    lengths = [
-        turning_route(GACHON, RAMP, TurningSettings(rounds=rounds)).route.path
-        for rounds in (15, 40, 90)
-    ]
+    lengths = [routed(RAMP, TurningSettings(rounds=rounds)).route.path for rounds in (15, 40, 90)]
     ways = [_length(path) for path in lengths]
     assert ways == sorted(ways, reverse=True)
 
@@ -93,7 +99,7 @@ def _length(path: np.ndarray) -> float:
 def test_where_nothing_is_in_the_way_the_single_move_is_the_path() -> None:
     goal = {"position_mm": [60, 40, 430], "rotation_wxyz": quaternion(4.0, -3.0)}
     scene = turning("environment_1", 8.0, 2.0, goal=goal, obstacles=[])
-    route = turning_route(GACHON, scene, ROUNDS)
+    route = routed(scene, ROUNDS)
     assert route.rounds == 1
     level = make_plan(GACHON, scene.changed(goal=Pose.level([0.06, 0.04, 0.43])), ROUNDS)
     assert "rotation" not in dict(sentences_of(level))
@@ -141,7 +147,7 @@ def test_a_search_that_finds_nothing_tells_what_was_in_the_way() -> None:
     ends = {"start": {"position_mm": [200, 0, 400]}, "goal": {"position_mm": [-200, 0, 400]}}
     scene = turning("environment_1", 5.0, 2.0, obstacles=wall, **ends)
     with pytest.raises(NoSolution, match="no path after 3 rounds") as caught:
-        turning_route(GACHON, scene, TurningSettings(rounds=3))
+        routed(scene, TurningSettings(rounds=3))
     assert "obstacle clearance" in str(caught.value)
     assert caught.value.values["rounds"] == 3.0
 
@@ -169,25 +175,6 @@ def test_a_plan_survives_its_file(tmp_path) -> None:
     save_plan(document, tmp_path / "plan.json")
     plan = load_plan(tmp_path / "plan.json")
     assert verify(plan).report.proved_obstacle_clearance >= 0.010
-
-
-@pytest.mark.parametrize(
-    ("given", "named"),
-    [
-        ({"cost": CostName.kinematic}, "--cost kinematic"),
-        ({"weight": ["length=1"]}, "--weight"),
-        ({"longest_mm": 900.0}, "--longest-mm"),
-    ],
-)
-def test_options_that_would_not_be_heeded_are_refused(tmp_path, given, named) -> None:
-    with pytest.raises(BadInput, match=f"--free-rotation knows no {named}"):
-        plan_verb(
-            CONFIGS / "gachon_8_6.yaml",
-            CONFIGS / "turn.yaml",
-            tmp_path / "plan.json",
-            free_rotation=True,
-            **given,
-        )
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"budget": 0.0}, {"rounds": 0}])

@@ -17,6 +17,10 @@ from cdpr.scene_file import SceneDocument
 from cdpr.statics.dexterity import rms_anchor_radius
 from cdpr.statics.feasibility import WrenchBox, capacity_margin
 from cdpr.statics.working import weight_wrench
+from planner.cost import KinematicCost
+from planner.turning.problem import Problem
+from planner.turning.routing import turning_problem
+from planner.weights import OBJECTIVES, Weights
 from tests.planner.exact.sampled_oracle import CoalScene
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -31,6 +35,11 @@ def turning(name: str, tilt_deg: float, turn_deg: float, **parts: Any) -> Scene:
     return scene_from_document(
         SceneDocument.model_validate(document | {"rotation_limits": limits} | parts)
     )
+
+
+def problem_of(rig: Rig, scene: Scene, weights: Weights = OBJECTIVES["length"]) -> Problem:
+    """What the search of a scene is given."""
+    return turning_problem(rig, scene, weights, KinematicCost(rig, scene.start.rotation))
 
 
 def quaternion(x_deg: float, y_deg: float, z_deg: float = 0.0) -> list[float]:
