@@ -32,6 +32,7 @@ class Winch:
         node_id: CANopen node of its drive.
         counts_per_metre: Signed counts for one metre of cable paid out.
         home_counts: Drive position with the platform at home.
+        absolute: The drive knows its position after its power was gone.
         drum_to_outlet: Cable between drum and outlet, [m].
         max_speed: Cable speed limit, [m/s].
         torque_constant: Cable tension at rated torque, [N].
@@ -40,6 +41,7 @@ class Winch:
     node_id: int
     counts_per_metre: float
     home_counts: int
+    absolute: bool
     drum_to_outlet: float
     max_speed: float
     torque_constant: float
@@ -215,6 +217,7 @@ def _winch(document: WinchDocument) -> Winch:
         node_id=document.node_id,
         counts_per_metre=counts_per_rev / (document.drum_mm_per_rev / 1000.0),
         home_counts=document.home_counts,
+        absolute=document.encoder == "absolute",
         drum_to_outlet=document.drum_to_outlet_mm / 1000.0,
         max_speed=document.max_speed_mm_s / 1000.0,
         torque_constant=document.torque_constant_n,

@@ -83,6 +83,10 @@ class WinchDocument(Document):
     drum_to_outlet_mm: NonNegative = Field(
         default=0.0, description="cable between drum and outlet; it stretches too"
     )
+    encoder: Literal["absolute", "incremental"] = Field(
+        default="incremental",
+        description="absolute: the drive knows its position after its power was gone",
+    )
     max_speed_mm_s: Positive
     torque_constant_n: Positive = Field(description="cable tension at rated torque")
 

@@ -121,6 +121,14 @@ class DriveGroup(Protocol):
         ...
 
     @property
+    def restarted(self) -> tuple[int, ...]:
+        """Nodes that `configure` found without this program's set-up.
+
+        They were switched on since they were last set up, or never were.
+        """
+        ...
+
+    @property
     def targets(self) -> Counts:
         """Targets last sent, shape (m,), [counts]; motion after ENABLING starts from them."""
         ...

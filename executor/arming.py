@@ -6,8 +6,10 @@ import numpy as np
 
 from cdpr.errors import Refused
 from cdpr.poses import Array
-from drivers.drive_group import Capabilities
+from cdpr.rig import Rig
+from drivers.drive_group import Capabilities, DriveGroup
 from executor.course import Course
+from executor.reference import ReferenceDocument
 
 
 def require_capabilities(drives: Capabilities, cycle: float) -> None:
@@ -73,3 +75,44 @@ def require_at_start(course: Course, actual: Array) -> None:
             " with `cdpr plan --start-mm`), or reference the drives; nothing was enabled",
             values={"off_mm": float(off[worst] * 1000), "cable": float(worst + 1)},
         )
+
+
+def require_still_referenced(
+    rig: Rig, reference: ReferenceDocument | None, group: DriveGroup
+) -> None:
+    """Drives without absolute encoders still count from where they were referenced.
+
+    Such a drive forgets its set-up and its position when its power goes, and nobody tells. So it
+    must hold the set-up of before, and stand where it was left.
+
+    Args:
+        rig: The robot.
+        reference: Of its drives; None where it needs none.
+        group: The drives, configured.
+
+    Raises:
+        Refused: One of them was switched on since, or was moved; nothing was enabled.
+    """
+    if reference is None:
+        return
+    stands = group.read_positions().positions
+    for drive, winch in enumerate(rig.winches):
+        if winch.absolute:
+            continue
+        if winch.node_id in group.restarted:
+            raise _lost(drive, "it was switched on since it was referenced")
+        off = abs((int(stands[drive]) - reference.stands_at[drive]) / winch.counts_per_metre)
+        if not off <= rig.motion.start_tolerance:
+            raise _lost(
+                drive, f"it stands {off * 1000:.1f} mm of cable away from where it was left"
+            )
+
+
+def _lost(drive: int, how: str) -> Refused:
+    return Refused(
+        f"the reference of drive {drive + 1} is lost: {how}",
+        where="arming",
+        why="its encoder is not absolute: after its power was gone it counts from anywhere",
+        next_step="reference the drives again with `cdpr home RIG`; nothing was enabled",
+        values={"drive": drive + 1},
+    )

@@ -29,12 +29,14 @@ class Outcome:
         state: Where the run ended.
         cause: Why it did not finish, if it did not.
         log: Its cycles.
+        holding: Every cable was held when the drives were last heard.
         started: When, UTC.
     """
 
     state: State
     cause: str
     log: RunLog
+    holding: bool
     started: datetime
 
 
@@ -86,4 +88,4 @@ def run_here(
     before_motion()
     started = datetime.now(UTC)
     loop.run()
-    return Outcome(loop.machine.state, loop.cause, recorder.log, started)
+    return Outcome(loop.machine.state, loop.cause, recorder.log, loop.holding, started)

@@ -64,6 +64,8 @@ class Loop:
         self._told: set[tuple[str, int]] = set()
         self._listener_error = ""
         self.cause = ""
+        self.holding = True
+        """Every cable was held when the drives were last heard."""
 
     def arm(self) -> None:
         """Confirms the drives' abilities, the set-points, and that the platform is at their start.
@@ -189,6 +191,7 @@ class Loop:
     def _record(self, done: Exchanged) -> None:
         if done.status is None:
             return
+        self.holding = done.status.holding or not self._taken_over
         record = CycleRecord(
             cycle=self._cycle,
             at=self._clock.time,

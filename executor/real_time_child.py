@@ -8,6 +8,7 @@ from multiprocessing.connection import Connection
 
 from cdpr.errors import CdprError, Fault, Refused
 from cdpr.poses import Pose
+from executor.arming import require_still_referenced
 from executor.clock import RealClock
 from executor.loop import Loop
 from executor.machine import ON_PATH
@@ -84,12 +85,13 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             on_cycle=on_cycle,
             on_event=on_event,
         )
+        require_still_referenced(course.rig, job.reference, drives.group)
         loop.arm()
         _say(link, Armed(denied))
         if not _may_go(link):
             return
         state = loop.run()
-    _say(link, Ended(state, loop.cause))
+    _say(link, Ended(state, loop.cause, loop.holding))
 
 
 def _no_real_time(denied: str) -> Refused:

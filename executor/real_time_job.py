@@ -17,6 +17,7 @@ from drivers.drive_group import DriveGroup
 from executor.announcing import Schedule
 from executor.course import Course
 from executor.machine import State
+from executor.reference import ReferenceDocument
 from executor.ring import Ring
 from executor.shared_memory import SharedMemory
 from executor.wire import RecordWire
@@ -62,6 +63,7 @@ class Job:
         pose_every: Cycles from one true pose of the simulated platform to the next; 0 for none.
         loads: What the simulated platform carries, by place in the table.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
+        reference: Where the drives were referenced, if they were.
     """
 
     rig: RigDocument
@@ -75,6 +77,7 @@ class Job:
     pose_every: int
     loads: Schedule[Load]
     need_real_time: bool
+    reference: ReferenceDocument | None
 
     @classmethod
     def of(
@@ -86,6 +89,7 @@ class Job:
         pose_every: int,
         loads: Schedule[Load],
         need_real_time: bool,
+        reference: ReferenceDocument | None,
     ) -> Job:
         """A job with shared memory of its own."""
         wire = RecordWire(course.rig.cable_count)
@@ -101,6 +105,7 @@ class Job:
             pose_every=pose_every,
             loads=loads,
             need_real_time=need_real_time,
+            reference=reference,
         )
 
     def course(self) -> Course:
@@ -128,10 +133,11 @@ class Armed:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The motion is over, and the drives hold by themselves."""
+    """The motion is over, and the drives hold by themselves; whether all did is told, too."""
 
     state: State
     cause: str
+    holding: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,7 +69,7 @@ def run_in_real_time(
         StoppedByOperator: The operator wanted to stop before anything moved.
     """
     custody = Custody(prepared.rig)
-    custody.require_free()
+    reference = custody.require_ready()
     course = course_of(prepared.checked)
     job = Job.of(
         course,
@@ -78,6 +78,7 @@ def run_in_real_time(
         pose_every=pose_every,
         loads=load_changes(prepared.scene, prepared.checked.table.stands),
         need_real_time=need_real_time,
+        reference=reference,
     )
     process = _Process(job, board)
     try:
@@ -89,9 +90,14 @@ def run_in_real_time(
             custody.prevented()
             raise
         started = datetime.now(UTC)
-        state, cause = process.supervise(recorder)
-        custody.end(state, cause, recorder.folder.path)
-        return Outcome(state, cause, recorder.log, started)
+        ended = process.supervise(recorder)
+        custody.end(
+            ended.state,
+            ended.cause,
+            recorder.folder.path,
+            stands_at=recorder.log.last_positions if ended.holding else None,
+        )
+        return Outcome(ended.state, ended.cause, recorder.log, ended.holding, started)
     finally:
         process.close()
         job.close()
@@ -127,7 +133,7 @@ class _Process:
                     return said.denied
                 raise said.error if isinstance(said, Failed) else self._died()
 
-    def supervise(self, recorder: Recorder) -> tuple[State, str]:
+    def supervise(self, recorder: Recorder) -> Ended:
         """Says go, and takes in what happens until the motion is over."""
         self._board.beat()
         with suppress(OSError):  # it died since it was armed, which is told below
@@ -141,10 +147,10 @@ class _Process:
                 said = self._heard()
             self._take_in(recorder)
         if isinstance(said, Ended):
-            return said.state, said.cause
+            return said
         error = said.error if isinstance(said, Failed) else self._died()
         self._record(partial(recorder.take_event, _lost(recorder, error)))
-        return State.LATCHED, error.what
+        return Ended(State.LATCHED, error.what, holding=True)  # by themselves, as SYNC stays away
 
     def close(self) -> None:
         """Waits for the process; whatever it does, it comes to rest and ends."""

@@ -31,6 +31,11 @@ class RunLog:
         """Number of cycles."""
         return len(self._records)
 
+    @property
+    def last_positions(self) -> tuple[int, ...] | None:
+        """Where the drives last said that they stand, [counts]; None before the first cycle."""
+        return self._records[-1].actual if self._records else None
+
     def table(self) -> CycleTable:
         """Everything that is known of the run's cycles."""
         records, rig, planned = self._records, self._rig, self._checked.table

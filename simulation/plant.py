@@ -47,6 +47,9 @@ class Plant:
         self._behind = self.winch_map.behind_outlet
         self._weight, self._centre = _weight(rig, load)
         self._reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
+        self._on_a_stand = False
+        self.miscounted: Array = np.zeros(rig.cable_count)
+        """By how much the drives count more than they would had they been referenced, [counts]."""
         self.pose = pose
         tensions = working_tensions(rig, pose, load).tensions
         self._unstrained = self.winch_map.unstrained(cables_at(rig, pose).lengths, tensions)
@@ -62,6 +65,13 @@ class Plant:
         self._weight, self._centre = _weight(self._rig, load)
         self.settle(self._unstrained)
 
+    def put_on_a_stand(self) -> None:
+        """A stand keeps the platform where it is, until somebody sees every cable taut.
+
+        Then the stand is taken away, and the platform hangs on its cables again.
+        """
+        self._on_a_stand = True
+
     def counts_for(self, pose: Pose, tensions: Array) -> Array:
         """Drive positions that hold a pose with given tensions, not rounded, shape (m,).
 
@@ -74,7 +84,7 @@ class Plant:
 
     def settle_counts(self, counts: Array) -> None:
         """`settle` at drive positions, shape (m,), [counts]."""
-        self.settle(self.winch_map.unstrained_from_counts(counts))
+        self.settle(self.winch_map.unstrained_from_counts(counts - self.miscounted))
 
     def settle(self, unstrained: Array) -> None:
         """Moves the platform to its equilibrium; the search starts where it is.
@@ -88,7 +98,10 @@ class Plant:
         if not (np.isfinite(unstrained).all() and (unstrained > 0.0).all()):
             raise self._lost("an unstrained length is not a positive number", unstrained)
         self._unstrained = np.array(unstrained)
-        if not self._settle_taut():
+        if self._on_a_stand:
+            self.tensions = read_only(self._pulled(self.pose)[1])
+            self._on_a_stand = bool(self.tensions.min() < self._rig.min_tension)
+        if not (self._on_a_stand or self._settle_taut()):
             self._settle_anyhow()
 
     def _settle_taut(self) -> bool:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 from cdpr.errors import BadInput, Fault
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
 
+    from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
     from cdpr.rig_file import RigDocument
     from cdpr.scene import Scene
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from executor.camera_process import CameraProcess
     from executor.observer import Observer, PictureSource, Trigger
     from simulation.camera import SyntheticCamera
+    from tracking.measurement import Observation
 
 SYNTHETIC = "synthetic"
 #: About so many pictures of a run are kept for its report.
@@ -91,6 +93,37 @@ def open_camera(
         yield process
     finally:
         process.close()
+
+
+def look_at_rest(
+    rig: Rig, name: str, pictures: int, true_pose: Callable[[], Pose] | None
+) -> list[Observation]:
+    """Pictures of a platform that stands still, each measured.
+
+    Args:
+        rig: The robot; its first camera is used.
+        name: From `choose_camera`.
+        pictures: How many.
+        true_pose: Where the simulated platform is.
+    """
+    import time
+
+    from cdpr.cli.jog import no_scene
+    from executor.observer import Trigger
+    from tracking.tracker import Tracker
+
+    camera = rig.cameras[0]
+    source, tracker = _source(rig, no_scene(rig), camera, name), Tracker(rig, camera)
+    try:
+        looks = []
+        for frame in range(pictures):
+            asked = time.monotonic()
+            pose = true_pose() if true_pose is not None else None
+            image, _ = source.picture(Trigger(frame, frame / camera.rate, asked, pose))
+            looks.append(tracker.observe(image, frame / camera.rate))
+        return looks
+    finally:
+        source.close()
 
 
 def make_observer(

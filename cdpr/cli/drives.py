@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
@@ -12,11 +12,18 @@ if TYPE_CHECKING:
     from cdpr.rig_file import RigDocument
     from cdpr.scene import Load
     from executor.real_time_job import ReadyDrives
+    from simulation.power_loss import PowerLoss
 
 
 @contextmanager
 def open_drives(
-    rig: Rig, simulated_start: Pose, load: Load, *, to_reset: bool = False
+    rig: Rig,
+    simulated_start: Pose,
+    load: Load,
+    *,
+    to_reset: bool = False,
+    lost_power: PowerLoss | None = None,
+    set_up_as: Callable[[Sequence[int]], Rig] | None = None,
 ) -> Iterator[ReadyDrives]:
     """Opens the bus and configures the drives; closes both at the end.
 
@@ -25,6 +32,9 @@ def open_drives(
         simulated_start: Where the platform stands when the drives are simulated here.
         load: What it carries then.
         to_reset: Also takes drives in fault, which are going to be reset.
+        lost_power: What became of drives that are simulated here.
+        set_up_as: For drives that are not referenced: the rig whose limits they get, by where they
+            stand [counts].
 
     Raises:
         BadInput: python-can has no such interface.
@@ -48,9 +58,17 @@ def open_drives(
             far_end = open_bus(settings)
             stack.callback(far_end.shutdown)
             rehearsal = Rehearsal(rig, far_end, simulated_start, load)
+            if lost_power is not None:
+                lost_power.happen_to(rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
             pump, true_pose, carry = rehearsal.pump, lambda: rehearsal.pose, rehearsal.carry
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)
+        if set_up_as is not None:
+            group.configure(to_reset=to_reset)
+            limited = set_up_as(group.read_positions().positions.tolist())
+            group.close()
+            group = make_drive_group(limited, bus, pump)
+            stack.callback(group.close)
         for remark in group.configure(to_reset=to_reset):
             err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
         yield ReadyDrives(group, true_pose, carry)

@@ -20,8 +20,18 @@ LONGEST_MM, FASTEST_MM_S = 50.0, 20.0
 def jog(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
     by_mm: Annotated[
-        tuple[float, float, float], typer.Option("--by-mm", help="how far: x y z, at most 50 mm")
-    ],
+        tuple[float, float, float] | None,
+        typer.Option("--by-mm", help="how far: x y z, at most 50 mm"),
+    ] = None,
+    cable: Annotated[
+        int | None, typer.Option("--cable", min=1, help="move one winch alone, with --mm")
+    ] = None,
+    mm: Annotated[
+        float | None, typer.Option("--mm", help="pay out so much; negative winds in; at most 50")
+    ] = None,
+    limit_n: Annotated[
+        float | None, typer.Option(help="with --cable: no cable may carry more (default: 60 %)")
+    ] = None,
     scene: Annotated[
         Path | None, typer.Option(help="what is in the way, and what the platform carries")
     ] = None,
@@ -55,15 +65,19 @@ def jog(
     """Move the platform straight by a few millimetres, slowly, from where it stands.
 
     A jog is a run: planned, proved, checked and gated like any other, and it can be stopped, held
-    and watched. With the interface 'virtual' the simulated platform hangs at home.
+    and watched. With the interface 'virtual' the simulated platform hangs at home. With --cable one
+    winch alone is moved: for commissioning, with cables that carry no load.
 
-    [dim]Example:[/dim]
+    [dim]Examples:[/dim]
+
+      cdpr jog rig.yaml --cable 3 --mm -5
 
       cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
     """
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.demo import free_folder
     from cdpr.cli.run import require_own_time, rig_on_bus
+    from cdpr.errors import BadInput
     from cdpr.plan import plan_from_document
     from drivers.bus import IN_PROCESS
     from executor.custody import Custody
@@ -72,11 +86,22 @@ def jog(
     the_rig = _slow(rig_on_bus(rig, interface, channel), speed_mm_s)
     in_process = the_rig.document.bus.interface == IN_PROCESS
     require_own_time(fast, in_process)
+    if cable is not None or mm is not None:
+        _one_cable(the_rig, cable, mm, by_mm, limit_n, speed_mm_s, fast, yes, without_real_time,
+                   as_json)  # fmt: skip
+        return
+    if by_mm is None:
+        raise BadInput(
+            "say how far: --by-mm X Y Z, or --cable N --mm X",
+            where="cdpr jog",
+            next_step="see `cdpr jog --help`",
+        )
     _require_short(by_mm)
     the_scene = _scene(scene, no_scene, clearance_mm, the_rig)
     folder = output or free_folder("jog")
     RunFolder.require_free(folder)
     Custody(the_rig).require_free()
+    the_rig = Custody(the_rig).referenced_rig()
     start = the_rig.home if in_process else _where_it_stands(the_rig, the_scene)
     document = _straight(the_rig, the_scene, start, by_mm, not as_json)
     code = carry_out(
@@ -90,6 +115,33 @@ def jog(
         as_json=as_json,
     )
     raise typer.Exit(code)
+
+
+def _one_cable(
+    rig: Rig,
+    cable: int | None,
+    mm: float | None,
+    by_mm: tuple[float, float, float] | None,
+    limit_n: float | None,
+    speed_mm_s: float,
+    fast: bool,
+    yes: bool,
+    without_real_time: bool,
+    as_json: bool,
+) -> None:
+    from cdpr.cli.jog_cable import jog_cable
+    from cdpr.errors import BadInput
+
+    if cable is None or mm is None or by_mm is not None:
+        raise BadInput(
+            "one cable is moved with --cable N and --mm X together, without --by-mm",
+            where="cdpr jog",
+            next_step="pass both, or --by-mm X Y Z to move the platform",
+        )
+    jog_cable(
+        rig, cable, mm, limit_n=limit_n, speed_mm_s=speed_mm_s, fast=fast, yes=yes,
+        without_real_time=without_real_time, as_json=as_json,
+    )  # fmt: skip
 
 
 def _slow(rig: Rig, speed_mm_s: float) -> Rig:
@@ -123,10 +175,8 @@ def _require_short(by_mm: tuple[float, float, float]) -> None:
 
 def _scene(path: Path | None, without: bool, clearance_mm: float | None, rig: Rig) -> Scene:
     """What is around; nothing only when somebody says so."""
-    from cdpr.document_types import PoseDocument
     from cdpr.errors import BadInput
-    from cdpr.scene import load_scene, scene_from_document
-    from cdpr.scene_file import SceneDocument
+    from cdpr.scene import load_scene
 
     if (path is None) != without:
         raise BadInput(
@@ -134,14 +184,21 @@ def _scene(path: Path | None, without: bool, clearance_mm: float | None, rig: Ri
             where="--scene",
             next_step="pass --scene with the file, or --no-scene if there is nothing to hit",
         )
-    if path is None:
-        home = PoseDocument.of(rig.home)
-        document = SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
-        scene = scene_from_document(document)
-    else:
-        scene = load_scene(path).changed(stops=())
+    scene = no_scene(rig) if path is None else load_scene(path).changed(stops=())
     clearance = None if clearance_mm is None else clearance_mm / 1000.0
     return scene.changed(clearance=clearance)
+
+
+def no_scene(rig: Rig) -> Scene:
+    """Nothing but the rig, at home."""
+    from cdpr.document_types import PoseDocument
+    from cdpr.scene import scene_from_document
+    from cdpr.scene_file import SceneDocument
+
+    home = PoseDocument.of(rig.home)
+    return scene_from_document(
+        SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
+    )
 
 
 def _where_it_stands(rig: Rig, scene: Scene) -> Pose:

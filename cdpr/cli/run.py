@@ -68,6 +68,7 @@ def run(
     start = _simulated_start(simulated_start_mm, in_process, fast)
     RunFolder.require_free(output)
     Custody(the_rig).require_free()
+    the_rig = Custody(the_rig).referenced_rig()
     the_plan = load_plan(plan)
     require_same_rig(the_plan, the_rig, plan)
     code = carry_out(

@@ -11,6 +11,7 @@ from cdpr.cli.output import out, show_facts, show_json
 from cdpr.cli.stop_facts import stop_facts
 
 if TYPE_CHECKING:
+    from cdpr.rig import Rig
     from executor.prepare import PreparedRun
 
 COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
@@ -34,6 +35,7 @@ def show_prepared(prepared: PreparedRun, simulated: bool) -> None:
                 f" at most {rig.motion.speed * 1000:g} mm/s",
             ),
             ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),
+            *_reference(rig),
             ("bus", f"{bus.interface} {bus.channel}{', simulated drives' if simulated else ''}"),
         ],
     )
@@ -50,3 +52,14 @@ def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
     for reason in summary["reasons"]:
         out.print(f"  {reason}", markup=False, soft_wrap=True)
     out.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def _reference(rig: Rig) -> list[tuple[str, str]]:
+    """Which reference the drives' counts are read by, where it is not the rig file's own."""
+    from executor.custody import Custody
+
+    custody = Custody(rig)
+    reference = custody.kept_reference()
+    if reference is None:
+        return []
+    return [("reference", f"{reference.made}, {reference.how}; {custody.file.path}")]

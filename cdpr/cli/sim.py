@@ -23,6 +23,19 @@ def sim(
         tuple[float, float, float] | None,
         typer.Option("--at-mm", help="where the platform stands: x y z (default: home)"),
     ] = None,
+    power_lost: Annotated[
+        int | None,
+        typer.Option(
+            "--power-lost", help="drives count from anywhere, cables hang slack: a seed", min=0
+        ),
+    ] = None,
+    slack_mm: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="with --power-lost: at most so slack")
+    ] = 5.0,
+    on_a_stand: Annotated[
+        bool,
+        typer.Option("--on-a-stand", help="with --power-lost: held until all cables are taut"),
+    ] = False,
     plan: Annotated[
         Path | None, typer.Option(help="put the platform at the start of this plan, with its load")
     ] = None,
@@ -45,6 +58,7 @@ def sim(
     from executor.realtime import real_time
     from executor.running import stop_requests
     from executor.wishes import OwnBoard
+    from simulation.power_loss import PowerLoss
     from simulation.rehearsal import Rehearsal
 
     the_rig = rig_on_bus(rig, interface, channel)
@@ -59,7 +73,10 @@ def sim(
     bus = open_bus(BusSettings.of(the_rig))
     try:
         rehearsal = Rehearsal(the_rig, bus, pose, load)
-        x, y, z = pose.position * 1000.0
+        if power_lost is not None:
+            loss = PowerLoss.drawn(the_rig, power_lost, slack_mm / 1000.0, on_a_stand=on_a_stand)
+            loss.happen_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+        x, y, z = rehearsal.pose.position * 1000.0
         out.print(
             f"{the_rig.cable_count} simulated drives of {the_rig.name} on"
             f" {BusSettings.of(the_rig)}; platform at {x:.1f}, {y:.1f}, {z:.1f} mm; Ctrl-C ends it",

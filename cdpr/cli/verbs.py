@@ -11,6 +11,7 @@ from cdpr.cli import bench
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
+from cdpr.cli.home import home
 from cdpr.cli.jog import jog
 from cdpr.cli.monitor import monitor
 from cdpr.cli.operate import hold, resume, speed
@@ -35,6 +36,7 @@ VERBS = (
     speed,
     monitor,
     reset,
+    home,
     jog,
     track,
     sim,

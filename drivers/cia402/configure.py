@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import can
 
@@ -26,10 +27,24 @@ from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 
+#: Communication parameters that are 0 in a drive that was just switched on. Source: CiA 301, 7.5.2.
+FORGOTTEN = (0x1006, 0x1017)
 
-def configure_drives(
-    rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool
-) -> tuple[str, ...]:
+
+@dataclass(frozen=True, slots=True)
+class SetUp:
+    """What became of setting the drives up.
+
+    Attributes:
+        remarks: What drives cannot do although a run would use it.
+        restarted: Nodes that did not hold our set-up any more, or never did.
+    """
+
+    remarks: tuple[str, ...]
+    restarted: tuple[int, ...]
+
+
+def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool) -> SetUp:
     """Writes and reads back every object of every drive, then starts their process data.
 
     Args:
@@ -37,9 +52,6 @@ def configure_drives(
         bus: An open bus.
         pump: As for `drivers.drive_group.make_drive_group`.
         to_reset: Also takes drives in fault, which are going to be reset.
-
-    Returns:
-        Remarks: what drives cannot do although a run would use it.
 
     Raises:
         HardwareMissing: Drives do not answer; with all their nodes.
@@ -55,9 +67,11 @@ def configure_drives(
     network.discard_waiting()
     _find_all(network, nodes)
     _refuse_duplicates(network)
-    entries = []
+    entries, restarted = [], []
     for drive, node in enumerate(nodes):
         _check_idle(network, node, to_reset)
+        if not _still_set_up(network, node, settings[drive]):
+            restarted.append(node)
         network.command(NmtCommand.PRE_OPERATIONAL, node)
         _write_all(network, node, settings[drive])
         entries.append(_watch_heartbeats(network, node, rig, drive))
@@ -66,7 +80,17 @@ def configure_drives(
     for node in nodes:
         network.command(NmtCommand.START, node)
     network.take_waiting()
-    return tuple(_unwatched_peers(nodes, entries))
+    return SetUp(tuple(_unwatched_peers(nodes, entries)), tuple(restarted))
+
+
+def _still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
+    """Whether it holds what only a set-up gives it: a drive that starts again forgets it."""
+    client = network.client(node)
+    return all(
+        client.read(setting.index, setting.sub, setting.name) == setting.data()
+        for setting in settings
+        if setting.index in FORGOTTEN
+    )
 
 
 def _refuse_duplicates(network: SetupNetwork) -> None:

@@ -59,6 +59,7 @@ class Cia402Group:
         steps = [JUMP_RESERVE * w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches]
         self._max_steps = tuple(steps)
         self._state = GroupState.OFFLINE
+        self._restarted: tuple[int, ...] = ()
         self._reset_memory()
 
     def _reset_memory(self) -> None:
@@ -92,6 +93,11 @@ class Cia402Group:
         return self._state
 
     @property
+    def restarted(self) -> tuple[int, ...]:
+        """Nodes that `configure` found without this program's set-up."""
+        return self._restarted
+
+    @property
     def targets(self) -> Counts:
         """Targets last sent, shape (m,), [counts]."""
         return np.array(self._targets, dtype=np.int64)
@@ -106,9 +112,10 @@ class Cia402Group:
             )
         self._state = GroupState.OFFLINE
         self._reset_memory()
-        remarks = configure_drives(self._rig, self._bus, self._pump, to_reset=to_reset)
+        set_up = configure_drives(self._rig, self._bus, self._pump, to_reset=to_reset)
         self._state = GroupState.CONFIGURED
-        return remarks
+        self._restarted = set_up.restarted
+        return set_up.remarks
 
     def read_positions(self) -> CycleStatus:
         """Sends SYNC until every drive has told its position; see `DriveGroup.read_positions`."""

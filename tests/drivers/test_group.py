@@ -104,6 +104,17 @@ def test_a_drive_that_falls_silent_after_set_up_is_named(bench: Bench) -> None:
         bench.group.read_positions()
 
 
+def test_a_drive_that_was_switched_on_since_it_was_set_up_is_told(bench: Bench) -> None:
+    assert bench.group.restarted == ()
+    bench.group.configure()
+    assert bench.group.restarted == tuple(range(1, 9)), "never set up"
+    bench.group.configure()
+    assert bench.group.restarted == ()
+    bench.drives[4].power_on()
+    bench.group.configure()
+    assert bench.group.restarted == (5,)
+
+
 def written_objects(bench: Bench) -> dict[tuple[int, int], int]:
     """What node 6 must hold in the end."""
     settings_of_6 = settings_for(bench.rig, 5, bench.rehearsal.plant.winch_map)

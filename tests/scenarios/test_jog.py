@@ -45,6 +45,15 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: P
         (WAY, 2, "say what is in the way"),
         ((*WAY, "--no-scene", "--scene", "scene.yaml"), 2, "say what is in the way"),
         ((*WAY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
+        (("--fast",), 2, "say how far"),
+        (("--cable", "3"), 2, "together"),
+        (("--mm", "3"), 2, "together"),
+        (("--cable", "3", "--mm", "1", *WAY), 2, "together"),
+        (("--cable", "9", "--mm", "1"), 2, "no cable 9"),
+        (("--cable", "3", "--mm", "0"), 2, "no way to go"),
+        (("--cable", "3", "--mm", "nan"), 2, "no way to go"),
+        (("--cable", "3", "--mm", "51"), 3, "more than 50 mm"),
+        (("--cable", "3", "--mm", "1", "--limit-n", "101"), 3, "limit of 101 N"),
     ],
 )
 def test_what_is_not_clearly_allowed_is_denied(

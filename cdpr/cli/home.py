@@ -1,0 +1,235 @@
+"""`cdpr home`: pretensions the cables and references the drums' counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from cdpr.poses import Pose
+    from cdpr.rig import Rig
+    from executor.real_time_job import ReadyDrives
+    from executor.reference import ReferenceDocument
+    from executor.winch_laws import WinchLaw
+    from executor.winch_motion import WinchesStand
+
+#: A cable is taken up no further than this, [mm], and no faster than that, [mm/s].
+FURTHEST_MM, FASTEST_MM_S = 200.0, 10.0
+
+
+def home(
+    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    at_home: Annotated[
+        bool, typer.Option("--at-home", help="a jig holds the platform at the rig's home pose")
+    ] = False,
+    pose_mm: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--pose-mm", help="a jig holds it level at x y z"),
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(help="it hangs free, and this camera measures it ('synthetic', or an index)"),
+    ] = None,
+    tension_n: Annotated[
+        float | None, typer.Option(help="pretension (default: twice the rig's smallest tension)")
+    ] = None,
+    limit_n: Annotated[
+        float | None, typer.Option(help="no cable may carry more (default: 60 % of the range)")
+    ] = None,
+    reach_mm: Annotated[
+        float, typer.Option(min=0.1, max=FURTHEST_MM, help="take up at most so much of a cable")
+    ] = 50.0,
+    speed_mm_s: Annotated[
+        float, typer.Option(min=0.01, max=FASTEST_MM_S, help="no winch is faster")
+    ] = 2.0,
+    pictures: Annotated[int, typer.Option(min=5, max=1000, help="to measure the pose in")] = 20,
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the rig file's")
+    ] = None,
+    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    simulated_slack_mm: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="how slack simulated cables hang at most")
+    ] = 5.0,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")] = False,
+    without_real_time: Annotated[
+        bool,
+        typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the reference as JSON")] = False,
+) -> None:
+    """Wind slack cables in until all are taut, then reference the drives at a pose that is known.
+
+    All winches together, slowly, each until its cable carries the pretension; a cable that carries
+    too much, or none after the whole reach, stops all. The reference is a file of its own, which
+    `cdpr run` and `cdpr jog` use. With the interface 'virtual' it is a rehearsal.
+
+    [dim]Examples:[/dim]
+
+      cdpr home rig.yaml --at-home
+
+      cdpr home configs/gachon_8_6.yaml --camera synthetic --fast
+    """
+    from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.output import show_json
+    from cdpr.cli.run import require_own_time, rig_on_bus
+    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of
+    from drivers.bus import IN_PROCESS
+    from executor.custody import Custody
+    from executor.winch_laws import TakeUp
+    from simulation.power_loss import PowerLoss
+
+    the_rig = rig_on_bus(rig, interface, channel)
+    in_process = the_rig.document.bus.interface == IN_PROCESS
+    require_own_time(fast, in_process)
+    known = _known_pose(the_rig, at_home, pose_mm, camera, in_process)
+    limit = limit_of(the_rig, limit_n)
+    target = _target(the_rig, tension_n, limit)
+    speed, reach = speed_mm_s / 1000.0, reach_mm / 1000.0
+    custody = Custody(the_rig)
+    custody.require_free()
+    if not as_json:
+        _show(the_rig, target, limit, reach, speed, camera)
+    if not (in_process or yes):
+        ask_operator("Wind the cables in now?", "nothing was moved")
+    made: list[ReferenceDocument] = []
+
+    def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
+        return TakeUp(as_set_up, counts, target=target, limit=limit, reach=reach, speed=speed)
+
+    def at_rest(stand: WinchesStand, drives: ReadyDrives) -> None:
+        made.append(_referenced(the_rig, stand, drives, known, camera, pictures))
+
+    lost = PowerLoss.drawn(
+        the_rig, 0, simulated_slack_mm / 1000.0, on_a_stand=camera is None
+    ) if in_process else None  # fmt: skip
+    motion = WinchMotion(
+        the_rig, known or the_rig.home, limit, speed, make_law, lost, fast, without_real_time,
+        as_json,
+    )  # fmt: skip
+    carry_out_by_law(motion, at_rest)
+    (reference,) = made
+    if not in_process:
+        custody.file.write(reference)
+    where = None if in_process else str(custody.file.path)
+    if as_json:
+        show_json({"file": where, **reference.model_dump(mode="json")})
+    else:
+        _tell(reference, where)
+
+
+def _known_pose(
+    rig: Rig,
+    at_home: bool,
+    pose_mm: tuple[float, float, float] | None,
+    camera: str | None,
+    in_process: bool,
+) -> Pose | None:
+    """The pose that is stated; None when the camera measures it.
+
+    Raises:
+        BadInput: It is not said how the pose is known, or in several ways.
+    """
+    from cdpr.cli.cameras import choose_camera
+    from cdpr.document_types import millimetres
+    from cdpr.errors import BadInput
+    from cdpr.poses import Pose
+
+    if (at_home, pose_mm is not None, camera is not None).count(True) != 1:
+        raise BadInput(
+            "say how the platform's pose is known: --at-home, --pose-mm or --camera",
+            where="cdpr home",
+            why="counts are referenced at a pose that is known, and at no guess",
+            next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z; or let it"
+            " hang in view of a calibrated camera and pass --camera INDEX",
+        )
+    if camera is not None:
+        choose_camera(rig, camera, False, in_process)
+        return None
+    if pose_mm is None:
+        return rig.home
+    pose = Pose.level(millimetres(list(pose_mm)))
+    inside = (rig.workspace_lower <= pose.position) & (pose.position <= rig.workspace_upper)
+    if not inside.all():
+        raise BadInput(
+            "this pose is outside the workspace",
+            where="--pose-mm",
+            next_step="name the position of the platform's origin in the world frame, in mm",
+        )
+    return pose
+
+
+def _target(rig: Rig, tension_n: float | None, limit: float) -> float:
+    from cdpr.errors import Refused
+
+    target = 2.0 * rig.min_tension if tension_n is None else tension_n
+    if not rig.min_tension <= target <= 0.8 * limit:
+        raise Refused(
+            f"a pretension of {target:g} N is not from {rig.min_tension:g} N up to 80 % of the"
+            f" limit of {limit:g} N",
+            where="--tension-n",
+            why="cables must be taut afterwards, and winding in must have room below the limit",
+            next_step="name another pretension or limit",
+        )
+    return target
+
+
+def _show(
+    rig: Rig, target: float, limit: float, reach: float, speed: float, camera: str | None
+) -> None:
+    from cdpr.cli.output import show_facts
+    from executor.winch_laws import wind_in_speed
+
+    fastest = wind_in_speed(rig, target, limit, speed).max() * 1000.0
+    bus = rig.document.bus
+    show_facts(
+        "ready to wind in",
+        [
+            ("rig", rig.name),
+            ("pretension", f"{target:g} N a cable, at most {limit:g} N"),
+            ("winches", f"all together, at most {fastest:.2f} mm/s and {reach * 1000:g} mm each"),
+            ("pose", "stated, held by a jig" if camera is None else f"measured, camera {camera}"),
+            ("bus", f"{bus.interface} {bus.channel}".strip()),
+        ],
+    )
+
+
+def _referenced(
+    rig: Rig,
+    stand: WinchesStand,
+    drives: ReadyDrives,
+    known: Pose | None,
+    camera: str | None,
+    pictures: int,
+) -> ReferenceDocument:
+    """The reference at the pose where the platform is held now."""
+    from cdpr.cli.cameras import look_at_rest
+    from executor.reference import reference_at
+    from executor.rest_pose import rest_pose
+
+    if known is not None:
+        return reference_at(rig, known, stand.counts, stand.tensions, "stated pose", 0.0)
+    assert camera is not None
+    found = rest_pose(rig, look_at_rest(rig, camera, pictures, drives.true_pose))
+    how = f"tags in {found.pictures} of {pictures} pictures, camera {rig.cameras[0].name!r}"
+    return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)
+
+
+def _tell(reference: ReferenceDocument, where: str | None) -> None:
+    from cdpr.cli.output import out, show_facts
+
+    x, y, z = reference.pose.position_mm
+    tensions = reference.tensions_n
+    facts: list[tuple[str, Any]] = [
+        ("platform", f"{x:.2f}, {y:.2f}, {z:.2f} mm, {reference.how}"),
+        ("uncertainty", f"{reference.uncertainty_mm:.3f} mm"),
+        ("tensions", f"{min(tensions):.1f} to {max(tensions):.1f} N"),
+        ("reference", where or "not kept: simulated drives end with this process"),
+    ]
+    show_facts("drives referenced; they hold", [(name, str(value)) for name, value in facts])
+    out.print("next: move a little with `cdpr jog`, or plan from here: `cdpr plan --start-mm`")

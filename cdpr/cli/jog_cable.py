@@ -1,0 +1,101 @@
+"""`cdpr jog --cable`: moves one winch alone, a little and slowly, for commissioning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cdpr.rig import Rig
+    from executor.real_time_job import ReadyDrives
+    from executor.winch_laws import WinchLaw
+    from executor.winch_motion import WinchesStand
+
+
+def jog_cable(
+    rig: Rig,
+    cable: int,
+    mm: float,
+    *,
+    limit_n: float | None,
+    speed_mm_s: float,
+    fast: bool,
+    yes: bool,
+    without_real_time: bool,
+    as_json: bool,
+) -> None:
+    """Moves one winch and tells what its cable did.
+
+    On a taut platform one cable alone moves by hardly more than its stretch before a tension is
+    too large, or another cable slack: both stop it.
+
+    Raises:
+        BadInput: There is no such cable, or no way to go.
+        Refused: The way is too long, or the bus is latched.
+        Fault: A tension left its bounds; all drives stopped together.
+    """
+    import math
+
+    from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.jog import LONGEST_MM
+    from cdpr.cli.output import out, show_facts, show_json
+    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of
+    from cdpr.errors import BadInput, Refused
+    from drivers.bus import IN_PROCESS
+    from executor.custody import Custody
+    from executor.winch_laws import CableStep
+
+    if not cable <= rig.cable_count:
+        raise BadInput(
+            f"there is no cable {cable}",
+            where="--cable",
+            next_step=f"name one from 1 to {rig.cable_count}, in the order of the rig file",
+        )
+    if mm == 0.0 or not math.isfinite(mm):
+        raise BadInput("that is no way to go", where="--mm", next_step="give mm, not 0")
+    if abs(mm) > LONGEST_MM:
+        raise Refused(
+            f"{abs(mm):g} mm are more than {LONGEST_MM:g} mm",
+            where="--mm",
+            why="one cable alone is moved in short steps, somebody looking",
+            next_step="go there in several steps",
+        )
+    limit = limit_of(rig, limit_n)
+    in_process = rig.document.bus.interface == IN_PROCESS
+    Custody(rig).require_free()
+    winch = rig.winches[cable - 1]
+    if not as_json:
+        show_facts(
+            "ready to move one cable",
+            [
+                ("rig", rig.name),
+                ("cable", f"{cable}, drive {winch.node_id}"),
+                ("way", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed_mm_s:g} mm/s"),
+                ("tension", f"at most {limit:g} N in any cable; none that is taut may go slack"),
+            ],
+        )
+    if not (in_process or yes):
+        ask_operator("Move this cable now?", "nothing was moved")
+    begun: list[Sequence[int]] = []
+
+    def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
+        begun.append(counts)
+        speed = speed_mm_s / 1000.0
+        return CableStep(
+            as_set_up, counts, cable=cable - 1, way=mm / 1000.0, limit=limit, speed=speed
+        )
+
+    def at_rest(_stand: WinchesStand, _drives: ReadyDrives) -> None:
+        """Nothing more to see while the drives are there."""
+
+    motion = WinchMotion(
+        rig, rig.home, limit, speed_mm_s / 1000.0, make_law, None, fast, without_real_time, as_json
+    )
+    stand = carry_out_by_law(motion, at_rest)
+    moved = (stand.counts[cable - 1] - begun[0][cable - 1]) / winch.counts_per_metre * 1000.0
+    tensions = [round(float(t), 2) for t in stand.tensions]
+    if as_json:
+        show_json({"cable": cable, "moved_mm": round(float(moved), 4), "tensions_n": tensions})
+        return
+    out.print(f"cable {cable} moved by {moved:+.3f} mm, positive pays out; the drives hold")
+    out.print(f"tensions: {', '.join(f'{t:.1f}' for t in tensions)} N", soft_wrap=True)

@@ -1,0 +1,219 @@
+"""Moves winches without a path: what `cdpr home` and `cdpr jog --cable` have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cdpr.poses import Pose
+    from cdpr.rig import Rig
+    from executor.real_time_job import ReadyDrives
+    from executor.records import CycleRecord, LoopEvent
+    from executor.winch_laws import WinchLaw
+    from executor.winch_motion import WinchesStand
+    from executor.wishes import WishBoard
+    from simulation.power_loss import PowerLoss
+
+#: Where the limit lies between the smallest and the largest tension, unless one is named.
+LIMIT_SHARE = 0.6
+#: Events of every motion, and one for the report of a defect alone.
+_OF_COURSE = frozenset({"enabled", "moving", "held", "traceback"})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WinchMotion:
+    """A motion that is wished for.
+
+    Attributes:
+        rig: The robot and its bus.
+        pose: Where its platform is about, ``world_from_platform``.
+        limit: Largest tension, [N].
+        speed: Fastest winch, [m/s].
+        make_law: From the rig as its drives are set up, and where they stand, [counts].
+        lost_power: What became of drives that are simulated in this process.
+        fast: Simulated time.
+        without_real_time: Move even if real-time scheduling is denied.
+        quiet: No progress.
+    """
+
+    rig: Rig
+    pose: Pose
+    limit: float
+    speed: float
+    make_law: Callable[[Rig, Sequence[int]], WinchLaw]
+    lost_power: PowerLoss | None
+    fast: bool
+    without_real_time: bool
+    quiet: bool
+
+
+def limit_of(rig: Rig, limit_n: float | None) -> float:
+    """The largest tension of the motion, [N].
+
+    Raises:
+        Refused: It is more than the rig's own, or nothing.
+    """
+    from cdpr.errors import Refused
+
+    if limit_n is None:
+        return rig.min_tension + LIMIT_SHARE * (rig.max_tension - rig.min_tension)
+    if not rig.min_tension < limit_n <= rig.max_tension:
+        raise Refused(
+            f"a limit of {limit_n:g} N is not above {rig.min_tension:g} and up to"
+            f" {rig.max_tension:g} N",
+            where="--limit-n",
+            why="the rig file allows such tensions only",
+            next_step="name another limit",
+        )
+    return limit_n
+
+
+def carry_out_by_law(
+    motion: WinchMotion, at_rest: Callable[[WinchesStand, ReadyDrives], None]
+) -> WinchesStand:
+    """Moves, in this process; ends with the drives holding by themselves.
+
+    Args:
+        motion: What is wished.
+        at_rest: Called after a motion that came to its end, while the drives are still there.
+
+    Raises:
+        Fault: It ended with a fault, which is latched; with its cause.
+        StoppedByOperator: The operator stopped it.
+        CdprError: Nothing was enabled, for the reason told.
+    """
+    from cdpr.cli.drives import open_drives
+    from cdpr.cli.jog import no_scene
+    from cdpr.errors import Fault, StoppedByOperator
+    from executor.command_server import serving
+    from executor.machine import State
+    from executor.running import announced, stop_requests
+    from executor.winch_motion import unreferenced
+    from executor.wishes import OwnBoard
+
+    rig, limited = motion.rig, []
+
+    def set_up_as(counts: Sequence[int]) -> Rig:
+        limited.append((unreferenced(
+            rig, counts, motion.pose, limit=motion.limit, speed=motion.speed
+        ), counts))  # fmt: skip
+        return limited[0][0]
+
+    board = OwnBoard()
+    status = _Status(rig, board)
+    load = no_scene(rig).load
+    with (
+        stop_requests(board),
+        announced() as listeners,
+        serving(listeners, board, status),
+        open_drives(
+            rig, motion.pose, load, lost_power=motion.lost_power, set_up_as=set_up_as
+        ) as drives,
+    ):
+        as_set_up, counts = limited[0]
+        law = motion.make_law(as_set_up, counts)
+        stand = _moved(motion, as_set_up, law, drives, board, status)
+        if stand.state is State.FINISHED:
+            at_rest(stand, drives)
+    if stand.state is State.STOPPED:
+        raise StoppedByOperator("stopped; the drives hold", next_step="begin anew when all is well")
+    if stand.state is not State.FINISHED:
+        raise Fault(
+            stand.cause,
+            where="winches",
+            why="the motion was stopped, all drives together; they hold",
+            next_step="find the cause and look at the platform, then `cdpr reset RIG`",
+        )
+    return stand
+
+
+def _moved(
+    motion: WinchMotion,
+    rig: Rig,
+    law: WinchLaw,
+    drives: ReadyDrives,
+    board: WishBoard,
+    status: _Status,
+) -> WinchesStand:
+    from contextlib import nullcontext
+
+    from cdpr.cli.output import err, progress_bar
+    from cdpr.errors import Refused
+    from drivers.bus import IN_PROCESS
+    from executor.clock import RealClock, SimulatedClock
+    from executor.custody import Custody
+    from executor.realtime import real_time
+    from executor.winch_motion import move_winches
+
+    cycle = rig.document.bus.cycle_ms / 1000.0
+    simulated = rig.document.bus.interface == IN_PROCESS
+    with (
+        nullcontext("") if motion.fast else real_time() as denied,
+        progress_bar("moving, %", 100.0, not motion.quiet) as advance,
+    ):
+        if denied and not (simulated or motion.without_real_time):
+            raise Refused(
+                f"no real-time scheduling: {denied}",
+                where="arming",
+                next_step="allow it as named above, or pass --without-real-time if you accept"
+                " that; nothing was enabled",
+            )
+
+        def on_cycle(record: CycleRecord) -> None:
+            status.take_cycle(record, law.progress)
+            if record.cycle % 10 == 0:
+                advance(100.0 * law.progress)
+
+        def on_event(event: LoopEvent) -> None:
+            status.events.append(event)
+            if not (motion.quiet or event.code in _OF_COURSE):
+                err.print(f"{event.code}: {event.text}", markup=False, soft_wrap=True)
+
+        return move_winches(
+            rig,
+            law,
+            drives.group,
+            SimulatedClock(cycle) if motion.fast else RealClock(cycle),
+            board,
+            record=Custody(rig).file.path,
+            on_cycle=on_cycle,
+            on_event=on_event,
+        )
+
+
+class _Status:
+    """How the motion stands, for `cdpr stop`, `hold`, `resume`, `speed` and `monitor`."""
+
+    def __init__(self, rig: Rig, board: WishBoard) -> None:
+        self._rig, self._board = rig, board
+        self._record: CycleRecord | None = None
+        self._progress = 0.0
+        self.events: list[LoopEvent] = []
+
+    def take_cycle(self, record: CycleRecord, progress: float) -> None:
+        """A cycle is over."""
+        self._record, self._progress = record, progress
+
+    def as_dict(self) -> dict[str, Any]:
+        """See `executor.status`; what only a path has is null."""
+        import os
+
+        record, bus = self._record, self._rig.document.bus
+        return {
+            "process": os.getpid(),
+            "rig": self._rig.name,
+            "bus": f"{bus.interface} {bus.channel}".strip(),
+            "folder": "",
+            "state": record.state.value if record else "preparing",
+            "cycle": None,
+            "row": round(100.0 * self._progress, 1),
+            "rows": 100,
+            "wished": {"hold": self._board.read().hold},
+            "drives": [],
+            "events": [
+                {"time_s": event.at, "code": event.code, "text": event.text}
+                for event in list(self.events)
+            ],
+        }

@@ -1,0 +1,140 @@
+"""Where the drums' counts were referenced: a dated file of its own, never the rig file.
+
+It lies beside the latch of the bus (`executor.state_folder`). `cdpr home` writes it; every motion
+ends by noting in it where the drives stand, and by declaring it lost when cables were let go.
+"""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from cdpr.document_types import Document, PoseDocument
+from cdpr.documents import content_hash, write_atomic
+from cdpr.errors import CdprError, Refused
+from cdpr.kinematics import cable_lengths
+from cdpr.poses import Array, Pose
+from cdpr.rig import Rig, rig_from_document
+from cdpr.statics.working import working_tensions
+from cdpr.winches import WinchMap
+from drivers.bus import BusSettings
+from executor.state_folder import state_file
+
+AGAIN = "reference the drives with `cdpr home RIG`; nothing was moved"
+
+
+class ReferenceDocument(Document):
+    """What the drives of one rig count at home, and how that came to be known."""
+
+    schema_version: Literal[1]
+    rig: str
+    rig_hash: str = Field(description="of what the counts depend on")
+    made: str = Field(description="when, ISO 8601, UTC")
+    how: str
+    pose: PoseDocument = Field(description="of the platform then")
+    uncertainty_mm: float = Field(description="of the pose, one standard deviation; 0 if stated")
+    home_counts: Annotated[list[int], Field(min_length=1)]
+    tensions_n: list[float]
+    stands_at: list[int] = Field(description="drive positions at the end of the last motion")
+    lost: str = Field(default="", description="why it counts no more")
+
+
+def reference_at(
+    rig: Rig, pose: Pose, counts: Array, tensions: Array, how: str, uncertainty: float
+) -> ReferenceDocument:
+    """The reference from taut cables at a known pose.
+
+    Args:
+        rig: The robot as its file describes it.
+        pose: ``world_from_platform``.
+        counts: Positions of the drives there, shape (m,), [counts].
+        tensions: Of the cables there, shape (m,), [N].
+        how: How the pose is known.
+        uncertainty: Of the pose, standard deviation of the position, [m].
+    """
+    winches = WinchMap(rig)
+    unstrained = winches.unstrained(cable_lengths(rig, pose), tensions)
+    home = winches.home_counts + counts - winches.counts(unstrained)
+    return ReferenceDocument(
+        schema_version=1,
+        rig=rig.name,
+        rig_hash=counting_hash(rig),
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        how=how,
+        pose=PoseDocument.of(pose),
+        uncertainty_mm=round(uncertainty * 1000.0, 4),
+        home_counts=[int(c) for c in np.rint(home)],
+        tensions_n=[round(float(t), 3) for t in tensions],
+        stands_at=[int(c) for c in np.rint(counts)],
+    )
+
+
+def as_in_the_file(rig: Rig) -> ReferenceDocument:
+    """What the rig file itself says that absolute encoders count at home."""
+    home = np.array([winch.home_counts for winch in rig.winches], dtype=np.float64)
+    tensions = working_tensions(rig, rig.home).tensions
+    return reference_at(rig, rig.home, home, tensions, "as in the rig file", 0.0)
+
+
+def counting_hash(rig: Rig) -> str:
+    """Of everything that decides what drives count at a pose."""
+    winches = [winch.model_dump(mode="json") for winch in rig.document.winches]
+    return content_hash({"rig": rig.plan_hash, "winches": winches})
+
+
+def referenced(rig: Rig, reference: ReferenceDocument) -> Rig:
+    """The rig with the counts of a reference in place of its file's."""
+    winches = [
+        winch.model_copy(update={"home_counts": home})
+        for winch, home in zip(rig.document.winches, reference.home_counts, strict=True)
+    ]
+    return rig_from_document(rig.document.model_copy(update={"winches": winches}))
+
+
+class ReferenceFile:
+    """The reference of one bus."""
+
+    def __init__(self, settings: BusSettings) -> None:
+        """Looks at nothing yet."""
+        self.path = state_file("reference", settings)
+
+    def read(self) -> ReferenceDocument | None:
+        """The reference; None where there is none.
+
+        Raises:
+            Refused: The file cannot be read: what it said cannot be ignored.
+        """
+        try:
+            text = self.path.read_text(encoding="utf-8")
+            return ReferenceDocument.model_validate_json(text)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError, ValueError) as error:
+            raise Refused(
+                "the reference of the drives cannot be read",
+                where=str(self.path),
+                why=str(error).splitlines()[0],
+                next_step=AGAIN,
+            ) from None
+
+    def write(self, reference: ReferenceDocument) -> None:
+        """Keeps it.
+
+        Raises:
+            Refused: It cannot be kept.
+        """
+        try:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            text = json.dumps(reference.model_dump(mode="json"), indent=1) + "\n"
+            write_atomic(self.path, text)
+        except (OSError, CdprError) as error:
+            raise Refused(
+                "the reference of the drives cannot be kept",
+                where=str(self.path),
+                why=error.why if isinstance(error, CdprError) else error.strerror or str(error),
+                next_step="make the folder writable for those who run the rig, then `cdpr home`",
+            ) from None

@@ -1,0 +1,209 @@
+"""How winches go on by themselves, without a path: what each is told next. Pure.
+
+Drives stay in their position mode: a tension is reached by winding cable in by less, each cycle,
+than could overstretch it before its tension is seen. No law pays cable out to cure a tension.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from cdpr.winches import WinchMap
+from executor.safety.watch import Finding, Reaction
+
+#: A cable that was taut stays so while its tension is above this share of what was asked for.
+STAYS_TAUT = 0.8
+#: Cycles in which all cables must be taut, and in which one that was taut must not be slack.
+TAUT_CYCLES, SLACK_CYCLES = 20, 5
+#: A step may raise a tension by this share of what is left to the limit: its effect is seen only
+#: two cycles later, and the cables opposite may be wound in meanwhile, too.
+SHARE_OF_ROOM = 0.125
+
+Targets = tuple[int, ...]
+
+
+class WinchLaw(Protocol):
+    """Says what each winch is told next."""
+
+    @property
+    def reach(self) -> tuple[Targets, Targets]:
+        """Where it begins, and how far it may go, [counts]."""
+        ...
+
+    @property
+    def done(self) -> bool:
+        """It has nothing left to do."""
+        ...
+
+    @property
+    def progress(self) -> float:
+        """How much of it is done, from 0 to 1."""
+        ...
+
+    def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Finding, ...]]:
+        """One more cycle.
+
+        Args:
+            pace: Share of a cycle that passes for the law; less than 1 while the feed is slowed.
+            tensions: Of the cables now, shape (m,), [N].
+
+        Returns:
+            Targets of all winches, [counts], and what makes going on wrong.
+        """
+        ...
+
+
+class TakeUp:
+    """Winds all cables in, slowly and together, each until it is taut."""
+
+    def __init__(
+        self, rig: Rig, begin: Sequence[int], *, target: float, limit: float, reach: float,
+        speed: float,
+    ) -> None:  # fmt: skip
+        """Nothing is wound in yet.
+
+        Args:
+            rig: The robot.
+            begin: Positions of the drives, [counts].
+            target: Tension at which a cable is taut, [N].
+            limit: Tension that none may have, [N].
+            reach: Longest way that one cable is wound in, [m].
+            speed: At most so fast, [m/s].
+        """
+        self._rig, self._begin = rig, np.array(begin, dtype=np.float64)
+        self._target, self._reach = target, reach
+        self._per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
+        self._step = wind_in_speed(rig, target, limit, speed) * _cycle(rig)
+        self._wound = np.zeros(rig.cable_count)
+        self._taut = np.zeros(rig.cable_count, dtype=bool)
+        self._cycles = 0
+
+    @property
+    def reach(self) -> tuple[Targets, Targets]:
+        """See `WinchLaw`."""
+        return self._targets(0.0 * self._wound), self._targets(0.0 * self._wound + self._reach)
+
+    @property
+    def done(self) -> bool:
+        """Every cable has been taut for a while."""
+        return self._cycles >= TAUT_CYCLES
+
+    @property
+    def progress(self) -> float:
+        """Share of cables that are taut."""
+        return float(np.mean(self._taut))
+
+    def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Finding, ...]]:
+        """See `WinchLaw`."""
+        pull = np.asarray(tensions)
+        self._taut = pull >= np.where(self._taut, STAYS_TAUT, 1.0) * self._target
+        self._cycles = self._cycles + 1 if self._taut.all() else 0
+        wanting = ~self._taut
+        short = wanting & (self._wound >= self._reach)
+        self._wound = np.where(
+            wanting, np.minimum(self._wound + pace * self._step, self._reach), self._wound
+        )
+        return self._targets(self._wound), tuple(
+            self._still_slack(int(cable), float(pull[cable])) for cable in np.flatnonzero(short)
+        )
+
+    def _targets(self, wound: Array) -> Targets:
+        counts = self._begin - self._per_metre * wound
+        return tuple(int(c) for c in np.rint(counts))
+
+    def _still_slack(self, cable: int, tension: float) -> Finding:
+        text = (
+            f"cable {cable + 1} carries {tension:.1f} N after {self._reach * 1000:g} mm were wound"
+            f" in, {self._target:.1f} N are wanted: it may be off its drum or pulley, or broken"
+        )
+        return Finding(Reaction.PATH_STOP, "not_taut", text, cable + 1)
+
+
+class CableStep:
+    """Moves one winch by a length of cable, smoothly, while all others stand."""
+
+    def __init__(
+        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float
+    ) -> None:
+        """Nothing moves yet.
+
+        Args:
+            rig: The robot.
+            begin: Positions of the drives, [counts].
+            cable: Which, from 0.
+            way: Cable to pay out, [m]; negative to wind in.
+            limit: Tension that no cable may have, [N].
+            speed: At most so fast, [m/s].
+        """
+        self._begin = tuple(begin)
+        self._cable, self._counts = cable, way * rig.winches[cable].counts_per_metre
+        self._least = rig.min_tension / 2.0
+        # A smooth step from rest to rest is 15/8 times as fast in its middle as on average.
+        self._duration = max(1.0, 1.875 * abs(way) / (speed * _cycle(rig)))
+        # A cable that is taut is moved as carefully as it would be wound in.
+        careful = wind_in_speed(rig, self._least, limit, speed)[cable]
+        self._pace_if_taut = float(careful) / speed
+        self._time = 0.0
+        self._was_taut: list[bool] | None = None
+        self._slack = [0] * rig.cable_count
+
+    @property
+    def reach(self) -> tuple[Targets, Targets]:
+        """See `WinchLaw`."""
+        return self._begin, self._at(1.0)
+
+    @property
+    def done(self) -> bool:
+        """The winch is where it was to go."""
+        return self._time >= self._duration
+
+    @property
+    def progress(self) -> float:
+        """Share of the time that it takes."""
+        return min(1.0, self._time / self._duration)
+
+    def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Finding, ...]]:
+        """See `WinchLaw`."""
+        taut = tensions[self._cable] >= self._least
+        pace *= self._pace_if_taut if taut else 1.0
+        self._time = min(self._time + pace, self._duration)
+        share = self._time / self._duration
+        smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        return self._at(smooth), tuple(self._made_slack(tensions))
+
+    def _at(self, share: float) -> Targets:
+        targets = list(self._begin)
+        targets[self._cable] += round(share * self._counts)
+        return tuple(targets)
+
+    def _made_slack(self, tensions: Sequence[float]) -> list[Finding]:
+        """Other cables that were taut and are slack; one that hung slack before may go on so."""
+        if self._was_taut is None:
+            self._was_taut = [tension >= self._least for tension in tensions]
+        found = []
+        for cable, tension in enumerate(tensions):
+            slack = self._was_taut[cable] and tension < self._least and cable != self._cable
+            self._slack[cable] = self._slack[cable] + 1 if slack else 0
+            if self._slack[cable] >= SLACK_CYCLES:
+                text = (
+                    f"cable {cable + 1} went slack ({tension:.1f} N, less than {self._least:.1f})"
+                    f" while cable {self._cable + 1} alone was moved"
+                )
+                found.append(Finding(Reaction.PATH_STOP, "went_slack", text, cable + 1))
+        return found
+
+
+def wind_in_speed(rig: Rig, target: float, limit: float, speed: float) -> Array:
+    """How fast each cable may be wound in while its tension is looked at, shape (m,), [m/s]."""
+    stiffness = rig.cable_stiffness / WinchMap(rig).home_unstrained
+    careful = SHARE_OF_ROOM * (limit - target) / stiffness / _cycle(rig)
+    return np.minimum(speed, careful)
+
+
+def _cycle(rig: Rig) -> float:
+    return rig.document.bus.cycle_ms / 1000.0

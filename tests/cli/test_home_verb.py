@@ -1,0 +1,69 @@
+"""`cdpr home` and `cdpr jog --cable` as typed: what is not clearly meant is denied."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.plans import RIG
+from tests.cli.program import call, one_message
+
+
+@pytest.fixture(autouse=True)
+def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "part"),
+    [
+        ((), 2, "how the platform's pose is known"),
+        (("--at-home", "--camera", "synthetic"), 2, "how the platform's pose is known"),
+        (("--at-home", "--pose-mm", "0", "0", "445"), 2, "how the platform's pose is known"),
+        (("--pose-mm", "0", "0", "4450"), 2, "outside the workspace"),
+        (("--pose-mm", "0", "0", "nan"), 2, "outside the workspace"),
+        (("--at-home", "--limit-n", "5"), 3, "limit of 5 N"),
+        (("--at-home", "--limit-n", "101"), 3, "limit of 101 N"),
+        (("--at-home", "--tension-n", "4"), 3, "pretension of 4 N"),
+        (("--at-home", "--tension-n", "50"), 3, "pretension of 50 N"),
+        (("--at-home", "--tension-n", "nan"), 3, "pretension of nan N"),
+        (("--at-home", "--limit-n", "nan"), 3, "limit of nan N"),
+        (("--at-home", "--interface", "udp_multicast"), 2, "--fast"),
+    ],
+)
+def test_what_is_not_clearly_meant_moves_nothing(
+    tmp_path: Path, options: tuple[str, ...], code: int, part: str
+) -> None:
+    one_message(call("home", RIG, "--fast", *options), code, part)
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_a_no_moves_nothing(tmp_path: Path) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990")
+    assert call("home", RIG, "--at-home", *bus, answers="n\n").code == 130
+    assert call("jog", RIG, "--cable", "1", "--mm", "1", *bus, answers="n\n").code == 130
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_a_rehearsal_tells_the_reference_and_keeps_nothing(tmp_path: Path) -> None:
+    answer = call("home", RIG, "--camera", "synthetic", "--pictures", "5", "--fast", "--json")
+    assert answer.code == 0, answer
+    told = json.loads(answer.out)
+    assert told["file"] is None
+    assert 0.0 < told["uncertainty_mm"] < 0.5
+    assert len(told["home_counts"]) == 8
+    assert min(told["tensions_n"]) >= 7.5
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:
+    answer = call("jog", RIG, "--cable", "3", "--mm", "-5", "--fast")
+    assert answer.code == 1
+    assert "more than" in answer.err
+    assert "stopped, all drives together" in answer.err
+    answer = call("jog", RIG, "--cable", "3", "--mm", "0.01", "--fast", "--json")
+    assert answer.code == 0, answer
+    assert json.loads(answer.out)["moved_mm"] == pytest.approx(0.01, abs=0.002)

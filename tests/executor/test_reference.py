@@ -1,0 +1,127 @@
+"""The reference of drives: which rig it counts for, and when it counts no more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cdpr.errors import Refused
+from cdpr.rig import Rig, load_rig, rig_from_document
+from executor.arming import require_still_referenced
+from executor.custody import Custody
+from executor.machine import State
+from executor.reference import ReferenceDocument, reference_at
+from tests.cli.plans import RIG
+
+
+@pytest.fixture(autouse=True)
+def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def rig_with(encoder: str, **winch: object) -> Rig:
+    document = load_rig(RIG).document
+    winches = [w.model_copy(update={"encoder": encoder, **winch}) for w in document.winches]
+    bus = document.bus.model_copy(update={"interface": "udp_multicast", "channel": "239.74.163.99"})
+    return rig_from_document(document.model_copy(update={"winches": winches, "bus": bus}))
+
+
+def reference_of(rig: Rig, shift: int = 1000) -> ReferenceDocument:
+    counts = np.full(rig.cable_count, float(shift))
+    return reference_at(rig, rig.home, counts, np.full(rig.cable_count, 20.0), "stated", 0.0)
+
+
+def test_it_takes_the_place_of_the_rig_files_counts() -> None:
+    rig = rig_with("incremental")
+    document = reference_of(rig)
+    Custody(rig).file.write(document)
+    found = Custody(rig).referenced_rig()
+    assert [w.home_counts for w in found.winches] == document.home_counts
+    assert found.plan_hash == rig.plan_hash
+    # Stretched by 20 N instead of the working tensions at home, micrometres apart.
+    off = np.array(document.home_counts) - 1000
+    assert np.abs(off / [w.counts_per_metre for w in rig.winches]).max() < 3e-5
+
+
+def test_without_one_only_absolute_encoders_move() -> None:
+    assert Custody(rig_with("absolute")).reference() is None
+    Custody(rig_with("absolute")).require_ready()
+    for ask in (Custody(rig_with("incremental")).reference, Custody(
+        rig_with("incremental")).require_ready):  # fmt: skip
+        with pytest.raises(Refused, match="never referenced: drive 1, 2") as caught:
+            ask()
+        assert "cdpr home" in caught.value.next_step
+
+
+def test_it_counts_for_its_rig_file_alone() -> None:
+    rig = rig_with("incremental")
+    Custody(rig).file.write(reference_of(rig))
+    with pytest.raises(Refused, match="another rig file"):
+        Custody(rig_with("incremental", drum_mm_per_rev=200.0)).reference()
+    with pytest.raises(Refused, match="another reference"):
+        Custody(rig).require_ready()
+    Custody(Custody(rig).referenced_rig()).require_ready()
+
+
+@pytest.mark.parametrize("encoder", ["absolute", "incremental"])
+def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
+    rig = rig_with(encoder)
+    if encoder == "incremental":
+        Custody(rig).file.write(reference_of(rig))
+    custody = Custody(rig)
+    custody.begin(Path("run"))
+    custody.end(State.LATCHED, "emergency stop", Path("run"), stands_at=None)
+    custody.prevented()  # as a reset releases the latch
+    for ask in (custody.reference, custody.require_ready):
+        with pytest.raises(Refused, match="no more referenced") as caught:
+            ask()
+        assert "emergency stop" in caught.value.why
+    Custody(rig).file.write(reference_of(rig))
+    assert custody.reference() is not None
+
+
+def test_every_motion_notes_where_the_drives_stand() -> None:
+    rig = rig_with("incremental")
+    custody = Custody(rig)
+    custody.file.write(reference_of(rig))
+    custody.begin(Path("run"))
+    custody.end(State.FINISHED, "", Path("run"), stands_at=range(8))
+    kept = custody.kept_reference()
+    assert kept is not None
+    assert kept.stands_at == list(range(8))
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema_version": 2}', "\x00"])
+def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
+    rig = rig_with("absolute")
+    custody = Custody(rig)
+    custody.file.write(reference_of(rig))
+    custody.file.path.write_text(content)
+    with pytest.raises(Refused, match="cannot be read"):
+        custody.reference()
+
+
+def group_at(rig: Rig, restarted: tuple[int, ...] = (), off_mm: float = 0.0) -> Any:
+    stands = np.full(rig.cable_count, 1000)
+    stands[3] += round(off_mm / 1000.0 * rig.winches[3].counts_per_metre)
+    return SimpleNamespace(
+        restarted=restarted, read_positions=lambda: SimpleNamespace(positions=stands)
+    )
+
+
+def test_a_drive_that_was_switched_on_again_or_moved_by_hand_is_found_out() -> None:
+    rig = rig_with("incremental")
+    reference = reference_of(rig)
+    require_still_referenced(rig, reference, group_at(rig, off_mm=0.9))
+    with pytest.raises(Refused, match=r"drive 4 is lost: it stands 1\.1 mm"):
+        require_still_referenced(rig, reference, group_at(rig, off_mm=1.1))
+    with pytest.raises(Refused, match="drive 4 is lost: it was switched on"):
+        require_still_referenced(rig, reference, group_at(rig, restarted=(4,)))
+    absolute = rig_with("absolute")
+    require_still_referenced(absolute, reference, group_at(absolute, (4,), 50.0))
+    require_still_referenced(rig, None, group_at(rig, (4,), 50.0))

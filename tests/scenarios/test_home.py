@@ -1,0 +1,309 @@
+"""Homing: slack cables are taken up, drives referenced; a run then goes where tags see it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpr.cli.jog import no_scene
+from cdpr.errors import Refused
+from cdpr.plan import plan_from_document
+from cdpr.poses import Array, Pose
+from cdpr.rig import Rig, load_rig
+from drivers.bus import BusSettings, open_bus
+from drivers.cia402.states import DriveState
+from drivers.drive_group import DriveGroup, make_drive_group
+from executor.clock import SimulatedClock
+from executor.machine import State
+from executor.prepare import prepare
+from executor.records import CycleRecord, LoopEvent
+from executor.reference import reference_at, referenced
+from executor.rest_pose import rest_pose
+from executor.run_folder import RunFolder
+from executor.standing_pose import standing_pose
+from executor.winch_laws import CableStep, TakeUp, WinchLaw
+from executor.winch_motion import WinchesStand, move_winches, unreferenced
+from executor.wishes import OwnBoard
+from planner.check import verify
+from simulation.camera import SyntheticCamera
+from simulation.power_loss import PowerLoss
+from simulation.rehearsal import Rehearsal
+from tests.cli.plans import HALL, RIG, straight_plan
+from tests.scenarios.stage import Stage
+from tracking.tracker import Tracker
+
+_CHANNELS = itertools.count()
+HOLDING = DriveState.QUICK_STOP_ACTIVE
+TARGET, LIMIT = 10.0, 60.0
+
+
+@dataclass
+class Place:
+    """A rig after its power was gone, and what is done there."""
+
+    rig: Rig
+    rehearsal: Rehearsal
+    group: DriveGroup
+    as_set_up: Rig
+    counts: list[int]
+    script: Callable[[Place, int], None] = lambda _place, _cycle: None
+    board: OwnBoard = field(default_factory=OwnBoard)
+    records: list[CycleRecord] = field(default_factory=list)
+    events: list[LoopEvent] = field(default_factory=list)
+    tensions: list[Array] = field(default_factory=list)
+
+    def take_up(self, reach: float = 0.02) -> WinchesStand:
+        law = TakeUp(
+            self.as_set_up, self.counts, target=TARGET, limit=LIMIT, reach=reach, speed=0.002
+        )
+        return self.move(law)
+
+    def move(self, law: WinchLaw) -> WinchesStand:
+        def on_cycle(record: CycleRecord) -> None:
+            self.records.append(record)
+            self.tensions.append(self.rehearsal.tensions)
+            self.script(self, record.cycle)
+
+        return move_winches(
+            self.as_set_up,
+            law,
+            self.group,
+            SimulatedClock(0.01),
+            self.board,
+            record=Path("nowhere"),
+            on_cycle=on_cycle,
+            on_event=self.events.append,
+        )
+
+    @property
+    def states(self) -> set[DriveState]:
+        return {drive.state for drive in self.rehearsal.drives}
+
+    def steps(self) -> Array:
+        """Of what was sent, in cable wound in, shape (n, m), [m]."""
+        per_metre = np.array([winch.counts_per_metre for winch in self.rig.winches])
+        sent = np.array([r.targets for r in self.records if np.isfinite(r.following_error)])
+        return -np.diff(sent, axis=0) / per_metre
+
+
+@contextmanager
+def after_power_loss(loss: PowerLoss | None, rig: Rig | None = None) -> Iterator[Place]:
+    rig = rig or load_rig(RIG)
+    settings = BusSettings("virtual", f"home-{next(_CHANNELS)}")
+    with open_bus(settings) as near, open_bus(settings) as far:
+        rehearsal = Rehearsal(rig, far, rig.home)
+        if loss is not None:
+            loss.happen_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+        group = make_drive_group(rig, near, rehearsal.pump)
+        group.configure()
+        counts = group.read_positions().positions.tolist()
+        as_set_up = unreferenced(rig, counts, rig.home, limit=LIMIT, speed=0.005)
+        group = make_drive_group(as_set_up, near, rehearsal.pump)
+        group.configure()
+        yield Place(rig, rehearsal, group, as_set_up, counts)
+
+
+def lost(seed: int, slack_mm: float = 3.0, *, on_a_stand: bool) -> PowerLoss:
+    return PowerLoss.drawn(load_rig(RIG), seed, slack_mm / 1000.0, on_a_stand=on_a_stand)
+
+
+@pytest.mark.parametrize("on_a_stand", [True, False])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slack_cables_are_wound_in_together_and_none_is_paid_out(
+    seed: int, on_a_stand: bool
+) -> None:
+    with after_power_loss(lost(seed, on_a_stand=on_a_stand)) as place:
+        assert place.rehearsal.tensions.min() < 0.1, "some hang slack"
+        stand = place.take_up()
+        assert (stand.state, stand.cause) == (State.FINISHED, "")
+        assert place.states == {HOLDING}
+        assert place.rehearsal.tensions.min() >= 0.75 * TARGET
+        assert np.max(place.tensions) <= LIMIT
+        assert np.abs(stand.tensions - place.rehearsal.tensions).max() < 0.1
+        steps = place.steps()
+        assert steps.min() >= 0.0
+        assert steps.max() <= 0.00002 + 2e-6
+        moving = {tuple(np.flatnonzero(row)) for row in steps}
+        assert any(len(cables) == place.rig.cable_count for cables in moving)
+
+
+def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
+    with after_power_loss(lost(5, on_a_stand=True)) as place:
+        stand = place.take_up()
+        rig = referenced(
+            place.rig,
+            reference_at(place.rig, place.rig.home, stand.counts, stand.tensions, "stated", 0.0),
+        )
+        place.group.close()
+        home = place.rig.home.position
+        way = no_scene(rig).changed(goal=Pose.level(home + np.array([0.012, -0.006, 0.015])))
+        document = straight_plan(rig, way, [tuple(home * 1e3), tuple(way.goal.position * 1e3)])
+        prepared = prepare(verify(plan_from_document(document), rig), rig)
+        bus = place.group._bus  # type: ignore[attr-defined]
+        unhomed = make_drive_group(place.rig, bus, place.rehearsal.pump)
+        unhomed.configure()
+        folder = RunFolder.create(tmp_path / "unhomed")
+        wrong = prepare(verify(plan_from_document(document), place.rig), place.rig)
+        with pytest.raises(Refused, match="not at the start"):
+            Stage(wrong, place.rehearsal, unhomed, folder, lambda _stage: None).run()
+        unhomed.close()
+        group = make_drive_group(rig, bus, place.rehearsal.pump)
+        group.configure()
+        folder = RunFolder.create(tmp_path / "run")
+        outcome = Stage(prepared, place.rehearsal, group, folder, lambda _stage: None).run()
+        assert outcome.state is State.FINISHED, outcome.cause
+        seen = rest_pose(rig, looks(rig, place.rehearsal.pose))
+        assert seen.pose.distance_to(way.goal) < 0.5e-3
+        assert place.rehearsal.pose.distance_to(way.goal) < 0.05e-3
+        group.close()
+
+
+def looks(rig: Rig, *poses: Pose) -> list[object]:
+    camera, tracker = (
+        SyntheticCamera(rig, no_scene(rig), rig.cameras[0]),
+        Tracker(rig, rig.cameras[0]),
+    )
+    poses = poses * 6 if len(poses) == 1 else poses
+    return [tracker.observe(camera.render(p, k), k / 10.0) for k, p in enumerate(poses)]
+
+
+def test_a_platform_that_hangs_free_is_referenced_where_the_tags_see_it() -> None:
+    with after_power_loss(lost(7, on_a_stand=False)) as place:
+        stand = place.take_up()
+        true = place.rehearsal.pose
+        assert true.angle_to(place.rig.home) > 0.005, "it came to hang elsewhere"
+        seen = rest_pose(place.rig, looks(place.rig, true))
+        assert seen.pose.distance_to(true) < 4.0 * seen.uncertainty
+        reference = reference_at(
+            place.rig, seen.pose, stand.counts, stand.tensions, "tags", seen.uncertainty
+        )
+        rig, load = referenced(place.rig, reference), no_scene(place.rig).load
+        found = standing_pose(rig, stand.counts, load)
+        assert found.distance_to(true) < 4.0 * seen.uncertainty
+
+
+@pytest.mark.parametrize("phase", [3, 60, 200])
+def test_stop_ends_it_in_every_phase_and_a_hold_waits(phase: int) -> None:
+    with after_power_loss(lost(1, on_a_stand=False)) as place:
+
+        def script(place: Place, cycle: int) -> None:
+            if cycle == phase:
+                place.board.ask_stop()
+
+        place.script = script
+        stand = place.take_up()
+        assert stand.state is State.STOPPED
+        assert DriveState.OPERATION_ENABLED not in place.states
+    with after_power_loss(lost(1, on_a_stand=False)) as place:
+
+        def hold(place: Place, cycle: int) -> None:
+            if cycle in (phase, phase + 100):
+                place.board.ask_hold(cycle == phase)
+
+        place.script = hold
+        assert place.take_up().state is State.FINISHED
+        still = [r.targets for r in place.records if r.cycle in (phase + 50, phase + 99)]
+        assert still[0] == still[1]
+
+
+def falls_silent(place: Place) -> None:
+    place.rehearsal.drives[2].silent = True
+
+
+def loses_all_torque(place: Place) -> None:
+    for drive in place.rehearsal.drives:
+        drive.state = DriveState.SWITCH_ON_DISABLED
+
+
+def starts_again(place: Place) -> None:
+    place.rehearsal.drives[4].power_on()
+
+
+def fails(place: Place) -> None:
+    place.rehearsal.drives[6].fail(0x2310)
+
+
+@pytest.mark.parametrize("happens", [falls_silent, loses_all_torque, starts_again, fails])
+def test_every_fault_stops_all_drives_together(happens: Callable[[Place], None]) -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+        place.script = lambda place, cycle: happens(place) if cycle == 80 else None
+        stand = place.take_up()
+        assert stand.state is State.LATCHED
+        assert stand.cause
+        assert DriveState.OPERATION_ENABLED not in place.states
+        after = np.array([r.targets for r in place.records if r.cycle > 83])
+        assert len(np.unique(after, axis=0)) == 1, "nothing is sent on after the fault"
+
+
+def test_a_cable_that_stays_slack_after_its_reach_stops_all() -> None:
+    slack = np.zeros(8)
+    slack[4] = 0.02
+    with after_power_loss(PowerLoss(np.zeros(8), slack, on_a_stand=True)) as place:
+        stand = place.take_up(reach=0.004)
+        assert stand.state is State.LATCHED
+        assert "cable 5 carries" in stand.cause
+        assert "off its drum" in stand.cause
+        assert np.abs(np.sum(place.steps(), axis=0)).max() <= 0.004 + 1e-5
+        assert place.states == {HOLDING}
+
+
+def test_one_cable_alone_moves_freely_only_while_it_hangs_slack() -> None:
+    with after_power_loss(lost(3, 6.0, on_a_stand=True)) as place:
+        law = CableStep(
+            place.as_set_up, place.counts, cable=2, way=-0.001, limit=LIMIT, speed=0.005
+        )
+        stand = place.move(law)
+        assert stand.state is State.FINISHED
+        moved = (stand.counts - place.counts) / [w.counts_per_metre for w in place.rig.winches]
+        assert moved == pytest.approx([0, 0, -0.001, 0, 0, 0, 0, 0], abs=3e-6)
+        assert place.steps().max() <= 0.005 * 0.01 + 2e-6
+
+
+@pytest.mark.parametrize(("way", "cause"), [(-0.005, "more than"), (0.005, "went slack")])
+def test_on_a_taut_platform_one_cable_alone_is_stopped(way: float, cause: str) -> None:
+    with after_power_loss(None) as place:
+        law = CableStep(place.as_set_up, place.counts, cable=2, way=way, limit=LIMIT, speed=0.005)
+        stand = place.move(law)
+        assert stand.state is State.LATCHED
+        assert cause in stand.cause
+        assert place.states == {HOLDING}
+        assert np.max(place.tensions) < 1.3 * LIMIT
+
+
+def test_a_pose_that_is_not_known_well_is_refused() -> None:
+    rig = load_rig(RIG)
+    home = rig.home
+    away = Pose.level(home.position + np.array([0.004, 0.0, 0.0]))
+    with pytest.raises(Refused, match="does not stand still"):
+        rest_pose(rig, looks(rig, home, away, home, away))
+    far = Pose.level(home.position + np.array([5.0, 5.0, 0.0]))
+    with pytest.raises(Refused, match="0 of 2 pictures"):
+        rest_pose(rig, looks(rig, far, far))
+
+
+def test_the_hall_robot_is_taken_up_too() -> None:
+    rig = load_rig(HALL)
+    loss = PowerLoss.drawn(rig, 1, 0.005, on_a_stand=False)
+    settings = BusSettings("virtual", f"home-{next(_CHANNELS)}")
+    with open_bus(settings) as near, open_bus(settings) as far:
+        rehearsal = Rehearsal(rig, far, rig.home)
+        loss.happen_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+        group = make_drive_group(rig, near, rehearsal.pump)
+        group.configure()
+        counts: Sequence[int] = group.read_positions().positions.tolist()
+        limited = unreferenced(rig, counts, rig.home, limit=400.0, speed=0.005)
+        group = make_drive_group(limited, near, rehearsal.pump)
+        group.configure()
+        law = TakeUp(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
+        stand = move_winches(
+            limited, law, group, SimulatedClock(0.01), OwnBoard(), record=Path("nowhere"),
+            on_cycle=lambda _record: None, on_event=lambda _event: None,
+        )  # fmt: skip
+        assert stand.state is State.FINISHED, stand.cause
+        assert rehearsal.tensions.min() >= 0.7 * 60.0
