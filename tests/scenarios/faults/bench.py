@@ -206,6 +206,7 @@ class LiveBench(Bench):
         self.prepared, self.folder, self.line, self.rehearsal = prepared, folder, line, rehearsal
         self._settings, self._masters = settings, masters
         self.process = 0
+        self.resumes_after: float | None = None
         self.outcome: dict[str, Any] = {}
 
     def kill(self) -> None:
@@ -244,7 +245,15 @@ class LiveBench(Bench):
             if gone(self.process):
                 break
             signal.sigtimedwait([], 0.02)
+            self._resume_when_due()
         signal.sigtimedwait([], 0.3)  # the drives have their own time-outs
+
+    def _resume_when_due(self) -> None:
+        if self.resumes_after is None or self.since is None:
+            return
+        if self.rehearsal.now - self.since > self.resumes_after:
+            self.resumes_after = None
+            os.kill(self.process, signal.SIGCONT)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from drivers.cia402.frames import (
     HEARTBEAT_BASE,
@@ -378,3 +379,23 @@ def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
     """This computer held the simulated drives up, before or while the fault happened."""
     silent = "drive 1 did not answer" in cause and not any(word in cause for word in fault.words)
     return bench.since is None or silent or "cycles late; stopped" in cause
+
+
+def row(
+    name: str, transport: str, bench: Bench, ended: State | None, cause: str, found: list[str]
+) -> dict[str, Any]:
+    """One line of the measured table; drives that go on have no time to the stop."""
+    fault = TABLE[name]
+    stop = bench.stop() if len(bench.lost) < len(bench.drives) else None
+    stops = stop is not None and fault.within is not None
+    return {
+        "fault": name,
+        "transport": transport,
+        "ended": ended.value if ended else "killed",
+        "cause": cause,
+        "stop_ms": round(1e3 * stop.time, 2) if stop and stops else None,
+        "spread_ms": round(1e3 * stop.spread, 2) if stop and stops else None,
+        "step_mm": round(1e3 * stop.worst_step, 3) if stop else None,
+        "travel_mm": round(1e3 * stop.travel, 3) if stop and stops else None,
+        "violations": found,
+    }

@@ -1,0 +1,124 @@
+"""F14–F16, F24: what is wrong before anything is enabled is refused with place and cause."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpr.errors import HardwareMissing, Refused
+from drivers.cia402.configure import configure_drives
+from drivers.cia402.objects import settings_for
+from drivers.cia402.states import DriveState
+from executor.machine import State
+from executor.prepare import PreparedRun
+from tests.scenarios.faults.bench import SimulatedBench, simulated
+
+ENABLED = DriveState.OPERATION_ENABLED
+SWITCHED_ON, DISABLED = DriveState.SWITCHED_ON, DriveState.SWITCH_ON_DISABLED
+READY, HOLDING = DriveState.READY_TO_SWITCH_ON, DriveState.QUICK_STOP_ACTIVE
+
+
+def nothing(_bench: object) -> None:
+    pass
+
+
+def configure(bench: SimulatedBench) -> None:
+    near = bench.stage.group._bus  # type: ignore[attr-defined]
+    configure_drives(bench.prepared.rig, near, bench.rehearsal.pump, to_reset=False)
+
+
+def test_f14_an_object_that_is_never_answered_is_named(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """Each object in turn; aborts and values that are not kept: tests/drivers/test_group.py."""
+    with simulated(prepared, tmp_path / "run", nothing) as bench:
+        drive = bench.drives[5]
+        settings = settings_for(prepared.rig, 5, bench.rehearsal.plant.winch_map)
+        answers = type(drive).on_sdo
+        for key in dict.fromkeys((s.index, s.sub) for s in settings):
+
+            def deaf(data: bytes, key: tuple[int, int] = key) -> None:
+                if (int.from_bytes(data[1:3], "little"), data[3]) != key:
+                    answers(drive, data)
+
+            bench.rehearsal._handlers[0x600 + drive.node] = deaf
+            with pytest.raises(HardwareMissing, match="drive 6 does not answer") as caught:
+                configure(bench)
+            assert f"drive 6, object {key[0]:04X}h:{key[1]:02X}" in caught.value.where
+        assert all(d.state is not ENABLED for d in bench.drives)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [((0x605A, 0), 2), ((0x6007, 0), 1), ((0x6072, 0), 65535), ((0x60C2, 1), 1)],
+)
+def test_f15_a_drive_that_keeps_another_value_is_not_armed(
+    prepared: PreparedRun, tmp_path: Path, key: tuple[int, int], value: int
+) -> None:
+    with simulated(prepared, tmp_path / "run", nothing) as bench:
+        bench.drives[2].objects.stuck.add(key)
+        bench.drives[2].objects[key] = value
+        with pytest.raises(Refused, match=f"holds {value}, it must hold") as caught:
+            configure(bench)
+        assert f"drive 3, object {key[0]:04X}h:{key[1]:02X}" in caught.value.where
+
+
+@pytest.mark.parametrize(
+    "states",
+    [
+        {0: SWITCHED_ON},
+        {0: READY, 1: SWITCHED_ON},
+        {6: HOLDING},
+        {0: HOLDING, 1: SWITCHED_ON, 2: READY},
+        dict.fromkeys(range(8), HOLDING),
+    ],
+)
+def test_f16_from_any_mixture_of_states_all_are_enabled_at_one_sync(
+    prepared: PreparedRun, tmp_path: Path, states: dict[int, DriveState]
+) -> None:
+    with simulated(prepared, tmp_path / "run", nothing) as bench:
+        for drive, state in states.items():
+            bench.drives[drive].state = state
+        assert bench.run() is State.FINISHED, bench.cause
+        assert bench.violations() == []
+
+
+def test_f16_a_drive_in_fault_keeps_all_others_without_power(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with simulated(prepared, tmp_path / "run", nothing) as bench:
+        bench.drives[4].fail(0x3210)
+        assert bench.run() is State.LATCHED
+        assert all(ENABLED not in sample.states for sample in bench.rehearsal.samples)
+        assert bench.violations() == []
+
+
+def test_f16_a_drive_that_loses_its_mode_is_not_armed(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with simulated(prepared, tmp_path / "run", nothing) as bench:
+        bench.drives[1].objects.measured(0x6061, 0, lambda: 1)
+        with pytest.raises(Refused) as caught:
+            configure(bench)
+        assert "drive 2, object 6061h" in caught.value.where
+
+
+@pytest.mark.parametrize("change", [1, -1, 4000])
+def test_f24_set_points_that_were_changed_after_their_check_are_not_armed(
+    prepared: PreparedRun, tmp_path: Path, change: int
+) -> None:
+    """NaN, jumps, speeds and limits are refused by the check: tests/executor/test_setpoints.py."""
+    setpoints = prepared.checked.table.setpoints
+    setpoints.setflags(write=True)
+    setpoints[200, 3] += change
+    try:
+        with simulated(prepared, tmp_path / "run", nothing) as bench:
+            with pytest.raises(Refused, match="not those that were checked"):
+                bench.run()
+            assert all(ENABLED not in sample.states for sample in bench.rehearsal.samples)
+    finally:
+        setpoints[200, 3] -= change
+        setpoints.setflags(write=False)
+    assert np.array_equal(setpoints, np.rint(prepared.checked.table.counts))
