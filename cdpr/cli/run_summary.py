@@ -46,11 +46,15 @@ def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
     if as_json:
         show_json({"run": str(folder), **summary})
         return
+    from executor.fault_pages import pages_of
+
     colour = COLOURS[summary["verdict"]]
     sentence = escape(summary["sentence"])
     out.print(f"[bold {colour}]{summary['verdict']}[/] {sentence}", soft_wrap=True)
     for reason in summary["reasons"]:
         out.print(f"  {reason}", markup=False, soft_wrap=True)
+    for page in pages_of(event["code"] for event in summary["events"]):
+        out.print(f"  more about it: {page}", markup=False, soft_wrap=True)
     out.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
 
 

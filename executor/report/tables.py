@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cdpr.legs import legs_of
 from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument
+from executor.fault_pages import page_of
 from executor.report.markup import known, list_table, table
 from executor.report.run_data import RunData
 
@@ -43,8 +44,8 @@ def stop_table(run: RunData) -> str:
 
 def event_table(run: RunData) -> str:
     """What happened, in order."""
-    rows = [(f"{e.time_s:.2f} s", e.code, e.text) for e in run.events]
-    return list_table(("Time", "Event", "Text"), rows)
+    rows = [(f"{e.time_s:.2f} s", e.code, e.text, page_of(e.code)) for e in run.events]
+    return list_table(("Time", "Event", "Text", "More about it"), rows)
 
 
 def _plan(run: RunData) -> list[tuple[str, str]]:

@@ -1,0 +1,54 @@
+"""The fault table over a CAN bus of the kernel, the executor in a process of its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cdpr.plan import load_plan
+from cdpr.rig import load_rig
+from drivers.bus import BusSettings
+from executor.prepare import PreparedRun, prepare
+from planner.check import verify
+from tests.cli.plans import RIG
+from tests.scenarios.faults.bench import live
+from tests.scenarios.faults.cases import TABLE, complaints, held_up, row
+from tests.scenarios.faults.masters import Masters
+
+pytestmark = [pytest.mark.hil, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def prepared(short_plan: Path) -> PreparedRun:
+    return prepare(verify(load_plan(short_plan)), load_rig(RIG))
+
+
+@pytest.fixture(scope="module")
+def masters(short_plan: Path) -> Iterator[Masters]:
+    starting = Masters(short_plan, RIG)
+    yield starting
+    starting.close()
+
+
+@pytest.mark.parametrize("name", [name for name, fault in TABLE.items() if fault.live])
+def test_a_fault(
+    prepared: PreparedRun,
+    masters: Masters,
+    channel: str,
+    artefacts: Path,
+    tmp_path: Path,
+    name: str,
+) -> None:
+    fault, settings = TABLE[name], BusSettings("socketcan", channel)
+    with live(prepared, tmp_path / "run", fault.script(), settings, masters) as bench:
+        ended = bench.run()
+        cause = str(bench.outcome.get("cause", ""))
+        assert not held_up(fault, bench, cause), cause
+        found = complaints(fault, bench, ended, cause, prepared.checked.table.cycle)
+        line = row(name, "vcan", bench, ended, cause, found)
+    with (artefacts / "faults.json").open("a") as file:
+        file.write(json.dumps(line, ensure_ascii=False) + "\n")
+    assert found == []
