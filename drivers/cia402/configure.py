@@ -23,7 +23,7 @@ from drivers.cia402.objects import (
     heartbeat_consumers,
     settings_for,
 )
-from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.sdo import OBJECT_DOES_NOT_EXIST, SetupNetwork
 from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 
@@ -68,19 +68,22 @@ def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: 
     _find_all(network, nodes)
     _refuse_duplicates(network)
     entries, restarted = [], []
+    absent: dict[Setting, list[int]] = {}
     for drive, node in enumerate(nodes):
         _check_idle(network, node, to_reset)
         if not _still_set_up(network, node, settings[drive]):
             restarted.append(node)
         network.command(NmtCommand.PRE_OPERATIONAL, node)
-        _write_all(network, node, settings[drive])
+        for setting in _write_all(network, node, settings[drive]):
+            absent.setdefault(setting, []).append(node)
         entries.append(_watch_heartbeats(network, node, rig, drive))
         _switch_off_unused(network, node)
         _expect(network, node, AFTER)
     for node in nodes:
         network.command(NmtCommand.START, node)
     network.take_waiting()
-    return SetUp(tuple(_unwatched_peers(nodes, entries)), tuple(restarted))
+    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries))
+    return SetUp(remarks, tuple(restarted))
 
 
 def _still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
@@ -102,6 +105,11 @@ def _refuse_duplicates(network: SetupNetwork) -> None:
             next_step="give every device on the bus its own node id",
             values={"node": node},
         )
+
+
+def _absent(absent: dict[Setting, list[int]]) -> Iterator[str]:
+    for setting, nodes in absent.items():
+        yield f"drive {', '.join(map(str, nodes))}: there is no {setting}: {setting.instead}"
 
 
 def _unwatched_peers(nodes: Sequence[int], entries: Sequence[int]) -> Iterator[str]:
@@ -172,16 +180,27 @@ def _check_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
         )
 
 
-def _write_all(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> None:
+def _write_all(
+    network: SetupNetwork, node: int, settings: Sequence[Setting]
+) -> tuple[Setting, ...]:
+    """Writes and reads back; those that the drive does not have and need not have."""
     client = network.client(node)
+    absent = []
     for setting in settings:
-        client.write(setting.index, setting.sub, setting.data(), setting.name)
+        try:
+            client.write(setting.index, setting.sub, setting.data(), setting.name)
+        except Refused as error:
+            if setting.instead and error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
+                absent.append(setting)
+                continue
+            raise
         if setting.transient:
             continue
         kept = client.read(setting.index, setting.sub, setting.name)
         if kept != setting.data():
             found = _number(kept, setting.form)
             raise _wrong(node, str(setting), found, str(setting.value), setting.why)
+    return tuple(absent)
 
 
 def _watch_heartbeats(network: SetupNetwork, node: int, rig: Rig, drive: int) -> int:

@@ -41,6 +41,7 @@ class Setting:
         name: What the standard calls it.
         why: The reason for the value.
         transient: It is written over later in the list, so that only a refusal counts.
+        instead: What does its work in drives that do not have the object; nothing where they must.
     """
 
     index: int
@@ -50,6 +51,7 @@ class Setting:
     name: str
     why: str
     transient: bool = False
+    instead: str = ""
 
     def data(self) -> bytes:
         """The value as the object holds it."""
@@ -186,7 +188,10 @@ def _process_data(node: int, cycle: float) -> tuple[Setting, ...]:
     sent = (0x60410010, 0x60640020, 0x60770010)
     return (
         *_mapped(0x1400, 0x1600, RPDO1_BASE + node, received),
-        Setting(0x1400, 5, "<H", deadline_ms, "RPDO1 deadline", "stop without set-points"),
+        Setting(
+            *(0x1400, 5, "<H", deadline_ms, "RPDO1 deadline", "stop without set-points"),
+            instead="the program sees a drive that stands still, and stops all",
+        ),
         Setting(0x1400, 1, "<I", RPDO1_BASE + node, "RPDO1 identifier", "switched on"),
         *_mapped(0x1800, 0x1A00, PDO_NO_RTR | TPDO1_BASE + node, sent),
         Setting(0x1800, 1, "<I", PDO_NO_RTR | TPDO1_BASE + node, "TPDO1 identifier", "switched on"),
@@ -215,9 +220,15 @@ def _supervision(cycle: float) -> tuple[Setting, ...]:
     produced_ms = round(1000 * cycle * heartbeat_cycles(cycle))
     return (
         Setting(0x1006, 0, "<I", period_us, "communication cycle period", "the cycle of the rig"),
-        Setting(0x1007, 0, "<I", period_us, "synchronous window length", "the whole cycle"),
+        Setting(
+            *(0x1007, 0, "<I", period_us, "synchronous window length", "the whole cycle"),
+            instead="without it the window has no end",
+        ),
         Setting(0x1017, 0, "<H", produced_ms, "producer heartbeat time", "peers watch each other"),
-        Setting(0x1029, 1, "<B", 1, "communication error behaviour", "keep reporting"),
+        Setting(
+            *(0x1029, 1, "<B", 1, "communication error behaviour", "keep reporting"),
+            instead="a drive may leave the NMT state operational, which is a fault",
+        ),
     )
 
 
@@ -240,7 +251,10 @@ def _reactions(rig: Rig, drive: int, cycle: float) -> tuple[Setting, ...]:
     return (
         Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
         Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
-        Setting(0x605E, 0, "<h", 2, "fault reaction option code", "ramp down before torque off"),
+        Setting(
+            *(0x605E, 0, "<h", 2, "fault reaction option code", "ramp down before torque off"),
+            instead="what a drive does in a fault is its maker's choice: read its manual",
+        ),
         _capped(0x6085, "quick stop deceleration", ramp, "stands within one cycle"),
         _capped(0x6065, "following error window", window, "motion.following_error_mm"),
         Setting(0x6066, 0, "<H", math.ceil(1000 * cycle), "following error time out", "one cycle"),
