@@ -120,8 +120,12 @@ class OtherDrive:
         if index == 0x6060:
             self._local.set_data(0x6061, 0, data)
         elif index in (0x1600, 0x1A00) and od.subindex:
-            if int.from_bytes(data, "little") >> 16 not in self._local.object_dictionary:
-                raise canopen.SdoAbortedError(0x06040041)
+            self._require(int.from_bytes(data, "little") >> 16)
+
+    def _require(self, index: int) -> None:
+        """What is not there cannot be mapped."""
+        if index not in self._local.object_dictionary:
+            raise canopen.SdoAbortedError(0x06040041)
 
     def _serve(self) -> None:
         while not self._over.is_set():

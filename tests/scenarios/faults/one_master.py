@@ -17,9 +17,24 @@ from executor.clock import RealClock
 from executor.execution import run_here
 from executor.prepare import PreparedRun
 from executor.realtime import real_time
-from executor.run_folder import RunFolder
+from executor.run_folder import RunEvent, RunFolder
 from executor.wishes import OwnBoard
 from tests.scenarios.faults.bench import recorder_for
+
+
+class _Folder(RunFolder):
+    """Writes events down at the end: the loop of the program does not write files either."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.waiting: list[RunEvent] = []
+
+    def append_event(self, event: RunEvent) -> None:
+        self.waiting.append(event)
+
+    def write(self) -> None:
+        for event in self.waiting:
+            super().append_event(event)
 
 
 def run(prepared: PreparedRun, settings: BusSettings, path: Path) -> None:
@@ -42,7 +57,7 @@ def _moved(
     )
     rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": document}))
     prepared = replace(prepared, rig=rig)
-    folder = RunFolder(path)
+    folder = _Folder(path)
     recorder = recorder_for(prepared, folder, board)
     with open_bus(settings) as bus, real_time():
         group = make_drive_group(rig, bus)
@@ -57,6 +72,7 @@ def _moved(
             carry=lambda _load: None,
             before_motion=lambda: None,
         )
+    folder.write()
     table = recorder.log.table()
     return {
         "state": outcome.state.value,
