@@ -177,7 +177,7 @@ class Latch:
         return Refused(
             f"a fault is latched{since}: {cause}",
             where=f"bus {self._bus}",
-            why=f"run folder {latched.folder}" if latched else "",
+            why=f"on record in {latched.folder}" if latched else "",
             next_step="find the cause and look at the platform, then `cdpr reset RIG`;"
             " nothing was moved",
         )
