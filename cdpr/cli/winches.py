@@ -160,6 +160,8 @@ def _moved(
                 next_step="allow it as named above, or pass --without-real-time if you accept"
                 " that; nothing was enabled",
             )
+        if denied:
+            err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
 
         def on_cycle(record: CycleRecord) -> None:
             status.take_cycle(record, law.progress)

@@ -21,7 +21,7 @@ from drivers.cia402.states import DriveState
 from drivers.drive_group import DriveGroup, make_drive_group
 from executor.clock import SimulatedClock
 from executor.machine import State
-from executor.prepare import prepare
+from executor.prepare import PreparedRun, prepare
 from executor.records import CycleRecord, LoopEvent
 from executor.reference import reference_at, referenced
 from executor.rest_pose import rest_pose
@@ -35,7 +35,7 @@ from simulation.camera import SyntheticCamera
 from simulation.power_loss import PowerLoss
 from simulation.rehearsal import Rehearsal
 from tests.cli.plans import HALL, RIG, straight_plan
-from tests.scenarios.stage import Stage
+from tests.scenarios.stage import Stage, at, staged
 from tracking.tracker import Tracker
 
 _CHANNELS = itertools.count()
@@ -307,3 +307,35 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         )  # fmt: skip
         assert stand.state is State.FINISHED, stand.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0
+
+
+def stops(stage: Stage) -> None:
+    stage.board.ask_stop()
+
+
+def emergency_stop(stage: Stage) -> None:
+    """The torque of all drives is gone, as when their supply is cut."""
+    for drive in stage.drives:
+        drive.state = DriveState.SWITCH_ON_DISABLED
+
+
+def one_fails(stage: Stage) -> None:
+    stage.drives[3].fail(0x2310)
+
+
+def hangs(stage: Stage) -> None:
+    stage.lateness = 5.0
+
+
+@pytest.mark.parametrize(
+    ("happens", "holding"),
+    [(stops, True), (hangs, True), (emergency_stop, False), (one_fails, False)],
+)
+def test_a_run_tells_whether_a_cable_was_let_go(
+    prepared: PreparedRun, tmp_path: Path, happens: Callable[[Stage], None], holding: bool
+) -> None:
+    """On it hangs whether the reference still counts: see `executor.custody`."""
+    with staged(prepared, tmp_path / "run", at(120, happens)) as stage:
+        outcome = stage.run()
+    assert outcome.state is (State.STOPPED if happens is stops else State.LATCHED)
+    assert outcome.holding is holding
