@@ -241,7 +241,8 @@ def test_a_late_cycle_is_noted_and_a_very_late_one_stops(lateness, reaction):
     if reaction is None:
         assert found == ()
         return
-    assert found == (Finding(reaction, "late", f"a cycle began {lateness:.1f} cycles late"),)
+    assert found == (Finding(reaction, "late", f"a cycle began {lateness:.1f} cycles late", 0),)
+    assert found[0].drive == 0, "all of them"
 
 
 def test_a_lateness_before_its_time_is_nothing():
