@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from cdpr.plan_file import PlanDocument
-    from cdpr.poses import Pose
     from cdpr.rig import Rig
     from cdpr.scene import Scene
 
-#: A jog is no longer than this, [mm], and no faster than that, [mm/s].
-LONGEST_MM, FASTEST_MM_S = 50.0, 20.0
+#: A jog is no faster than this, [mm/s].
+FASTEST_MM_S = 20.0
 
 
 def jog(
@@ -23,6 +21,9 @@ def jog(
         tuple[float, float, float] | None,
         typer.Option("--by-mm", help="how far: x y z, at most 50 mm"),
     ] = None,
+    to_home: Annotated[
+        bool, typer.Option("--to-home", help="instead: to the rig's home pose, and turned as there")
+    ] = False,
     cable: Annotated[
         int | None, typer.Option("--cable", min=1, help="move one winch alone, with --mm")
     ] = None,
@@ -76,6 +77,7 @@ def jog(
     """
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.demo import free_folder
+    from cdpr.cli.jog_way import moved, require_short, straight_way, where_it_stands
     from cdpr.cli.run import require_own_time, rig_on_bus
     from cdpr.errors import BadInput
     from cdpr.plan import plan_from_document
@@ -90,20 +92,22 @@ def jog(
         _one_cable(the_rig, cable, mm, by_mm, limit_n, speed_mm_s, fast, yes, without_real_time,
                    as_json)  # fmt: skip
         return
-    if by_mm is None:
+    if (by_mm is None) != to_home:
         raise BadInput(
-            "say how far: --by-mm X Y Z, or --cable N --mm X",
+            "say how far: --by-mm X Y Z, --to-home, or --cable N --mm X",
             where="cdpr jog",
             next_step="see `cdpr jog --help`",
         )
-    _require_short(by_mm)
+    if by_mm is not None:
+        require_short(by_mm)
     the_scene = _scene(scene, no_scene, clearance_mm, the_rig)
     folder = output or free_folder("jog")
     RunFolder.require_free(folder)
     Custody(the_rig).require_free()
     the_rig = Custody(the_rig).referenced_rig()
-    start = the_rig.home if in_process else _where_it_stands(the_rig, the_scene)
-    document = _straight(the_rig, the_scene, start, by_mm, not as_json)
+    start = the_rig.home if in_process else where_it_stands(the_rig, the_scene)
+    goal = the_rig.home if by_mm is None else moved(start, by_mm)
+    document = straight_way(the_rig, the_scene, start, goal, not as_json)
     code = carry_out(
         prepared_run(plan_from_document(document), the_rig, quiet=as_json),
         folder,
@@ -154,25 +158,6 @@ def _slow(rig: Rig, speed_mm_s: float) -> Rig:
     return rig_from_document(document.model_copy(update={"motion": motion}))
 
 
-def _require_short(by_mm: tuple[float, float, float]) -> None:
-    import math
-
-    from cdpr.errors import BadInput, Refused
-
-    length = math.hypot(*by_mm)
-    if not 0.0 < length < math.inf:
-        raise BadInput(
-            "that is no way to go", where="--by-mm", next_step="give x y z in mm, not all 0"
-        )
-    if length > LONGEST_MM:
-        raise Refused(
-            f"a jog of {length:.1f} mm is longer than {LONGEST_MM:g} mm",
-            where="--by-mm",
-            why="a longer way is planned around what is in it",
-            next_step="jog less far, or plan a path from here with `cdpr plan --start-mm`",
-        )
-
-
 def _scene(path: Path | None, without: bool, clearance_mm: float | None, rig: Rig) -> Scene:
     """What is around; nothing only when somebody says so."""
     from cdpr.errors import BadInput
@@ -199,47 +184,3 @@ def no_scene(rig: Rig) -> Scene:
     return scene_from_document(
         SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
     )
-
-
-def _where_it_stands(rig: Rig, scene: Scene) -> Pose:
-    """Asks the drives; none of them is enabled for it."""
-    import numpy as np
-
-    from cdpr.cli.drives import open_drives
-    from executor.standing_pose import standing_pose
-
-    with open_drives(rig, rig.home, scene.load) as drives:
-        positions = drives.group.read_positions().positions
-    return standing_pose(rig, np.array(positions, dtype=np.float64), scene.load)
-
-
-def _straight(
-    rig: Rig, scene: Scene, start: Pose, by_mm: tuple[float, float, float], shown: bool
-) -> PlanDocument:
-    """A plan that goes straight there.
-
-    Raises:
-        CdprError: Start or goal cannot be used.
-        Refused: Something is in the straight way.
-    """
-    import math
-
-    from cdpr.cli.plan import planned
-    from cdpr.document_types import millimetres
-    from cdpr.errors import Refused
-    from cdpr.poses import Pose
-    from planner.optimal.settings import OptimalSettings
-
-    goal = Pose(start.position + millimetres(list(by_mm)), start.rotation)
-    way = scene.changed(start=start, goal=goal)
-    document = planned(rig, way, OptimalSettings(seed=0, rounds=1), shown)
-    straight = math.hypot(*by_mm)
-    if document.quality.length_mm > straight + 0.01:
-        raise Refused(
-            f"the straight way of {straight:.1f} mm is not free; the way around is"
-            f" {document.quality.length_mm:.1f} mm",
-            where="--by-mm",
-            why="cables or platform would come too near to something on the straight way",
-            next_step="jog another way, or plan a path with `cdpr plan --start-mm`",
-        )
-    return document

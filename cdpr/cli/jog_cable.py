@@ -37,7 +37,7 @@ def jog_cable(
     import math
 
     from cdpr.cli.carry_out import ask_operator
-    from cdpr.cli.jog import LONGEST_MM
+    from cdpr.cli.jog_way import LONGEST_MM
     from cdpr.cli.output import out, show_facts, show_json
     from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of
     from cdpr.errors import BadInput, Refused

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cdpr.cli.jog import no_scene
+from cdpr.cli.jog_way import straight_way
 from cdpr.errors import Refused
 from cdpr.plan import plan_from_document
 from cdpr.poses import Array, Pose
@@ -173,7 +174,9 @@ def looks(rig: Rig, *poses: Pose) -> list[object]:
     return [tracker.observe(camera.render(p, k), k / 10.0) for k, p in enumerate(poses)]
 
 
-def test_a_platform_that_hangs_free_is_referenced_where_the_tags_see_it() -> None:
+def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
+    tmp_path: Path,
+) -> None:
     with after_power_loss(lost(7, on_a_stand=False)) as place:
         stand = place.take_up()
         true = place.rehearsal.pose
@@ -186,6 +189,19 @@ def test_a_platform_that_hangs_free_is_referenced_where_the_tags_see_it() -> Non
         rig, load = referenced(place.rig, reference), no_scene(place.rig).load
         found = standing_pose(rig, stand.counts, load)
         assert found.distance_to(true) < 4.0 * seen.uncertainty
+        home = straight_way(rig, no_scene(rig), found, rig.home, False)
+        prepared = prepare(verify(plan_from_document(home), rig), rig)
+        bus = place.group._bus  # type: ignore[attr-defined]
+        place.group.close()
+        group = make_drive_group(rig, bus, place.rehearsal.pump)
+        group.configure()
+        folder = RunFolder.create(tmp_path / "run")
+        outcome = Stage(prepared, place.rehearsal, group, folder, lambda _stage: None).run()
+        assert outcome.state is State.FINISHED, outcome.cause
+        reached = place.rehearsal.pose
+        assert reached.distance_to(rig.home) < 4.0 * seen.uncertainty
+        assert reached.angle_to(rig.home) < 0.01
+        group.close()
 
 
 @pytest.mark.parametrize("phase", [3, 60, 200])

@@ -46,6 +46,8 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: P
         ((*WAY, "--no-scene", "--scene", "scene.yaml"), 2, "say what is in the way"),
         ((*WAY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
         (("--fast",), 2, "say how far"),
+        (("--to-home", *WAY), 2, "say how far"),
+        (("--to-home",), 2, "say what is in the way"),
         (("--cable", "3"), 2, "together"),
         (("--mm", "3"), 2, "together"),
         (("--cable", "3", "--mm", "1", *WAY), 2, "together"),
