@@ -1,94 +1,103 @@
-"""Camera matrix and lens distortion from pictures of a chessboard."""
+"""Camera matrix and lens distortion from pictures of a board."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.boards import Board, Seen, mirrored
+from calibration.uncertainty import Uncertainty, uncertainty_of
 from cdpr.errors import BadInput
-from cdpr.poses import Array, read_only
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
 
 Image = NDArray[np.uint8]
 
-#: Fewer pictures than this cannot be calibrated from; forty and more, tilted up to 40°, are good.
-LEAST_VIEWS = 6
-_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-
-
-@dataclass(frozen=True, slots=True)
-class Chessboard:
-    """A printed chessboard.
-
-    Attributes:
-        columns: Inner corners along a row of squares.
-        rows: Inner corners along a column.
-        square: Side of a square, [m].
-    """
-
-    columns: int
-    rows: int
-    square: float
-
-    def points(self) -> Array:
-        """Inner corners in the board's plane, row after row, shape (n, 3), [m]."""
-        grid = np.array([(x, y, 0.0) for y in range(self.rows) for x in range(self.columns)])
-        return np.asarray(grid * self.square)
+LEAST_VIEWS = 4
+"""Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
+_FAR_OFF, _OFF = 4.0, 0.5
+"""A view is left out whose error is so many times the median, and so many pixels at least."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """A camera's matrix and distortion with what is known about their quality.
+    """A camera's matrix and distortion, and what they rest on.
 
     Attributes:
         size: Width and height of the pictures, [px].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: k1, k2, p1, p2, k3; shape (5,).
-        deviations: Standard deviations by name (fx, fy, cx, cy in px; the rest without unit), as
-            the least-squares fit states them; real errors are a few times larger.
+        uncertainty: What is known about their errors.
+        views: What was seen of the board in each picture used, by name.
+        boards: Where the board was in the camera's frame, by name.
         view_errors: RMS distance of each used picture's corners, by name, [px].
-        unused: Pictures in which the board was not found.
+        unused: Why each of the other pictures is not used, by name.
         data_hash: Of the corners it rests on.
     """
 
     size: tuple[int, int]
     matrix: Array
     distortion: Array
-    deviations: dict[str, float]
-    view_errors: dict[str, float]
-    unused: tuple[str, ...]
+    uncertainty: Uncertainty
+    views: Mapping[str, Seen]
+    boards: Mapping[str, Pose]
+    view_errors: Mapping[str, float]
+    unused: Mapping[str, str]
     data_hash: str
 
     @property
     def error(self) -> float:
-        """RMS distance over all pictures, [px]; small also when too little is covered."""
-        return float(np.sqrt(np.mean(np.square(list(self.view_errors.values())))))
+        """RMS distance over all corners, [px]; small also when too little is covered."""
+        counts = [len(view.corners) for view in self.views.values()]
+        squares = np.square(list(self.view_errors.values()))
+        return float(np.sqrt(np.average(squares, weights=counts)))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The nine numbers by the names of `calibration.uncertainty.NAMES`."""
+        return values_of(self.matrix, self.distortion)
 
 
-def find_board(image: Image, board: Chessboard) -> Array | None:
-    """Inner corners of the board, shape (n, 2), [px], or None when it is not seen whole."""
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
-    return np.asarray(corners, dtype=np.float64).reshape(-1, 2) if found else None
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    matrix: Array
+    distortion: Array
+    turns: dict[str, Array]
+    places: dict[str, Array]
+    errors: dict[str, float] = field(default_factory=dict)
 
 
-def calibrate_camera(pictures: Iterable[tuple[str, Image]], board: Chessboard) -> CameraCalibration:
+def values_of(matrix: Array, distortion: Array) -> dict[str, float]:
+    """The nine numbers of a camera by name."""
+    from calibration.uncertainty import NAMES
+
+    numbers = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion]
+    return {name: float(number) for name, number in zip(NAMES, numbers, strict=True)}
+
+
+def calibrate_camera(
+    pictures: Iterable[tuple[str, Image]],
+    board: Board,
+    unused: Mapping[str, str] | None = None,
+) -> CameraCalibration:
     """Fits a pinhole with five distortion coefficients.
 
     Args:
         pictures: Names and grey pictures of one size.
         board: What they show.
+        unused: Pictures that were left out before, with the reasons.
 
     Raises:
-        BadInput: Pictures of different sizes, or too few with the whole board.
+        BadInput: Pictures of different sizes, or too few that show the board.
     """
-    views: dict[str, Array] = {}
-    unused: list[str] = []
+    views: dict[str, Seen] = {}
+    left_out = dict(unused or {})
     size: tuple[int, int] | None = None
+    example: Image | None = None
     for name, image in pictures:
         own = (image.shape[1], image.shape[0])
         size = size or own
@@ -98,40 +107,103 @@ def calibrate_camera(pictures: Iterable[tuple[str, Image]], board: Chessboard) -
                 where=name,
                 next_step="use pictures of one camera in one size",
             )
-        corners = find_board(image, board)
-        if corners is None:
-            unused.append(name)
+        seen = board.find(image)
+        if seen is None:
+            left_out[name] = "does not show the board"
+            example = image if example is None else example
         else:
-            views[name] = corners
+            views[name] = seen
     if size is None or len(views) < LEAST_VIEWS:
-        raise BadInput(
-            f"the whole board is to be seen in {len(views)} of {len(views) + len(unused)} pictures;"
-            f" {LEAST_VIEWS} are the least",
-            why=f"a board of {board.columns} x {board.rows} inner corners was looked for",
-            next_step="check the board's numbers, or take more pictures of it, tilted up to 40°",
-        )
-    return calibrate_from_corners(views, board, size, tuple(unused))
+        raise _too_few(views, left_out, board, example)
+    return calibrate_from_views(views, size, left_out)
 
 
-def calibrate_from_corners(
-    views: dict[str, Array], board: Chessboard, size: tuple[int, int], unused: tuple[str, ...] = ()
+def calibrate_from_views(
+    views: Mapping[str, Seen], size: tuple[int, int], unused: Mapping[str, str] | None = None
 ) -> CameraCalibration:
-    """Fits the camera to the board's corners in each picture, shape (n, 2), [px], by name."""
-    points = board.points().astype(np.float32)
-    seen = [corners.astype(np.float32).reshape(-1, 1, 2) for corners in views.values()]
-    nothing = np.zeros(0)
-    _, matrix, distortion, _, _, deviations, _, errors = cv2.calibrateCameraExtended(
-        [points] * len(seen), seen, size, np.eye(3), nothing
-    )
+    """Fits the camera to the board's corners in each picture.
+
+    A picture whose corners are far off, as of a board that moved or was mistaken, is left out.
+
+    Raises:
+        BadInput: Too few pictures are left, or they determine nothing.
+    """
+    left_out, used = dict(unused or {}), dict(views)
+    fit = _fit(used, size)
+    limit = max(_FAR_OFF * float(np.median(list(fit.errors.values()))), _OFF)
+    bad = {name: error for name, error in fit.errors.items() if error > limit}
+    if bad and len(used) - len(bad) >= LEAST_VIEWS:
+        for name, error in bad.items():
+            left_out[name] = f"has corners that are {error:.2f} px off, far more than the others"
+            del used[name]
+        fit = _fit(used, size)
     digest = hashlib.sha256()
-    for name, corners in views.items():
-        digest.update(name.encode() + np.ascontiguousarray(np.round(corners, 6)).tobytes())
+    for name, seen in used.items():
+        digest.update(name.encode() + np.ascontiguousarray(np.round(seen.corners, 6)).tobytes())
     return CameraCalibration(
         size=size,
-        matrix=read_only(matrix),
-        distortion=read_only(np.ravel(distortion)[:5]),
-        deviations=dict(zip(_NAMES, np.ravel(deviations).tolist(), strict=False)),
-        view_errors=dict(zip(views, np.ravel(errors).tolist(), strict=True)),
-        unused=unused,
+        matrix=read_only(fit.matrix),
+        distortion=read_only(fit.distortion),
+        uncertainty=uncertainty_of(
+            list(used.values()),
+            list(fit.turns.values()),
+            list(fit.places.values()),
+            fit.matrix,
+            fit.distortion,
+        ),
+        views=used,
+        boards={
+            name: Pose(fit.places[name], matrix_from_rotation_vector(fit.turns[name]))
+            for name in used
+        },
+        view_errors=fit.errors,
+        unused=left_out,
         data_hash=digest.hexdigest(),
+    )
+
+
+def _fit(views: Mapping[str, Seen], size: tuple[int, int]) -> _Fit:
+    points = [seen.points.astype(np.float32).reshape(-1, 1, 3) for seen in views.values()]
+    corners = [seen.corners.astype(np.float32).reshape(-1, 1, 2) for seen in views.values()]
+    try:
+        _, matrix, distortion, turns, places, _, _, errors = cv2.calibrateCameraExtended(
+            points, corners, size, np.eye(3), np.zeros(0)
+        )
+    except cv2.error:
+        raise _undetermined() from None
+    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all() and matrix[0, 0] > 0.0):
+        raise _undetermined()
+    return _Fit(
+        matrix=np.asarray(matrix, dtype=np.float64),
+        distortion=np.ravel(distortion)[:5].astype(np.float64),
+        turns={name: np.ravel(turn) for name, turn in zip(views, turns, strict=True)},
+        places={name: np.ravel(place) for name, place in zip(views, places, strict=True)},
+        errors=dict(zip(views, np.ravel(errors).tolist(), strict=True)),
+    )
+
+
+def _undetermined() -> BadInput:
+    return BadInput(
+        "these pictures do not determine a camera",
+        why="the fit found no finite answer, as when the board stands the same way in all of them",
+        next_step="take more pictures, with the board tilted up to 40° every way",
+    )
+
+
+def _too_few(
+    views: Mapping[str, Seen], unused: Mapping[str, str], board: Board, example: Image | None
+) -> BadInput:
+    count = len(views) + len(unused)
+    why = f"{board} was looked for"
+    if example is not None and mirrored(board, example):
+        why += "; flipped over it is there, so the pictures are mirrored, or the board's print is"
+    told = [f"{name} {reason}" for name, reason in unused.items()]
+    if told:
+        more = f" and {len(told) - 4} more" if len(told) > 5 else ""
+        why += "; " + "; ".join(told[: 4 if more else 5]) + more
+    return BadInput(
+        f"the board is to be seen in {len(views)} of {count} pictures; {LEAST_VIEWS} are the least",
+        why=why,
+        next_step="check the board's kind and numbers, or take more pictures of it, tilted up to"
+        " 40°; 40 are good",
     )

@@ -10,12 +10,19 @@ import yaml
 
 from calibration.camera import CameraCalibration
 from calibration.extrinsics import ExtrinsicCalibration
+from calibration.verdict import Verdict
 from cdpr.documents import write_atomic
 
 
-def camera_result(result: CameraCalibration, name: str, on: date) -> dict[str, object]:
+def camera_result(
+    result: CameraCalibration, verdict: Verdict, name: str, on: date
+) -> dict[str, object]:
     """The result in the keys of the rig file's ``cameras`` section, with its quality."""
-    matrix = result.matrix
+    values, widths = result.values, result.uncertainty.half_widths
+    intervals = {
+        key: [value - float(width), value + float(width)]
+        for (key, value), width in zip(values.items(), widths, strict=True)
+    }
     return {
         "schema_version": 1,
         "kind": "camera",
@@ -23,15 +30,21 @@ def camera_result(result: CameraCalibration, name: str, on: date) -> dict[str, o
         "camera": name,
         "width_px": result.size[0],
         "height_px": result.size[1],
-        "fx_px": float(matrix[0, 0]),
-        "fy_px": float(matrix[1, 1]),
-        "cx_px": float(matrix[0, 2]),
-        "cy_px": float(matrix[1, 2]),
+        **{key: values[key] for key in ("fx_px", "fy_px", "cx_px", "cy_px")},
         "distortion": [float(x) for x in result.distortion],
-        "standard_deviations": {k: float(v) for k, v in result.deviations.items()},
         "rms_px": result.error,
+        "intervals": intervals,
+        "verdict": str(verdict),
+        "good_enough": verdict.good,
+        "next_steps": list(verdict.next_steps),
+        "distance_m": verdict.distance,
+        "error_mm": verdict.error * 1e3,
+        "halves_apart_mm": verdict.halves * 1e3,
+        "wanted_mm": verdict.wanted * 1e3,
+        "covered": verdict.covered,
+        "pictures_used": len(result.views),
         "view_errors_px": {k: float(v) for k, v in result.view_errors.items()},
-        "unused_pictures": list(result.unused),
+        "unused_pictures": dict(result.unused),
         "data_sha256": result.data_hash,
     }
 

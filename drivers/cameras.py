@@ -1,9 +1,8 @@
-"""Where pictures come from: a folder of files, a video, a camera."""
+"""Pictures of a video and of a camera."""
 
 from __future__ import annotations
 
 import os
-import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,8 +17,6 @@ from cdpr.rig import Camera
 
 Image = NDArray[np.uint8]
 
-#: Endings of picture files, in lower case.
-PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 #: Pictures a camera may fail to give in a row before it counts as gone.
 LOST_PICTURES = 5
 
@@ -37,68 +34,6 @@ class Frame:
     time: float
     image: Image
     name: str
-
-
-class ImageFolder:
-    """The pictures of a folder in the order of their names, numbers counted as numbers.
-
-    Args:
-        folder: Where they are.
-        camera: The camera that took them.
-        rate: Pictures a second; the camera's when left out.
-        on_unreadable: Told the name of each file that is no picture; the others are still used.
-
-    Raises:
-        BadInput: The folder is missing or has no pictures.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        camera: Camera,
-        rate: float | None = None,
-        on_unreadable: Callable[[str], None] | None = None,
-    ) -> None:
-        if not folder.is_dir():
-            raise BadInput("no such folder", where=str(folder), next_step="check the path")
-        found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS]
-        if not found:
-            raise BadInput(
-                "the folder has no pictures",
-                where=str(folder),
-                next_step=f"name a folder with files that end in {', '.join(PICTURE_ENDINGS)}",
-            )
-        self.files = tuple(sorted(found, key=lambda path: _natural(path.name)))
-        self.unreadable: list[str] = []
-        self._folder, self._camera = folder, camera
-        self._rate = rate or camera.rate
-        self._on_unreadable = on_unreadable
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __iter__(self) -> Iterator[Frame]:
-        """The readable pictures.
-
-        Raises:
-            BadInput: One is not of the camera's size, or none can be read.
-        """
-        self.unreadable.clear()
-        for number, path in enumerate(self.files):
-            image = _read_picture(path)
-            if image is None:
-                self.unreadable.append(path.name)
-                if self._on_unreadable is not None:
-                    self._on_unreadable(path.name)
-                continue
-            refuse_wrong_size(image, self._camera, str(path))
-            yield Frame(number / self._rate, image, path.name)
-        if len(self.unreadable) == len(self.files):
-            raise BadInput(
-                f"none of the {len(self.files)} files is a picture that can be read",
-                where=str(self._folder),
-                next_step="check that the files were copied whole",
-            )
 
 
 class VideoFile:
@@ -263,28 +198,7 @@ def _opened(source: int | str) -> cv2.VideoCapture:
         cv2.utils.logging.setLogLevel(before)
 
 
-def _read_picture(path: Path) -> Image | None:
-    """A grey picture, or None when the file holds none; also for names that OpenCV cannot open."""
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError:
-        return None
-    if not data.size:
-        return None
-    try:
-        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
-        return None
-    return None if picture is None else np.asarray(picture, dtype=np.uint8)
-
-
 def _grey(picture: NDArray[np.generic]) -> Image:
     if picture.ndim == 3:
         return np.asarray(cv2.cvtColor(picture.astype(np.uint8), cv2.COLOR_BGR2GRAY), np.uint8)
     return picture.astype(np.uint8)
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sorts ``frame_10`` behind ``frame_9``."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(1, int(p), "") if p.isdigit() else (0, 0, p) for p in parts]

@@ -127,7 +127,8 @@ def _source(
     """The pictures, and how many there are where that is known."""
     from cdpr.cli.output import err
     from cdpr.errors import BadInput
-    from drivers.cameras import ImageFolder, LiveCamera, VideoFile
+    from drivers.cameras import LiveCamera, VideoFile
+    from drivers.picture_folder import ImageFolder
 
     if source == SYNTHETIC:
         if plan is None or scene is None:

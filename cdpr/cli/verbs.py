@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import typer
 
-from cdpr.cli import bench
+from cdpr.cli import bench, calibrate
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
@@ -50,9 +50,15 @@ def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
         app.command()(_interruptible(verb))
-    group = typer.Typer(help="Measure the planner.", no_args_is_help=True)
-    group.command()(_interruptible(bench.paper))
-    app.add_typer(group, name="bench")
+    _add_group(app, "calibrate", "Calibrate cameras.", calibrate.camera)
+    _add_group(app, "bench", "Measure the planner.", bench.paper)
+
+
+def _add_group(app: typer.Typer, name: str, text: str, *verbs: Callable[..., None]) -> None:
+    group = typer.Typer(help=text, no_args_is_help=True)
+    for verb in verbs:
+        group.command()(_interruptible(verb))
+    app.add_typer(group, name=name)
 
 
 def _interruptible(verb: Callable[..., None]) -> Callable[..., None]:

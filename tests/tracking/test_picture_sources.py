@@ -12,7 +12,8 @@ import pytest
 from cdpr.errors import BadInput, HardwareMissing
 from cdpr.poses import Pose
 from cdpr.rig import Camera, Rig
-from drivers.cameras import Frame, ImageFolder, LiveCamera, VideoFile
+from drivers.cameras import Frame, LiveCamera, VideoFile
+from drivers.picture_folder import ImageFolder
 from simulation.camera import SyntheticCamera
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.pose_log import POSE_COLUMNS, pose_row, write_pose_log

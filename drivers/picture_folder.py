@@ -1,0 +1,180 @@
+"""The picture files of a folder."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cdpr.errors import BadInput
+from cdpr.rig import Camera
+from drivers.cameras import Frame, Image, refuse_wrong_size
+
+#: Endings of picture files, in lower case.
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
+
+
+class ImageFolder:
+    """The pictures of a folder in the order of their names, numbers counted as numbers.
+
+    Args:
+        folder: Where they are.
+        camera: The camera that took them.
+        rate: Pictures a second; the camera's when left out.
+        on_unreadable: Told the name of each file that is no picture; the others are still used.
+
+    Raises:
+        BadInput: The folder is missing or has no pictures.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        camera: Camera,
+        rate: float | None = None,
+        on_unreadable: Callable[[str], None] | None = None,
+    ) -> None:
+        self.files = picture_files(folder)
+        self.unreadable: list[str] = []
+        self._folder, self._camera = folder, camera
+        self._rate = rate or camera.rate
+        self._on_unreadable = on_unreadable
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The readable pictures.
+
+        Raises:
+            BadInput: One is not of the camera's size, or none can be read.
+        """
+        self.unreadable.clear()
+        for number, path in enumerate(self.files):
+            image = read_picture(path)
+            if image is None:
+                self.unreadable.append(path.name)
+                if self._on_unreadable is not None:
+                    self._on_unreadable(path.name)
+                continue
+            refuse_wrong_size(image, self._camera, str(path))
+            yield Frame(number / self._rate, image, path.name)
+        if len(self.unreadable) == len(self.files):
+            raise _no_picture(self._folder, len(self.files))
+
+
+class OneCamerasPictures:
+    """The pictures of a folder that are of one size, upright as their files say (EXIF).
+
+    A camera that was turned by hand stores how; where the pictures are of one size only as the
+    sensor gave them, they are taken so. Files that cannot be used are named, the others are used.
+
+    Args:
+        folder: Where they are.
+
+    Attributes:
+        size: Width and height, [px].
+        names: Of the pictures used, in order.
+        unused: Why each of the other files is not used, by name.
+        upright: Whether pictures are turned as their files say.
+
+    Raises:
+        BadInput: The folder is missing, has no pictures, or none that can be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        files = picture_files(folder)
+        self.unused: dict[str, str] = {}
+        sizes: dict[Path, tuple[int, int]] = {}
+        for path in files:
+            image = read_picture(path)
+            if image is None:
+                self.unused[path.name] = "is no picture that can be read"
+            else:
+                sizes[path] = _size(image)
+        if not sizes:
+            raise _no_picture(folder, len(files))
+        self.upright = True
+        if len(set(sizes.values())) > 1:
+            as_stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
+            if len(set(as_stored.values())) == 1:
+                sizes, self.upright = as_stored, False
+        counted = Counter(sizes.values())
+        self.size = max(counted, key=lambda size: (counted[size], size))
+        for path, size in sizes.items():
+            if size != self.size:
+                self.unused[path.name] = (
+                    f"has {size[0]} x {size[1]} px, most have {self.size[0]} x {self.size[1]} px"
+                )
+        self._files = [path for path in sizes if path.name not in self.unused]
+        self.names = tuple(path.name for path in self._files)
+
+    def __iter__(self) -> Iterator[tuple[str, Image]]:
+        """Name and grey picture."""
+        for path in self._files:
+            image = read_picture(path, self.upright)
+            if image is not None and _size(image) == self.size:
+                yield path.name, image
+
+
+def picture_files(folder: Path) -> tuple[Path, ...]:
+    """The files of a folder that end like pictures, in order of their names.
+
+    Numbers in names are counted as numbers.
+
+    Raises:
+        BadInput: The folder is missing or has none.
+    """
+    if not folder.is_dir():
+        raise BadInput("no such folder", where=str(folder), next_step="check the path")
+    found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS]
+    if not found:
+        raise BadInput(
+            "the folder has no pictures",
+            where=str(folder),
+            next_step=f"name a folder with files that end in {', '.join(PICTURE_ENDINGS)}",
+        )
+    return tuple(sorted(found, key=lambda path: _natural(path.name)))
+
+
+def read_picture(path: Path, upright: bool = True) -> Image | None:
+    """A grey picture, or None when the file holds none; also for names that OpenCV cannot open.
+
+    Args:
+        path: The file.
+        upright: Whether it is turned as the file says (EXIF).
+    """
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError:
+        return None
+    if not data.size:
+        return None
+    flags = cv2.IMREAD_GRAYSCALE | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        picture = cv2.imdecode(data, flags)
+    except cv2.error:
+        return None
+    return None if picture is None else np.asarray(picture, dtype=np.uint8)
+
+
+def _size(image: Image | None) -> tuple[int, int]:
+    return (0, 0) if image is None else (image.shape[1], image.shape[0])
+
+
+def _no_picture(folder: Path, count: int) -> BadInput:
+    return BadInput(
+        f"none of the {count} files is a picture that can be read",
+        where=str(folder),
+        next_step="check that the files were copied whole",
+    )
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorts ``frame_10`` behind ``frame_9``."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(1, int(p), "") if p.isdigit() else (0, 0, p) for p in parts]

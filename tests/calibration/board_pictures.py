@@ -1,0 +1,60 @@
+"""Pictures of boards from a camera that is known exactly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+
+SIZE = (640, 480)
+MATRIX = np.array([[600.0, 0.0, 322.0], [0.0, 603.0, 238.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([-0.12, 0.05, 0.0008, -0.0006, 0.0])
+_SUB = 3
+
+
+def poses_before_the_camera(
+    middle: Array, count: int, seed: int = 4, spread: float = 0.06
+) -> list[Pose]:
+    """Tilted board poses whose middle, board frame, shape (3,), [m], is near the picture's."""
+    rng = np.random.default_rng(seed)
+    poses = []
+    for _ in range(count):
+        turn = matrix_from_rotation_vector(rng.uniform(-0.6, 0.6, 3))
+        place = np.array([*rng.uniform(-spread, spread, 2), rng.uniform(0.4, 0.6)])
+        poses.append(Pose(place - turn @ middle, turn))
+    return poses
+
+
+def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> np.ndarray:
+    """What the camera sees of a print on a board, on a grey wall.
+
+    Args:
+        print_: Grey picture of the print.
+        pixel: Side of its pixels, [m].
+        origin: Where the board's origin is on it, shape (2,), [m] from its top left corner.
+        pose: Of the board's frame, whose x and y run along the print's, in the camera's.
+    """
+    columns = (np.arange(SIZE[0] * _SUB) + 0.5) / _SUB - 0.5
+    rows = (np.arange(SIZE[1] * _SUB) + 0.5) / _SUB - 0.5
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
+    flat = cv2.undistortPoints(pixels, MATRIX, DISTORTION).reshape(-1, 2)
+    rays = np.column_stack([flat, np.ones(len(flat))]) @ pose.rotation
+    eye = -pose.rotation.T @ pose.position
+    places = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
+    found = ((places + origin) / pixel - 0.5).astype(np.float32)
+    shape = (SIZE[1] * _SUB, SIZE[0] * _SUB)
+    fine = cv2.remap(
+        print_.astype(np.float32),
+        found[:, 0].reshape(shape),
+        found[:, 1].reshape(shape),
+        cv2.INTER_LINEAR,
+        borderValue=150.0,
+    )
+    return np.round(cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)).astype(np.uint8)
+
+
+def with_noise(image: np.ndarray, seed: int) -> np.ndarray:
+    """A picture with the noise of a sensor."""
+    noise = np.random.default_rng(seed).normal(scale=1.5, size=image.shape)
+    return np.clip(image + noise, 0.0, 255.0).round().astype(np.uint8)

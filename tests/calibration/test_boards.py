@@ -1,0 +1,116 @@
+"""Boards in rendered pictures: every point where it is, and no point that is not there."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.boards import Charuco, Chessboard, TagGrid, mirrored
+from calibration.camera import calibrate_camera
+from cdpr.errors import BadInput
+from tests.calibration.board_pictures import (
+    DISTORTION,
+    MATRIX,
+    SIZE,
+    picture_of,
+    poses_before_the_camera,
+    with_noise,
+)
+
+CHARUCO = Charuco(7, 5, 0.040, 0.030, "4X4_50")
+TAGS = TagGrid(5, 4, 0.040, 0.012, "tag36h11", first=20)
+PIXEL = 0.0005
+
+
+def charuco_print() -> np.ndarray:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard((7, 5), 0.040, 0.030, dictionary)
+    return board.generateImage((560, 400), marginSize=0)
+
+
+def tag_print() -> np.ndarray:
+    """White, with the official pictures of the tags, which are OpenCV's turned by 180°."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11)
+    sheet = np.full((4 * 104 + 40, 5 * 104 + 40), 255, np.uint8)
+    for number in range(20):
+        row, column = divmod(number, 5)
+        tag = cv2.aruco.generateImageMarker(dictionary, 20 + number, 80)[::-1, ::-1]
+        top, left = 24 + row * 104, 24 + column * 104
+        sheet[top : top + 80, left : left + 80] = tag
+    return sheet
+
+
+def pictures(board: Charuco | TagGrid, count: int) -> list[tuple[np.ndarray, object]]:
+    if isinstance(board, Charuco):
+        sheet, origin, middle = charuco_print(), np.zeros(2), np.array([0.14, 0.1, 0.0])
+    else:
+        sheet, origin, middle = tag_print(), np.full(2, 0.012), np.array([0.12, 0.1, 0.0])
+    return [
+        (with_noise(picture_of(sheet, PIXEL, origin, pose), k), pose)
+        for k, pose in enumerate(poses_before_the_camera(middle, count))
+    ]
+
+
+@pytest.mark.parametrize(("board", "limit"), [(CHARUCO, 0.12), (TAGS, 0.06)])
+def test_points_are_found_where_they_are(board: Charuco | TagGrid, limit: float) -> None:
+    errors, points = [], 0
+    for image, pose in pictures(board, 8):
+        seen = board.find(image)
+        if seen is None:
+            continue
+        turned = cv2.Rodrigues(pose.rotation)[0]
+        truth = cv2.projectPoints(seen.points, turned, pose.position, MATRIX, DISTORTION)[0]
+        errors.append(seen.corners - truth.reshape(-1, 2))
+        points += len(seen.points)
+    assert points > 120
+    off = np.concatenate(errors)
+    assert np.sqrt(np.mean(off**2)) < limit
+    assert np.abs(off.mean(axis=0)).max() < 0.03  # no bias
+
+
+@pytest.mark.parametrize("board", [CHARUCO, TAGS])
+def test_the_camera_comes_back_from_parts_of_a_board(board: Charuco | TagGrid) -> None:
+    named = [(f"{k}.png", image) for k, (image, _) in enumerate(pictures(board, 14))]
+    found = calibrate_camera(named, board)
+    off = np.abs(found.matrix - MATRIX)[[0, 1, 0, 1], [0, 1, 2, 2]]
+    assert (off < 4.0).all()
+    assert found.error < 0.2
+    assert found.size == SIZE
+
+
+@pytest.mark.parametrize("board", [CHARUCO, TAGS])
+def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid) -> None:
+    image = pictures(board, 1)[0][0]
+    other = TAGS if board is CHARUCO else CHARUCO
+    assert other.find(image) is None
+    flipped = np.ascontiguousarray(image[:, ::-1])
+    assert board.find(flipped) is None
+    assert mirrored(board, flipped)
+    with pytest.raises(BadInput) as caught:
+        calibrate_camera([("a", flipped), ("b", flipped)], board)
+    assert "mirrored" in caught.value.why
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: Chessboard(2, 6, 0.02), "3 inner corners"),
+        (lambda: Chessboard(9, 6, 0.0), "side of a square"),
+        (lambda: Charuco(7, 5, 0.03, 0.03, "4X4_50"), "smaller than its square"),
+        (lambda: Charuco(7, 5, 0.03, 0.02, "9X9_50"), "unknown dictionary"),
+        (lambda: Charuco(20, 20, 0.03, 0.02, "4X4_50"), "50 markers, the board needs 200"),
+        (lambda: TagGrid(3, 1, 0.03, 0.01, "tag36h11"), "needs 4 tags"),
+        (lambda: TagGrid(3, 2, 0.03, 0.0, "tag36h11"), "gap"),
+        (lambda: TagGrid(3, 2, 0.03, 0.01, "tag99h1"), "unknown tag family"),
+    ],
+)
+def test_boards_that_cannot_be_are_refused(make, named: str) -> None:
+    with pytest.raises(BadInput, match=named):
+        make()
+
+
+def test_pictures_too_small_or_empty_show_no_board() -> None:
+    for board in (Chessboard(9, 6, 0.025), CHARUCO, TAGS):
+        assert board.find(np.zeros((8, 8), np.uint8)) is None
+        assert board.find(np.full((480, 640), 128, np.uint8)) is None

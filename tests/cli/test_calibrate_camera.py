@@ -1,0 +1,133 @@
+"""`cdpr calibrate camera` on folders as people have them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from tests.calibration.board_pictures import MATRIX, picture_of, poses_before_the_camera, with_noise
+from tests.cli.program import call
+
+BOARD = ("--board", "chessboard", "--columns", "9", "--rows", "6", "--square-mm", "25")
+MIDDLE = np.array([0.1, 0.0625, 0.0])
+
+
+def chessboard_print() -> np.ndarray:
+    squares = np.add.outer(np.arange(9), np.arange(12)) % 2
+    inner = np.where(squares == 0, 30, 220).astype(np.uint8)
+    inner[0], inner[-1], inner[:, 0], inner[:, -1] = 220, 220, 220, 220
+    return np.kron(inner, np.ones((50, 50), np.uint8))
+
+
+def pictures(count: int, spread: float) -> list[np.ndarray]:
+    origin = np.full(2, 0.050)
+    return [
+        with_noise(picture_of(chessboard_print(), 0.0005, origin, pose), k)
+        for k, pose in enumerate(poses_before_the_camera(MIDDLE, count, spread=spread))
+    ]
+
+
+def save(path: Path, image: np.ndarray) -> None:
+    good, data = cv2.imencode(path.suffix, image)
+    assert good
+    path.write_bytes(data.tobytes())
+
+
+def turned_by_exif(image: np.ndarray) -> bytes:
+    """A JPEG whose pixels are turned by 90°, and which says so (orientation 6)."""
+    turned = np.ascontiguousarray(np.rot90(image))  # stored anticlockwise, shown turned back
+    data = cv2.imencode(".jpg", turned, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    entry = struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0)
+    tiff = b"MM\x00\x2a" + struct.pack(">IH", 8, 1) + entry + struct.pack(">I", 0)
+    body = b"Exif\x00\x00" + tiff
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fourteen good pictures in several formats, and files that are of no use."""
+    folder = tmp_path_factory.mktemp("my pictures")
+    for k, image in enumerate(pictures(14, 0.09)):
+        if k == 0:
+            (folder / "turned.jpg").write_bytes(turned_by_exif(image))
+        elif k == 1:
+            save(folder / "colour.png", cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+        else:
+            save(folder / f"view_{k}.png", image)
+    save(folder / "wall.png", np.full((480, 640), 128, np.uint8))
+    save(folder / "small.png", np.full((240, 320), 128, np.uint8))
+    (folder / "broken.jpg").write_bytes(b"not a picture")
+    (folder / "notes.txt").write_text("taken on Monday")
+    return folder
+
+
+def test_a_folder_is_calibrated_and_what_is_of_no_use_is_named(folder, tmp_path) -> None:
+    answer = call("calibrate", "camera", folder, *BOARD, "--json", "-o", tmp_path / "out")
+    found = json.loads(answer.out)
+    assert found["pictures_used"] == 14
+    assert found["fx_px"] == pytest.approx(MATRIX[0, 0], abs=3.0)
+    assert found["fy_px"] == pytest.approx(MATRIX[1, 1], abs=3.0)
+    assert found["cx_px"] == pytest.approx(MATRIX[0, 2], abs=3.0)
+    assert found["cy_px"] == pytest.approx(MATRIX[1, 2], abs=3.0)
+    assert len(found["distortion"]) == 5
+    assert found["rms_px"] < 0.2
+    low, high = found["intervals"]["fx_px"]
+    assert low < found["fx_px"] < high
+    assert set(found["unused_pictures"]) == {"wall.png", "small.png", "broken.jpg"}
+    assert found["verdict"].startswith("good enough for" if answer.code == 0 else "not good enough")
+    (saved,) = (tmp_path / "out").glob("calibration_camera_camera_*.yaml")
+    assert yaml.safe_load(saved.read_text()) == found
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "broken.jpg" in page
+    assert "<script" not in page
+
+
+def test_people_read_the_verdict_first(folder) -> None:
+    answer = call("calibrate", "camera", folder, *BOARD, "--wanted-mm", "5")
+    assert answer.code == 0, answer
+    assert answer.out.splitlines()[1].split()[:3] == ["verdict", "good", "enough"]
+    assert "small.png has 320 x 240 px, most have 640 x 480 px" in answer.out
+
+
+def test_a_poor_set_with_small_errors_is_not_good_enough(tmp_path) -> None:
+    for k, image in enumerate(pictures(1, 0.0) * 8):
+        save(tmp_path / f"{k}.png", with_noise(image, k))
+    answer = call("calibrate", "camera", tmp_path, *BOARD, "--json")
+    if answer.code == 2:
+        assert "do not determine" in answer.err
+        return
+    assert answer.code == 3
+    found = json.loads(answer.out)
+    assert found["rms_px"] < 0.3
+    assert found["verdict"].startswith("not good enough")
+    assert "tilt the board up to 40° every way" in found["next_steps"]
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--columns", "9", "--rows", "6"), "needs --square-mm"),
+        ((*BOARD, "--tag-mm", "30"), "knows no --tag-mm"),
+        (("--columns", "8", "--rows", "5", "--square-mm", "25"), "is to be seen in 0 of"),
+        (("--columns", "2", "--rows", "5", "--square-mm", "25"), "3 inner corners"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(folder, options, named: str) -> None:
+    answer = call("calibrate", "camera", folder, *options)
+    assert answer.code == 2
+    assert named in answer.err
+    assert "Traceback" not in answer.err
+
+
+def test_three_pictures_are_too_few(tmp_path) -> None:
+    for k, image in enumerate(pictures(3, 0.05)):
+        save(tmp_path / f"{k}.png", image)
+    answer = call("calibrate", "camera", tmp_path, *BOARD)
+    assert answer.code == 2
+    assert "seen in 3 of 3 pictures; 4 are the least" in answer.err
