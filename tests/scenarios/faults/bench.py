@@ -59,9 +59,11 @@ class Bench(ABC):
         since: When the fault happened, on the drives' clock; None before.
         fault_cycle: SYNCs from the beginning until the fault.
         lost: Drives that were broken on purpose, from 0.
+        blur: What times are exact to, [s].
         missed_start: See `samples.violations`.
     """
 
+    blur = 1e-6
     prepared: PreparedRun
     rehearsal: WatchedRehearsal
     line: FaultBus
@@ -192,6 +194,8 @@ def simulated(
 
 class LiveBench(Bench):
     """The executor in a process of its own, the drives in a thread of this one; real time."""
+
+    blur = 0.005  # the fault happens anywhere between two looks of a drive at its time-outs
 
     def __init__(
         self,

@@ -368,9 +368,9 @@ def complaints(
     if fault.within is None or len(bench.lost) == len(bench.drives):
         return found
     stop = bench.stop()
-    if stop.time > fault.within * cycle + 1e-6:
+    if stop.time > fault.within * cycle + bench.blur:
         found.append(f"the last drive stopped after {1e3 * stop.time:.1f} ms")
-    if stop.spread > fault.spread * cycle + 1e-6:
+    if stop.spread > fault.spread * cycle + bench.blur:
         found.append(f"the drives stopped within {1e3 * stop.spread:.1f} ms of each other")
     return found
 
