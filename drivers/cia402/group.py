@@ -9,13 +9,16 @@ import numpy as np
 
 from cdpr.errors import HardwareMissing, Refused
 from cdpr.rig import Rig
+from drivers.bus import hears_itself
 from drivers.bus_faults import BusFault
 from drivers.bus_load import TESTED_HZ, check_bus_load, heartbeat_cycles
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.cyclic import CyclicBus
+from drivers.cia402.cyclic import CyclicFrames
+from drivers.cia402.master_ids import commanding_ids, foreign_text
 from drivers.cia402.sequence import Goal, next_words
 from drivers.cia402.states import FAULTED, TORQUE_ON, ControlWord, DriveState
 from drivers.cia402.watch import DriveWatch
+from drivers.cyclic_bus import CyclicBus
 from drivers.drive_group import (
     WHOLE_BUS,
     Capabilities,
@@ -25,6 +28,7 @@ from drivers.drive_group import (
     GroupState,
     Pump,
 )
+from drivers.own_frames import OwnFrames
 from drivers.torque import winding_signs
 
 STEP_TIMEOUT = 1.0
@@ -64,7 +68,9 @@ class Cia402Group:
 
     def _reset_memory(self) -> None:
         count = len(self._nodes)
-        self._cyclic = CyclicBus(self._bus, self._nodes)
+        own = OwnFrames(commanding_ids(self._nodes), hears_itself=hears_itself(self._bus))
+        self._cyclic = CyclicBus(self._bus, own, foreign_text)
+        self._frames = CyclicFrames(self._nodes)
         self._watch = DriveWatch(self._nodes, self._max_steps)
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
@@ -162,7 +168,7 @@ class Cia402Group:
         self._known = True
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
-            self._cyclic.send_heartbeat()
+            self._cyclic.send((self._frames.heartbeat,))
 
     def receive(self, timeout_s: float) -> CycleStatus:
         """Takes the replies of this cycle; see `DriveGroup.receive`."""
@@ -215,7 +221,7 @@ class Cia402Group:
         self._words = words
         self._note_released()
         self._watch.begin_cycle()
-        self._cyclic.send_cycle(words, self._targets)
+        self._cyclic.send(self._frames.of_cycle(words, self._targets))
 
     def _note_released(self) -> None:
         for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):

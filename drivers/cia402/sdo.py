@@ -25,10 +25,11 @@ from drivers.cia402.frames import (
     NmtCommand,
     make_nmt,
 )
-from drivers.cia402.own_frames import OwnFrames, foreign_text, set_up_ids
+from drivers.cia402.master_ids import foreign_text, set_up_ids
 from drivers.cia402.texts import abort_text
 from drivers.drive_group import Pump
 from drivers.error_frames import error_frame_fault
+from drivers.own_frames import OwnFrames
 
 RESPONSE_TIMEOUT = 0.5
 """For the answer to one request, [s]."""

@@ -12,10 +12,11 @@ from drivers.cia402.frames import (
     Reply,
     parse_emergency,
     parse_heartbeat,
+    parse_reply,
 )
-from drivers.cia402.reply_check import ReplyCheck
 from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.cia402.texts import emergency_text
+from drivers.reply_check import ReplyCheck
 
 
 class DriveWatch:
@@ -80,8 +81,10 @@ class DriveWatch:
         self._check.hear(drive)
         if stale or self.answered[drive]:
             return
-        reply = self._check.believed(drive, data)
-        if reply is not None:
+        reply = parse_reply(data)
+        if reply is None:
+            self._check.reject(drive, f"its reply has {len(data)} bytes instead of 8")
+        elif self._check.believed(drive, reply.position):
             self._note(drive, reply)
 
     def _note(self, drive: int, reply: Reply) -> None:

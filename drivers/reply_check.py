@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.cia402.frames import Reply, parse_reply
-
 BAD_CYCLES = 2
 """Cycles in a row that are one too many: one bad frame may happen, two are a defect."""
 
@@ -46,25 +44,22 @@ class ReplyCheck:
         """Notes that a drive answered, in time or late."""
         self._heard[drive] += 1
 
-    def believed(self, drive: int, data: bytes | bytearray) -> Reply | None:
-        """The reply in a frame, or None when it cannot be true."""
-        reply = parse_reply(data)
-        if reply is None:
-            self._reject(drive, f"its reply has {len(data)} bytes instead of 8")
-            return None
+    def believed(self, drive: int, position: int) -> bool:
+        """Whether a position [counts] can be true; it then counts as the drive's."""
         last = self._positions[drive]
         if last is not None:
-            step, allowed = abs(reply.position - last), self._max_steps[drive] * self._age[drive]
+            step, allowed = abs(position - last), self._max_steps[drive] * self._age[drive]
             if step > allowed:
                 text = f"its position jumped by {step} counts, at most {allowed:.0f} are possible"
-                self._reject(drive, text)
-                return None
+                self.reject(drive, text)
+                return False
         self._reasons[drive] = ""
-        self._positions[drive] = reply.position
+        self._positions[drive] = position
         self._age[drive] = 0
-        return reply
+        return True
 
-    def _reject(self, drive: int, reason: str) -> None:
+    def reject(self, drive: int, reason: str) -> None:
+        """A reply was thrown away."""
         self.rejected += 1
         self._reasons[drive] = reason
 
