@@ -29,6 +29,9 @@ SENTENCES = {
     "list_type": "must be a list",
     "model_type": "must hold keys and values",
     "dict_type": "must hold keys and values",
+    "model_attributes_type": "must hold keys and values",
+    "union_tag_invalid": "its {discriminator} {tag!r} is none of {expected_tags}",
+    "union_tag_not_found": "must tell its {discriminator}",
     "literal_error": "must be {expected}",
     "recursion_loop": "refers to itself",
 }

@@ -21,7 +21,7 @@ from cdpr.rig_file import (
 )
 
 #: Parts of a rig file that a plan's proof does not rest on; they may change under a plan.
-NOT_IN_PLAN_HASH = ("description", "bus", "tags", "cameras", "motion", "winches")
+NOT_IN_PLAN_HASH = ("description", "bus", "drives", "tags", "cameras", "motion", "winches")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,13 +29,16 @@ class Winch:
     """A winch: how cable length becomes drive counts.
 
     Attributes:
-        node_id: CANopen node of its drive.
+        node_id: Node of its drive on the bus.
         counts_per_metre: Signed counts for one metre of cable paid out.
         home_counts: Drive position with the platform at home.
         absolute: The drive knows its position after its power was gone.
         drum_to_outlet: Cable between drum and outlet, [m].
         max_speed: Cable speed limit, [m/s].
         torque_constant: Cable tension at rated torque, [N].
+        counts_per_turn: Counts of one turn of the motor shaft.
+        rated_torque: Of the motor at `torque_constant`, [N·m].
+        brake: It has one that closes by itself when its drive has no torque.
     """
 
     node_id: int
@@ -45,6 +48,9 @@ class Winch:
     drum_to_outlet: float
     max_speed: float
     torque_constant: float
+    counts_per_turn: int
+    rated_torque: float
+    brake: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,6 +219,7 @@ def _array(points_mm: list[list[float]]) -> Array:
 
 def _winch(document: WinchDocument) -> Winch:
     counts_per_rev = document.counts_per_rev * document.gear_ratio * document.direction
+    drum_radius = document.drum_mm_per_rev / 1000.0 / (2.0 * np.pi)
     return Winch(
         node_id=document.node_id,
         counts_per_metre=counts_per_rev / (document.drum_mm_per_rev / 1000.0),
@@ -221,6 +228,9 @@ def _winch(document: WinchDocument) -> Winch:
         drum_to_outlet=document.drum_to_outlet_mm / 1000.0,
         max_speed=document.max_speed_mm_s / 1000.0,
         torque_constant=document.torque_constant_n,
+        counts_per_turn=document.counts_per_rev,
+        rated_torque=document.torque_constant_n * drum_radius / document.gear_ratio,
+        brake=document.brake,
     )
 
 

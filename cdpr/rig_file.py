@@ -18,6 +18,7 @@ from cdpr.document_types import (
     UnitVector,
     Vector,
 )
+from cdpr.drives_file import ODRIVE_LAST_NODE, Cia402Document, DrivesDocument
 
 
 class PlatformDocument(Document):
@@ -89,6 +90,9 @@ class WinchDocument(Document):
     )
     max_speed_mm_s: Positive
     torque_constant_n: Positive = Field(description="cable tension at rated torque")
+    brake: bool = Field(
+        default=False, description="a brake that closes by itself when the drive has no torque"
+    )
 
 
 class MotionDocument(Document):
@@ -115,7 +119,6 @@ class BusDocument(Document):
     channel: str
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
     cycle_ms: Annotated[float, Field(ge=1, le=100)] = 10.0
-    protocol: Literal["cia402"] = "cia402"
 
 
 class TagDocument(PoseDocument):
@@ -172,6 +175,7 @@ class RigDocument(Document):
     winches: Annotated[list[WinchDocument], Field(min_length=1)]
     motion: MotionDocument = MotionDocument()
     bus: BusDocument
+    drives: DrivesDocument = Cia402Document(type="cia402")
     tags: TagsDocument | None = None
     cameras: list[CameraDocument] = []
 
@@ -183,6 +187,7 @@ class RigDocument(Document):
             self._a_winch_each,
             self._a_pulley_each,
             self._nodes_once,
+            self._nodes_of_odrives,
             self._tags_once,
             self._cameras_once,
             self._home_inside,
@@ -211,6 +216,16 @@ class RigDocument(Document):
     def _nodes_once(self) -> list[Finding]:
         nodes = [(("winches", i, "node_id"), w.node_id) for i, w in enumerate(self.winches)]
         return _repeated("node_id", nodes)
+
+    def _nodes_of_odrives(self) -> list[Finding]:
+        if self.drives.type != "odrive":
+            return []
+        what = f"an ODrive has a node id from 0 to {ODRIVE_LAST_NODE}"
+        return [
+            (("winches", i, "node_id"), what)
+            for i, winch in enumerate(self.winches)
+            if winch.node_id > ODRIVE_LAST_NODE
+        ]
 
     def _tags_once(self) -> list[Finding]:
         if self.tags is None:

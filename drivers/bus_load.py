@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from cdpr.drives_file import OdriveDocument
 from cdpr.errors import Refused
 from cdpr.rig import Rig
 
@@ -54,7 +55,7 @@ def heartbeat_timeout(cycle: float) -> float:
 
 
 def bus_load(drives: int, cycle: float, bitrate: int) -> float:
-    """Share of the bus that cyclic frames and heartbeats need, worst stuffing.
+    """Share of the bus that CiA 402 drives need with their heartbeats, worst stuffing.
 
     Args:
         drives: Number of drives m.
@@ -65,6 +66,20 @@ def bus_load(drives: int, cycle: float, bitrate: int) -> float:
     return (cycle_bits(drives) + heartbeats) / (cycle * bitrate)
 
 
+def odrive_bus_load(drives: int, cycle: float, bitrate: int, told: OdriveDocument) -> float:
+    """The same of ODrives, which send estimates, torques and heartbeats when it is their time."""
+    periods = (cycle, *(ms / 1e3 for ms in (told.estimates_ms, told.torques_ms, told.heartbeat_ms)))
+    return drives * frame_bits(_PDO_BYTES) * sum(1.0 / period for period in periods) / bitrate
+
+
+def _load(rig: Rig, cycle: float) -> float:
+    """Of a rig's own drives and bit rate, at a cycle [s]."""
+    drives, bitrate = rig.document.drives, rig.document.bus.bitrate
+    if isinstance(drives, OdriveDocument):
+        return odrive_bus_load(rig.cable_count, cycle, bitrate, drives)
+    return bus_load(rig.cable_count, cycle, bitrate)
+
+
 def check_bus_load(rig: Rig) -> float:
     """The load of a rig's bus.
 
@@ -72,23 +87,24 @@ def check_bus_load(rig: Rig) -> float:
         Refused: It is above 70 %.
     """
     bus = rig.document.bus
-    cycle = bus.cycle_ms / 1000.0
-    load = bus_load(rig.cable_count, cycle, bus.bitrate)
+    load = _load(rig, bus.cycle_ms / 1000.0)
     if load > MAX_LOAD:
         raise Refused(
             f"{rig.cable_count} drives every {bus.cycle_ms:g} ms need {load:.0%} of a bus of"
             f" {bus.bitrate} bit/s; the limit is {MAX_LOAD:.0%}",
             where=f"rig {rig.name}: bus",
-            why=f"a cycle is {cycle_bits(rig.cable_count)} bits at worst; a stop must get through",
-            next_step=_advice(rig.cable_count, bus.bitrate),
+            why=f"a cycle is {load * bus.bitrate * bus.cycle_ms / 1e3:.0f} bits at worst;"
+            " a stop must get through",
+            next_step=_advice(rig),
             values={"load": load, "limit": MAX_LOAD, "cycle_ms": bus.cycle_ms},
         )
     return load
 
 
-def _advice(drives: int, bitrate: int) -> str:
+def _advice(rig: Rig) -> str:
     """The shortest cycle with room for everything, but none that arming would refuse."""
+    seldom = ", or longer drives.*_ms" if rig.document.drives.type == "odrive" else ""
     for tenths in range(FASTEST_TENTHS_MS, SLOWEST_TENTHS_MS + 1):
-        if bus_load(drives, tenths / 10_000.0, bitrate) <= MAX_LOAD:
-            return f"set bus.cycle_ms to {tenths / 10.0:g} or more, or raise the bitrate"
-    return "raise the bitrate; no cycle that a rig may have is long enough for this one"
+        if _load(rig, tenths / 10_000.0) <= MAX_LOAD:
+            return f"set bus.cycle_ms to {tenths / 10.0:g} or more{seldom}, or raise the bitrate"
+    return f"raise the bitrate{seldom}; no cycle that a rig may have is long enough for this one"

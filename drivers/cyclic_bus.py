@@ -73,6 +73,16 @@ class CyclicBus:
         if failure is not None:
             raise failure
 
+    def forget_waiting(self) -> None:
+        """Throws away what came while nobody listened; that it overflowed then is no fault.
+
+        Raises:
+            BusFault: The bus failed.
+        """
+        while take(self._bus, 0.0) is not None:
+            pass
+        self._lost = lost_frames(self._bus)
+
     def discard_stale(self, listener: Listener) -> None:
         """Replies that came too late for their cycle are thrown away, never used as new ones.
 

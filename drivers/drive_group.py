@@ -62,6 +62,8 @@ class Capabilities:
         holds_on_quick_stop: A quick stop ends in holding under torque.
         has_brake: Every winch has a brake that closes before the torque goes.
         max_hz: Highest tested rate of cycles, [Hz].
+        watchdog_ms: A drive without SYNC disarms itself, which closes its brake, after this time
+            without a set-point, [ms]; None where there is no such watchdog.
     """
 
     sync: bool
@@ -69,6 +71,7 @@ class Capabilities:
     holds_on_quick_stop: bool
     has_brake: bool
     max_hz: float
+    watchdog_ms: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,18 +79,19 @@ class CycleStatus:
     """What the drives told in one cycle; arrays are read-only and in the order of the winches.
 
     Attributes:
-        positions: Actual positions at the cycle's SYNC, shape (m,), [counts]; the last known one
-            where a drive is missing.
-        demands: Positions that the drives were to reach by this SYNC, shape (m,), [counts]: the
-            targets of one cycle before. `positions - demands` is the following error.
+        positions: Actual positions at the cycle's SYNC, or as told in it, shape (m,), [counts];
+            the last known one where a drive is missing.
+        demands: Where the drives were to be when they told their positions, shape (m,), [counts]:
+            at a SYNC the targets of one cycle before. `positions - demands` is the following error.
         torques: Actual torques, positive where they pull the cable in, shape (m,), [per mille of
             rated torque]. Tension at rest is torque / 1000 times the winch's `torque_constant`.
-        status_words: As received, shape (m,).
-        missing: True for drives that did not answer in this cycle, shape (m,).
+        status_words: The state of each drive in its protocol's code, shape (m,); `drive_states`
+            tells what they say.
+        missing: True for drives from which this cycle's answer is overdue, shape (m,).
         faults: Node and text of every fault since the last reset, oldest first; the node is
             `WHOLE_BUS` where it is the bus that failed.
         state: State of the group.
-        holding: Every drive holds under torque (enabled or in quick stop).
+        holding: Every cable is held: by its drive under torque, or by its closed brake.
         stopped: Every drive told in this cycle that it follows no set-points.
         rejected: Frames thrown away since `configure` because their length or their content could
             not be true.
@@ -129,6 +133,11 @@ class DriveGroup(Protocol):
         ...
 
     @property
+    def stopping(self) -> bool:
+        """A stop is under way that needs more cycles: the drives do not finish it by themselves."""
+        ...
+
+    @property
     def targets(self) -> Counts:
         """Targets last sent, shape (m,), [counts]; motion after ENABLING starts from them."""
         ...
@@ -149,7 +158,7 @@ class DriveGroup(Protocol):
         ...
 
     def read_positions(self) -> CycleStatus:
-        """Sends SYNC until every drive has told its position; changes no drive's state.
+        """Waits until every drive has told its position; changes no drive's state.
 
         Raises:
             HardwareMissing: A drive does not answer; with its node.
@@ -158,7 +167,7 @@ class DriveGroup(Protocol):
         ...
 
     def send_cycle(self, targets: Sequence[int]) -> None:
-        """Sends one cycle: set-points, SYNC, and the master's heartbeat when it is due.
+        """Sends one cycle: all set-points, and what makes them count together where there is such.
 
         Args:
             targets: One position a drive, [counts]. They count in state ENABLED; in every other
@@ -201,8 +210,12 @@ class DriveGroup(Protocol):
         ...
 
 
-def drive_states(status_words: Sequence[int]) -> tuple[str, ...]:
+def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
     """What status words of a `CycleStatus` say, for people."""
+    if rig.document.drives.type == "odrive":
+        from drivers.odrive.messages import state_text
+
+        return tuple(state_text(word) for word in status_words)
     from drivers.cia402.states import state_of
 
     return tuple(state_of(word).value for word in status_words)
@@ -219,9 +232,14 @@ def make_drive_group(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> Dri
 
     Raises:
         Refused: The bus is too slow for the rig's cycle.
-        BadInput: The rig's numbers do not fit the drives' objects.
+        BadInput: The rig's numbers do not fit the drives, or a package or file that they need is
+            not there.
     """
     # The protocol's library is loaded only by those who talk to drives.
+    if rig.document.drives.type == "odrive":
+        from drivers.odrive.group import OdriveGroup
+
+        return OdriveGroup(rig, bus, pump)
     from drivers.cia402.group import Cia402Group
 
     return Cia402Group(rig, bus, pump)

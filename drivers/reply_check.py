@@ -7,6 +7,9 @@ from collections.abc import Sequence
 BAD_CYCLES = 2
 """Cycles in a row that are one too many: one bad frame may happen, two are a defect."""
 
+JUMP_RESERVE = 4.0
+"""A position that changes this much faster than its winch may turn is no position."""
+
 
 class ReplyCheck:
     """Looks at every reply before it counts.

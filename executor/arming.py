@@ -11,20 +11,30 @@ from drivers.drive_group import Capabilities, DriveGroup
 from executor.course import Course
 from executor.reference import ReferenceDocument
 
+WATCHDOG_CYCLES = 3
+"""Cycles that a drive's watchdog must last at least: one late cycle is no reason to disarm."""
+
 
 def require_capabilities(drives: Capabilities, cycle: float) -> None:
     """Drives must start, stop and hold together without the master, or have brakes.
 
+    Drives that no SYNC holds together get their set-points back to back, and when these stay away
+    each is stopped by its own watchdog, which frees its cable: then every winch needs a brake.
+
     Raises:
         Refused: They do not, or the cycle is faster than they were tested with.
     """
+    watchdog = (drives.watchdog_ms or 0.0) / 1000.0
+    braked = drives.has_brake and watchdog > 0.0
     missing = []
-    if not drives.sync:
+    if not (drives.sync or braked):
         missing.append("take their set-points at one SYNC")
-    if not (drives.holds_on_comm_loss or drives.has_brake):
+    if not (drives.holds_on_comm_loss or braked):
         missing.append("hold when the master is lost")
     if not (drives.holds_on_quick_stop or drives.has_brake):
         missing.append("hold after a quick stop")
+    if drives.watchdog_ms is not None and not watchdog >= WATCHDOG_CYCLES * cycle - 1e-9:
+        missing.append(f"stay armed for {WATCHDOG_CYCLES} cycles without a set-point")
     if not cycle * drives.max_hz >= 1.0 - 1e-9:
         missing.append(f"keep up with a cycle of {cycle * 1000:g} ms")
     if missing:
@@ -32,8 +42,14 @@ def require_capabilities(drives: Capabilities, cycle: float) -> None:
             f"these drives do not {', nor '.join(missing)}",
             where="arming",
             why="a cable robot whose drives do not stop together and hold drops its platform",
-            next_step="use drives that do, or winches with brakes; nothing was enabled",
+            next_step=f"use drives that do, or winches with brakes{_declared(drives)};"
+            " nothing was enabled",
         )
+
+
+def _declared(drives: Capabilities) -> str:
+    """What the rig file must say of drives that only brakes make fit."""
+    return "" if drives.sync else " (winches[].brake of all, and drives.watchdog_ms)"
 
 
 def require_unchanged(course: Course) -> None:

@@ -63,6 +63,7 @@ class Loop:
         self._taken_over = False
         self._told: set[tuple[str, int]] = set()
         self._listener_error = ""
+        self._held = _HELD if group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = ""
         self.holding = True
         """Every cable was held when the drives were last heard."""
@@ -171,7 +172,7 @@ class Loop:
                 return
             if status is not None and status.stopped and (status.holding or not was_enabled):
                 self.machine.on(Event.HELD)
-                self._tell("held", _HELD if status.holding else _NEVER_ENABLED)
+                self._tell("held", self._held if status.holding else _NEVER_ENABLED)
                 return
         self._fault("hold_timeout", f"the drives did not go over to hold in {HOLD_TIMEOUT:g} s")
 
@@ -275,9 +276,11 @@ class Loop:
             self._tell("stop_not_sent", f"{error}; the drives stop when they miss the master")
 
     def _drain(self) -> None:
-        """A few more cycles, so that what the drives do during a quick stop is on record."""
+        """A few more cycles, for drives whose stop needs them, and so that all is on record."""
         try:
-            for _ in range(SETTLING):
+            for cycle in range(round(HOLD_TIMEOUT / self._course.cycle)):
+                if cycle >= SETTLING and not self._group.stopping:
+                    return
                 targets = self._exchange.resting_targets
                 self._record(self._exchange.cycle(Purpose.HOLD, targets, at_rest=True))
         except Exception as error:  # the drives have been told to stop; nothing more is owed
@@ -299,6 +302,7 @@ _WITHOUT_QUICK_STOP = ON_PATH | {State.SECURING}
 _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.HOLDING})
 
 _HELD = "at rest; the drives hold by themselves under torque"
+_BRAKED = "at rest; the brakes of the winches hold"
 _NEVER_ENABLED = "stopped before all drives were enabled; none of them follows set-points"
 
 

@@ -107,7 +107,7 @@ class RunStatus:
     def _drives(self, record: CycleRecord) -> list[dict[str, Any]]:
         columns = zip(
             self._prepared.rig.winches,
-            drive_states(record.words),
+            drive_states(self._prepared.rig, record.words),
             record.actual,
             record.targets,
             record.torques,

@@ -53,11 +53,11 @@ def open_drives(
         pump, true_pose = None, None
         carry: Callable[[Load], None] = _happens_by_itself
         if settings.interface == IN_PROCESS:
-            from simulation.rehearsal import Rehearsal
+            from simulation.simulate import make_rehearsal
 
             far_end = open_bus(settings)
             stack.callback(far_end.shutdown)
-            rehearsal = Rehearsal(rig, far_end, simulated_start, load)
+            rehearsal = make_rehearsal(rig, far_end, simulated_start, load)
             if lost_power is not None:
                 lost_power.happen_to(rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
             pump, true_pose, carry = rehearsal.pump, lambda: rehearsal.pose, rehearsal.carry

@@ -113,7 +113,7 @@ def _drives_reset(rig: Rig) -> list[str]:
                 why="it lost power or the bus since it was set up",
                 next_step="check power and wiring, then reset again; the latch stays engaged",
             )
-        return list(drive_states(status.status_words.tolist()))
+        return list(drive_states(rig, status.status_words.tolist()))
 
 
 def _counted(silent: list[int], status: CycleStatus) -> list[int]:

@@ -59,7 +59,7 @@ def sim(
     from executor.running import stop_requests
     from executor.wishes import OwnBoard
     from simulation.power_loss import PowerLoss
-    from simulation.rehearsal import Rehearsal
+    from simulation.simulate import make_rehearsal
 
     the_rig = rig_on_bus(rig, interface, channel)
     if the_rig.document.bus.interface == IN_PROCESS:
@@ -72,7 +72,7 @@ def sim(
     pose, load = _start(the_rig, start_mm, plan)
     bus = open_bus(BusSettings.of(the_rig))
     try:
-        rehearsal = Rehearsal(the_rig, bus, pose, load)
+        rehearsal = make_rehearsal(the_rig, bus, pose, load)
         if power_lost is not None:
             loss = PowerLoss.drawn(the_rig, power_lost, slack_mm / 1000.0, on_a_stand=on_a_stand)
             loss.happen_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])

@@ -29,6 +29,7 @@ from drivers.drive_group import (
     Pump,
 )
 from drivers.own_frames import OwnFrames
+from drivers.reply_check import JUMP_RESERVE
 from drivers.torque import winding_signs
 
 STEP_TIMEOUT = 1.0
@@ -36,9 +37,6 @@ STEP_TIMEOUT = 1.0
 
 RESET_CYCLES = 10
 """Cycles a drive has to leave the state FAULT after a reset."""
-
-JUMP_RESERVE = 4.0
-"""A position that changes this much faster than its winch may turn is no position."""
 
 FIRST_READING_ATTEMPTS = 10
 FIRST_READINGS = 2
@@ -84,13 +82,14 @@ class Cia402Group:
 
     @property
     def capabilities(self) -> Capabilities:
-        """CiA 402 drives as `configure` sets them up; brakes are not declared in the rig file."""
+        """CiA 402 drives as `configure` sets them up."""
         return Capabilities(
             sync=True,
             holds_on_comm_loss=True,
             holds_on_quick_stop=True,
-            has_brake=False,
+            has_brake=all(winch.brake for winch in self._rig.winches),
             max_hz=TESTED_HZ,
+            watchdog_ms=None,
         )
 
     @property
@@ -102,6 +101,11 @@ class Cia402Group:
     def restarted(self) -> tuple[int, ...]:
         """Nodes that `configure` found without this program's set-up."""
         return self._restarted
+
+    @property
+    def stopping(self) -> bool:
+        """Never: the drives finish a stop by themselves."""
+        return False
 
     @property
     def targets(self) -> Counts:

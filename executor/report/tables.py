@@ -134,7 +134,7 @@ def _bus(run: RunData) -> list[tuple[str, str]]:
     return [
         ("Drives", "simulated" if summary["simulated"] else "real"),
         ("Interface", summary["interface"]),
-        ("Protocol", f"{bus.protocol}, {bus.bitrate // 1000} kbit/s"),
+        ("Protocol", f"{run.rig.document.drives.type}, {bus.bitrate // 1000} kbit/s"),
         ("Cycle", f"{summary['cycle_ms']:g} ms"),
         ("Cycles", str(summary["cycles"])),
         ("Replies lost", str(summary["lost_replies"])),

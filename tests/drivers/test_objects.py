@@ -15,9 +15,9 @@ from cdpr.winches import WinchMap
 from drivers.cia402.objects import (
     heartbeat_consumers,
     interpolation_time,
-    position_limits,
     settings_for,
 )
+from drivers.travel import position_limits
 
 
 def final_values(rig: Rig, drive: int) -> dict[tuple[int, int], int]:

@@ -18,7 +18,8 @@ from cdpr.statics.working import working_tensions
 from drivers.bus import BusSettings, open_bus
 from drivers.cia402.states import DriveState
 from drivers.drive_group import DriveGroup, GroupCommand, GroupState, make_drive_group
-from simulation.rehearsal import Rehearsal, RehearsalStatus
+from simulation.rehearsal import Rehearsal
+from simulation.simulated_rig import RehearsalStatus
 
 _CHANNELS = itertools.count()
 

@@ -1,0 +1,238 @@
+"""Sets every ODrive up, and reads back what can be read back, before any of them is enabled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import can
+
+from cdpr.drives_file import OdriveDocument
+from cdpr.errors import BadInput, HardwareMissing, Refused
+from cdpr.rig import Rig
+from cdpr.winches import WinchMap
+from drivers.drive_group import Pump
+from drivers.odrive.dbc import Layout, Layouts
+from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
+from drivers.odrive.link import ECHO_WAIT, RESPONSE_TIMEOUT, SetupLink
+from drivers.odrive.messages import AxisError, AxisState, ControlMode, InputMode, error_text
+from drivers.travel import position_limits
+
+HEARTBEATS_WAITED = 3.2
+"""Periods after which a heartbeat is missed; two may be lost."""
+
+SPEED_RESERVE = 1.5
+TORQUE_RESERVE = 1.2
+"""Limits above what a run may need: the watch over following error and tension must trip first."""
+
+WHOLE_IN_FLOAT = 2**24
+"""Whole numbers up to this are exact in the 32-bit float of a set-point."""
+
+OLDEST_FIRMWARE = (0, 6)
+NO_SUPPLY = 1.0
+"""Below this voltage a drive has no supply, [V]."""
+
+CONFIRMATION_WAIT = 0.01
+"""For the confirmation of a write, [s]."""
+
+Told = dict[int, tuple[float, ...]]
+
+
+def configure_drives(
+    rig: Rig,
+    document: OdriveDocument,
+    layouts: Layouts,
+    bus: can.BusABC,
+    pump: Pump | None,
+    *,
+    to_reset: bool,
+) -> tuple[str, ...]:
+    """Sets every drive up; arguments and errors as for `drivers.drive_group.DriveGroup.configure`.
+
+    A watchdog that expired while nothing was enabled only tells that a master went away; it is
+    cleared, on drives that all hold by their brakes.
+    """
+    nodes = tuple(winch.node_id for winch in rig.winches)
+    check_resolution(rig)
+    known = read_endpoints(Path(document.endpoints), document) if document.endpoints else None
+    link = SetupLink(bus, pump, layouts, nodes)
+    _check_versions(link, layouts, nodes, known)
+    _check_idle(link, layouts, nodes, document, to_reset)
+    _check_supply(link, layouts, nodes)
+    if known is not None:
+        for node in nodes:
+            for wanted in wanted_settings(document):
+                _set(link, layouts, node, known.by_name[wanted.name], wanted)
+    for winch in rig.winches:
+        turns = SPEED_RESERVE * winch.max_speed * abs(winch.counts_per_metre)
+        torque = TORQUE_RESERVE * rig.max_tension / winch.torque_constant * winch.rated_torque
+        limits = turns / winch.counts_per_turn, torque / document.motor_torque_constant_nm_a
+        link.tell(winch.node_id, layouts.set_limits, *limits)
+        mode = ControlMode.POSITION, InputMode.PASSTHROUGH
+        link.tell(winch.node_id, layouts.set_controller_mode, *mode)
+    if known is not None:
+        return ()
+    return (
+        "the drives' watchdog and message periods were not read back, because the rig file names"
+        " no drives.endpoints; they must be as the rig file says",
+    )
+
+
+def check_resolution(rig: Rig) -> None:
+    """A set-point is a 32-bit float of turns: it must tell every count of the travel apart.
+
+    Raises:
+        BadInput: It does not.
+    """
+    winch_map = WinchMap(rig)
+    for drive in range(rig.cable_count):
+        farthest = max(map(abs, position_limits(rig, drive, winch_map)))
+        if farthest > WHOLE_IN_FLOAT:
+            raise BadInput(
+                f"positions up to {farthest} counts are finer than an ODrive's set-point",
+                where=f"rig {rig.name}: winches[{drive}]",
+                next_step="choose a smaller counts_per_rev (for ODrives it is a unit of your own"
+                " choice), or home_counts nearer to 0",
+            )
+
+
+def _answers(
+    link: SetupLink, layout: Layout, nodes: Sequence[int], timeout: float, where: str
+) -> Told:
+    """One message of every drive.
+
+    Raises:
+        HardwareMissing: From one none came.
+    """
+    told: Told = {}
+    for node, values in link.answers(layout, timeout):
+        if node in nodes:
+            told[node] = values
+        if len(told) == len(nodes):
+            return told
+    silent = ", ".join(str(node) for node in nodes if node not in told)
+    raise HardwareMissing(
+        f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",
+        where=where,
+        why="no power, a broken cable, a wrong bit rate or node id, or the message is switched off",
+        next_step="check power and wiring, and node id, bit rate and message periods with"
+        " odrivetool",
+        values={"nodes": silent},
+    )
+
+
+def _check_versions(
+    link: SetupLink, layouts: Layouts, nodes: Sequence[int], known: Endpoints | None
+) -> None:
+    """Every drive answers and is one, with a firmware that speaks these messages."""
+    where = "configuring the drives"
+    for node in nodes:
+        link.ask(node, layouts.get_version)
+    told = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, where)
+    for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
+        if node in nodes:
+            raise Refused(
+                f"node {node} answers twice: two devices have this node id",
+                where=where,
+                next_step="give every drive a node id of its own",
+                values={"node": node},
+            )
+    for node, (_, *version) in told.items():
+        firmware = tuple(int(part) for part in version)
+        text = ".".join(map(str, firmware))
+        if firmware[:2] < OLDEST_FIRMWARE:
+            raise Refused(
+                f"its firmware {text} is too old",
+                where=f"drive {node}",
+                why="CANSimple of firmware 0.6 has other messages",
+                next_step="update it with odrivetool",
+                values={"node": node, "firmware": text},
+            )
+        if known is not None and firmware != known.firmware:
+            wanted = ".".join(map(str, known.firmware))
+            raise Refused(
+                f"its firmware is {text}, drives.endpoints is for {wanted}",
+                where=f"drive {node}",
+                why="the same number is another setting in another firmware",
+                next_step="take flat_endpoints.json of the drive's firmware",
+                values={"node": node, "firmware": text},
+            )
+
+
+def _check_idle(
+    link: SetupLink, layouts: Layouts, nodes: Sequence[int], document: OdriveDocument, reset: bool
+) -> None:
+    """No drive is enabled or busy; one that is enabled belongs to somebody."""
+    wait = HEARTBEATS_WAITED * document.heartbeat_ms / 1000.0
+    told = _answers(link, layouts.heartbeat, nodes, wait, "configuring the drives")
+    for node, (_, state, _) in told.items():
+        if state != AxisState.IDLE:
+            enabled = state == AxisState.CLOSED_LOOP_CONTROL
+            raise Refused(
+                f"drive {node} is {'enabled already' if enabled else f'in axis state {state}'}",
+                where=f"drive {node}, Heartbeat",
+                why="another program moves it, or it did not stop when its master went away",
+                next_step="end the other program; otherwise press the emergency stop",
+                values={"node": node},
+            )
+    for node, (errors, _, _) in told.items():
+        if int(errors) & ~AxisError.WATCHDOG_TIMER_EXPIRED and not reset:
+            raise Refused(
+                f"drive {node} is in fault: {error_text(int(errors))}",
+                where=f"drive {node}, Heartbeat",
+                why="it disarmed itself; its brake holds the cable",
+                next_step="remove the cause, then `cdpr reset RIG`",
+                values={"node": node},
+            )
+    if any(errors == AxisError.WATCHDOG_TIMER_EXPIRED for errors, _, _ in told.values()):
+        for node in nodes:
+            link.tell(node, layouts.clear_errors, 0)
+
+
+def _check_supply(link: SetupLink, layouts: Layouts, nodes: Sequence[int]) -> None:
+    for node in nodes:
+        link.ask(node, layouts.get_bus_voltage_current)
+    layout = layouts.get_bus_voltage_current
+    told = _answers(link, layout, nodes, RESPONSE_TIMEOUT, "configuring the drives")
+    for node, (voltage, _) in told.items():
+        if not voltage > NO_SUPPLY:  # also when it is no number
+            raise Refused(
+                f"drive {node} has no supply: {voltage:.1f} V",
+                where=f"drive {node}, Get_Bus_Voltage_Current",
+                next_step="switch the supply of the motors on",
+                values={"node": node, "voltage": voltage},
+            )
+
+
+def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wanted: Wanted) -> None:
+    """Writes a setting and reads it back.
+
+    Raises:
+        HardwareMissing: The drive does not tell it.
+        Refused: It does not keep it.
+    """
+    raw = endpoint.to_raw(wanted.value)
+    link.write(node, endpoint.number, raw, endpoint.size)
+    # From firmware 0.6.11 on the write is confirmed; the confirmation is not the answer.
+    for _ in link.answers(layouts.txsdo, CONFIRMATION_WAIT):
+        pass
+    link.read(node, endpoint.number)
+    for answering, (number, told) in link.answers(layouts.txsdo, RESPONSE_TIMEOUT):
+        if answering != node or number != endpoint.number:
+            continue
+        if int(told) == raw:
+            return
+        found = endpoint.from_raw(int(told))
+        raise Refused(
+            f"the drive holds {found:g}, it must hold {wanted.value:g}",
+            where=f"drive {node}, endpoint {endpoint.name}",
+            why=f"needed because: {wanted.why}",
+            next_step="look the endpoint up in ODrive's API reference; the drives stay as they are",
+            values={"node": node, "endpoint": endpoint.name},
+        )
+    raise HardwareMissing(
+        f"drive {node} does not tell {endpoint.name}",
+        where="configuring the drives",
+        next_step="check that drives.endpoints is of the drive's firmware and board",
+        values={"node": node, "endpoint": endpoint.name},
+    )

@@ -1,0 +1,131 @@
+"""The settings of an ODrive by name: the flat endpoints of its firmware, and what cdpr wants there.
+
+ODrive publishes a `flat_endpoints.json` for each firmware and board; it tells the number and the
+type behind each name of the API reference.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cdpr.documents import read_text
+from cdpr.drives_file import OdriveDocument
+from cdpr.errors import BadInput
+
+_FORMS = {
+    "bool": "<?",
+    "uint8": "<B",
+    "int8": "<b",
+    "uint16": "<H",
+    "int16": "<h",
+    "uint32": "<I",
+    "int32": "<i",
+    "float": "<f",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """One setting of a drive.
+
+    Attributes:
+        name: Such as ``axis0.config.enable_watchdog``.
+        number: On the bus.
+        form: Its type, as `struct` names it.
+    """
+
+    name: str
+    number: int
+    form: str
+
+    @property
+    def size(self) -> int:
+        """Of a value, [bytes]."""
+        return struct.calcsize(self.form)
+
+    def to_raw(self, value: float) -> int:
+        """The four bytes of a value, as the number that the message holds."""
+        return int.from_bytes(struct.pack(self.form, value).ljust(4, b"\0"), "little")
+
+    def from_raw(self, raw: int) -> float:
+        """The inverse of `to_raw`."""
+        data = raw.to_bytes(4, "little")
+        return float(struct.unpack_from(self.form, data)[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A setting, what it must hold, and why.
+
+    Attributes:
+        name: Of the endpoint.
+        value: What it must hold.
+        why: The reason for the value.
+    """
+
+    name: str
+    value: float
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoints:
+    """The endpoints of one firmware.
+
+    Attributes:
+        firmware: Major, minor, revision.
+        by_name: Those that cdpr uses.
+    """
+
+    firmware: tuple[int, int, int]
+    by_name: dict[str, Endpoint]
+
+
+def wanted_settings(document: OdriveDocument) -> tuple[Wanted, ...]:
+    """What every drive of a rig must hold; the limits are set by messages of their own."""
+    can, config = "axis0.config.can", "axis0.config"
+    watchdog = (document.watchdog_ms or 0.0) / 1000.0
+    return (
+        Wanted(f"{config}.watchdog_timeout", watchdog, "drives.watchdog_ms"),
+        Wanted(f"{config}.enable_watchdog", watchdog > 0.0, "it stops when its master is gone"),
+        Wanted(f"{can}.heartbeat_msg_rate_ms", document.heartbeat_ms, "drives.heartbeat_ms"),
+        Wanted(f"{can}.encoder_msg_rate_ms", document.estimates_ms, "drives.estimates_ms"),
+        Wanted(f"{can}.torques_msg_rate_ms", document.torques_ms, "drives.torques_ms"),
+        Wanted(f"{can}.input_vel_scale", 1000, "feed-forward comes in steps of 0.001 turns/s"),
+        Wanted(f"{can}.input_torque_scale", 1000, "feed-forward comes in steps of 0.001 N·m"),
+        Wanted(
+            "axis0.controller.config.circular_setpoints", False, "a cable is no circle of turns"
+        ),
+    )
+
+
+def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
+    """The endpoints in a `flat_endpoints.json`.
+
+    Raises:
+        BadInput: The file cannot be read, is no such file, or has no endpoint of a name that is
+            needed.
+    """
+    text = read_text(path)
+    try:
+        content: dict[str, Any] = json.loads(text)
+        firmware = str(content["fw_version"]).partition("-")[0].split(".")
+        major, minor, revision = (int(part) for part in firmware)
+        found = {w.name: _endpoint(w.name, content) for w in wanted_settings(document)}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BadInput(
+            f"these are not the endpoints that are needed: {error!r}",
+            where=str(path),
+            next_step="take flat_endpoints.json of the drives' firmware and board from ODrive, or"
+            " leave drives.endpoints out",
+        ) from error
+    return Endpoints((major, minor, revision), found)
+
+
+def _endpoint(name: str, content: dict[str, Any]) -> Endpoint:
+    entry = content["endpoints"][name]
+    return Endpoint(name, int(entry["id"]), _FORMS[entry["type"]])

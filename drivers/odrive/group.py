@@ -1,0 +1,356 @@
+"""All ODrives of a rig as one group: no SYNC, brakes that close when an axis is disarmed.
+
+Every cycle sends all set-points back to back. A stop, wanted or not, keeps every target where it is
+(at top speed a drive then stands within a cycle), holds under torque until the platform is at rest,
+and disarms all drives back to back, which closes their brakes. Without a master the drives' own
+watchdogs disarm them: they were fed by the same batch of frames and run out together.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from enum import Enum, auto
+from pathlib import Path
+
+import can
+import numpy as np
+
+from cdpr.drives_file import OdriveDocument
+from cdpr.errors import HardwareMissing, Refused
+from cdpr.rig import Rig
+from drivers.bus import hears_itself
+from drivers.bus_faults import BusFault
+from drivers.bus_load import TESTED_HZ, check_bus_load
+from drivers.cyclic_bus import CyclicBus
+from drivers.drive_group import (
+    WHOLE_BUS,
+    Capabilities,
+    Counts,
+    CycleStatus,
+    GroupCommand,
+    GroupState,
+    Pump,
+)
+from drivers.odrive.configure import configure_drives
+from drivers.odrive.dbc import OWN_DBC, read_layouts
+from drivers.odrive.frames import OdriveFrames
+from drivers.odrive.link import commanding_ids, foreign_text
+from drivers.odrive.messages import RESULT_TEXTS, AxisState, state_text
+from drivers.odrive.watch import OdriveWatch
+from drivers.own_frames import OwnFrames
+from drivers.reply_check import JUMP_RESERVE
+from drivers.torque import winding_signs
+
+STEP_TIMEOUT = 1.0
+"""For enabling and for disarming, [s]: a brake takes a few tenths, and heartbeats are slow."""
+
+SETTLING = 0.1
+"""Held under torque before the brakes close, [s]."""
+
+FIRST_READING_ATTEMPTS = 20
+FIRST_READINGS = 2
+FIRST_READING_TIMEOUT = 0.1
+"""For the messages of all drives, [s]."""
+
+
+class _Stop(Enum):
+    """How far a stop is."""
+
+    NONE = auto()
+    HOLDING = auto()
+    DISARMING = auto()
+    OVER = auto()
+
+
+class OdriveGroup:
+    """ODrives in position control; see `drivers.drive_group.DriveGroup`."""
+
+    def __init__(self, rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> None:
+        """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
+        document = rig.document.drives
+        if not isinstance(document, OdriveDocument):
+            raise TypeError("the rig has no ODrives")
+        check_bus_load(rig)
+        self._rig, self._document, self._bus, self._pump = rig, document, bus, pump
+        self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
+        self._nodes = tuple(winch.node_id for winch in rig.winches)
+        self._frames = OdriveFrames(rig, self._layouts)
+        cycle = rig.document.bus.cycle_ms / 1000.0
+        self._patience = max(3, round(STEP_TIMEOUT / cycle))
+        self._settling = max(1, round(SETTLING / cycle))
+        self._max_steps = tuple(
+            JUMP_RESERVE * w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches
+        )
+        self._per_mille = winding_signs(rig) * 1000.0 / [w.rated_torque for w in rig.winches]
+        self._state = GroupState.OFFLINE
+        self._reset_memory()
+
+    def _reset_memory(self) -> None:
+        ids = commanding_ids(self._layouts, self._nodes)
+        own = OwnFrames(ids, hears_itself=hears_itself(self._bus))
+        self._cyclic = CyclicBus(self._bus, own, foreign_text)
+        self._watch = OdriveWatch(self._rig, self._document, self._layouts, self._max_steps)
+        self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
+        self._stop = _Stop.NONE
+        self._waited = 0
+        self._resetting = 0
+        self._faults: list[tuple[int, str]] = []
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What the rig file declares, and what no ODrive does."""
+        return Capabilities(
+            sync=False,
+            holds_on_comm_loss=False,
+            holds_on_quick_stop=False,
+            has_brake=all(winch.brake for winch in self._rig.winches),
+            max_hz=TESTED_HZ,
+            watchdog_ms=self._document.watchdog_ms,
+        )
+
+    @property
+    def state(self) -> GroupState:
+        """Where the group stands."""
+        return self._state
+
+    @property
+    def restarted(self) -> tuple[int, ...]:
+        """All whose encoder is not absolute: an ODrive keeps its settings without power."""
+        return tuple(winch.node_id for winch in self._rig.winches if not winch.absolute)
+
+    @property
+    def stopping(self) -> bool:
+        """Drives hold under torque that are still to be handed over to their brakes."""
+        return self._stop in (_Stop.HOLDING, _Stop.DISARMING)
+
+    @property
+    def targets(self) -> Counts:
+        """Targets last sent, shape (m,), [counts]."""
+        return np.array(self._last(), dtype=np.int64)
+
+    def configure(self, *, to_reset: bool = False) -> tuple[str, ...]:
+        """Sets every drive up; see `DriveGroup.configure`."""
+        if self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping:
+            raise Refused(
+                "the drives are enabled; they cannot be set up now",
+                where="configuring the drives",
+                next_step="stop them first",
+            )
+        self._state = GroupState.OFFLINE
+        self._reset_memory()
+        remarks = configure_drives(
+            self._rig, self._document, self._layouts, self._bus, self._pump, to_reset=to_reset
+        )
+        self._state = GroupState.CONFIGURED
+        return remarks
+
+    def read_positions(self) -> CycleStatus:
+        """Listens until every drive has told position and state; see `DriveGroup`."""
+        self._online()
+        self._cyclic.forget_waiting()
+        self._watch.forget_positions()
+        self._watch.forget_heartbeats()
+        agreed = 0
+        for _ in range(FIRST_READING_ATTEMPTS):
+            self._watch.begin_cycle()
+            status = self.receive(FIRST_READING_TIMEOUT)
+            agreed = 0 if status.missing.any() else agreed + 1
+            if agreed >= FIRST_READINGS and self._watch.states_known:
+                self._recent.clear()
+                return status
+        silent = [n for n, gone in zip(self._nodes, self._watch.missing, strict=True) if gone]
+        names = ", ".join(map(str, silent or self._nodes))
+        raise HardwareMissing(
+            f"no {'position' if silent else 'heartbeat'} from drives {names}",
+            where="reading the drives' positions",
+            why="a drive lost power or the bus, or sends its messages more seldom than the rig file"
+            " says",
+            next_step="check power, wiring and the message periods, then start again",
+            values={"nodes": names},
+        )
+
+    def send_cycle(self, targets: Sequence[int]) -> None:
+        """Sends one cycle; see `DriveGroup.send_cycle`."""
+        self._online()
+        try:
+            self._cyclic.discard_stale(self._watch)
+        except BusFault as fault:
+            self._latch_bus(fault)
+            raise
+        self._watch.begin_cycle()
+        before = self._last()
+        if self._state is GroupState.ENABLED:
+            now = [int(target) for target in targets]
+        elif self._state is GroupState.ENABLING or self.stopping:
+            now = before  # a sagging drive is not followed down
+        else:
+            now = list(self._watch.positions)
+            before = now
+        self._recent.append(now)
+        self._waited += 1
+        if self._stop is _Stop.DISARMING:
+            self._cyclic.send(self._frames.axis_states(AxisState.IDLE))
+            return
+        self._cyclic.send(self._frames.set_points(now, before))
+        if self._state is GroupState.ENABLING and self._waited == 1:
+            self._cyclic.send(self._frames.axis_states(AxisState.CLOSED_LOOP_CONTROL))
+
+    def receive(self, timeout_s: float) -> CycleStatus:
+        """Takes what the drives tell in this cycle; see `DriveGroup.receive`."""
+        self._online()
+        if self._pump is not None:
+            self._pump()
+            timeout_s = 0.0
+        try:
+            self._cyclic.take_replies(self._watch, timeout_s)
+            self._cyclic.end_cycle()
+        except BusFault as fault:
+            self._latch_bus(fault)
+            raise
+        self._watch.end_cycle()
+        self._look_for_faults()
+        self._advance()
+        return self._status()
+
+    def command(self, command: GroupCommand) -> None:
+        """Sets where the group goes; see `DriveGroup.command`."""
+        self._online()
+        if command is GroupCommand.ENABLE:
+            self._begin_enabling()
+        elif command is GroupCommand.RESET_FAULT:
+            self._reset_fault()
+        else:
+            self._begin_stop(GroupState.QUICK_STOP)
+
+    def quick_stop_now(self) -> None:
+        """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
+        self._begin_stop(GroupState.QUICK_STOP)
+        if self._stop is _Stop.HOLDING:
+            self._cyclic.send(self._frames.set_points(self._last(), self._last()))
+
+    def close(self) -> None:
+        """Lets go of the bus without sending anything."""
+        self._state = GroupState.OFFLINE
+
+    def _online(self) -> None:
+        if self._state is GroupState.OFFLINE:
+            raise Refused(
+                "the drives are not set up",
+                where="drive group",
+                next_step="call configure() first",
+            )
+
+    def _last(self) -> list[int]:
+        return self._recent[-1] if self._recent else list(self._watch.positions)
+
+    def _look_for_faults(self) -> None:
+        if self._resetting:
+            self._resetting -= 1
+            return
+        enabled = self._state is GroupState.ENABLED
+        powered = enabled or self._state is GroupState.ENABLING or self._stop is _Stop.HOLDING
+        self._latch(self._watch.faults(powered=powered, enabled=enabled))
+
+    def _latch_bus(self, fault: BusFault) -> None:
+        """A bus that fails stops the group for good, whatever the caller does with the error."""
+        self._latch([(WHOLE_BUS, fault.what)])
+
+    def _latch(self, found: list[tuple[int, str]]) -> None:
+        self._faults += [fault for fault in found if fault not in self._faults]
+        if found:
+            self._begin_stop(GroupState.FAULT)
+
+    def _begin_stop(self, state: GroupState) -> None:
+        """Targets stay where they are; a stop that has begun is not begun anew."""
+        powered = self._state in (GroupState.ENABLING, GroupState.ENABLED)
+        if self._state is not GroupState.FAULT:
+            self._state = state
+        if powered or self._stop is _Stop.NONE:
+            idle = _Stop.OVER if self._all_disarmed() else _Stop.DISARMING
+            self._stop, self._waited = _Stop.HOLDING if powered else idle, 0
+
+    def _advance(self) -> None:
+        """Sees whether the way under way has come to its end, or was not in time."""
+        if self._stop is _Stop.HOLDING and self._waited >= self._settling:
+            self._stop, self._waited = _Stop.DISARMING, 0
+            self._watch.forget_heartbeats()
+        elif self._stop is _Stop.DISARMING and self._waited > 0:
+            if self._all_disarmed() or self._waited > self._patience:
+                self._stop = _Stop.OVER
+        elif self._state is GroupState.ENABLING:
+            if self._watch.in_state(AxisState.CLOSED_LOOP_CONTROL):
+                self._state = GroupState.ENABLED
+            elif self._waited > self._patience:
+                self._latch(self._not_enabled())
+
+    def _all_disarmed(self) -> bool:
+        return self._watch.states_known and not self._watch.any_enabled()
+
+    def _not_enabled(self) -> list[tuple[int, str]]:
+        watch = self._watch
+        found = []
+        for node, state, result in zip(self._nodes, watch.states, watch.results, strict=True):
+            if state != AxisState.CLOSED_LOOP_CONTROL:
+                why = RESULT_TEXTS.get(result, f"procedure result {result}")
+                text = f"drive {node} stays {state_text(state)} on the way to closed loop control"
+                found.append((node, f"{text}: {why}"))
+        return found
+
+    def _status(self) -> CycleStatus:
+        watch = self._watch
+        positions = np.array(watch.positions, dtype=np.int64)
+        told = np.array(self._recent or [watch.positions], dtype=np.int64)
+        # A drive tells its position when it is its time: somewhere between the last set-points.
+        demands = np.clip(positions, told.min(axis=0), told.max(axis=0))
+        torques = np.rint(np.array(watch.torques) * self._per_mille).astype(np.int64)
+        words = np.array(watch.status_words, dtype=np.int64)
+        missing = np.array(watch.missing)
+        for array in (positions, demands, torques, words, missing):
+            array.setflags(write=False)
+        braked = self.capabilities.has_brake and self._all_disarmed()
+        return CycleStatus(
+            positions=positions,
+            demands=demands,
+            torques=torques,
+            status_words=words,
+            missing=missing,
+            faults=tuple(self._faults),
+            state=self._state,
+            holding=braked or watch.in_state(AxisState.CLOSED_LOOP_CONTROL),
+            stopped=self._stop is _Stop.OVER and self._all_disarmed() and not missing.any(),
+            rejected=watch.rejected,
+            error_frames=self._cyclic.error_frames,
+        )
+
+    def _begin_enabling(self) -> None:
+        if self._state is GroupState.ENABLED:
+            return
+        if self._state is GroupState.FAULT:
+            raise Refused(
+                "cannot enable the drives: a fault is latched",
+                where="drive group",
+                why="; ".join(text for _, text in self._faults),
+                next_step="find the cause, then reset the fault",
+            )
+        if self.stopping:
+            raise Refused("cannot enable the drives: they are being stopped", where="drive group")
+        self._cyclic.forget_waiting()  # the drives went on telling while nobody listened
+        self._state, self._stop, self._waited = GroupState.ENABLING, _Stop.NONE, 0
+        self._recent.clear()
+
+    def _reset_fault(self) -> None:
+        """Takes the errors off all drives, when none holds the platform by its torque."""
+        if self._watch.any_enabled() or self._stop is _Stop.HOLDING:
+            raise Refused(
+                "drives cannot be reset while some hold the platform under torque",
+                where="drive group",
+                why="resetting one drive of a platform under tension moves it",
+                next_step="wait until the brakes have closed, then reset the fault",
+            )
+        self._faults.clear()
+        self._cyclic.forget_faults()
+        self._cyclic.send(self._frames.clear_errors())
+        self._state, self._stop = GroupState.CONFIGURED, _Stop.NONE
+        heartbeat = self._document.heartbeat_ms / self._rig.document.bus.cycle_ms
+        self._resetting = int(heartbeat) + 2  # until what they say is newer than this

@@ -1,0 +1,243 @@
+"""A rig in software, whatever its drives speak: m drives on one bus, and the plant behind them."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, Protocol, TypeVar
+
+import can
+import numpy as np
+
+from cdpr.poses import Array, Pose
+from cdpr.rig import Rig
+from cdpr.scene import Load
+from drivers.bus import SentFrame, take, transmit
+from drivers.bus_faults import BusDown
+from simulation.drive_motion import Motor
+from simulation.plant import Plant
+
+Frame = bytes | bytearray
+
+TOP_SPEED_RESERVE = 1.5
+"""A simulated motor turns this much faster than its winch's speed limit."""
+
+IDLE_WAIT = 0.005
+"""Longest wait for a frame before time-outs of the drives are looked at, [s]."""
+
+
+class WinchDrive(Protocol):
+    """What a rig needs of a simulated drive.
+
+    Attributes:
+        motor: What it moves.
+        torque: Actual torque, set by the rig, in the unit of its protocol.
+    """
+
+    motor: Motor
+    torque: float
+
+    @property
+    def state(self) -> Enum:
+        """Its state in the words of its protocol."""
+        ...
+
+    @property
+    def torque_on(self) -> bool:
+        """The motor holds or moves the cable; otherwise the brake does."""
+        ...
+
+    def advance(self, elapsed: float) -> None:
+        """Lets time pass, [s]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RehearsalStatus:
+    """What `SimulatedRig.serve` tells while it runs.
+
+    Attributes:
+        cycles: Cycles seen.
+        states: State of each drive.
+        pose: Of the platform, ``world_from_platform``.
+        tensions: Shape (m,), [N].
+    """
+
+    cycles: int
+    states: tuple[Enum, ...]
+    pose: Pose
+    tensions: Array
+
+
+Drive = TypeVar("Drive", bound=WinchDrive)
+
+
+class SimulatedRig(ABC, Generic[Drive]):
+    """Simulated drives and their platform on one end of a CAN bus.
+
+    Attributes:
+        drives: In the order of the winches.
+        plant: What they move.
+        cycles: Cycles seen.
+    """
+
+    def __init__(
+        self, rig: Rig, bus: can.BusABC, start_pose: Pose, load: Load | None = None
+    ) -> None:
+        """Switches the drives on with the platform hanging at a pose under working tensions.
+
+        Args:
+            rig: The robot.
+            bus: An open bus for the drives; the caller's.
+            start_pose: ``world_from_platform``.
+            load: What the platform carries.
+
+        Raises:
+            TensionInfeasible: The cables cannot hold the platform there.
+            Fault: The bus did not take the drives' first frames.
+        """
+        self._rig, self._bus = rig, bus
+        self._cycle = rig.document.bus.cycle_ms / 1000.0
+        self.plant = Plant(rig, start_pose, load)
+        self.cycles = 0
+        self._per_newton = self._torque_per_newton()
+        self._counts = np.rint(self.plant.counts_for(start_pose, self.plant.tensions))
+        self.plant.settle_counts(self._counts)
+        self.drives: tuple[Drive, ...] = ()
+        self.drives = tuple(
+            self._make_drive(number, float(counts), self._top_speed(number))
+            for number, counts in enumerate(self._counts)
+        )
+
+    @abstractmethod
+    def _torque_per_newton(self) -> Array:
+        """Torque by tension, shape (m,), in the unit of the drives' protocol."""
+
+    @abstractmethod
+    def _make_drive(self, number: int, position: float, top_speed: float) -> Drive:
+        """Switches a drive on: its place among the winches, position [counts], speed [counts/s]."""
+
+    @abstractmethod
+    def _handle(self, message: can.Message) -> None:
+        """Hands a frame to whom it is for."""
+
+    @abstractmethod
+    def pump(self) -> None:
+        """Works off every frame that waits, and answers.
+
+        Raises:
+            Fault: The bus failed, or the platform has no equilibrium.
+        """
+
+    def _top_speed(self, number: int) -> float:
+        winch = self._rig.winches[number]
+        return TOP_SPEED_RESERVE * winch.max_speed * abs(winch.counts_per_metre)
+
+    @property
+    def pose(self) -> Pose:
+        """Where the platform truly is, ``world_from_platform``."""
+        self._settle()
+        return self.plant.pose
+
+    @property
+    def tensions(self) -> Array:
+        """Of the cables, shape (m,), [N]."""
+        self._settle()
+        return self.plant.tensions
+
+    def carry(self, load: Load) -> None:
+        """The platform carries something else from now on.
+
+        Raises:
+            Fault: The platform has no equilibrium with it.
+        """
+        self._settle()
+        self.plant.carry(load)
+
+    def advance(self, seconds: float) -> None:
+        """Lets time pass without a frame, in cycles at most: time-outs run, motors move."""
+        while seconds > 1e-12:
+            step = min(seconds, self._cycle)
+            self._advance(step)
+            seconds -= step
+
+    def serve(
+        self,
+        stop_requested: Callable[[], bool],
+        on_status: Callable[[RehearsalStatus], None] | None = None,
+        *,
+        status_period: float = 0.5,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Answers in real time until told to stop or interrupted from the keyboard.
+
+        When this process is held up, the drives' time stands still: they do not blame the master
+        for it. While the interface is down they hear and reach nobody, as with their cable pulled,
+        and go on when it is up again.
+
+        Args:
+            stop_requested: Asked every few milliseconds; true ends it.
+            on_status: Called every ``status_period`` seconds, between two frames.
+            status_period: [s].
+            clock: Monotonic seconds.
+
+        Raises:
+            Fault: The bus failed, or the platform has no equilibrium.
+        """
+        try:
+            last = told = clock()
+            while not stop_requested():
+                message = self._heard()
+                now = clock()
+                self._let_pass(now - last, message)
+                last = now
+                if message is not None:
+                    self._handle(message)
+                elif on_status is not None and now - told >= status_period:
+                    told = now
+                    on_status(self.status())
+        except KeyboardInterrupt:
+            return
+
+    def _let_pass(self, waited: float, message: can.Message | None) -> None:
+        """Time that passed until a frame came, or none did; of a longer time only a cycle."""
+        self._advance(min(waited, self._cycle))
+
+    def status(self) -> RehearsalStatus:
+        """Where everything stands."""
+        states = tuple(drive.state for drive in self.drives)
+        return RehearsalStatus(self.cycles, states, self.pose, self.tensions)
+
+    def _heard(self) -> can.Message | None:
+        """The next frame; none while the interface is down."""
+        try:
+            return take(self._bus, IDLE_WAIT)
+        except BusDown:
+            time.sleep(IDLE_WAIT)  # the kernel tells it at once, and time must pass all the same
+            return None
+
+    def _advance(self, elapsed: float) -> None:
+        for drive in self.drives:
+            drive.advance(elapsed)
+
+    def _feel(self) -> None:
+        """The drives feel the cables as they are now."""
+        self._settle()
+        torques = self.plant.tensions * self._per_newton
+        for drive, torque in zip(self.drives, torques.tolist(), strict=True):
+            drive.torque = torque if drive.torque_on else 0.0
+
+    def _settle(self) -> None:
+        """The platform goes where the drums let it; nothing to do while none has turned."""
+        counts = np.array([drive.motor.position for drive in self.drives])
+        if not np.array_equal(counts, self._counts):
+            self.plant.settle_counts(counts)
+            self._counts = counts
+
+    def _send(self, can_id: int, data: Frame) -> None:
+        with suppress(BusDown):  # nobody is reached
+            transmit(self._bus, SentFrame(can_id, data))
