@@ -136,7 +136,7 @@ class OdriveWatch:
         """What is wrong with the drives as they stand, by node.
 
         Args:
-            powered: The group is under power or on its way there; missing messages are a fault then.
+            powered: The group is under power or on its way there; silence is a fault then.
             enabled: Every axis was enabled and must be so.
         """
         found = [
