@@ -282,9 +282,17 @@ class Loop:
                 if cycle >= SETTLING and not self._group.stopping:
                     return
                 targets = self._exchange.resting_targets
-                self._record(self._exchange.cycle(Purpose.HOLD, targets, at_rest=True))
+                done = self._exchange.cycle(Purpose.HOLD, targets, at_rest=True)
+                self._record(done)
+                self._tell_reasons(done.findings)
         except Exception as error:  # the drives have been told to stop; nothing more is owed
             self._tell("bus_lost", f"{error}; the drives stop when they miss the master")
+
+    def _tell_reasons(self, findings: tuple[Finding, ...]) -> None:
+        """What a drive says of itself may come after what the stop was for."""
+        for finding in findings:
+            if finding.code == "drive_fault" and finding.text not in self.cause:
+                self._tell_once(finding)
 
     def _tell_cause(self, code: str, text: str) -> None:
         """Tells why the run does not finish; the first cause is kept."""

@@ -175,7 +175,7 @@ class _Process:
         how = f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
         return Fault(
             f"the real-time process ended without a word ({how}); the drives stop and hold by"
-            " themselves as SYNC stays away",
+            " themselves as set-points stay away",
             where="real-time process",
             why="it was killed, or the system ran out of memory",
             next_step="look at the platform first; then start again from where it is",

@@ -65,7 +65,7 @@ def doctor(
     answers = [python_version(), *own_packages(), *libraries(), *machine()]
     if rig is not None:
         the_rig = load_rig(rig)
-        answers += [*rig_bus(the_rig), *rig_cameras(the_rig, camera)]
+        answers += [*rig_drives(the_rig), *rig_bus(the_rig), *rig_cameras(the_rig, camera)]
     if as_json:
         keys = ("name", "good", "text", "fix")
         show_json([{key: getattr(answer, key) for key in keys} for answer in answers])
@@ -132,6 +132,27 @@ def machine() -> list[Answer]:
         Answer("processors", cores >= 2, f"{cores}", "use a machine with two or more cores"),
         Answer("kernel", True, text),
     ]
+
+
+def rig_drives(rig: Rig) -> list[Answer]:
+    """Whether the package and the files are there that the drives of a rig need."""
+    from cdpr.drives_file import OdriveDocument
+    from cdpr.errors import BadInput
+
+    drives = rig.document.drives
+    if not isinstance(drives, OdriveDocument):
+        return []
+    from drivers.odrive.dbc import OWN_DBC, read_layouts
+    from drivers.odrive.endpoints import read_endpoints
+
+    try:
+        read_layouts(Path(drives.dbc) if drives.dbc else OWN_DBC)
+        if drives.endpoints is not None:
+            read_endpoints(Path(drives.endpoints), drives)
+    except BadInput as error:
+        return [Answer("drives", False, f"{error.where}: {error.what}", error.next_step)]
+    known = "read back" if drives.endpoints else "not read back: the rig file names no endpoints"
+    return [Answer("drives", True, f"ODrives; their settings are {known}")]
 
 
 def rig_bus(rig: Rig) -> list[Answer]:

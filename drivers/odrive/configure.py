@@ -35,6 +35,8 @@ NO_SUPPLY = 1.0
 CONFIRMATION_WAIT = 0.01
 """For the confirmation of a write, [s]."""
 
+WHERE = "configuring the drives"
+
 Told = dict[int, tuple[float, ...]]
 
 
@@ -97,15 +99,18 @@ def check_resolution(rig: Rig) -> None:
 
 
 def _answers(
-    link: SetupLink, layout: Layout, nodes: Sequence[int], timeout: float, where: str
+    link: SetupLink, layout: Layout, nodes: Sequence[int], timeout: float, *, asked: bool
 ) -> Told:
     """One message of every drive.
 
     Raises:
         HardwareMissing: From one none came.
+        Refused: A question was answered twice.
     """
     told: Told = {}
     for node, values in link.answers(layout, timeout):
+        if node in told and asked:
+            raise _twice(node)
         if node in nodes:
             told[node] = values
         if len(told) == len(nodes):
@@ -113,7 +118,7 @@ def _answers(
     silent = ", ".join(str(node) for node in nodes if node not in told)
     raise HardwareMissing(
         f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",
-        where=where,
+        where=WHERE,
         why="no power, a broken cable, a wrong bit rate or node id, or the message is switched off",
         next_step="check power and wiring, and node id, bit rate and message periods with"
         " odrivetool",
@@ -121,22 +126,25 @@ def _answers(
     )
 
 
+def _twice(node: int) -> Refused:
+    return Refused(
+        f"node {node} answers twice: two devices have this node id",
+        where=WHERE,
+        next_step="give every drive a node id of its own",
+        values={"node": node},
+    )
+
+
 def _check_versions(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], known: Endpoints | None
 ) -> None:
     """Every drive answers and is one, with a firmware that speaks these messages."""
-    where = "configuring the drives"
     for node in nodes:
         link.ask(node, layouts.get_version)
-    told = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, where)
+    told = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
-            raise Refused(
-                f"node {node} answers twice: two devices have this node id",
-                where=where,
-                next_step="give every drive a node id of its own",
-                values={"node": node},
-            )
+            raise _twice(node)
     for node, (_, *version) in told.items():
         firmware = tuple(int(part) for part in version)
         text = ".".join(map(str, firmware))
@@ -164,7 +172,7 @@ def _check_idle(
 ) -> None:
     """No drive is enabled or busy; one that is enabled belongs to somebody."""
     wait = HEARTBEATS_WAITED * document.heartbeat_ms / 1000.0
-    told = _answers(link, layouts.heartbeat, nodes, wait, "configuring the drives")
+    told = _answers(link, layouts.heartbeat, nodes, wait, asked=False)
     for node, (_, state, _) in told.items():
         if state != AxisState.IDLE:
             enabled = state == AxisState.CLOSED_LOOP_CONTROL
@@ -193,7 +201,7 @@ def _check_supply(link: SetupLink, layouts: Layouts, nodes: Sequence[int]) -> No
     for node in nodes:
         link.ask(node, layouts.get_bus_voltage_current)
     layout = layouts.get_bus_voltage_current
-    told = _answers(link, layout, nodes, RESPONSE_TIMEOUT, "configuring the drives")
+    told = _answers(link, layout, nodes, RESPONSE_TIMEOUT, asked=True)
     for node, (voltage, _) in told.items():
         if not voltage > NO_SUPPLY:  # also when it is no number
             raise Refused(
@@ -232,7 +240,7 @@ def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wante
         )
     raise HardwareMissing(
         f"drive {node} does not tell {endpoint.name}",
-        where="configuring the drives",
+        where=WHERE,
         next_step="check that drives.endpoints is of the drive's firmware and board",
         values={"node": node, "endpoint": endpoint.name},
     )

@@ -94,6 +94,7 @@ class OdriveGroup:
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
         self._stop = _Stop.NONE
         self._waited = 0
+        self._all_hold = False  # the stop under way found all drives enabled
         self._resetting = 0
         self._faults: list[tuple[int, str]] = []
 
@@ -248,8 +249,9 @@ class OdriveGroup:
         if self._resetting:
             self._resetting -= 1
             return
-        enabled = self._state is GroupState.ENABLED
-        powered = enabled or self._state is GroupState.ENABLING or self._stop is _Stop.HOLDING
+        holding = self._stop is _Stop.HOLDING
+        enabled = self._state is GroupState.ENABLED or (holding and self._all_hold)
+        powered = enabled or holding or self._state is GroupState.ENABLING
         self._latch(self._watch.faults(powered=powered, enabled=enabled))
 
     def _latch_bus(self, fault: BusFault) -> None:
@@ -264,6 +266,7 @@ class OdriveGroup:
     def _begin_stop(self, state: GroupState) -> None:
         """Targets stay where they are; a stop that has begun is not begun anew."""
         powered = self._state in (GroupState.ENABLING, GroupState.ENABLED)
+        self._all_hold = self._all_hold or self._state is GroupState.ENABLED
         if self._state is not GroupState.FAULT:
             self._state = state
         if powered or self._stop is _Stop.NONE:
@@ -337,6 +340,7 @@ class OdriveGroup:
             raise Refused("cannot enable the drives: they are being stopped", where="drive group")
         self._cyclic.forget_waiting()  # the drives went on telling while nobody listened
         self._state, self._stop, self._waited = GroupState.ENABLING, _Stop.NONE, 0
+        self._all_hold = False
         self._recent.clear()
 
     def _reset_fault(self) -> None:
