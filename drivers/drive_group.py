@@ -38,8 +38,6 @@ class GroupState(Enum):
     """All drives were told to stop and hold under torque."""
     FAULT = auto()
     """As QUICK_STOP, because of a fault; latched until RESET_FAULT."""
-    DISABLED = auto()
-    """Powered off in order: operation disabled, brakes closed, torque off."""
 
 
 class GroupCommand(Enum):
@@ -47,8 +45,6 @@ class GroupCommand(Enum):
 
     ENABLE = auto()
     QUICK_STOP = auto()
-    HALT_POWER = auto()
-    """Disable operation, then shut down once every drive has closed its brake."""
     RESET_FAULT = auto()
 
 

@@ -33,7 +33,7 @@ from drivers.reply_check import JUMP_RESERVE
 from drivers.torque import winding_signs
 
 STEP_TIMEOUT = 1.0
-"""For enabling and for powering off, [s]: a brake takes a few tenths to open or close."""
+"""For enabling, [s]: a brake takes a few tenths to open."""
 
 RESET_CYCLES = 10
 """Cycles a drive has to leave the state FAULT after a reset."""
@@ -198,8 +198,6 @@ class Cia402Group:
             self._stop()
         elif command is GroupCommand.ENABLE:
             self._begin_enabling()
-        elif command is GroupCommand.HALT_POWER:
-            self._begin_power_off()
         else:
             self._reset_fault()
 
@@ -235,7 +233,7 @@ class Cia402Group:
                 self._released[drive] = True
 
     def _look_for_faults(self) -> None:
-        powered = self._goal in (Goal.ENABLE, Goal.POWER_OFF)
+        powered = self._goal is Goal.ENABLE
         found = self._watch.news()
         if not powered:  # an emergency of a drive that moves nothing becomes its state's reason
             found = [(node, text) for node, text in found if node in self._watch.restarted]
@@ -269,11 +267,6 @@ class Cia402Group:
                 self._state = GroupState.ENABLED
             elif self._cycles_to_goal > self._patience:
                 self._latch(self._late(DriveState.OPERATION_ENABLED))
-        elif self._goal is Goal.POWER_OFF:
-            if all(_is_off(state) for state in states):
-                self._goal, self._state = Goal.IDLE, GroupState.DISABLED
-            elif self._cycles_to_goal > self._patience:
-                self._latch(self._late(DriveState.READY_TO_SWITCH_ON))
 
     def _late(self, wanted: DriveState) -> list[tuple[int, str]]:
         return [
@@ -319,12 +312,6 @@ class Cia402Group:
         self._refuse_latched("enable the drives")
         self._goal, self._state, self._cycles_to_goal = Goal.ENABLE, GroupState.ENABLING, 0
 
-    def _begin_power_off(self) -> None:
-        self._refuse_latched("take the torque off")
-        self._goal, self._cycles_to_goal = Goal.POWER_OFF, 0
-        if self._state in (GroupState.ENABLING, GroupState.ENABLED):
-            self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
-
     def _refuse_latched(self, wish: str) -> None:
         if self._state is not GroupState.FAULT:
             return
@@ -361,7 +348,3 @@ class Cia402Group:
         if self._state is GroupState.FAULT:
             self._goal = Goal.RESET_FAULT if faulted else Goal.STOP
             self._state = GroupState.CONFIGURED if faulted else GroupState.QUICK_STOP
-
-
-def _is_off(state: DriveState) -> bool:
-    return state in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)

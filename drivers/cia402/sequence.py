@@ -19,7 +19,6 @@ class Goal(Enum):
     """No power; a drive found under torque is told to stop and hold."""
     ENABLE = auto()
     STOP = auto()
-    POWER_OFF = auto()
     RESET_FAULT = auto()
 
 
@@ -58,8 +57,6 @@ def next_words(
         return (ControlWord.QUICK_STOP,) * len(states)
     if goal is Goal.ENABLE:
         return _enable(states, released)
-    if goal is Goal.POWER_OFF:
-        return _power_off(states, released)
     if goal is Goal.RESET_FAULT:
         return tuple(
             ControlWord.RESET_FAULT if state is DriveState.FAULT else _idle(state)
@@ -87,18 +84,3 @@ def _enable(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[Con
         return (ControlWord.ENABLE_OPERATION,) * len(states)
     word = _NEXT_WORD[min(lowest, 1)]
     return tuple(ControlWord.QUICK_STOP if s in _MAY_HOLD else word for s in states)
-
-
-def _power_off(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[ControlWord, ...]:
-    """Operation disabled on all, then shut down once none is under torque.
-
-    The only way out of QUICK STOP ACTIVE without "disable voltage" leads through OPERATION
-    ENABLED, for all drives together and with targets on the actual positions.
-    """
-    if any(state in FAULTED for state in states):
-        return (ControlWord.QUICK_STOP,) * len(states)
-    if DriveState.QUICK_STOP_ACTIVE in states:
-        return _enable(states, released)
-    if DriveState.OPERATION_ENABLED in states:
-        return (ControlWord.SWITCH_ON,) * len(states)
-    return (ControlWord.SHUTDOWN,) * len(states)
