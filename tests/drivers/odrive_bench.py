@@ -1,0 +1,97 @@
+"""A master and simulated ODrives on one virtual bus, and files of endpoints for them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+
+from cdpr.rig import Rig, load_rig, rig_from_document
+from drivers.bus import BusSettings, open_bus
+from drivers.drive_group import CycleStatus, GroupCommand, GroupState
+from drivers.odrive.endpoints import wanted_settings
+from drivers.odrive.group import OdriveGroup
+from simulation.odrive_drive import SimulatedOdrive
+from simulation.odrive_rehearsal import OdriveRehearsal
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+ODRIVE_RIG = CONFIGS / "gachon_8_6_odrive.yaml"
+_CHANNELS = itertools.count()
+
+
+def odrive_rig(brakes: bool = True, **changes: Any) -> Rig:
+    """The ready rig with other `drives`."""
+    document = load_rig(ODRIVE_RIG).document
+    winches = [winch.model_copy(update={"brake": brakes}) for winch in document.winches]
+    drives = document.drives.model_copy(update=changes)
+    return rig_from_document(document.model_copy(update={"drives": drives, "winches": winches}))
+
+
+def write_endpoints(path: Path, rig: Rig, firmware: str = "0.6.11") -> Path:
+    """A file in the form of ODrive's flat_endpoints.json."""
+    document: Any = rig.document.drives
+    types = {bool: "bool", int: "uint32", float: "float"}
+    names = {w.name: types[type(w.value)] for w in wanted_settings(document)}
+    endpoints = {
+        name: {"id": 200 + i, "type": kind} for i, (name, kind) in enumerate(names.items())
+    }
+    path.write_text(
+        json.dumps({"fw_version": firmware, "hw_version": "4.4.58", "endpoints": endpoints})
+    )
+    return path
+
+
+@dataclass
+class OdriveBench:
+    """Both ends of a bus, in one thread; a cycle passes with each reply that is waited for."""
+
+    rig: Rig
+    group: OdriveGroup
+    rehearsal: OdriveRehearsal
+    ear: can.BusABC
+
+    @property
+    def drives(self) -> tuple[SimulatedOdrive, ...]:
+        return self.rehearsal.drives
+
+    def cycle(self, targets: list[int] | None = None) -> CycleStatus:
+        self.group.send_cycle(self.group.targets.tolist() if targets is None else targets)
+        return self.group.receive(0.0)
+
+    def cycles(self, count: int) -> CycleStatus:
+        for _ in range(count):
+            status = self.cycle()
+        return status
+
+    def enable(self) -> CycleStatus:
+        self.group.configure()
+        self.group.read_positions()
+        self.group.command(GroupCommand.ENABLE)
+        for _ in range(30):
+            status = self.cycle()
+            if status.state is not GroupState.ENABLING:
+                break
+        return status
+
+    def frames(self) -> list[can.Message]:
+        """What was said since the last call."""
+        heard = []
+        while (message := self.ear.recv(0.0)) is not None:
+            heard.append(message)
+        return heard
+
+
+@contextmanager
+def odrive_bench(rig: Rig | None = None) -> Iterator[OdriveBench]:
+    """Drives at home, not configured."""
+    rig = rig or odrive_rig()
+    settings = BusSettings("virtual", f"odrive-{next(_CHANNELS)}")
+    with open_bus(settings) as master, open_bus(settings) as far, open_bus(settings) as ear:
+        rehearsal = OdriveRehearsal(rig, far, rig.home)
+        yield OdriveBench(rig, OdriveGroup(rig, master, rehearsal.pump), rehearsal, ear)

@@ -1,0 +1,391 @@
+"""ODrives as one group: looked at, enabled together, stopped together, never one alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from cdpr.errors import BadInput, Fault, HardwareMissing, Refused
+from cdpr.rig import Rig, rig_from_document
+from drivers.drive_group import GroupCommand, GroupState, drive_states
+from drivers.odrive.configure import check_resolution
+from drivers.odrive.endpoints import read_endpoints, wanted_settings
+from drivers.odrive.messages import AxisError, AxisState, can_id, node_and_command
+from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
+
+SET_AXIS_STATE, SET_INPUT_POS = 0x07, 0x0C
+WATCHDOG_S = 0.1
+
+
+@pytest.fixture
+def bench() -> Iterator[OdriveBench]:
+    with odrive_bench() as made:
+        yield made
+
+
+def states(bench: OdriveBench) -> set[AxisState]:
+    return {drive.state for drive in bench.drives}
+
+
+def test_all_drives_are_enabled_where_they_stand_and_follow(bench: OdriveBench) -> None:
+    status = bench.enable()
+    assert status.state is GroupState.ENABLED
+    assert status.holding
+    assert states(bench) == {AxisState.CLOSED_LOOP_CONTROL}
+    stood = status.positions
+    per_metre = np.array([w.counts_per_metre for w in bench.rig.winches])
+    for step in range(1, 11):
+        targets = stood + np.rint(per_metre * 2e-4 * step).astype(int)
+        status = bench.cycle(targets.tolist())
+        assert np.array_equal(bench.group.targets, targets)
+        error = (status.positions - status.demands) / per_metre
+        assert np.abs(error).max() < 1e-5
+        assert not status.missing.any()
+    assert np.abs(status.positions - targets).max() <= 1
+    assert drive_states(bench.rig, status.status_words.tolist()) == ("closed loop control",) * 8
+
+
+def test_torques_are_tensions_in_per_mille_of_rated_torque(bench: OdriveBench) -> None:
+    bench.enable()
+    status = bench.cycles(3)
+    rated = np.array([w.torque_constant for w in bench.rig.winches])
+    told = status.torques / 1000.0 * rated
+    assert told == pytest.approx(bench.rehearsal.tensions, abs=0.51e-3 * rated.max())
+    assert (status.torques > 0).all()
+
+
+def test_set_points_go_back_to_back_with_their_speed(bench: OdriveBench) -> None:
+    bench.enable()
+    bench.frames()
+    targets = bench.group.targets + 100
+    bench.group.send_cycle(targets.tolist())
+    sent = [m for m in bench.frames() if m.data]
+    assert [node_and_command(m.arbitration_id) for m in sent] == [
+        (winch.node_id, SET_INPUT_POS) for winch in bench.rig.winches
+    ]
+    turns, speed, torque = bench.group._layouts.set_input_pos.unpack(sent[0].data) or ()
+    assert turns == pytest.approx(targets[0] / 16384, abs=1e-6)
+    assert speed == pytest.approx(100 / 16384 / 0.01, abs=1e-3)
+    assert torque == 0.0
+
+
+def test_a_stop_holds_under_torque_then_hands_all_drives_to_their_brakes(
+    bench: OdriveBench,
+) -> None:
+    status = bench.enable()
+    stood = bench.cycle((status.positions + 40).tolist())
+    bench.group.quick_stop_now()
+    held = 0
+    while AxisState.CLOSED_LOOP_CONTROL in states(bench):
+        assert states(bench) == {AxisState.CLOSED_LOOP_CONTROL}, "all or none"
+        assert bench.group.stopping
+        status = bench.cycle((stood.positions + 10_000).tolist())
+        assert not status.stopped
+        held += 1
+    assert 10 <= held <= 12
+    for _ in range(12):
+        status = bench.cycle()
+    assert not bench.group.stopping
+    assert status.state is GroupState.QUICK_STOP
+    assert status.stopped
+    assert status.holding
+    assert np.abs(status.positions - stood.positions).max() <= 40
+    assert status.faults == ()
+
+
+def test_a_stop_before_anything_was_enabled_is_over_at_once(bench: OdriveBench) -> None:
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.QUICK_STOP)
+    assert not bench.group.stopping
+    status = bench.cycle()
+    assert status.stopped
+    assert states(bench) == {AxisState.IDLE}
+
+
+def test_drives_can_be_enabled_again_after_a_stop(bench: OdriveBench) -> None:
+    bench.enable()
+    bench.group.command(GroupCommand.QUICK_STOP)
+    with pytest.raises(Refused, match="being stopped"):
+        bench.group.command(GroupCommand.ENABLE)
+    bench.cycles(30)
+    bench.group.command(GroupCommand.ENABLE)
+    assert bench.cycles(10).state is GroupState.ENABLED
+
+
+def test_without_a_master_all_are_disarmed_together_by_their_watchdogs(bench: OdriveBench) -> None:
+    bench.enable()
+    began = [drive.motor.position for drive in bench.drives]
+    bench.rehearsal.advance(WATCHDOG_S - 0.011)  # a cycle has passed since they were fed
+    assert states(bench) == {AxisState.CLOSED_LOOP_CONTROL}
+    bench.rehearsal.advance(0.002)
+    assert states(bench) == {AxisState.IDLE}
+    assert {drive.errors for drive in bench.drives} == {AxisError.WATCHDOG_TIMER_EXPIRED}
+    assert [drive.motor.position for drive in bench.drives] == began
+
+
+def test_after_that_a_new_master_finds_them_idle_and_starts_from_where_they_are(
+    bench: OdriveBench,
+) -> None:
+    bench.enable()
+    bench.rehearsal.advance(1.0)
+    bench.group.close()
+    status = bench.enable()
+    assert status.state is GroupState.ENABLED
+    assert {drive.errors for drive in bench.drives} == {0}
+
+
+FAULTS: dict[str, tuple[Callable[[OdriveBench], object], str, int]] = {
+    "axis error": (lambda b: b.drives[2].fail(0x2000), "drive 3: motor too hot", 6),
+    "watchdog of one": (
+        lambda b: b.drives[2].fail(AxisError.WATCHDOG_TIMER_EXPIRED),
+        "drive 3: watchdog",
+        6,
+    ),
+    "disarmed by another tool": (
+        lambda b: b.drives[2]._disarm(0),
+        "drive 3 was disarmed; its brake holds",
+        6,
+    ),
+    "no heartbeat": (
+        lambda b: b.drives[2].silent.add("heartbeat"),
+        "drive 3: its heartbeat is missing",
+        18,
+    ),
+    "no torque": (
+        lambda b: b.drives[2].silent.add("torques"),
+        "drive 3 does not tell its torque",
+        7,
+    ),
+    "no number": (
+        lambda b: setattr(b.drives[2].motor, "position", float("nan")),
+        "drive 3: its position is not a number",
+        3,
+    ),
+    "a jump": (
+        lambda b: setattr(b.drives[2].motor, "position", b.drives[2].motor.position + 20_000),
+        "drive 3: its position jumped",
+        3,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_of_one_is_a_hold_of_all_then_brakes(bench: OdriveBench, name: str) -> None:
+    happens, words, within = FAULTS[name]
+    bench.enable()
+    bench.cycles(8)
+    bench.rehearsal._feel = lambda: None  # type: ignore[method-assign]  # a NaN has no equilibrium
+    targets = bench.group.targets
+    happens(bench)
+    others = [drive for i, drive in enumerate(bench.drives) if i != 2]
+    for _ in range(within):
+        status = bench.cycle()
+        if status.state is GroupState.FAULT:
+            break
+    assert any(words in text for _, text in status.faults), status.faults
+    held = 0
+    while any(drive.torque_on for drive in others):
+        assert all(drive.torque_on for drive in others), "the others hold together"
+        bench.cycle((targets + 5_000).tolist())
+        assert np.array_equal(bench.group.targets, targets), "nothing moves on"
+        held += 1
+    assert 8 <= held <= 12
+    with pytest.raises(Refused, match="a fault is latched"):
+        bench.group.command(GroupCommand.ENABLE)
+
+
+def test_a_silent_drive_is_missing_in_a_few_cycles(bench: OdriveBench) -> None:
+    bench.enable()
+    bench.drives[4].deaf = True
+    missing = [bench.cycle().missing.tolist() for _ in range(4)]
+    assert [row[4] for row in missing] == [False, True, True, True]
+    assert not any(any(row[:4]) or any(row[5:]) for row in missing)
+
+
+def test_messages_at_other_periods_than_the_cycle_are_not_missing() -> None:
+    with odrive_bench(odrive_rig(estimates_ms=25, torques_ms=40, heartbeat_ms=70)) as bench:
+        bench.enable()
+        for _ in range(60):
+            status = bench.cycle()
+            assert not status.missing.any()
+            assert status.state is GroupState.ENABLED, status.faults
+
+
+def test_another_program_that_commands_a_drive_is_a_fault_of_the_bus(bench: OdriveBench) -> None:
+    bench.enable()
+    bench.ear.send(can.Message(arbitration_id=can_id(3, SET_INPUT_POS), data=bytes(8)))
+    bench.ear.send(
+        can.Message(arbitration_id=can_id(3, SET_INPUT_POS), data=bytes(8), is_extended_id=False)
+    )
+    with pytest.raises(Fault, match="another program commands drive 3"):
+        bench.cycle()
+    assert bench.group.state is GroupState.FAULT
+
+
+def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
+    bench: OdriveBench,
+) -> None:
+    bench.drives[5].calibrated = False
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    status = bench.cycles(105)
+    assert status.state is GroupState.FAULT
+    assert status.faults[0][1].startswith("drive 6 stays idle on the way to closed loop control")
+    assert "not calibrated" in status.faults[0][1]
+    bench.cycles(15)
+    assert states(bench) == {AxisState.IDLE}
+
+
+def _twin(bench: OdriveBench) -> None:
+    twin = OdriveRehearsalTwin(bench)
+    bench.rehearsal._by_node[4].hear = twin.hear  # type: ignore[method-assign]
+
+
+class OdriveRehearsalTwin:
+    """Two devices with one node id: each question is answered twice."""
+
+    def __init__(self, bench: OdriveBench) -> None:
+        self._hear = bench.rehearsal._by_node[4].hear
+
+    def hear(self, command: int, data: bytes) -> None:
+        self._hear(command, data)
+        self._hear(command, data)
+
+
+REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
+    "silent": (lambda b: setattr(b.drives[1], "deaf", True), HardwareMissing, "drive 2: no"),
+    "no heartbeat": (
+        lambda b: b.drives[1].silent.add("heartbeat"),
+        HardwareMissing,
+        "drive 2: no Heartbeat",
+    ),
+    "old firmware": (
+        lambda b: setattr(b.drives[1].settings, "firmware", (0, 5, 6)),
+        Refused,
+        "firmware 0.5.6 is too old",
+    ),
+    "enabled already": (
+        lambda b: setattr(b.drives[1], "state", AxisState.CLOSED_LOOP_CONTROL),
+        Refused,
+        "drive 2 is enabled already",
+    ),
+    "in fault": (lambda b: b.drives[1].fail(0x100), Refused, "supply over-voltage"),
+    "no supply": (lambda b: setattr(b.drives[1], "supply", 0.0), Refused, "drive 2 has no supply"),
+    "a twin": (_twin, Refused, "node 4 answers twice"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_drives_that_are_not_fit_are_refused_before_anything_is_enabled(
+    bench: OdriveBench, name: str
+) -> None:
+    happens, kind, words = REFUSED[name]
+    happens(bench)
+    bench.rehearsal.pump()
+    with pytest.raises(kind, match=words):
+        bench.group.configure()
+    commands = {node_and_command(m.arbitration_id)[1] for m in bench.frames()}
+    assert SET_AXIS_STATE not in commands
+    assert bench.group.state is GroupState.OFFLINE
+
+
+def test_without_endpoints_it_is_told_that_settings_were_not_read_back(bench: OdriveBench) -> None:
+    (remark,) = bench.group.configure()
+    assert "not read back" in remark
+
+
+def test_settings_are_written_and_read_back_with_the_endpoints_of_the_firmware(
+    tmp_path: Path,
+) -> None:
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    rig = odrive_rig(endpoints=str(file))
+    with odrive_bench(rig) as bench:
+        assert bench.group.configure() == ()
+        document: Any = rig.document.drives
+        known = read_endpoints(file, document)
+        for drive in bench.drives:
+            for wanted in wanted_settings(document):
+                endpoint = known.by_name[wanted.name]
+                raw = drive.settings.values[endpoint.number]
+                assert endpoint.from_raw(raw) == pytest.approx(float(wanted.value))
+
+
+def test_a_setting_that_is_not_kept_is_refused_with_drive_and_endpoint(tmp_path: Path) -> None:
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    with odrive_bench(odrive_rig(endpoints=str(file))) as bench:
+        bench.drives[6].settings.stuck.add(200)
+        with pytest.raises(Refused, match=r"holds 0, it must hold 0\.1") as caught:
+            bench.group.configure()
+    assert caught.value.where == "drive 7, endpoint axis0.config.watchdog_timeout"
+    assert "drives.watchdog_ms" in caught.value.why
+
+
+def test_endpoints_of_another_firmware_are_refused(tmp_path: Path) -> None:
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig(), "0.6.10-1")
+    with odrive_bench(odrive_rig(endpoints=str(file))) as bench:
+        bench.drives[3].settings.firmware = (0, 6, 11)
+        with pytest.raises(Refused, match=r"is 0\.6\.11, drives\.endpoints is for 0\.6\.10"):
+            bench.group.configure()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"fw_version": "0.6.11", "endpoints": {}}'])
+def test_a_file_that_holds_no_endpoints_is_refused(tmp_path: Path, text: str) -> None:
+    document: Any = odrive_rig().document.drives
+    path = tmp_path / "endpoints.json"
+    path.write_text(text)
+    with pytest.raises(BadInput, match="not the endpoints that are needed"):
+        read_endpoints(path, document)
+
+
+def test_errors_are_reset_on_all_drives_and_only_while_none_holds_by_torque(
+    bench: OdriveBench,
+) -> None:
+    bench.enable()
+    bench.drives[1].fail(0x2000)
+    bench.cycles(8)
+    with pytest.raises(Refused, match="while some hold the platform under torque"):
+        bench.group.command(GroupCommand.RESET_FAULT)
+    assert bench.drives[1].errors
+    bench.cycles(30)
+    bench.group.command(GroupCommand.RESET_FAULT)
+    status = bench.cycles(10)
+    assert status.state is GroupState.CONFIGURED
+    assert status.faults == ()
+    assert {drive.errors for drive in bench.drives} == {0}
+
+
+def test_drives_in_fault_are_taken_to_be_reset(bench: OdriveBench) -> None:
+    bench.drives[1].fail(0x2000)
+    bench.group.configure(to_reset=True)
+    assert bench.group.read_positions().state is GroupState.FAULT
+    bench.group.command(GroupCommand.RESET_FAULT)
+    assert bench.cycles(10).state is GroupState.CONFIGURED
+
+
+def test_what_drives_tell_is_the_rig_files(bench: OdriveBench) -> None:
+    told = bench.group.capabilities
+    assert (told.sync, told.has_brake, told.watchdog_ms) == (False, True, 100.0)
+    with odrive_bench(odrive_rig(brakes=False, watchdog_ms=None)) as other:
+        assert not other.group.capabilities.has_brake
+        assert other.group.capabilities.watchdog_ms is None
+
+
+def with_counts(rig: Rig, counts_per_rev: int) -> Rig:
+    winches = [
+        w.model_copy(update={"counts_per_rev": counts_per_rev}) for w in rig.document.winches
+    ]
+    return rig_from_document(rig.document.model_copy(update={"winches": winches}))
+
+
+def test_counts_that_a_float_cannot_tell_apart_are_refused() -> None:
+    check_resolution(with_counts(odrive_rig(), 100_000))
+    with pytest.raises(BadInput, match="finer than an ODrive's set-point") as caught:
+        check_resolution(with_counts(odrive_rig(), 2_000_000))
+    assert "counts_per_rev" in caught.value.next_step

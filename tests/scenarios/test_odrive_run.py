@@ -1,0 +1,257 @@
+"""The whole program on simulated ODrives: a run, its faults, and rigs that are not armed."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from cdpr.errors import Refused
+from cdpr.plan import load_plan, save_plan
+from cdpr.rig import load_rig
+from drivers.bus import BusSettings, open_bus
+from drivers.drive_group import make_drive_group
+from drivers.odrive.messages import AxisError, AxisState
+from executor.machine import State
+from executor.prepare import PreparedRun, prepare
+from executor.run_folder import RunFolder
+from planner.check import verify
+from simulation.odrive_rehearsal import OdriveRehearsal
+from tests.cli.plans import CONFIGS, GOAL_MM, START_MM, free_scene, straight_plan
+from tests.cli.program import call, nothing_written
+from tests.scenarios.stage import Stage, at
+
+ODRIVE = CONFIGS / "gachon_8_6_odrive.yaml"
+CRUISING = 150
+HELD_CYCLES = 10
+"""Under torque before the brakes close."""
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A straight path of 58 mm."""
+    path = tmp_path_factory.mktemp("odrive") / "plan.json"
+    scene = free_scene(START_MM, GOAL_MM)
+    save_plan(straight_plan(load_rig(ODRIVE), scene, [START_MM, GOAL_MM]), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def prepared(plan: Path) -> PreparedRun:
+    return prepare(verify(load_plan(plan)), load_rig(ODRIVE))
+
+
+@dataclass
+class Seen:
+    """Every cycle of a run: which axes are enabled, and what they were told."""
+
+    enabled: list[tuple[bool, ...]] = field(default_factory=list)
+    targets: list[tuple[int, ...]] = field(default_factory=list)
+
+    def look(self, stage: Stage) -> None:
+        self.enabled.append(tuple(drive.torque_on for drive in stage.drives))
+        self.targets.append(tuple(stage.group.targets.tolist()))
+
+
+@contextmanager
+def staged(
+    prepared: PreparedRun, path: Path, script: Callable[[Any], None]
+) -> Iterator[tuple[Any, Seen]]:
+    """As `tests.scenarios.stage.staged`, with ODrives at the other end."""
+    settings = BusSettings("virtual", f"odrive-{path}")
+    seen = Seen()
+
+    def each_cycle(stage: Stage) -> None:
+        script(stage)
+        seen.look(stage)
+
+    with open_bus(settings) as near, open_bus(settings) as far:
+        rehearsal: Any = OdriveRehearsal(prepared.rig, far, prepared.scene.start)
+        group = make_drive_group(prepared.rig, near, rehearsal.pump)
+        group.configure()
+        yield Stage(prepared, rehearsal, group, RunFolder.create(path), each_cycle), seen
+        group.close()
+
+
+def test_a_plan_is_run_on_odrives_from_the_rig_file_alone(plan: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    answer = call(*("run", plan, "--rig", ODRIVE, "-o", run, "--fast", "--no-camera", "--json"))
+    assert answer.code == 0, answer
+    assert "were not read back" in answer.said
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["verdict"] == "PASSED"
+    assert summary["lost_replies"] == 0
+    events = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
+    assert [event["code"] for event in events] == ["enabled", "moving", "held"]
+    assert events[-1]["text"] == "at rest; the brakes of the winches hold"
+    assert "odrive, 1000 kbit/s" in (run / "report.html").read_text()
+
+
+def test_targets_move_by_steps_of_the_path_and_all_axes_change_together(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", lambda _: None) as (stage, seen):
+        outcome = stage.run()
+        assert outcome.state is State.FINISHED
+        assert {drive.state for drive in stage.drives} == {AxisState.IDLE}
+        assert stage.rehearsal.pose.distance_to(prepared.scene.goal) < 1e-4
+    assert all(len(set(row)) == 1 for row in seen.enabled), "never one alone"
+    steps = np.abs(np.diff(np.array(seen.targets[3:]), axis=0))
+    per_metre = np.abs([w.counts_per_metre for w in prepared.rig.winches])
+    assert (steps <= prepared.rig.motion.speed * 0.01 * per_metre + 1.0).all()
+
+
+def deaf(stage: Any) -> None:
+    stage.drives[2].deaf = True
+
+
+def test_an_operators_stop_ends_on_the_brakes(prepared: PreparedRun, tmp_path: Path) -> None:
+    script = at(CRUISING, lambda stage: stage.board.ask_stop())
+    with staged(prepared, tmp_path / "run", script) as (stage, seen):
+        assert stage.run().state is State.STOPPED
+        assert {drive.state for drive in stage.drives} == {AxisState.IDLE}
+    assert all(len(set(row)) == 1 for row in seen.enabled)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What happens to drive 3 in cycle `CRUISING`, and how it must be told.
+
+    Attributes:
+        happens: Called at the beginning of the cycle.
+        code: Of the event that tells what the drive says, or does not.
+        words: In it.
+        within: Cycles from there until the others are told to stay where they are.
+    """
+
+    happens: Callable[[Any], object]
+    code: str
+    words: str
+    within: int
+
+
+CASES = {
+    "axis error": Case(
+        lambda stage: stage.drives[2].fail(0x1000), "drive_fault", "motor current above", 7
+    ),
+    "watchdog": Case(
+        lambda stage: stage.drives[2].fail(AxisError.WATCHDOG_TIMER_EXPIRED),
+        "drive_fault",
+        "watchdog: no set-point in time",
+        7,
+    ),
+    "emergency stop of one": Case(
+        lambda stage: stage.drives[2].hear(2, b""), "drive_fault", "emergency stop", 7
+    ),
+    "starts anew": Case(
+        lambda stage: stage.drives[2].power_on(), "drive_fault", "drive 3 was disarmed", 7
+    ),
+    "no heartbeat": Case(
+        lambda stage: stage.drives[2].silent.add("heartbeat"),
+        "drive_fault",
+        "its heartbeat is missing",
+        18,
+    ),
+    "no position": Case(
+        lambda stage: stage.drives[2].silent.add("estimates"), "drive_silent", "drive 3", 4
+    ),
+    "no torque": Case(
+        lambda stage: stage.drives[2].silent.add("torques"), "drive_fault", "its torque", 8
+    ),
+    "cable pulled": Case(deaf, "drive_silent", "drive 3", 4),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_fault_of_one_drive_is_a_hold_of_all_and_then_their_brakes(
+    prepared: PreparedRun, tmp_path: Path, name: str
+) -> None:
+    case = CASES[name]
+    with staged(prepared, tmp_path / "run", at(CRUISING, case.happens)) as (stage, seen):
+        outcome = stage.run()
+        assert outcome.state is State.LATCHED
+        assert "drive 3" in outcome.cause or "cable 3" in outcome.cause
+        # That a cable lost its tension is seen before the drive's next heartbeat says why.
+        first = next(event for event in stage.events() if event.time_s >= CRUISING * 0.01)
+        assert any(e.code == case.code and case.words in e.text for e in stage.events())
+        # A drive whose bus cable is pulled is disarmed by its own watchdog.
+        stage.rehearsal.advance(0.2)
+        assert {drive.state for drive in stage.drives} == {AxisState.IDLE}
+    noticed = round(first.time_s / 0.01)
+    assert noticed - CRUISING <= case.within
+    targets = np.array(seen.targets)
+    assert (targets[noticed + 2 :] == targets[noticed + 2]).all(), "nothing moves on"
+    others = np.delete(np.array(seen.enabled), 2, axis=1)
+    assert (others.all(axis=1) | ~others.any(axis=1)).all(), "the others never one alone"
+    held = int(others[noticed:].all(axis=1).sum())
+    assert HELD_CYCLES <= held <= HELD_CYCLES + 3
+
+
+def changed_rig(tmp_path: Path, brake: bool = True, **drives: Any) -> Path:
+    data = yaml.safe_load(ODRIVE.read_text())
+    data["drives"].update(drives)
+    data["drives"] = {key: value for key, value in data["drives"].items() if value is not None}
+    data["winches"][4]["brake"] = brake
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"brake": False}, "winches with brakes (winches[].brake of all"),
+        ({"watchdog_ms": None}, "hold when the master is lost"),
+        ({"watchdog_ms": 25}, "stay armed for 3 cycles without a set-point"),
+    ],
+)
+def test_a_rig_whose_drives_would_drop_the_platform_is_not_armed(
+    plan: Path, tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    rig = changed_rig(tmp_path, **changes)
+    with nothing_written(tmp_path):
+        answer = call("run", plan, "--rig", rig, "-o", tmp_path / "run", "--fast", "--no-camera")
+    assert answer.code == Refused.exit_code, answer
+    assert words in answer.said
+
+
+def test_an_unfit_dbc_file_is_refused_before_anything_moves(plan: Path, tmp_path: Path) -> None:
+    rig = changed_rig(tmp_path, dbc=str(tmp_path / "none.dbc"))
+    with nothing_written(tmp_path):
+        answer = call("run", plan, "--rig", rig, "-o", tmp_path / "run", "--fast", "--no-camera")
+    assert answer.code == 2, answer
+    assert "the DBC file cannot be read" in answer.said
+
+
+def test_a_bus_that_the_drives_messages_would_fill_is_refused(plan: Path, tmp_path: Path) -> None:
+    rig = changed_rig(tmp_path, estimates_ms=1, torques_ms=1)
+    answer = call("run", plan, "--rig", rig, "-o", tmp_path / "run", "--fast", "--no-camera")
+    assert answer.code == Refused.exit_code, answer
+    assert "the limit is 70%" in answer.said
+    assert "drives.*_ms" in answer.said
+
+
+def test_the_doctor_names_the_extra_and_the_files_that_odrives_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def answer(rig: Path) -> dict[str, Any]:
+        told = json.loads(call("doctor", rig, "--json").out)
+        return next(entry for entry in told if entry["name"] == "drives")
+
+    assert answer(ODRIVE)["good"]
+    lost = answer(changed_rig(tmp_path, endpoints=str(tmp_path / "none.json")))
+    assert not lost["good"]
+    assert "no such file" in lost["text"]
+    for module in [name for name in sys.modules if name.partition(".")[0] == "cantools"]:
+        monkeypatch.setitem(sys.modules, module, None)
+    without = answer(ODRIVE)
+    assert not without["good"]
+    assert "cdpr[odrive]" in without["fix"]
