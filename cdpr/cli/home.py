@@ -232,4 +232,7 @@ def _tell(reference: ReferenceDocument, where: str | None) -> None:
         ("reference", where or "not kept: simulated drives end with this process"),
     ]
     show_facts("drives referenced; they hold", [(name, str(value)) for name, value in facts])
-    out.print("next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`")
+    out.print(
+        "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`",
+        soft_wrap=True,
+    )

@@ -191,11 +191,12 @@ class _Status:
     def __init__(self, rig: Rig, board: WishBoard) -> None:
         self._rig, self._board = rig, board
         self._record: CycleRecord | None = None
-        self._progress = 0.0
+        self._began, self._progress = 0.0, 0.0
         self.events: list[LoopEvent] = []
 
     def take_cycle(self, record: CycleRecord, progress: float) -> None:
         """A cycle is over."""
+        self._began = record.at if self._record is None else self._began
         self._record, self._progress = record, progress
 
     def as_dict(self) -> dict[str, Any]:
@@ -215,7 +216,7 @@ class _Status:
             "wished": {"hold": self._board.read().hold},
             "drives": [],
             "events": [
-                {"time_s": event.at, "code": event.code, "text": event.text}
+                {"time_s": round(event.at - self._began, 3), "code": event.code, "text": event.text}
                 for event in list(self.events)
             ],
         }

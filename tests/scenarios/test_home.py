@@ -121,6 +121,8 @@ def test_slack_cables_are_wound_in_together_and_none_is_paid_out(
 ) -> None:
     with after_power_loss(lost(seed, on_a_stand=on_a_stand)) as place:
         assert place.rehearsal.tensions.min() < 0.1, "some hang slack"
+        torque_limits = {drive.objects[0x6072, 0] for drive in place.rehearsal.drives}
+        assert torque_limits == {1.2 * LIMIT / 100.0 * 1000.0}, "of the drives themselves, in ‰"
         stand = place.take_up()
         assert (stand.state, stand.cause) == (State.FINISHED, "")
         assert place.states == {HOLDING}
