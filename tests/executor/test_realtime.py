@@ -1,0 +1,38 @@
+"""What the system grants this process, as it tells itself."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from executor.realtime import CAP_IPC_LOCK, CAP_SYS_NICE
+
+ROOT = Path(__file__).parents[2]
+#: Gives a privilege up for good, then tells whether it is still there.
+TELL = """
+import ctypes, sys
+from executor.realtime import has_capability
+data = (ctypes.c_uint32 * 6)()
+header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # _LINUX_CAPABILITY_VERSION_3
+libc = ctypes.CDLL(None, use_errno=True)
+libc.capget(header, data)
+dropped = int(sys.argv[1])
+data[0] &= ~(1 << dropped)
+libc.capset(header, data)
+print(has_capability(14), has_capability(23))
+"""
+
+
+@pytest.mark.parametrize(
+    ("dropped", "told"), [(CAP_IPC_LOCK, "False True"), (CAP_SYS_NICE, "True False")]
+)
+def test_a_privilege_is_told_apart_from_being_root(dropped: int, told: str) -> None:
+    answer = subprocess.run(
+        [sys.executable, "-c", TELL, str(dropped)], capture_output=True, text=True, cwd=ROOT
+    )
+    if answer.stdout.strip() == "False False":
+        pytest.skip("only a process with these privileges can give one up")
+    assert answer.stdout.strip() == told, answer.stderr

@@ -1,0 +1,76 @@
+"""Drives without absolute encoders: no run before homing, none after one was switched on."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cdpr.errors import Refused
+from cdpr.rig import rig_from_document
+from drivers.bus import BusSettings
+from executor.latch import Latch
+from executor.prepare import PreparedRun, prepare
+from executor.real_time_process import run_in_real_time
+from simulation.power_loss import PowerLoss
+from tests.cli.plans import RIG
+from tests.cli.program import call
+from tests.scenarios.test_real_time import drives_on
+
+
+@pytest.mark.slow
+def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on(
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
+    channel = f"239.74.163.26:{20000 + (os.getpid() * 19) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
+    run = ("run", short_plan, "--rig", rig, "--no-camera", *bus)
+    with drives_on(channel, prepared) as rehearsal:
+        loss = PowerLoss.drawn(prepared.rig, 4, 0.002, on_a_stand=True)
+        loss.happen_to(prepared.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+        first = call(*run, "-o", tmp_path / "first")
+        assert first.code == 3
+        assert "never referenced" in first.err
+        start = [f"{x:.6f}" for x in prepared.scene.start.position * 1000.0]
+        homed = call("home", rig, "--pose-mm", *start, *bus, "--json")
+        assert homed.code == 0, homed
+        told = json.loads(homed.out)
+        assert Path(told["file"]).is_file()
+        assert told["home_counts"] != [0] * 8
+        second = call(*run, "-o", tmp_path / "second")
+        assert second.code == 0, second
+        assert told["file"] in second.out.replace("\n", "").replace("  ", "")
+        assert rehearsal.pose.distance_to(prepared.scene.goal) < 0.1e-3
+        stood = [drive.motor.position for drive in rehearsal.drives]
+        rehearsal.drives[5].power_on()
+        third = call(*run, "-o", tmp_path / "third")
+        assert third.code == 3
+        assert "drive 6 is lost: it was switched on" in third.err
+        assert [drive.motor.position for drive in rehearsal.drives] == stood
+
+
+def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_path: Path) -> None:
+    """Whoever calls it: nothing is started, no drive is asked for anything."""
+    settings = BusSettings("socketcan", "can7")
+    document = prepared.rig.document.bus.model_copy(
+        update={"interface": settings.interface, "channel": settings.channel}
+    )
+    rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": document}))
+    on_bus = prepare(prepared.plan, rig)
+    Latch(settings).engage("rig", tmp_path, "cable 4 is slack")
+    nothing: Any = None
+    with pytest.raises(Refused, match="cable 4 is slack"):
+        run_in_real_time(
+            on_bus,
+            nothing,
+            nothing,
+            nothing,
+            pose_every=0,
+            need_real_time=False,
+            before_motion=lambda _denied: pytest.fail("it was about to move"),
+        )
