@@ -105,7 +105,13 @@ class Custody:
             self._latch.release()
 
     def end(
-        self, state: State, cause: str, record: Path, *, stands_at: Sequence[int] | None
+        self,
+        state: State,
+        cause: str,
+        record: Path,
+        *,
+        holding: bool,
+        stands_at: Sequence[int] | None,
     ) -> None:
         """The motion is over: the bus is released when it ended well, else latched.
 
@@ -113,17 +119,18 @@ class Custody:
             state: Where it ended.
             cause: Why it did not end well.
             record: Where it is on record.
-            stands_at: Where the drives stand, [counts]; None when cables were let go.
+            holding: Every cable was held to the end.
+            stands_at: Where the drives stand, [counts]; None when nobody heard it.
         """
         if not self._is_kept:
             return
         self._latch.settle(self._rig.name, state, cause, record)
         reference = self.kept_reference()
-        if stands_at is None:
+        if not holding:
             reference = reference or as_in_the_file(self._rig)
             lost = f"drives let go of cables under tension ({cause})"
             self.file.write(reference.model_copy(update={"lost": reference.lost or lost}))
-        elif reference is not None:
+        elif reference is not None and stands_at is not None:
             self.file.write(reference.model_copy(update={"stands_at": list(stands_at)}))
 
     def _require_absolute(self) -> None:

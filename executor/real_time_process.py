@@ -95,7 +95,8 @@ def run_in_real_time(
             ended.state,
             ended.cause,
             recorder.folder.path,
-            stands_at=recorder.log.last_positions if ended.holding else None,
+            holding=ended.holding,
+            stands_at=recorder.log.last_positions,
         )
         return Outcome(ended.state, ended.cause, recorder.log, ended.holding, started)
     finally:

@@ -31,8 +31,8 @@ class WinchesStand:
     Attributes:
         state: How it ended.
         cause: Why it did not finish, if it did not.
-        counts: Positions of the drives, at rest, shape (m,), [counts].
-        tensions: By their torques, at rest, shape (m,), [N].
+        counts: Positions of the drives, at rest, shape (m,), [counts]; NaN when none was told.
+        tensions: By their torques, at rest, shape (m,), [N]; NaN when none was told.
     """
 
     state: State
@@ -115,13 +115,16 @@ def move_winches(
     try:
         loop.run()
     finally:
-        stands_at = last[-1].actual if last and loop.holding else None
-        custody.end(loop.machine.state, loop.cause, record, stands_at=stands_at)
+        custody.end(
+            loop.machine.state,
+            loop.cause,
+            record,
+            holding=loop.holding,
+            stands_at=last[-1].actual if last else None,
+        )
     rated = np.array([winch.torque_constant for winch in rig.winches])
-    torques = np.array([cycle.torques for cycle in last], dtype=np.float64)
-    return WinchesStand(
-        loop.machine.state,
-        loop.cause,
-        np.mean([cycle.actual for cycle in last], axis=0),
-        torques.mean(axis=0) / 1000.0 * rated,
-    )
+    unknown = [np.full(rig.cable_count, np.nan)]
+    torques = np.array([cycle.torques for cycle in last] or unknown, dtype=np.float64)
+    counts = np.array([cycle.actual for cycle in last] or unknown, dtype=np.float64)
+    tensions = torques.mean(axis=0) / 1000.0 * rated
+    return WinchesStand(loop.machine.state, loop.cause, counts.mean(axis=0), tensions)

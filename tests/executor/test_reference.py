@@ -75,7 +75,7 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
         Custody(rig).file.write(reference_of(rig))
     custody = Custody(rig)
     custody.begin(Path("run"))
-    custody.end(State.LATCHED, "emergency stop", Path("run"), stands_at=None)
+    custody.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
     custody.prevented()  # as a reset releases the latch
     for ask in (custody.reference, custody.require_ready):
         with pytest.raises(Refused, match="no more referenced") as caught:
@@ -90,10 +90,13 @@ def test_every_motion_notes_where_the_drives_stand() -> None:
     custody = Custody(rig)
     custody.file.write(reference_of(rig))
     custody.begin(Path("run"))
-    custody.end(State.FINISHED, "", Path("run"), stands_at=range(8))
+    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
     kept = custody.kept_reference()
     assert kept is not None
     assert kept.stands_at == list(range(8))
+    custody.begin(Path("run"))
+    custody.end(State.LATCHED, "killed", Path("run"), holding=True, stands_at=None)
+    assert custody.kept_reference() == kept, "nobody heard anything of the drives"
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema_version": 2}', "\x00"])

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from cdpr.plan import plan_from_document
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, load_rig
 from drivers.bus import BusSettings, open_bus
+from drivers.bus_faults import BusDown
 from drivers.cia402.states import DriveState
 from drivers.drive_group import DriveGroup, make_drive_group
 from executor.clock import SimulatedClock
@@ -257,6 +259,21 @@ def test_every_fault_stops_all_drives_together(happens: Callable[[Place], None])
         assert DriveState.OPERATION_ENABLED not in place.states
         after = np.array([r.targets for r in place.records if r.cycle > 83])
         assert len(np.unique(after, axis=0)) == 1, "nothing is sent on after the fault"
+
+
+def test_a_bus_that_dies_at_once_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+
+        def broken(_targets: object) -> None:
+            raise BusDown("the interface is down", "can0")
+
+        there = SimpleNamespace(positions=np.array(place.counts))
+        monkeypatch.setattr(place.group, "read_positions", lambda: there)
+        monkeypatch.setattr(place.group, "send_cycle", broken)
+        stand = place.take_up()
+        assert stand.state is State.LATCHED
+        assert "interface is down" in stand.cause
+        assert np.isnan(stand.counts).all()
 
 
 def test_a_cable_that_stays_slack_after_its_reach_stops_all() -> None:
