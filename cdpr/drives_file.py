@@ -9,6 +9,7 @@ from pydantic import Field
 from cdpr.document_types import Document, Positive
 
 Period = Annotated[int, Field(ge=1, le=1000)]
+Identity = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 FileName = Annotated[str, Field(min_length=1)]
 
 ODRIVE_LAST_NODE = 62
@@ -19,6 +20,12 @@ class Cia402Document(Document):
     """CANopen drives in cyclic synchronous position mode; all they need is set over the bus."""
 
     type: Literal["cia402"]
+    vendor_id: Identity | None = Field(
+        default=None, description="1018h:01 that every drive must tell; left out: not looked at"
+    )
+    product_code: Identity | None = Field(
+        default=None, description="1018h:02 that every drive must tell; left out: not looked at"
+    )
 
 
 class OdriveDocument(Document):

@@ -23,6 +23,9 @@ from drivers.torque import winding_signs
 from simulation.drive import SimulatedDrive
 from simulation.simulated_rig import Frame, SimulatedRig
 
+FINEST = 0.001
+"""Shorter times are added up before the drives are told of them, [s]: it costs less."""
+
 
 class Rehearsal(SimulatedRig[SimulatedDrive]):
     """CiA 402 drives and their platform; as in real drives, their time is locked to SYNC.
@@ -39,6 +42,7 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
         self._cyclic = {SYNC_ID, *(RPDO1_BASE + drive.node for drive in self.drives)}
         self._begun = False
         self._passed = 0.0  # of the drives' time since the last SYNC
+        self._waited = 0.0  # and what is too short to be told to every drive
 
     def _torque_per_newton(self) -> Array:
         """In per mille of rated torque."""
@@ -66,13 +70,15 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
             self._handle(message)
 
     def _let_pass(self, waited: float, message: can.Message | None) -> None:
+        self._waited += waited
         if message is not None and message.arbitration_id == SYNC_ID:
             self._advance(self._cycle - self._passed)
-            self._passed = 0.0
-        else:  # time passes whatever else is said on the bus
-            waited = min(waited, self._cycle)
-            self._advance(waited)
-            self._passed += waited
+            self._passed = self._waited = 0.0
+        elif self._waited >= FINEST:  # time passes whatever else is said on the bus
+            step = min(self._waited, self._cycle)
+            self._advance(step)
+            self._passed += step
+            self._waited = 0.0
 
     def _routes(self) -> dict[int, Callable[[Frame], None]]:
         """What to do with each identifier."""

@@ -21,6 +21,7 @@ from drivers.cia402.objects import (
     Expectation,
     Setting,
     heartbeat_consumers,
+    identity,
     settings_for,
 )
 from drivers.cia402.sdo import OBJECT_DOES_NOT_EXIST, SetupNetwork
@@ -65,7 +66,7 @@ def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: 
     nodes = [winch.node_id for winch in rig.winches]
     network = SetupNetwork(bus, pump, nodes)
     network.discard_waiting()
-    _find_all(network, nodes)
+    _find_all(network, nodes, (*BEFORE, *identity(rig)))
     _refuse_duplicates(network)
     entries, restarted = [], []
     absent: dict[Setting, list[int]] = {}
@@ -126,12 +127,14 @@ def _unwatched_peers(nodes: Sequence[int], entries: Sequence[int]) -> Iterator[s
         )
 
 
-def _find_all(network: SetupNetwork, nodes: Iterable[int]) -> None:
-    """Every drive answers and is one; the silent ones are named together."""
+def _find_all(
+    network: SetupNetwork, nodes: Iterable[int], expectations: Sequence[Expectation]
+) -> None:
+    """Every drive answers and is what it must be; the silent ones are named together."""
     silent: list[HardwareMissing] = []
     for node in nodes:
         try:
-            _expect(network, node, BEFORE)
+            _expect(network, node, expectations)
         except HardwareMissing as error:
             silent.append(error)
     if len(silent) > 1:

@@ -6,6 +6,7 @@ import math
 import struct
 from dataclasses import dataclass
 
+from cdpr.drives_file import Cia402Document
 from cdpr.errors import BadInput
 from cdpr.rig import Rig
 from cdpr.winches import WinchMap
@@ -82,6 +83,21 @@ BEFORE = (
     Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are commanded here"),
     Expectation(0x6502, 0, 0x80, 0x80, "supported drive modes", "cyclic synchronous position"),
 )
+
+
+def identity(rig: Rig) -> tuple[Expectation, ...]:
+    """Whose drives they must be, where the rig file says so (1018h)."""
+    drives = rig.document.drives
+    if not isinstance(drives, Cia402Document):
+        return ()
+    named = ((1, drives.vendor_id, "vendor id"), (2, drives.product_code, "product code"))
+    why = "the rig file names these drives"
+    return tuple(
+        Expectation(0x1018, sub, 0xFFFFFFFF, value, name, why)
+        for sub, value, name in named
+        if value is not None
+    )
+
 
 #: What it must tell after the set-up.
 AFTER = (Expectation(0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode was taken"),)

@@ -275,7 +275,7 @@ TABLE: dict[str, Fault] = {
     "F6 20 % of SYNC lost": Fault(lost_syncs(0.2, 5), within=PATH_STOP, words=("did not answer",)),
     "F6 drives miss 0.1 % of SYNC": goes_on(deaf_drives(0.001, 6)),
     "F6 drives miss 20 % of SYNC": Fault(
-        deaf_drives(0.2, 6), within=PATH_STOP, words=("did not answer",), rows=2.0
+        deaf_drives(0.2, 6), within=PATH_STOP, words=("did not answer",), rows=2.0, spread=3.0
     ),
     "F7 a drive falls silent": Fault(broken(3, by=silence), words=("drive 4 did not answer",)),
     "F7 a drive and the master fall silent": Fault(

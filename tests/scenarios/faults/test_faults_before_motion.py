@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from cdpr.drives_file import Cia402Document
 from cdpr.errors import HardwareMissing, Refused
+from cdpr.rig import rig_from_document
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.objects import settings_for
 from drivers.cia402.states import DriveState
@@ -63,6 +66,23 @@ def test_f15_a_drive_that_keeps_another_value_is_not_armed(
         with pytest.raises(Refused, match=f"holds {value}, it must hold") as caught:
             configure(bench)
         assert f"drive 3, object {key[0]:04X}h:{key[1]:02X}" in caught.value.where
+
+
+@pytest.mark.parametrize(("key", "sub"), [("vendor_id", 1), ("product_code", 2)])
+def test_f15_a_drive_of_another_maker_is_not_armed(
+    prepared: PreparedRun, tmp_path: Path, key: str, sub: int
+) -> None:
+    named = Cia402Document(type="cia402", **{key: 0x2E3})
+    rig = rig_from_document(prepared.rig.document.model_copy(update={"drives": named}))
+    with simulated(prepared, tmp_path / "run", nothing) as bench:
+        bench.prepared = replace(prepared, rig=rig)
+        for drive in bench.drives:
+            drive.objects[0x1018, sub] = 0x2E3
+        configure(bench)
+        bench.drives[6].objects[0x1018, sub] = 0x2E4
+        with pytest.raises(Refused, match="holds 2E4h, it must hold 2E3h") as caught:
+            configure(bench)
+        assert f"drive 7, object 1018h:0{sub}" in caught.value.where
 
 
 @pytest.mark.parametrize(
