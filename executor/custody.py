@@ -133,6 +133,16 @@ class Custody:
         elif reference is not None and stands_at is not None:
             self.file.write(reference.model_copy(update={"stands_at": list(stands_at)}))
 
+    def go_by_the_rig_file(self) -> None:
+        """From now on the drives count what the rig file says; no reference is kept.
+
+        Raises:
+            Refused: A drive without absolute encoder cannot do so; or a fault is latched.
+        """
+        self.require_free()
+        self._require_absolute()
+        self.file.remove()
+
     def _require_absolute(self) -> None:
         if not self._is_kept:
             return

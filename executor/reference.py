@@ -121,6 +121,22 @@ class ReferenceFile:
                 next_step=AGAIN,
             ) from None
 
+    def remove(self) -> None:
+        """Nothing is on file any more.
+
+        Raises:
+            Refused: It cannot be removed.
+        """
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise Refused(
+                "the reference of the drives cannot be removed",
+                where=str(self.path),
+                why=error.strerror or str(error),
+                next_step="make the folder writable for those who run the rig",
+            ) from None
+
     def write(self, reference: ReferenceDocument) -> None:
         """Keeps it.
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
+    from executor.custody import Custody
     from executor.real_time_job import ReadyDrives
     from executor.reference import ReferenceDocument
     from executor.winch_laws import WinchLaw
@@ -33,6 +34,12 @@ def home(
         str | None,
         typer.Option(help="it hangs free, and this camera measures it ('synthetic', or an index)"),
     ] = None,
+    as_rig_file: Annotated[
+        bool,
+        typer.Option(
+            "--as-rig-file", help="move nothing: absolute encoders count what the rig file says"
+        ),
+    ] = False,
     tension_n: Annotated[
         float | None, typer.Option(help="pretension (default: twice the rig's smallest tension)")
     ] = None,
@@ -76,6 +83,7 @@ def home(
       cdpr home configs/gachon_8_6.yaml --camera synthetic --fast
     """
     from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.home_facts import show_reference, show_wish
     from cdpr.cli.output import show_json
     from cdpr.cli.run import require_own_time, rig_on_bus
     from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of
@@ -87,14 +95,17 @@ def home(
     the_rig = rig_on_bus(rig, interface, channel)
     in_process = the_rig.document.bus.interface == IN_PROCESS
     require_own_time(fast, in_process)
-    known = _known_pose(the_rig, at_home, pose_mm, camera, in_process)
+    if as_rig_file and not (at_home or pose_mm or camera):
+        _go_by_the_rig_file(Custody(the_rig), yes or in_process, as_json)
+        return
+    known = _known_pose(the_rig, at_home, pose_mm, camera, in_process, as_rig_file)
     limit = limit_of(the_rig, limit_n)
     target = _target(the_rig, tension_n, limit)
     speed, reach = speed_mm_s / 1000.0, reach_mm / 1000.0
     custody = Custody(the_rig)
     custody.require_free()
     if not as_json:
-        _show(the_rig, target, limit, reach, speed, camera)
+        show_wish(the_rig, target, limit, reach, speed, camera)
     if not (in_process or yes):
         ask_operator("Wind the cables in now?", "nothing was moved")
     made: list[ReferenceDocument] = []
@@ -120,7 +131,7 @@ def home(
     if as_json:
         show_json({"file": where, **reference.model_dump(mode="json")})
     else:
-        _tell(reference, where)
+        show_reference(reference, where)
 
 
 def _known_pose(
@@ -129,6 +140,7 @@ def _known_pose(
     pose_mm: tuple[float, float, float] | None,
     camera: str | None,
     in_process: bool,
+    as_rig_file: bool,
 ) -> Pose | None:
     """The pose that is stated; None when the camera measures it.
 
@@ -140,9 +152,9 @@ def _known_pose(
     from cdpr.errors import BadInput
     from cdpr.poses import Pose
 
-    if (at_home, pose_mm is not None, camera is not None).count(True) != 1:
+    if (at_home, pose_mm is not None, camera is not None).count(True) != 1 or as_rig_file:
         raise BadInput(
-            "say how the platform's pose is known: --at-home, --pose-mm or --camera",
+            "say how the platform's pose is known: --at-home, --pose-mm or --camera alone",
             where="cdpr home",
             why="counts are referenced at a pose that is known, and at no guess",
             next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z; or let it"
@@ -164,6 +176,20 @@ def _known_pose(
     return pose
 
 
+def _go_by_the_rig_file(custody: Custody, yes: bool, as_json: bool) -> None:
+    """Drops the reference, so that the rig file's counts are the drives' again."""
+    from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.output import out, show_json
+
+    if not yes:
+        ask_operator("Do all drives count what the rig file says?", "the reference is as it was")
+    custody.go_by_the_rig_file()
+    if as_json:
+        show_json({"file": None})
+    else:
+        out.print("no reference is kept; drives count what the rig file says at home")
+
+
 def _target(rig: Rig, tension_n: float | None, limit: float) -> float:
     from cdpr.errors import Refused
 
@@ -177,26 +203,6 @@ def _target(rig: Rig, tension_n: float | None, limit: float) -> float:
             next_step="name another pretension or limit",
         )
     return target
-
-
-def _show(
-    rig: Rig, target: float, limit: float, reach: float, speed: float, camera: str | None
-) -> None:
-    from cdpr.cli.output import show_facts
-    from executor.winch_laws import wind_in_speed
-
-    fastest = wind_in_speed(rig, target, limit, speed).max() * 1000.0
-    bus = rig.document.bus
-    show_facts(
-        "ready to wind in",
-        [
-            ("rig", rig.name),
-            ("pretension", f"{target:g} N a cable, at most {limit:g} N"),
-            ("winches", f"all together, at most {fastest:.2f} mm/s and {reach * 1000:g} mm each"),
-            ("pose", "stated, held by a jig" if camera is None else f"measured, camera {camera}"),
-            ("bus", f"{bus.interface} {bus.channel}".strip()),
-        ],
-    )
 
 
 def _referenced(
@@ -218,21 +224,3 @@ def _referenced(
     found = rest_pose(rig, look_at_rest(rig, camera, pictures, drives.true_pose))
     how = f"tags in {found.pictures} of {pictures} pictures, camera {rig.cameras[0].name!r}"
     return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)
-
-
-def _tell(reference: ReferenceDocument, where: str | None) -> None:
-    from cdpr.cli.output import out, show_facts
-
-    x, y, z = reference.pose.position_mm
-    tensions = reference.tensions_n
-    facts: list[tuple[str, Any]] = [
-        ("platform", f"{x:.2f}, {y:.2f}, {z:.2f} mm, {reference.how}"),
-        ("uncertainty", f"{reference.uncertainty_mm:.3f} mm"),
-        ("tensions", f"{min(tensions):.1f} to {max(tensions):.1f} N"),
-        ("reference", where or "not kept: simulated drives end with this process"),
-    ]
-    show_facts("drives referenced; they hold", [(name, str(value)) for name, value in facts])
-    out.print(
-        "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`",
-        soft_wrap=True,
-    )

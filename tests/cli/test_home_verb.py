@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from cdpr.cli.run import rig_on_bus
+from cdpr.errors import Refused
+from executor.custody import Custody
+from executor.reference import as_in_the_file
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
 
@@ -23,6 +27,7 @@ def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ((), 2, "how the platform's pose is known"),
         (("--at-home", "--camera", "synthetic"), 2, "how the platform's pose is known"),
         (("--at-home", "--pose-mm", "0", "0", "445"), 2, "how the platform's pose is known"),
+        (("--at-home", "--as-rig-file"), 2, "how the platform's pose is known"),
         (("--pose-mm", "0", "0", "4450"), 2, "outside the workspace"),
         (("--pose-mm", "0", "0", "nan"), 2, "outside the workspace"),
         (("--at-home", "--limit-n", "5"), 3, "limit of 5 N"),
@@ -67,3 +72,18 @@ def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:
     answer = call("jog", RIG, "--cable", "3", "--mm", "0.01", "--fast", "--json")
     assert answer.code == 0, answer
     assert json.loads(answer.out)["moved_mm"] == pytest.approx(0.01, abs=0.002)
+
+
+def test_a_lost_reference_can_be_dropped_for_what_absolute_encoders_count(tmp_path: Path) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41991")
+    rig = rig_on_bus(RIG, *bus[1::2])
+    Custody(rig).file.write(as_in_the_file(rig).model_copy(update={"lost": "emergency stop"}))
+    with pytest.raises(Refused, match="no more referenced"):
+        Custody(rig).require_ready()
+    assert call("home", RIG, "--as-rig-file", *bus, answers="n\n").code == 130
+    assert Custody(rig).file.path.is_file()
+    assert call("home", RIG, "--as-rig-file", *bus, "--yes").code == 0
+    Custody(rig).require_ready()
+    counting = tmp_path / "rig.yaml"
+    counting.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
+    one_message(call("home", counting, "--as-rig-file", *bus, "--yes"), 3, "never referenced")
