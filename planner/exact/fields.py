@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import leaf
 from planner.exact.vectors import Vector, dot
 
 Array = NDArray[np.float64]
@@ -21,8 +21,7 @@ Integers = NDArray[np.int64]
 class World(NamedTuple):
     """One rig at one orientation in one scene; `planner.exact.world.build_world` makes it.
 
-    Bodies are the m cables and then the platform. Pair ``piece * (m + 1) + body`` is one body and
-    one piece of an obstacle.
+    Bodies are the m cables and then the platform. A pair is one body and one piece of an obstacle.
 
     Attributes:
         limits: Lower and upper corner of the workspace box, shape (2, 3), [m].
@@ -42,7 +41,9 @@ class World(NamedTuple):
         triangles: Of all meshes, world frame, shape (t, 3, 3), [m].
         planes: Of all pairs, shape (l, 6): unit normal n; the limit of n · position; how little
             the ungrown piece reaches along n; how far the exit does (-inf for the platform).
-        first_plane: Where each pair's planes begin, shape (k (m + 1) + 1,).
+        pairs: All pairs, those that forbid most positions first: piece, body, the first of the
+            planes before which a position is allowed, the first of those behind all of which it is
+            forbidden, and the last of these + 1, shape (k (m + 1), 5).
     """
 
     limits: Array
@@ -55,69 +56,69 @@ class World(NamedTuple):
     points: Array
     triangles: Array
     planes: Array
-    first_plane: Integers
+    pairs: Integers
 
 
-@kernel
+@leaf
 def _triple(array: Array, index: int, column: int) -> Vector:
     return (array[index, column], array[index, column + 1], array[index, column + 2])
 
 
-@kernel
+@leaf
 def outlet(world: World, cable: int) -> Vector:
     """Outlet of a cable, world frame, [m]."""
     return _triple(world.cables, cable, 0)
 
 
-@kernel
+@leaf
 def feed(world: World, cable: int) -> Vector:
     """Feed direction of a cable's pulley, world frame."""
     return _triple(world.cables, cable, 3)
 
 
-@kernel
+@leaf
 def anchor(world: World, cable: int) -> Vector:
     """Anchor of a cable, platform frame, [m]."""
     return _triple(world.cables, cable, 6)
 
 
-@kernel
+@leaf
 def arm(world: World, cable: int) -> Vector:
     """From the platform's origin to a cable's anchor under translation, world axes, [m]."""
     return _triple(world.cables, cable, 9)
 
 
-@kernel
+@leaf
 def half_size(world: World) -> Vector:
     """Half extents of the platform box, [m]."""
     return _triple(world.platform, 3, 0)
 
 
-@kernel
+@leaf
 def centre(world: World, piece: int) -> Vector:
     """Origin of a piece, world frame, [m]."""
     return _triple(world.pieces, piece, 9)
 
 
-@kernel
+@leaf
 def box_half(world: World, piece: int) -> Vector:
     """Half extents of a box, [m]."""
     return _triple(world.pieces, piece, 12)
 
 
-@kernel
+@leaf
 def box_sum(world: World, piece: int) -> Vector:
     """Half extents of a box grown by the platform, [m]; zeros where that is no box."""
     return _triple(world.pieces, piece, 15)
 
 
-@kernel
+@leaf
 def disc_axis(world: World, piece: int) -> Vector:
     """Axis of the disc that a piece is grown by, world frame."""
     return _triple(world.pieces, piece, 6)
 
 
-@kernel
+@leaf
 def in_frame(world: World, piece: int, vector: Vector) -> Vector:
     """A vector of the world in the axes of a piece."""
     return (
@@ -127,13 +128,13 @@ def in_frame(world: World, piece: int, vector: Vector) -> Vector:
     )
 
 
-@kernel
+@leaf
 def ball(world: World, piece: int) -> float:
     """Radius of the ball that a piece is grown by, [m]."""
     return world.pieces[piece, 18]  # type: ignore[no-any-return]
 
 
-@kernel
+@leaf
 def disc(world: World, piece: int) -> float:
     """Radius of the disc that a piece is grown by, [m]."""
     return world.pieces[piece, 19]  # type: ignore[no-any-return]

@@ -50,30 +50,29 @@ def turning_edge_free(world: World, start: Array, end: Array, rotation: Array, t
             return False
     if not (math.isfinite(turn[0]) and math.isfinite(turn[1]) and math.isfinite(turn[2])):
         return False
-    for piece in range(len(world.spans)):
-        for body in range(len(world.bodies)):
-            if not pair_free(world, piece, body, before, after, rotation, turn):
-                return False
+    for pair in range(len(world.pairs)):
+        if not _pair_free(world, pair, before, after, rotation, turn):
+            return False
     return True
 
 
 @kernel
-def pulley_pair_free(world: World, piece: int, body: int, before: Vector, after: Vector) -> bool:
+def pulley_pair_free(world: World, pair: int, before: Vector, after: Vector) -> bool:
     """Whether a cable over a pulley keeps what it needs to a piece under translation."""
-    return pair_free(world, piece, body, before, after, world.platform[:3], np.zeros(3))
+    return _pair_free(world, pair, before, after, world.platform[:3], np.zeros(3))
 
 
 @kernel
-def pair_free(
+def _pair_free(
     world: World,
-    piece: int,
-    body: int,
+    pair: int,
     before: Vector,
     after: Vector,
     rotation: Array,
     turn: Array,
 ) -> bool:
     """Whether one body keeps what it needs to one piece; arguments as of `turning_edge_free`."""
+    piece, body = world.pairs[pair, 0], world.pairs[pair, 1]
     way, needed = minus(after, before), world.bodies[body, 0]
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     lows, highs = np.empty(_DEEPEST), np.empty(_DEEPEST)
@@ -86,7 +85,7 @@ def pair_free(
         swept = _swept(world, body, before, way, rotation, turn, low, high)
         bound = _bound(world, body, swept, share * norm(way), share * angle)
         if bound < np.inf:
-            if _plane_between(world, piece, body, swept, needed + bound):
+            if _plane_between(world, pair, swept, needed + bound):
                 continue
             if points_apart(world, piece, swept, needed + bound):
                 continue
@@ -179,10 +178,9 @@ def _bound(world: World, body: int, swept: Array, travel: float, angle: float) -
 
 
 @kernel
-def _plane_between(world: World, piece: int, body: int, swept: Array, needed: float) -> bool:
+def _plane_between(world: World, pair: int, swept: Array, needed: float) -> bool:
     """Whether one of the pair's planes has all swept points before it, by what is needed."""
-    pair = piece * len(world.bodies) + body
-    for k in range(world.first_plane[pair], world.first_plane[pair + 1]):
+    for k in range(world.pairs[pair, 2], world.pairs[pair, 3]):
         limit = world.planes[k, 4] - needed
         normal = (world.planes[k, 0], world.planes[k, 1], world.planes[k, 2])
         proved = True

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import kernel, leaf
 from planner.exact.fields import (
     World,
     ball,
@@ -36,7 +36,38 @@ from planner.exact.vectors import Vector, minus, plus, row, turned
 Points = NDArray[np.float64]
 
 
-@kernel
+@leaf
+def box_apart(
+    pieces: Points,
+    cables: Points,
+    bodies: Points,
+    piece: int,
+    body: int,
+    start: Vector,
+    end: Vector,
+) -> bool:
+    """`cable_apart` for a cable with a point exit and a box; the arrays are those of the world."""
+    arm = (cables[body, 9], cables[body, 10], cables[body, 11])
+    return triangle_box_apart(
+        _in_box(pieces, piece, row(cables, body)),
+        _in_box(pieces, piece, plus(start, arm)),
+        _in_box(pieces, piece, plus(end, arm)),
+        (pieces[piece, 12], pieces[piece, 13], pieces[piece, 14]),
+        bodies[body, 0],
+    )
+
+
+@leaf
+def _in_box(pieces: Points, piece: int, point: Vector) -> Vector:
+    away = minus(point, (pieces[piece, 9], pieces[piece, 10], pieces[piece, 11]))
+    return (
+        pieces[piece, 0] * away[0] + pieces[piece, 1] * away[1] + pieces[piece, 2] * away[2],
+        pieces[piece, 3] * away[0] + pieces[piece, 4] * away[1] + pieces[piece, 5] * away[2],
+        pieces[piece, 6] * away[0] + pieces[piece, 7] * away[1] + pieces[piece, 8] * away[2],
+    )
+
+
+@leaf
 def cable_apart(
     world: World, piece: int, exit: Vector, b: Vector, c: Vector, needed: float
 ) -> bool:
@@ -53,20 +84,18 @@ def cable_apart(
         )
     if kind == ROUND:
         return cable_squared(world, piece, exit, b, c) >= (needed + ball(world, piece)) ** 2
-    swept = np.empty((3, 3))
-    swept[0], swept[1], swept[2] = exit, b, c
-    return points_apart(world, piece, swept, needed)
+    return _triangle_apart(world, piece, exit, b, c, needed)
 
 
-@kernel
+@leaf
 def platform_apart(world: World, piece: int, start: Vector, end: Vector, needed: float) -> bool:
     """Whether the platform stays ``needed`` [m] from a piece's surface between two positions."""
     if world.spans[piece, 0] == ROUND or world.pieces[piece, 15] > 0.0:
         return platform_squared(world, piece, start, end) >= (needed + ball(world, piece)) ** 2
-    return points_apart(world, piece, platform_points(world, start, end), needed)
+    return _platform_hull_apart(world, piece, start, end, needed)
 
 
-@kernel
+@leaf
 def cable_distance(
     world: World, piece: int, exit: Vector, b: Vector, c: Vector, enough: float
 ) -> float:
@@ -77,12 +106,10 @@ def cable_distance(
     kind = world.spans[piece, 0]
     if kind in (BOX, ROUND):
         return math.sqrt(cable_squared(world, piece, exit, b, c)) - ball(world, piece)
-    swept = np.empty((3, 3))
-    swept[0], swept[1], swept[2] = exit, b, c
-    return points_distance(world, piece, swept, enough)
+    return _triangle_distance(world, piece, exit, b, c, enough)
 
 
-@kernel
+@leaf
 def platform_distance(world: World, piece: int, start: Vector, end: Vector, enough: float) -> float:
     """Distance of the platform's way to the piece's surface, [m]; 0 or less where they touch.
 
@@ -90,10 +117,10 @@ def platform_distance(world: World, piece: int, start: Vector, end: Vector, enou
     """
     if world.spans[piece, 0] == ROUND or world.pieces[piece, 15] > 0.0:
         return math.sqrt(platform_squared(world, piece, start, end)) - ball(world, piece)
-    return points_distance(world, piece, platform_points(world, start, end), enough)
+    return _platform_hull_distance(world, piece, start, end, enough)
 
 
-@kernel
+@leaf
 def cable_squared(world: World, piece: int, exit: Vector, b: Vector, c: Vector) -> float:
     """Squared distance of a triangle to a box, or to the axis of a round piece, [m²]."""
     if world.spans[piece, 0] == BOX:
@@ -111,7 +138,7 @@ def cable_squared(world: World, piece: int, exit: Vector, b: Vector, c: Vector) 
     return triangle_segment_squared(exit, b, c, ends[0], ends[1])
 
 
-@kernel
+@leaf
 def platform_squared(world: World, piece: int, start: Vector, end: Vector) -> float:
     """Squared distance of the platform's way to a parallel box or a round piece's axis, [m²]."""
     if world.spans[piece, 0] == BOX:
@@ -131,7 +158,7 @@ def platform_squared(world: World, piece: int, start: Vector, end: Vector) -> fl
     return min(triangle_box_squared(a, b, c, half), triangle_box_squared(a, c, d, half))
 
 
-@kernel
+@leaf
 def _seen(world: World, point: int, position: Vector) -> Vector:
     """A point of the world in the frame of the platform at a position."""
     away, turn = minus(row(world.points, point), position), world.platform
@@ -140,6 +167,41 @@ def _seen(world: World, point: int, position: Vector) -> Vector:
         turn[0, 1] * away[0] + turn[1, 1] * away[1] + turn[2, 1] * away[2],
         turn[0, 2] * away[0] + turn[1, 2] * away[1] + turn[2, 2] * away[2],
     )
+
+
+@kernel
+def _triangle_apart(
+    world: World, piece: int, exit: Vector, b: Vector, c: Vector, needed: float
+) -> bool:
+    return points_apart(world, piece, _triangle(exit, b, c), needed)
+
+
+@kernel
+def _triangle_distance(
+    world: World, piece: int, exit: Vector, b: Vector, c: Vector, enough: float
+) -> float:
+    return points_distance(world, piece, _triangle(exit, b, c), enough)
+
+
+@kernel
+def _platform_hull_apart(
+    world: World, piece: int, start: Vector, end: Vector, needed: float
+) -> bool:
+    return points_apart(world, piece, platform_points(world, start, end), needed)
+
+
+@kernel
+def _platform_hull_distance(
+    world: World, piece: int, start: Vector, end: Vector, enough: float
+) -> float:
+    return points_distance(world, piece, platform_points(world, start, end), enough)
+
+
+@kernel
+def _triangle(a: Vector, b: Vector, c: Vector) -> Points:
+    swept = np.empty((3, 3))
+    swept[0], swept[1], swept[2] = a, b, c
+    return swept
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Self clearance of a rig: proved once over the workspace box, then only what is left, by edge."""
+"""Self clearance of a rig: proved beforehand where that goes, then only what is left, by edge."""
 
 from __future__ import annotations
 
@@ -9,20 +9,15 @@ from cdpr.errors import BadInput
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from cdpr.self_clearance import SelfModel
-from planner.exact.compiled import kernel
+from planner.exact.cells import CELLS, WORD, Masks, open_along, words_for
+from planner.exact.compiled import inlined, kernel
 from planner.exact.fields import World
 from planner.exact.moving_edge import turned_by
-from planner.exact.self_region import (
-    PROVED,
-    REFUTED,
-    Robot,
-    pair_over_region,
-    platform_over_region,
-)
+from planner.exact.self_boxes import box_proved, compared, mark_open_cells
+from planner.exact.self_region import PROVED, REFUTED, Robot
 from planner.exact.vectors import Vector, along, minus
 from planner.exact.world import ROUND_OFF
 
-_MOST_BOXES = 2048
 _MOST_PIECES = 4096
 _DEEPEST = 64
 _FINEST = 1e-9
@@ -54,15 +49,27 @@ def build_robot(rig: Rig, world: World, clearance: float) -> Robot:
         platform_needed=clearance + rig.cable_radius + guard,
         open_pairs=np.arange(len(model.pairs)),
         open_cables=np.arange(rig.cable_count),
+        open_cells=np.zeros((CELLS, CELLS, CELLS, 0), dtype=np.uint64),
     )
     count = len(model.pairs)
     open_pairs = [k for k in range(count) if not box_proved(world, robot, k)]
     cables = range(rig.cable_count)
     open_cables = [k for k in cables if not box_proved(world, robot, count + k)]
+    left = [*open_pairs, *(count + k for k in open_cables)]
     return robot._replace(
         open_pairs=np.array(open_pairs, dtype=np.int64),
         open_cables=np.array(open_cables, dtype=np.int64),
+        open_cells=_open_cells(world, robot, left),
     )
+
+
+def _open_cells(world: World, robot: Robot, left: list[int]) -> Masks:
+    """In which cells of the workspace which of some comparisons are open."""
+    masks = np.zeros((CELLS, CELLS, CELLS, words_for(len(left))), dtype=np.uint64)
+    for number, which in enumerate(left):
+        word, bit = number // WORD, np.uint64(1 << (number % WORD))
+        mark_open_cells(world, robot, which, masks, word, bit)
+    return masks
 
 
 def _stubs(ends: Array, model: SelfModel) -> Array:
@@ -76,7 +83,8 @@ def _stubs(ends: Array, model: SelfModel) -> Array:
 def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool:
     """Whether the cables keep the self clearance under a translation.
 
-    What is proved over the whole workspace is not looked at, so both ends must lie in it.
+    What is proved over the cells that the edge passes is not looked at, so both ends must lie in
+    the workspace.
 
     Args:
         world: Where; gives the orientation.
@@ -90,14 +98,29 @@ def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool
     ends, middle = np.empty((2, 3)), along(before, minus(after, before), 0.5)
     ends[0], ends[1] = before, after
     count = len(robot.open_pairs)
-    for k in range(count + len(robot.open_cables)):
-        which = robot.open_pairs[k] if k < count else pairs + robot.open_cables[k - count]
-        found = _compared(world, robot, which, rotation, ends, middle, 0.0)
-        if found == REFUTED:
-            return False
-        if found != PROVED and not _clear(world, robot, which, before, after, rotation, still):
-            return False
+    for word in range(robot.open_cells.shape[3]):
+        mask, k = open_along(robot.open_cells, world.limits, before, after, word), word * WORD
+        while mask != np.uint64(0):
+            if mask & np.uint64(1):
+                which = robot.open_pairs[k] if k < count else pairs + robot.open_cables[k - count]
+                found = compared(world, robot, which, rotation, ends, middle, 0.0)
+                if found == REFUTED:
+                    return False
+                if found != PROVED and not _clear(
+                    world, robot, which, before, after, rotation, still
+                ):
+                    return False
+            mask, k = mask >> np.uint64(1), k + 1
     return True
+
+
+@inlined
+def is_open(world: World, robot: Robot, start: Vector, end: Vector) -> bool:
+    """Whether anything is left to compare along a translation within the workspace."""
+    for word in range(robot.open_cells.shape[3]):
+        if open_along(robot.open_cells, world.limits, start, end, word) != np.uint64(0):
+            return True
+    return False
 
 
 @kernel
@@ -121,7 +144,7 @@ def self_turning_edge_free(
     ends[0], ends[1] = before, after
     middle = along(before, minus(after, before), 0.5)
     for which in range(len(robot.pairs) + len(world.cables)):
-        found = _compared(world, robot, which, there, ends, middle, angle / 2.0)
+        found = compared(world, robot, which, there, ends, middle, angle / 2.0)
         if found == REFUTED:
             return False
         if found != PROVED and not _clear(world, robot, which, before, after, rotation, turn):
@@ -139,7 +162,7 @@ def _clear(
     rotation: Array,
     turn: Array,
 ) -> bool:
-    """One comparison along an edge that is halved until decided; ``which`` as in `_compared`."""
+    """One comparison along an edge that is halved until decided; ``which`` as in `compared`."""
     way = minus(after, before)
     angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     size = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2) + angle
@@ -153,7 +176,7 @@ def _clear(
         ends[0], ends[1] = along(before, way, low), along(before, way, high)
         at, there = along(before, way, middle), turned_by(rotation, turn, middle)
         off = angle * (high - low) / 2.0
-        found = _compared(world, robot, which, there, ends, at, off)
+        found = compared(world, robot, which, there, ends, at, off)
         if found == PROVED:
             continue
         if found == REFUTED or tried >= _MOST_PIECES or waiting + 2 > _DEEPEST:
@@ -162,53 +185,6 @@ def _clear(
             return False
         lows[waiting], highs[waiting] = middle, high
         lows[waiting + 1], highs[waiting + 1] = low, middle
-        waiting += 2
-    return True
-
-
-@kernel
-def _compared(
-    world: World,
-    robot: Robot,
-    which: int,
-    rotation: Array,
-    corners: Array,
-    middle: Vector,
-    angle: float,
-) -> int:
-    """Comparison ``which`` over a region: the pairs in turn, then each cable with the platform."""
-    pairs = len(robot.pairs)
-    if which < pairs:
-        return pair_over_region(world, robot, which, rotation, corners, middle, angle)
-    return platform_over_region(world, robot, which - pairs, rotation, corners, middle, angle)
-
-
-@kernel
-def box_proved(world: World, robot: Robot, which: int) -> bool:
-    """Whether one comparison is proved over the workspace box; ``which`` as in `_compared`."""
-    boxes, corners = np.empty((_DEEPEST, 6)), np.empty((8, 3))
-    boxes[0, :3], boxes[0, 3:] = world.limits[0], world.limits[1]
-    waiting, tried = 1, 0
-    rotation = world.platform[:3]
-    while waiting > 0:
-        waiting -= 1
-        tried += 1
-        box = boxes[waiting].copy()
-        for corner in range(8):
-            for axis in range(3):
-                corners[corner, axis] = box[axis + 3 * ((corner >> axis) & 1)]
-        at = ((box[0] + box[3]) / 2.0, (box[1] + box[4]) / 2.0, (box[2] + box[5]) / 2.0)
-        found = _compared(world, robot, which, rotation, corners, at, 0.0)
-        if found == PROVED:
-            continue
-        if found == REFUTED or tried >= _MOST_BOXES or waiting + 2 > _DEEPEST:
-            return False
-        longest = 0
-        for axis in range(1, 3):
-            if box[axis + 3] - box[axis] > box[longest + 3] - box[longest]:
-                longest = axis
-        boxes[waiting], boxes[waiting + 1] = box, box
-        boxes[waiting, longest + 3], boxes[waiting + 1, longest] = at[longest], at[longest]
         waiting += 2
     return True
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from planner.exact.cells import Masks
 from planner.exact.compiled import kernel
 from planner.exact.exits import exit_point, exit_travel
 from planner.exact.fields import World, anchor, half_size
@@ -43,6 +44,8 @@ class Robot(NamedTuple):
         platform_needed: Between the line of a cable and the platform, radius included, [m].
         open_pairs: Pairs not proved over the whole workspace, shape (k,).
         open_cables: Cables not proved against the platform over the whole workspace, shape (l,).
+        open_cells: In which cells of it which of these are open, the pairs first, shape (c, c, c,
+            words); see `planner.exact.cells`.
     """
 
     pairs: Integers
@@ -52,6 +55,7 @@ class Robot(NamedTuple):
     platform_needed: float
     open_pairs: Integers
     open_cables: Integers
+    open_cells: Masks
 
 
 @kernel

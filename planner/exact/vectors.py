@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import kernel, leaf
 
 Vector = tuple[float, float, float]
 
@@ -56,13 +56,13 @@ def norm(a: Vector) -> float:
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
 
 
-@kernel
+@leaf
 def row(array: NDArray[np.float64], index: int) -> Vector:
     """A row of an array, shape (k, 3)."""
     return (array[index, 0], array[index, 1], array[index, 2])
 
 
-@kernel
+@leaf
 def turned(matrix: NDArray[np.float64], a: Vector) -> Vector:
     """The product of a matrix, shape (3, 3), and a vector."""
     return (

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import leaf
 from planner.exact.edge import row_of
 from planner.exact.vectors import Vector
 from planner.optimal.problem import Problem, edge_allowed
@@ -27,7 +27,7 @@ _FROM_INSIDE = 0.25
 """Part of the samples that are uniform in the workspace box."""
 
 
-@kernel
+@leaf
 def connect(
     problem: Problem,
     ends: Array,
@@ -54,11 +54,13 @@ def connect(
         The number of vertices of the path; 0 where none was found yet.
     """
     if counts[0] == 0:
-        trees[0, 0], trees[1, 0] = ends[0], ends[1]
+        _put(trees[0], 0, row_of(ends[0]))
+        _put(trees[1], 0, row_of(ends[1]))
         parents[0, 0], parents[1, 0] = -1, -1
         counts[0], counts[1], counts[2] = 1, 1, counts[2] + 1
         if edge_allowed(problem, row_of(ends[0]), row_of(ends[1])):
-            path[0], path[1] = ends[0], ends[1]
+            _put(path, 0, row_of(ends[0]))
+            _put(path, 1, row_of(ends[1]))
             return 2
     for _ in range(samples):
         counts[3] += 1
@@ -75,7 +77,7 @@ def connect(
     return 0
 
 
-@kernel
+@leaf
 def _sample(problem: Problem, state: State) -> Vector:
     """A point of the workspace, most often on its walls, edges or in its corners.
 
@@ -91,13 +93,13 @@ def _sample(problem: Problem, state: State) -> Vector:
     )
 
 
-@kernel
+@leaf
 def _drawn(state: State, wide: float, low: float, high: float) -> float:
     share = 0.5 + wide * (uniform(state) - 0.5)
     return low + min(max(share, 0.0), 1.0) * (high - low)
 
 
-@kernel
+@leaf
 def _extended(
     problem: Problem,
     trees: Array,
@@ -114,13 +116,13 @@ def _extended(
         return -1
     if counts[tree] < NODES:
         new = counts[tree]
-        trees[tree, new, 0], trees[tree, new, 1], trees[tree, new, 2] = wanted
+        _put(trees[tree], new, wanted)
         parents[tree, new] = nearest
         counts[tree] = new + 1
     return nearest
 
 
-@kernel
+@leaf
 def _nearest(trees: Array, tree: int, count: int, wanted: Vector) -> int:
     best, least = 0, np.inf
     for i in range(count):
@@ -135,7 +137,7 @@ def _nearest(trees: Array, tree: int, count: int, wanted: Vector) -> int:
     return best
 
 
-@kernel
+@leaf
 def _joined(
     trees: Array, parents: Integers, first: int, between: Vector, second: int, path: Array
 ) -> int:
@@ -150,11 +152,16 @@ def _joined(
         return 0
     node = first
     for i in range(length - 1, -1, -1):
-        path[i] = trees[0, node]
+        _put(path, i, row_of(trees[0, node]))
         node = parents[0, node]
-    path[length, 0], path[length, 1], path[length, 2] = between
+    _put(path, length, between)
     node = second
     for i in range(length + 1, length + 1 + other):
-        path[i] = trees[1, node]
+        _put(path, i, row_of(trees[1, node]))
         node = parents[1, node]
     return length + 1 + other
+
+
+@leaf
+def _put(points: Array, place: int, point: Vector) -> None:
+    points[place, 0], points[place, 1], points[place, 2] = point

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import leaf
 from planner.exact.vectors import Vector
 
 Array = NDArray[np.float64]
 
 
-@kernel
+@leaf
 def interpolated(grid: Array, values: Array, point: Vector) -> float:
     """The value at a point; outside the lattice that of the nearest point on its border.
 
@@ -31,7 +31,7 @@ def interpolated(grid: Array, values: Array, point: Vector) -> float:
     return front * (1.0 - x) + (low * (1.0 - y) + high * y) * x  # type: ignore[no-any-return]
 
 
-@kernel
+@leaf
 def _cell(value: float, lower: float, spacing: float, count: int) -> tuple[float, int]:
     """Place within a cell, 0 … 1, and the number of the cell, along one axis."""
     scaled = (value - lower) / spacing

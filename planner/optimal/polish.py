@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import leaf
 from planner.exact.edge import row_of
 from planner.exact.vectors import Vector, along, dot, minus
 from planner.optimal.polyline import Change, Polyline, replace
@@ -24,7 +24,7 @@ _CUT, _MOVE, _MOVE_TWO, _SLIDE, _DROP, _SPLIT = 0, 1, 2, 3, 4, 5
 _NOWHERE = (0.0, 0.0, 0.0)
 
 
-@kernel
+@leaf
 def polish(problem: Problem, line: Polyline, state: State, trials: int) -> None:
     """Tries so many kinds of changes at random places.
 
@@ -44,7 +44,7 @@ def polish(problem: Problem, line: Polyline, state: State, trials: int) -> None:
             change = Change(change.first, change.last, change.number, one, two, False)
 
 
-@kernel
+@leaf
 def _kind(line: Polyline, state: State) -> int:
     """What to try next. Source of the shares: measured on the paper's scenes."""
     choice = uniform(state)
@@ -61,18 +61,18 @@ def _kind(line: Polyline, state: State) -> int:
     return _DROP
 
 
-@kernel
+@leaf
 def _size(state: State) -> float:
     """The size of a move, every scale equally often."""
     return _SMALLEST * math.exp(uniform(state) * math.log(_LARGEST / _SMALLEST))
 
 
-@kernel
+@leaf
 def _vertex(line: Polyline, k: int) -> Vector:
     return row_of(line.points[k])
 
 
-@kernel
+@leaf
 def _drawn(line: Polyline, state: State, kind: int, way: Vector, size: float) -> Change:
     """One change of a kind at a random place."""
     vertices = line.counts[0]
@@ -95,7 +95,7 @@ def _drawn(line: Polyline, state: State, kind: int, way: Vector, size: float) ->
     return Change(k - 1, k + 1, 1, along(_vertex(line, k), way, size), _NOWHERE, False)
 
 
-@kernel
+@leaf
 def _cut(line: Polyline, state: State) -> Change:
     """A straight line from somewhere on one edge to somewhere on a later one."""
     edges = line.counts[0] - 1
@@ -112,7 +112,7 @@ def _cut(line: Polyline, state: State) -> Change:
     return Change(first, second + 1, 2, one, two, True)
 
 
-@kernel
+@leaf
 def _tightened(problem: Problem, line: Polyline, change: Change) -> Change:
     """Draws a moved vertex toward the straight line of its neighbours, as far as allowed."""
     before, after = _vertex(line, change.first), _vertex(line, change.last)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import leaf
 from planner.exact.edge import row_of
 from planner.exact.vectors import Vector
 from planner.optimal.problem import (
@@ -75,7 +75,7 @@ def polyline_of(points: Array) -> Polyline:
     return Polyline(points.copy(), np.zeros((len(points), 3)), np.array([len(points), 0]))
 
 
-@kernel
+@leaf
 def measure(problem: Problem, line: Polyline) -> float:
     """Fills in what the edges are worth, and gives the cost of the whole path."""
     for i in range(line.counts[0] - 1):
@@ -86,7 +86,7 @@ def measure(problem: Problem, line: Polyline) -> float:
     return cost_of(problem, line)
 
 
-@kernel
+@leaf
 def cost_of(problem: Problem, line: Polyline) -> float:
     """The cost of the whole path, its edges being measured."""
     total, clearance, margin = 0.0, math.inf, math.inf
@@ -97,7 +97,7 @@ def cost_of(problem: Problem, line: Polyline) -> float:
     return total - gained(problem, clearance, margin)
 
 
-@kernel
+@leaf
 def replace(problem: Problem, line: Polyline, change: Change) -> bool:
     """Makes a change, if it makes the path cheaper and every new edge is allowed."""
     added = change.number - (change.last - change.first - 1)
@@ -132,7 +132,7 @@ def replace(problem: Problem, line: Polyline, change: Change) -> bool:
     return True
 
 
-@kernel
+@leaf
 def _corner(line: Polyline, change: Change, i: int) -> Vector:
     """Vertex ``i`` of the changed part: the one before, the new ones, the one after."""
     if i == 0:
@@ -142,7 +142,7 @@ def _corner(line: Polyline, change: Change, i: int) -> Vector:
     return change.one if i == 1 else change.two
 
 
-@kernel
+@leaf
 def _gain(
     problem: Problem,
     line: Polyline,
@@ -163,7 +163,7 @@ def _gain(
     return gained(problem, clearance, margin) - gained(problem, old_clearance, old_margin)
 
 
-@kernel
+@leaf
 def _put(
     line: Polyline,
     change: Change,
@@ -178,10 +178,10 @@ def _put(
     shift = count - (change.last - first - 1)
     if shift > 0:
         for i in range(old - 1, change.last - 1, -1):
-            line.points[i + shift], line.edges[i + shift] = line.points[i], line.edges[i]
+            _move(line, i, i + shift)
     elif shift < 0:
         for i in range(change.last, old):
-            line.points[i + shift], line.edges[i + shift] = line.points[i], line.edges[i]
+            _move(line, i, i + shift)
     line.counts[0] = old + shift
     if count >= 1:
         line.points[first + 1, 0], line.points[first + 1, 1], line.points[first + 1, 2] = change.one
@@ -191,3 +191,10 @@ def _put(
         k = i + 2 - count
         line.edges[first + i, 0] = costs[k]
         line.edges[first + i, 1], line.edges[first + i, 2] = lows[2 * k], lows[2 * k + 1]
+
+
+@leaf
+def _move(line: Polyline, place: int, to: int) -> None:
+    for column in range(3):
+        line.points[to, column] = line.points[place, column]
+        line.edges[to, column] = line.edges[place, column]

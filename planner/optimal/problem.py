@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.exact.capacity import Load
-from planner.exact.compiled import kernel
+from planner.exact.compiled import inlined, kernel, leaf
 from planner.exact.edge import edge_clearance, in_workspace, obstacles_free
 from planner.exact.fields import World
 from planner.exact.holding import Holding, edge_held
-from planner.exact.self_edge import self_edge_free
+from planner.exact.self_edge import is_open, self_edge_free
 from planner.exact.self_region import Robot
 from planner.exact.vectors import Vector, along, minus, norm
 from planner.optimal.grid import interpolated
@@ -61,7 +61,7 @@ class Problem(NamedTuple):
     terms: Array
 
 
-@kernel
+@inlined
 def edge_allowed(problem: Problem, start: Vector, end: Vector) -> bool:
     """Whether an edge keeps everything asked for: workspace, clearances, wrench feasibility."""
     world, robot = problem.world, problem.robot
@@ -69,34 +69,41 @@ def edge_allowed(problem: Problem, start: Vector, end: Vector) -> bool:
         return False
     if not obstacles_free(world, start, end):
         return False
-    least = problem.terms[LEAST_MARGIN]
-    proved = len(robot.open_pairs) + len(robot.open_cables) == 0
-    if proved and least == NO_MARGIN:
-        return True
-    before, after = np.array(start), np.array(end)
-    if not (proved or self_edge_free(world, robot, before, after)):
+    if is_open(world, robot, start, end) and not _keeps_off(problem, start, end):
         return False
+    least = problem.terms[LEAST_MARGIN]
     if least == NO_MARGIN:
         return True
-    margin = lowest_margin(problem, start, end)
+    margin = lowest_margin(problem.grid, problem.margins, start, end)
     if least < ASK_PROOF or margin < 0.0:  # far from held: not worth the time of a proof
         return bool(margin >= least)
-    return bool(edge_held(world, problem.load, problem.holding, before, after))
+    return _is_held(problem, start, end)
 
 
 @kernel
-def lowest_margin(problem: Problem, start: Vector, end: Vector) -> float:
+def _keeps_off(problem: Problem, start: Vector, end: Vector) -> bool:
+    return self_edge_free(problem.world, problem.robot, np.array(start), np.array(end))
+
+
+@kernel
+def _is_held(problem: Problem, start: Vector, end: Vector) -> bool:
+    before, after = np.array(start), np.array(end)
+    return edge_held(problem.world, problem.load, problem.holding, before, after)
+
+
+@leaf
+def lowest_margin(grid: Array, margins: Array, start: Vector, end: Vector) -> float:
     """The smallest interpolated capacity margin at samples of an edge, [N]."""
     way = minus(end, start)
     steps = math.ceil(norm(way) / _SAMPLING) + 1
     least = math.inf
     for i in range(steps + 1):
         at = along(start, way, i / steps)
-        least = min(least, interpolated(problem.grid, problem.margins, at))
+        least = min(least, interpolated(grid, margins, at))
     return least
 
 
-@kernel
+@leaf
 def edge_cost(problem: Problem, start: Vector, end: Vector) -> float:
     """What an edge adds to the sums in the cost: weighted length and integral of c, [m]."""
     way = minus(end, start)
@@ -113,14 +120,14 @@ def edge_cost(problem: Problem, start: Vector, end: Vector) -> float:
     return float(cost + weight * total * length / steps)
 
 
-@kernel
+@leaf
 def edge_lows(problem: Problem, start: Vector, end: Vector) -> tuple[float, float]:
     """Smallest clearance [m] and margin [N] of an edge; infinite where they have no weight."""
     clearance, margin = math.inf, math.inf
     if problem.terms[CLEARANCE] > 0.0:
         clearance = _clearance(problem.world, start, end)
     if problem.terms[CAPACITY] > 0.0:
-        margin = lowest_margin(problem, start, end)
+        margin = lowest_margin(problem.grid, problem.margins, start, end)
     return clearance, margin
 
 
@@ -137,7 +144,7 @@ def _clearance(world: World, start: Vector, end: Vector) -> float:
     return least
 
 
-@kernel
+@leaf
 def gained(problem: Problem, clearance: float, margin: float) -> float:
     """What smallest clearance and margin of a whole path take off its cost."""
     gain = 0.0

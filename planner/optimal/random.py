@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.exact.compiled import kernel
+from planner.exact.compiled import leaf
 from planner.exact.vectors import Vector
 
 State = NDArray[np.uint64]
@@ -26,7 +26,7 @@ def seeded(seed: int) -> State:
     return np.array([seed % 2**64], dtype=np.uint64)
 
 
-@kernel
+@leaf
 def uniform(state: State) -> float:
     """A number in [0, 1)."""
     state[0] += _GAMMA
@@ -37,13 +37,13 @@ def uniform(state: State) -> float:
     return float(mixed >> np.uint64(11)) * _UNIT
 
 
-@kernel
+@leaf
 def below(state: State, count: int) -> int:
     """A whole number in 0 … count - 1."""
     return int(uniform(state) * count)
 
 
-@kernel
+@leaf
 def direction(state: State) -> Vector:
     """A unit vector, uniform on the sphere."""
     height = 2.0 * uniform(state) - 1.0
