@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,14 @@ from cdpr.legs import Leg
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from planner.cost import KinematicCost
-from planner.optimal.routing import OptimalRoute, optimal_route
 from planner.optimal.settings import OptimalSettings
-from planner.paper.routing import paper_route
 from planner.route import Progress, Route
 from planner.settings import PlannerSettings
-from planner.turning.routing import TurningRoute, turning_route
 from planner.turning.settings import TurningSettings
+
+if TYPE_CHECKING:
+    from planner.optimal.routing import OptimalRoute
+    from planner.turning.routing import TurningRoute
 
 Settings = PlannerSettings | OptimalSettings | TurningSettings
 """Of any planner."""
@@ -68,13 +70,20 @@ def way_through(
     found: list[OptimalRoute | TurningRoute] = []
     for leg, own in zip(legs, settings, strict=True):
         try:
+            # Each planner is imported when it is asked for: its kernels take a while to load.
             if isinstance(own, OptimalSettings):
+                from planner.optimal.routing import optimal_route
+
                 found.append(optimal_route(rig, leg.scene, own, kinematic, progress, clock))
                 routes.append(found[-1].route)
             elif isinstance(own, TurningSettings):
+                from planner.turning.routing import turning_route
+
                 found.append(turning_route(rig, leg.scene, own, kinematic, progress, clock))
                 routes.append(found[-1].route)
             else:
+                from planner.paper.routing import paper_route
+
                 routes.append(paper_route(rig, leg.scene, own, kinematic, progress))
         except NoSolution as error:
             if len(legs) > 1:
