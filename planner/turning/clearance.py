@@ -28,27 +28,25 @@ def pose_clearance(world: World, position: Vector, rotation: Array, enough: floa
         enough: [m].
     """
     least, platform = enough, len(world.bodies) - 1
-    corners, line = np.empty((8, 3)), np.empty((2, 3))
+    corners, lines = np.empty((8, 3)), np.empty((platform, 2, 3))
     place_corners(world, rotation, position, corners)
-    for body in range(platform + 1):
-        points = corners
-        if body < platform:
-            at = plus(position, turned(rotation, anchor(world, body)))
-            line[0], line[1] = exit_point(world, body, at), at
-            points = line
-        radius = world.bodies[body, 1]
-        for piece in range(len(world.spans)):
-            if _room_at_planes(world, piece, body, points) - radius < least:
-                found = points_distance(world, piece, points, least + radius) - radius
-                least = min(least, found)
+    for cable in range(platform):
+        at = plus(position, turned(rotation, anchor(world, cable)))
+        lines[cable, 0], lines[cable, 1] = exit_point(world, cable, at), at
+    for pair in range(len(world.pairs)):
+        piece, body = world.pairs[pair, 0], world.pairs[pair, 1]
+        points, radius = lines[body] if body < platform else corners, world.bodies[body, 1]
+        if _room_at_planes(world, pair, points) - radius < least:
+            found = points_distance(world, piece, points, least + radius) - radius
+            least = min(least, found)
     return least
 
 
 @kernel
-def _room_at_planes(world: World, piece: int, body: int, points: Array) -> float:
-    """A lower bound of the distance of the hull of points to a piece, [m]."""
-    pair, room = piece * len(world.bodies) + body, -np.inf
-    for k in range(world.first_plane[pair], world.first_plane[pair + 1]):
+def _room_at_planes(world: World, pair: int, points: Array) -> float:
+    """A lower bound of the distance of the hull of a body's points to a piece, [m]."""
+    room = -np.inf
+    for k in range(world.pairs[pair, 2], world.pairs[pair, 3]):
         normal = (world.planes[k, 0], world.planes[k, 1], world.planes[k, 2])
         reach = -np.inf
         for i in range(len(points)):
