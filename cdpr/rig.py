@@ -149,6 +149,16 @@ class Rig:
         return len(self.outlets)
 
     @cached_property
+    def drive_names(self) -> dict[int, str]:
+        """What drives are called, by node id, in the order of the cables: ``cable 1 (drive 11)``.
+
+        Cables and winches are counted from 1 in the order of the file; a drive's number is its
+        node id.
+        """
+        nodes = [winch.node_id for winch in self.winches]
+        return {node: f"cable {k} (drive {node})" for k, node in enumerate(nodes, start=1)}
+
+    @cached_property
     def plan_hash(self) -> str:
         """Hash of the parts of the rig that a plan's proof rests on."""
         document = self.document.model_dump(mode="json")

@@ -84,8 +84,8 @@ class CycleStatus:
         status_words: The state of each drive in its protocol's code, shape (m,); `drive_states`
             tells what they say.
         missing: True for drives from which this cycle's answer is overdue, shape (m,).
-        faults: Node and text of every fault since the last reset, oldest first; the node is
-            `WHOLE_BUS` where it is the bus that failed.
+        faults: Node and text of every fault since the last reset, oldest first; the text names
+            cable and drive, and the node is `WHOLE_BUS` where it is the bus that failed.
         state: State of the group.
         holding: Every cable is held: by its drive under torque, or by its closed brake.
         stopped: Every drive told in this cycle that it follows no set-points.

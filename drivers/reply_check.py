@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 BAD_CYCLES = 2
 """Cycles in a row that are one too many: one bad frame may happen, two are a defect."""
@@ -18,11 +18,11 @@ class ReplyCheck:
         rejected: Replies that were not believed, of all drives.
     """
 
-    def __init__(self, nodes: Sequence[int], max_steps: Sequence[float]) -> None:
-        """Takes node ids and how far each drive's position can change in a cycle, [counts]."""
-        count = len(nodes)
+    def __init__(self, names: Mapping[int, str], max_steps: Sequence[float]) -> None:
+        """Takes names by node id, and how far each position can change in a cycle, [counts]."""
+        count = len(names)
         self.rejected = 0
-        self._nodes, self._max_steps = tuple(nodes), tuple(max_steps)
+        self._names, self._max_steps = tuple(names.items()), tuple(max_steps)
         self._positions: list[int | None] = [None] * count
         self._age = [1] * count
         self._heard = [0] * count
@@ -32,7 +32,7 @@ class ReplyCheck:
 
     def forget_positions(self) -> None:
         """The next position of each drive is believed whatever it is."""
-        self._positions = [None] * len(self._nodes)
+        self._positions = [None] * len(self._names)
 
     def begin_cycle(self) -> None:
         """Counts who answered the last SYNC more than once, up to now, when the next one goes."""
@@ -40,8 +40,8 @@ class ReplyCheck:
             repeats + 1 if heard > 1 else 0
             for repeats, heard in zip(self._repeats, self._heard, strict=True)
         ]
-        self._heard = [0] * len(self._nodes)
-        self._reasons = [""] * len(self._nodes)
+        self._heard = [0] * len(self._names)
+        self._reasons = [""] * len(self._names)
 
     def hear(self, drive: int) -> None:
         """Notes that a drive answered, in time or late."""
@@ -77,13 +77,15 @@ class ReplyCheck:
     def faults(self) -> list[tuple[int, str]]:
         """Drives whose answers cannot be relied on, by node."""
         found = [
-            (node, f"drive {node}: {reason}, {bad} cycles in a row")
-            for node, reason, bad in zip(self._nodes, self._reasons, self._bad_cycles, strict=True)
+            (node, f"{name}: {reason}, {bad} cycles in a row")
+            for (node, name), reason, bad in zip(
+                self._names, self._reasons, self._bad_cycles, strict=True
+            )
             if bad >= BAD_CYCLES
         ]
         found += [
-            (node, f"drive {node} answers twice: two devices have this node id")
-            for node, repeats in zip(self._nodes, self._repeats, strict=True)
+            (node, f"{name} answers twice: two devices have this node id")
+            for (node, name), repeats in zip(self._names, self._repeats, strict=True)
             if repeats >= BAD_CYCLES
         ]
         return found

@@ -116,19 +116,20 @@ def require_still_referenced(
         if winch.absolute:
             continue
         if winch.node_id in group.restarted:
-            raise _lost(drive, "it was switched on since it was referenced")
+            raise _lost(rig, drive, "it was switched on since it was referenced")
         off = abs((int(stands[drive]) - reference.stands_at[drive]) / winch.counts_per_metre)
         if not off <= rig.motion.start_tolerance:
             raise _lost(
-                drive, f"it stands {off * 1000:.1f} mm of cable away from where it was left"
+                rig, drive, f"it stands {off * 1000:.1f} mm of cable away from where it was left"
             )
 
 
-def _lost(drive: int, how: str) -> Refused:
+def _lost(rig: Rig, drive: int, how: str) -> Refused:
+    node = rig.winches[drive].node_id
     return Refused(
-        f"the reference of drive {drive + 1} is lost: {how}",
+        f"the reference of {rig.drive_names[node]} is lost: {how}",
         where="arming",
         why="its encoder is not absolute: after its power was gone it counts from anywhere",
         next_step="reference the drives again with `cdpr home RIG`; nothing was enabled",
-        values={"drive": drive + 1},
+        values={"cable": drive + 1, "drive": node},
     )

@@ -146,10 +146,11 @@ class Custody:
     def _require_absolute(self) -> None:
         if not self._is_kept:
             return
-        nodes = [str(winch.node_id) for winch in self._rig.winches if not winch.absolute]
-        if nodes:
+        names = self._rig.drive_names
+        relative = [names[w.node_id] for w in self._rig.winches if not w.absolute]
+        if relative:
             raise self._refusal(
-                f"never referenced: drive {', '.join(nodes)}",
+                f"never referenced: {', '.join(relative)}",
                 "an encoder that is not absolute (winches[].encoder in the rig file) counts from"
                 " anywhere once its power was gone",
             )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cdpr.poses import Array
-from drivers.drive_group import WHOLE_BUS, CycleStatus, DriveGroup, GroupState
+from drivers.drive_group import CycleStatus, DriveGroup, GroupState
 from executor.clock import Clock
 from executor.course import Course
 from executor.safety.gate import Purpose, Request, Verdict, examine
@@ -52,8 +52,10 @@ class Exchange:
         self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
         self._rated = np.array([w.torque_constant for w in rig.winches])
         self._limits = gate_limits(rig, course.setpoints, course.cycle)
-        self._watch = Watch.fresh(watch_limits(rig), rig.cable_count)
-        self._stuck = StuckWatch.fresh(least_steps(rig))
+        names = tuple(rig.drive_names.values())
+        self._numbers = {node: k for k, node in enumerate(rig.drive_names, start=1)}
+        self._watch = Watch.fresh(watch_limits(rig), names)
+        self._stuck = StuckWatch.fresh(least_steps(rig), names)
         self.armed = False
         self.latched = False
         self.targets: tuple[int, ...] | None = None
@@ -124,7 +126,7 @@ class Exchange:
             following_errors=errors.tolist(),
             tensions=(np.asarray(status.torques) / 1000.0 * self._rated).tolist(),
             missing=missing,
-            faults=[_named(node, text) for node, text in status.faults],
+            faults=[(self._numbers.get(node, 0), text) for node, text in status.faults],
             lateness=lateness,
         )
         self._watch, findings = self._watch.look(seen)
@@ -132,10 +134,6 @@ class Exchange:
             following, status.positions.tolist(), status.demands.tolist(), missing
         )
         return (*findings, *stuck)
-
-
-def _named(node: int, text: str) -> str:
-    return text if node == WHOLE_BUS else f"node {node}: {text}"
 
 
 def _largest(errors: Array) -> float:

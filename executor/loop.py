@@ -61,7 +61,7 @@ class Loop:
         self._feed = Feed(len(course), course.cycle, course.rig.motion)
         self._cycle = 0
         self._taken_over = False
-        self._told: set[tuple[str, int]] = set()
+        self._told: set[tuple[str, str]] = set()
         self._listener_error = ""
         self._held = _HELD if group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = ""
@@ -248,8 +248,10 @@ class Loop:
 
     def _tell_once(self, finding: Finding) -> None:
         """What is wrong in every cycle is told in the first."""
-        if (finding.code, finding.drive) not in self._told:
-            self._told.add((finding.code, finding.drive))
+        # A drive may report several faults, each once; what the watch measures changes its text.
+        what = finding.text if finding.code == "drive_fault" else str(finding.drive)
+        if (finding.code, what) not in self._told:
+            self._told.add((finding.code, what))
             self._tell(finding.code, finding.text)
 
     def _react(self, finding: Finding) -> None:

@@ -69,7 +69,7 @@ def jog_cable(
             "ready to move one cable",
             [
                 ("rig", rig.name),
-                ("cable", f"{cable}, drive {winch.node_id}"),
+                ("cable", rig.drive_names[winch.node_id]),
                 ("way", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed_mm_s:g} mm/s"),
                 ("tension", f"at most {limit:g} N in any cable; none that is taut may go slack"),
             ],

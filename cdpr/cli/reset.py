@@ -105,10 +105,14 @@ def _drives_reset(rig: Rig) -> list[str]:
                 why="the cause is still there",
                 next_step="remove it, then reset again; the latch stays engaged",
             )
-        gone = [w.node_id for w, n in zip(rig.winches, silent, strict=True) if n >= MISSING_CYCLES]
+        gone = [
+            name
+            for name, n in zip(rig.drive_names.values(), silent, strict=True)
+            if n >= MISSING_CYCLES
+        ]
         if gone:
             raise HardwareMissing(
-                f"drive {', '.join(map(str, gone))} fell silent while the drives settled",
+                f"{', '.join(gone)} fell silent while the drives settled",
                 where="reset",
                 why="it lost power or the bus since it was set up",
                 next_step="check power and wiring, then reset again; the latch stays engaged",

@@ -69,7 +69,7 @@ class Cia402Group:
         own = OwnFrames(commanding_ids(self._nodes), hears_itself=hears_itself(self._bus))
         self._cyclic = CyclicBus(self._bus, own, foreign_text)
         self._frames = CyclicFrames(self._nodes)
-        self._watch = DriveWatch(self._nodes, self._max_steps)
+        self._watch = DriveWatch(self._rig.drive_names, self._max_steps)
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
         self._released = [False] * count
@@ -269,8 +269,9 @@ class Cia402Group:
                 self._latch(self._late(DriveState.OPERATION_ENABLED))
 
     def _late(self, wanted: DriveState) -> list[tuple[int, str]]:
+        names = self._rig.drive_names
         return [
-            (node, f"drive {node} stays in {state.value} on the way to {wanted.value}")
+            (node, f"{names[node]} stays in {state.value} on the way to {wanted.value}")
             for node, state in zip(self._nodes, self._watch.states, strict=True)
             if state is not wanted
         ]
@@ -325,17 +326,17 @@ class Cia402Group:
     def _reset_fault(self) -> None:
         """Clears the latch; a drive in fault is reset only when no other holds the platform."""
         states = self._watch.states
-        restarted = sorted(self._watch.restarted)
+        names, restarted = self._rig.drive_names, sorted(self._watch.restarted)
         if restarted:
             raise Refused(
-                f"drive {restarted[0]} restarted: its set-up and its position are lost",
+                f"{names[restarted[0]]} restarted: its set-up and its position are lost",
                 where="drive group",
                 next_step="set the drives up again and check the reference (home) positions",
             )
         faulted = [n for n, s in zip(self._nodes, states, strict=True) if s in FAULTED]
         if faulted and any(s in TORQUE_ON for s in states):
             raise Refused(
-                f"drive {faulted[0]} cannot be reset while other drives hold the platform",
+                f"{names[faulted[0]]} cannot be reset while other drives hold the platform",
                 where="drive group",
                 why="resetting one drive of a platform under tension moves it",
                 next_step="support the platform, press the emergency stop so that no drive holds,"

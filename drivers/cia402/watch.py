@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from drivers.cia402.frames import (
     EMCY_BASE,
@@ -22,10 +22,11 @@ from drivers.reply_check import ReplyCheck
 class DriveWatch:
     """The last word of every drive: replies, emergencies, heartbeats."""
 
-    def __init__(self, nodes: Sequence[int], max_steps: Sequence[float]) -> None:
-        """Takes node ids, and the farthest each drive can turn in a cycle, [counts]."""
-        count = len(nodes)
-        self.nodes = tuple(nodes)
+    def __init__(self, names: Mapping[int, str], max_steps: Sequence[float]) -> None:
+        """Takes names by node id, and the farthest each drive can turn in a cycle, [counts]."""
+        count, nodes = len(names), tuple(names)
+        self.nodes = nodes
+        self._names = dict(names)
         self.status_words = [0] * count
         self.positions = [0] * count
         self.torques = [0] * count
@@ -33,7 +34,7 @@ class DriveWatch:
         self.answered = [False] * count
         self.restarted: set[int] = set()
         self._wrong_lengths = 0
-        self._check = ReplyCheck(nodes, max_steps)
+        self._check = ReplyCheck(names, max_steps)
         self._news: list[tuple[int, str]] = []
         self._dropped: list[tuple[int, str]] = []
         self._emergencies: dict[int, str] = {}
@@ -94,7 +95,7 @@ class DriveWatch:
         self.states[drive] = state
         if before is DriveState.OPERATION_ENABLED and state is not before:
             node = self.nodes[drive]
-            self._dropped.append((node, f"drive {node} stopped by itself: {state.value}"))
+            self._dropped.append((node, f"{self._names[node]} stopped by itself: {state.value}"))
 
     def news(self) -> list[tuple[int, str]]:
         """Emergencies, restarts and NMT states told since the last call, by node."""
@@ -119,7 +120,7 @@ class DriveWatch:
         for node, state in zip(self.nodes, self.states, strict=True):
             if state in FAULTED:
                 cause = self._emergencies.get(node, "it sent no reason")
-                found.append((node, f"drive {node} is in {state.value}: {cause}"))
+                found.append((node, f"{self._names[node]} is in {state.value}: {cause}"))
         return found + (self._check.faults() if powered else [])
 
     def forget_emergencies(self) -> None:
@@ -134,7 +135,7 @@ class DriveWatch:
         elif message.code & 0xFF00:
             text = emergency_text(message.code)
             self._emergencies[node] = text
-            self._news.append((node, f"drive {node}: {text}"))
+            self._news.append((node, f"{self._names[node]}: {text}"))
 
     def _heartbeat(self, node: int, data: bytes | bytearray) -> None:
         state = parse_heartbeat(data)
@@ -143,7 +144,7 @@ class DriveWatch:
         elif state == NmtState.BOOT_UP:
             self.restarted.add(node)
             self._news.append(
-                (node, f"drive {node} restarted: its set-up and its position are lost")
+                (node, f"{self._names[node]} restarted: its set-up and its position are lost")
             )
         elif state != NmtState.OPERATIONAL:
-            self._news.append((node, f"drive {node} left the NMT state operational"))
+            self._news.append((node, f"{self._names[node]} left the NMT state operational"))

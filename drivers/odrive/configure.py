@@ -128,7 +128,7 @@ def _answers(
 
 def _twice(node: int) -> Refused:
     return Refused(
-        f"node {node} answers twice: two devices have this node id",
+        f"drive {node} answers twice: two devices have this node id",
         where=WHERE,
         next_step="give every drive a node id of its own",
         values={"node": node},

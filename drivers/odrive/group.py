@@ -296,7 +296,8 @@ class OdriveGroup:
         for node, state, result in zip(self._nodes, watch.states, watch.results, strict=True):
             if state != AxisState.CLOSED_LOOP_CONTROL:
                 why = RESULT_TEXTS.get(result, f"procedure result {result}")
-                text = f"drive {node} stays {state_text(state)} on the way to closed loop control"
+                name = self._rig.drive_names[node]
+                text = f"{name} stays {state_text(state)} on the way to closed loop control"
                 found.append((node, f"{text}: {why}"))
         return found
 

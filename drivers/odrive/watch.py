@@ -41,8 +41,9 @@ class OdriveWatch:
         self.nodes = tuple(winch.node_id for winch in rig.winches)
         self.states, self.errors, self.results = [0] * count, [0] * count, [0] * count
         self.positions, self.torques = [0] * count, [0.0] * count
+        self._names = rig.drive_names
         self._per_turn = [winch.counts_per_turn for winch in rig.winches]
-        self._check = ReplyCheck(self.nodes, max_steps)
+        self._check = ReplyCheck(rig.drive_names, max_steps)
         self._fresh = [False] * count
         self._layouts = layouts
         # Cycles since each kind of message came, and how many there may be.
@@ -140,13 +141,16 @@ class OdriveWatch:
             enabled: Every axis was enabled and must be so.
         """
         found = [
-            (node, f"drive {node}: {error_text(errors)}")
+            (node, f"{self._names[node]}: {error_text(errors)}")
             for node, errors in zip(self.nodes, self.errors, strict=True)
             if errors
         ]
         if enabled:
             found += [
-                (node, f"drive {node} was disarmed; its brake holds the cable (axis state {state})")
+                (
+                    node,
+                    f"{self._names[node]} was disarmed; its brake holds (axis state {state})",
+                )
                 for node, state in zip(self.nodes, self.states, strict=True)
                 if state != AxisState.CLOSED_LOOP_CONTROL
             ]
@@ -157,9 +161,9 @@ class OdriveWatch:
         for drive, node in enumerate(self.nodes):
             late = {kind: self._ages[kind][drive] - self._most[kind] for kind in self._most}
             if late["heartbeat"] > 0:
-                found.append((node, f"drive {node}: its heartbeat is missing"))
+                found.append((node, f"{self._names[node]}: its heartbeat is missing"))
             if late["torque"] > MISSED_TORQUES:
-                found.append((node, f"drive {node} does not tell its torque"))
+                found.append((node, f"{self._names[node]} does not tell its torque"))
         return found
 
     def _heartbeat(self, drive: int, values: tuple[float, ...]) -> None:

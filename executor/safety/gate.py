@@ -124,14 +124,14 @@ def _move(limits: Limits, request: Request) -> Verdict:
         if not limits.lowest[drive] <= target <= limits.highest[drive]:
             return Verdict(
                 False,
-                f"drive {drive + 1}: target {target} outside"
+                f"cable {drive + 1}: target {target} outside"
                 f" [{limits.lowest[drive]}, {limits.highest[drive]}] counts",
             )
         step = abs(target - request.previous[drive])
         if step > limits.largest_step[drive]:
             return Verdict(
                 False,
-                f"drive {drive + 1}: step of {step} counts, allowed {limits.largest_step[drive]}",
+                f"cable {drive + 1}: step of {step} counts, allowed {limits.largest_step[drive]}",
             )
     return _near_actual(limits, request)
 
@@ -147,7 +147,7 @@ def _near_actual(limits: Limits, request: Request) -> Verdict:
         if lag > limits.largest_lag[drive]:
             return Verdict(
                 False,
-                f"drive {drive + 1}: target {lag} counts from the actual position,"
+                f"cable {drive + 1}: target {lag} counts from the actual position,"
                 f" allowed {limits.largest_lag[drive]}",
             )
     return ALLOWED

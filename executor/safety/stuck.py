@@ -58,11 +58,17 @@ class StuckWatch:
     """All drives; `look` returns the next watch and what was found."""
 
     drives: tuple[Drive, ...]
+    names: tuple[str, ...]
 
     @classmethod
-    def fresh(cls, least: Sequence[int]) -> StuckWatch:
-        """A watch that has seen nothing; the smallest step that says something a drive."""
-        return cls(tuple(Drive(counts) for counts in least))
+    def fresh(cls, least: Sequence[int], names: Sequence[str]) -> StuckWatch:
+        """A watch that has seen nothing.
+
+        Args:
+            least: The smallest step that says something, one a drive, [counts].
+            names: What the drives are called.
+        """
+        return cls(tuple(Drive(counts) for counts in least), tuple(names))
 
     def look(
         self,
@@ -83,22 +89,22 @@ class StuckWatch:
             ValueError: Not one entry for every drive.
         """
         if not following:
-            return StuckWatch(tuple(drive.forgotten() for drive in self.drives)), ()
+            return replace(self, drives=tuple(drive.forgotten() for drive in self.drives)), ()
         rows = zip(self.drives, positions, demands, missing, strict=True)
         drives = tuple(
             drive if silent else drive.seen(position, demand)
             for drive, position, demand, silent in rows
         )
         found = [
-            _finding(number, drive.standing)
+            _finding(number, self.names[number - 1], drive.standing)
             for number, (drive, silent) in enumerate(zip(drives, missing, strict=True), start=1)
             if drive.standing and not silent
         ]
-        return StuckWatch(drives), tuple(found)
+        return replace(self, drives=drives), tuple(found)
 
 
-def _finding(number: int, cycles: int) -> Finding:
-    text = f"drive {number} stood still for {cycles} cycle{'s' if cycles > 1 else ''}"
+def _finding(number: int, name: str, cycles: int) -> Finding:
+    text = f"{name} stood still for {cycles} cycle{'s' if cycles > 1 else ''}"
     text += " while its set-points went on"
     if cycles < STUCK_CYCLES:
         return Finding(Reaction.NOTE, "set_point_missed", text, number)

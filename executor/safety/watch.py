@@ -26,7 +26,7 @@ class Finding:
         reaction: What must happen.
         code: Stable name.
         text: What, where, measured value and limit.
-        drive: Which drive it is about, counted from 1; 0 for all.
+        drive: Which cable and drive it is about, counted from 1 as in the rig file; 0 for all.
     """
 
     reaction: Reaction
@@ -70,7 +70,8 @@ class Observation:
         following_errors: Signed, in cable length, [m].
         tensions: From the drives' torque, [N].
         missing: True where a drive did not answer.
-        faults: What drives reported as wrong.
+        faults: What drives reported as wrong: which drive, counted from 1, or 0 for the bus, and
+            the text.
         lateness: How late the cycle began, in cycles.
     """
 
@@ -78,7 +79,7 @@ class Observation:
     following_errors: Sequence[float]
     tensions: Sequence[float]
     missing: Sequence[bool]
-    faults: Sequence[str]
+    faults: Sequence[tuple[int, str]]
     lateness: float
 
 
@@ -87,16 +88,17 @@ class Watch:
     """Counts in a row, per drive; `look` returns the next watch and what was found."""
 
     limits: WatchLimits
+    names: tuple[str, ...]
     missing: tuple[int, ...]
     slack: tuple[int, ...]
     loose: tuple[int, ...]
     over: tuple[int, ...]
 
     @classmethod
-    def fresh(cls, limits: WatchLimits, drives: int) -> Watch:
-        """A watch that has seen nothing."""
-        zeros = (0,) * drives
-        return cls(limits, zeros, zeros, zeros, zeros)
+    def fresh(cls, limits: WatchLimits, names: Sequence[str]) -> Watch:
+        """A watch that has seen nothing, of drives that are called so."""
+        zeros = (0,) * len(names)
+        return cls(limits, tuple(names), zeros, zeros, zeros, zeros)
 
     def look(self, seen: Observation) -> tuple[Watch, tuple[Finding, ...]]:
         """Takes in one cycle.
@@ -115,6 +117,7 @@ class Watch:
         # A drive that did not answer says nothing new about its tension.
         watch = Watch(
             limits,
+            self.names,
             _counted(self.missing, seen.missing, [False] * len(seen.missing)),
             _counted(self.slack, slack, seen.missing),
             _counted(self.loose, loose, seen.missing),
@@ -130,10 +133,11 @@ class Watch:
     def _replies(self, seen: Observation) -> list[Finding]:
         found = [
             Finding(Reaction.QUICK_STOP, "drive_fault", text, number)
-            for number, text in enumerate(seen.faults, start=1)
+            for number, text in seen.faults
         ]
         for drive, count in enumerate(self.missing, start=1):
-            text = f"drive {drive} did not answer for {count} cycle{'s' if count > 1 else ''}"
+            name = self.names[drive - 1]
+            text = f"{name} did not answer for {count} cycle{'s' if count > 1 else ''}"
             if count >= self.limits.missing_cycles:
                 found.append(Finding(Reaction.QUICK_STOP, "drive_silent", text, drive))
             elif count:

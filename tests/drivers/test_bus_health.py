@@ -312,7 +312,7 @@ def test_drives_that_were_turned_by_hand_between_two_readings_are_believed(bench
 
 
 def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
-    check = ReplyCheck((1,), (500.0,))
+    check = ReplyCheck({1: "drive 1"}, (500.0,))
     check.begin_cycle()
     assert check.believed(0, 40_000)
     assert not check.believed(0, -40_000)
@@ -327,7 +327,7 @@ def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
 def test_a_position_is_believed_exactly_when_the_drum_can_have_turned_so_far(
     step: int, gap: int, start: int
 ) -> None:
-    check = ReplyCheck((1,), (500.0,))
+    check = ReplyCheck({1: "drive 1"}, (500.0,))
     check.begin_cycle()
     assert check.believed(0, start)
     check.end_cycle()

@@ -363,7 +363,7 @@ def test_torque_that_goes_without_a_word_stops_the_others(bench: Bench) -> None:
     bench.drives[6].state = DriveState.SWITCH_ON_DISABLED
     for _ in range(2):
         bench.cycle()
-    assert bench.status.faults == ((7, "drive 7 stopped by itself: switch on disabled"),)
+    assert bench.status.faults == ((7, "cable 7 (drive 7) stopped by itself: switch on disabled"),)
     assert [d.state for d in bench.drives].count(HOLDING) == 7
 
 

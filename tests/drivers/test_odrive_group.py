@@ -141,35 +141,35 @@ def test_after_that_a_new_master_finds_them_idle_and_starts_from_where_they_are(
 
 
 FAULTS: dict[str, tuple[Callable[[OdriveBench], object], str, int]] = {
-    "axis error": (lambda b: b.drives[2].fail(0x2000), "drive 3: motor too hot", 6),
+    "axis error": (lambda b: b.drives[2].fail(0x2000), "(drive 3): motor too hot", 6),
     "watchdog of one": (
         lambda b: b.drives[2].fail(AxisError.WATCHDOG_TIMER_EXPIRED),
-        "drive 3: watchdog",
+        "(drive 3): watchdog",
         6,
     ),
     "disarmed by another tool": (
         lambda b: b.drives[2]._disarm(0),
-        "drive 3 was disarmed; its brake holds",
+        "(drive 3) was disarmed; its brake holds",
         6,
     ),
     "no heartbeat": (
         lambda b: b.drives[2].silent.add("heartbeat"),
-        "drive 3: its heartbeat is missing",
+        "(drive 3): its heartbeat is missing",
         18,
     ),
     "no torque": (
         lambda b: b.drives[2].silent.add("torques"),
-        "drive 3 does not tell its torque",
+        "(drive 3) does not tell its torque",
         7,
     ),
     "no number": (
         lambda b: setattr(b.drives[2].motor, "position", float("nan")),
-        "drive 3: its position is not a number",
+        "(drive 3): its position is not a number",
         3,
     ),
     "a jump": (
         lambda b: setattr(b.drives[2].motor, "position", b.drives[2].motor.position + 20_000),
-        "drive 3: its position jumped",
+        "(drive 3): its position jumped",
         3,
     ),
 }
@@ -237,8 +237,9 @@ def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
     bench.group.command(GroupCommand.ENABLE)
     status = bench.cycles(105)
     assert status.state is GroupState.FAULT
-    assert status.faults[0][1].startswith("drive 6 stays idle on the way to closed loop control")
-    assert "not calibrated" in status.faults[0][1]
+    told = status.faults[0][1]
+    assert told.startswith("cable 6 (drive 6) stays idle on the way to closed loop control")
+    assert "not calibrated" in told
     bench.cycles(15)
     assert states(bench) == {AxisState.IDLE}
 
@@ -278,7 +279,7 @@ REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]]
     ),
     "in fault": (lambda b: b.drives[1].fail(0x100), Refused, "supply over-voltage"),
     "no supply": (lambda b: setattr(b.drives[1], "supply", 0.0), Refused, "drive 2 has no supply"),
-    "a twin": (_twin, Refused, "node 4 answers twice"),
+    "a twin": (_twin, Refused, "drive 4 answers twice"),
 }
 
 

@@ -53,7 +53,7 @@ def test_without_one_only_absolute_encoders_move() -> None:
     Custody(rig_with("absolute")).require_ready()
     for ask in (Custody(rig_with("incremental")).reference, Custody(
         rig_with("incremental")).require_ready):  # fmt: skip
-        with pytest.raises(Refused, match="never referenced: drive 1, 2") as caught:
+        with pytest.raises(Refused, match=r"referenced: cable 1 \(drive 1\), cable 2 ") as caught:
             ask()
         assert "cdpr home" in caught.value.next_step
 
@@ -121,9 +121,9 @@ def test_a_drive_that_was_switched_on_again_or_moved_by_hand_is_found_out() -> N
     rig = rig_with("incremental")
     reference = reference_of(rig)
     require_still_referenced(rig, reference, group_at(rig, off_mm=0.9))
-    with pytest.raises(Refused, match=r"drive 4 is lost: it stands 1\.1 mm"):
+    with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it stands 1\.1 mm"):
         require_still_referenced(rig, reference, group_at(rig, off_mm=1.1))
-    with pytest.raises(Refused, match="drive 4 is lost: it was switched on"):
+    with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it was switched on"):
         require_still_referenced(rig, reference, group_at(rig, restarted=(4,)))
     absolute = rig_with("absolute")
     require_still_referenced(absolute, reference, group_at(absolute, (4,), 50.0))

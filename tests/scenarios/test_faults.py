@@ -95,7 +95,7 @@ def unplug(stage: Stage) -> None:
 
 CASES = {
     "a drive falls silent": Case(
-        silence(3), "drive_silent", ("drive 4 did not answer",), lost=(3,)
+        silence(3), "drive_silent", ("(drive 4) did not answer",), lost=(3,)
     ),
     "a drive reports an emergency": Case(
         lambda stage: stage.drives[2].fail(0x2310), "drive_fault", ("drive 3",), lost=(2,)
@@ -103,14 +103,14 @@ CASES = {
     "a drive starts anew": Case(
         lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
     ),
-    "a winch jams": Case(jam, "drive_stuck", ("drive 2 stood still",), lost=(1,)),
+    "a winch jams": Case(jam, "drive_stuck", ("(drive 2) stood still",), lost=(1,)),
     "a winch slips": Case(slip, "following_error", ("cable 2", "allowed 2.00 mm"), lost=(1,)),
     "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "torn"), within=5),
     "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "102.0 N"), within=60),
     "the loop is late": Case(late, "late", ("3.0 cycles late",), within=40),
-    "the table was changed": Case(jump_in_table, "gate_denied", ("drive 4", "step"), within=30),
+    "the table was changed": Case(jump_in_table, "gate_denied", ("cable 4", "step"), within=30),
     "a drive is silent while enabling": Case(
-        silence(6), "drive_silent", ("drive 7 did not answer",), cycle=1, lost=(6,)
+        silence(6), "drive_silent", ("(drive 7) did not answer",), cycle=1, lost=(6,)
     ),
     "a drive fails while enabling": Case(
         lambda stage: stage.drives[6].fail(0x3210), "drive_fault", ("drive 7",), cycle=2, lost=(6,)
@@ -118,7 +118,7 @@ CASES = {
     "a drive is never enabled": Case(
         lambda stage: setattr(stage.drives[4], "_command_enable", lambda: None),
         "drive_fault",
-        ("drive 5 stays in switched on",),
+        ("(drive 5) stays in switched on",),
         cycle=0,
         within=110,
     ),
@@ -130,7 +130,7 @@ CASES = {
         lost=(4,),
     ),
     "a drive falls silent at the goal": Case(
-        silence(0), "drive_silent", ("drive 1 did not answer",), cycle=320, lost=(0,)
+        silence(0), "drive_silent", ("(drive 1) did not answer",), cycle=320, lost=(0,)
     ),
 }
 
@@ -275,7 +275,7 @@ def test_a_stop_wish_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path
         summary = concluded(stage, outcome)
     assert outcome.state is State.LATCHED
     assert summary["verdict"] == "FAILED"
-    assert any("drive 4 did not answer" in event["text"] for event in summary["events"])
+    assert any("(drive 4) did not answer" in event["text"] for event in summary["events"])
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -190,7 +190,7 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
         bus = ("--interface", "udp_multicast", "--channel", channel)
         answer = call("reset", RIG, *bus, "--yes")
     assert answer.code == 4, answer
-    assert "drive 5 fell silent" in answer.err
+    assert "(drive 5) fell silent" in answer.err
     assert latch.read() is not None
 
 

@@ -50,7 +50,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         rehearsal.drives[5].power_on()
         third = call(*run, "-o", tmp_path / "third")
         assert third.code == 3
-        assert "drive 6 is lost: it was switched on" in third.err
+        assert "cable 6 (drive 6) is lost: it was switched on" in third.err
         assert [drive.motor.position for drive in rehearsal.drives] == stood
 
 

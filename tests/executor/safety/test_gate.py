@@ -64,7 +64,7 @@ def test_a_step_may_be_the_limit_and_not_a_count_more(drive, sign):
         good = replace(MOVE, previous=previous, targets=at, actual=previous)
         assert _allowed(good)
         reason = _denied(replace(good, targets=beyond))
-        assert reason == f"drive {drive + 1}: step of {limit + 1} counts, allowed {limit}"
+        assert reason == f"cable {drive + 1}: step of {limit + 1} counts, allowed {limit}"
 
 
 @each_drive
@@ -76,7 +76,7 @@ def test_a_target_may_be_the_end_of_its_range_and_not_a_count_more(drive, side, 
     assert _allowed(inside)
     reason = _denied(replace(inside, targets=beyond))
     assert reason == (
-        f"drive {drive + 1}: target {end + sign} outside"
+        f"cable {drive + 1}: target {end + sign} outside"
         f" [{LIMITS.lowest[drive]}, {LIMITS.highest[drive]}] counts"
     )
 
@@ -90,7 +90,7 @@ def test_a_target_may_lag_by_the_limit_and_not_a_count_more(drive, sign, request
     assert _allowed(replace(request_, actual=at))
     reason = _denied(replace(request_, actual=beyond))
     assert reason == (
-        f"drive {drive + 1}: target {limit + 1} counts from the actual position, allowed {limit}"
+        f"cable {drive + 1}: target {limit + 1} counts from the actual position, allowed {limit}"
     )
 
 

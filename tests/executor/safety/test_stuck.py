@@ -10,13 +10,14 @@ from executor.safety.stuck import StuckWatch
 from executor.safety.watch import Finding, Reaction
 
 HERE = (True, (0, 0), (0, 0), (False, False))
-NOTE = "drive {} stood still for 1 cycle while its set-points went on"
-STOP = "drive {} stood still for {} cycles while its set-points went on"
+NAMES = ("cable 1 (drive 11)", "cable 2 (drive 9)")
+NOTE = "{} stood still for 1 cycle while its set-points went on"
+STOP = "{} stood still for {} cycles while its set-points went on"
 
 
 def look(cycles, least=(10, 10)):
     """What is found in the last of some cycles."""
-    watch, found = StuckWatch.fresh(least), ()
+    watch, found = StuckWatch.fresh(least, NAMES), ()
     for cycle in cycles:
         watch, found = watch.look(*cycle)
     return found
@@ -40,11 +41,11 @@ def test_one_cycle_is_noted_and_two_in_a_row_stop(drive, sign):
     number = drive + 1
     assert look(list(steps(stuck, demands, drive))[:3]) == ()
     assert look(list(steps(stuck, demands, drive))[:4]) == (
-        Finding(Reaction.NOTE, "set_point_missed", NOTE.format(number), number),
+        Finding(Reaction.NOTE, "set_point_missed", NOTE.format(NAMES[drive]), number),
     )
     for cycles in (2, 3):
         assert look(list(steps(stuck, demands, drive))[: 3 + cycles]) == (
-            Finding(Reaction.QUICK_STOP, "drive_stuck", STOP.format(number, cycles), number),
+            Finding(Reaction.QUICK_STOP, "drive_stuck", STOP.format(NAMES[drive], cycles), number),
         )
 
 
@@ -84,7 +85,7 @@ def test_a_reply_that_is_missing_says_nothing_new():
     positions, demands = [0, 100, 100, 100, 100], [0, 100, 200, 300, 400]
     assert look(list(steps(positions, demands, missing={3}))[:4]) == ()
     (stop,) = look(steps(positions, demands, missing={3}))
-    assert stop.text == STOP.format(1, 2)
+    assert stop.text == STOP.format(NAMES[0], 2)
     late = [0, 100, 100, 300]
     assert look(steps(late, demands[:4], missing={2})) == (), "two steps in one"
 
@@ -97,7 +98,7 @@ def test_drives_that_follow_nothing_are_not_judged():
 
 
 def test_an_entry_is_needed_for_every_drive():
-    watch = StuckWatch.fresh((10, 10))
+    watch = StuckWatch.fresh((10, 10), NAMES)
     for place in (1, 2, 3):
         short = list(HERE)
         short[place] = short[place][:1]
@@ -108,7 +109,7 @@ def test_an_entry_is_needed_for_every_drive():
 @given(st.lists(st.integers(-200, 200), max_size=30))
 def test_a_drive_that_does_what_it_is_told_is_never_found(changes):
     places = [sum(changes[:k]) for k in range(len(changes) + 1)]
-    watch = StuckWatch.fresh((10,))
+    watch = StuckWatch.fresh((10,), NAMES[:1])
     for place in places:
         watch, found = watch.look(True, (place,), (place,), (False,))
         assert found == ()

@@ -20,6 +20,7 @@ FINE = Observation(
     faults=(),
     lateness=0.0,
 )
+NAMES = ("cable 1 (drive 11)", "cable 2 (drive 9)", "cable 3 (drive 12)")
 each_drive = pytest.mark.parametrize("drive", range(3))
 
 
@@ -29,7 +30,7 @@ def _put(values: tuple[object, ...], drive: int, value: object) -> tuple[object,
 
 def _look(*cycles: Observation) -> tuple[Finding, ...]:
     """What is found in the last of some cycles."""
-    watch, found = Watch.fresh(LIMITS, 3), ()
+    watch, found = Watch.fresh(LIMITS, NAMES), ()
     for seen in cycles:
         watch, found = watch.look(seen)
     return found
@@ -59,10 +60,10 @@ def test_limits_have_the_values_of_the_stop_rules():
 def test_one_lost_reply_is_noted_and_two_in_a_row_stop():
     lost = _with("missing", 1, True)
     (note,) = _look(lost)
-    assert note == Finding(Reaction.NOTE, "reply_lost", "drive 2 did not answer for 1 cycle", 2)
+    assert note == Finding(Reaction.NOTE, "reply_lost", f"{NAMES[1]} did not answer for 1 cycle", 2)
     (stop,) = _look(lost, lost)
     assert stop == Finding(
-        Reaction.QUICK_STOP, "drive_silent", "drive 2 did not answer for 2 cycles", 2
+        Reaction.QUICK_STOP, "drive_silent", f"{NAMES[1]} did not answer for 2 cycles", 2
     )
     assert _codes(lost, FINE, lost) == [("reply_lost", Reaction.NOTE)]
     assert _codes(lost, FINE) == []
@@ -75,12 +76,12 @@ def test_replies_are_counted_for_each_drive_alone(drive):
     assert _codes(_with("missing", others[0], True), _with("missing", drive, True)) == [
         ("reply_lost", Reaction.NOTE)
     ]
-    assert f"drive {drive + 1} " in _look(_with("missing", drive, True))[0].text
+    assert f"{NAMES[drive]} " in _look(_with("missing", drive, True))[0].text
 
 
 def test_a_watch_may_be_told_to_wait_longer_for_replies():
     patient = replace(LIMITS, missing_cycles=4)
-    watch, lost = Watch.fresh(patient, 3), _with("missing", 0, True)
+    watch, lost = Watch.fresh(patient, NAMES), _with("missing", 0, True)
     found = []
     for _ in range(5):
         watch, (finding,) = watch.look(lost)
@@ -90,10 +91,10 @@ def test_a_watch_may_be_told_to_wait_longer_for_replies():
 
 
 def test_every_fault_that_drives_report_stops_at_once():
-    seen = replace(FINE, following=False, faults=("node 3: over-current", "node 4: hot"))
+    seen = replace(FINE, following=False, faults=((3, "over-current"), (0, "bus-off")))
     assert _look(seen) == (
-        Finding(Reaction.QUICK_STOP, "drive_fault", "node 3: over-current", 1),
-        Finding(Reaction.QUICK_STOP, "drive_fault", "node 4: hot", 2),
+        Finding(Reaction.QUICK_STOP, "drive_fault", "over-current", 3),
+        Finding(Reaction.QUICK_STOP, "drive_fault", "bus-off", 0),
     )
 
 
@@ -109,7 +110,7 @@ def test_a_following_error_may_be_the_limit_and_not_more(drive, sign):
 
 
 def test_a_following_error_is_told_in_millimetres():
-    wide = Watch.fresh(replace(LIMITS, following_error=0.5), 3)
+    wide = Watch.fresh(replace(LIMITS, following_error=0.5), NAMES)
     (found,) = wide.look(_with("following_errors", 0, 2.5))[1]
     assert found.text == "cable 1 is 2500.00 mm from its set-point, allowed 500.00 mm"
 
@@ -213,7 +214,7 @@ def test_a_silent_drive_neither_resets_nor_adds_to_its_count_of_slack():
 def test_drives_that_do_not_follow_are_not_judged_by_errors_and_tensions(field):
     seen = replace(_with(field, 0, NAN), following=False)
     assert _look(*[seen] * 9) == ()
-    assert [c for c, _ in _codes(*[seen] * 9, replace(seen, faults=("x",)))] == ["drive_fault"]
+    assert [c for c, _ in _codes(*[seen] * 9, replace(seen, faults=((0, "x"),)))] == ["drive_fault"]
     lost = replace(seen, missing=(True, False, False))
     assert _codes(lost, lost) == [("drive_silent", Reaction.QUICK_STOP)]
 
@@ -255,7 +256,7 @@ def test_everything_is_told_at_once_gravest_first():
         following_errors=(0.0, 0.1, 0.0),
         tensions=(20.0, 20.0, 2.0),
         missing=(True, False, False),
-        faults=("node 1: hot",),
+        faults=((1, "hot"),),
         lateness=3.0,
     )
     low = _with("tensions", 2, 2.0)
@@ -274,7 +275,7 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
     """A row that is too short would hide the last drive."""
     values = (getattr(FINE, field) * 2)[:count]
     with pytest.raises(ValueError, match="entries for 3 drives"):
-        Watch.fresh(LIMITS, 3).look(replace(FINE, **{field: values}))
+        Watch.fresh(LIMITS, NAMES).look(replace(FINE, **{field: values}))
 
 
 @given(
@@ -285,7 +286,7 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
 )
 def test_counts_are_runs_of_what_was_seen(cycles):
     """Against counting by hand, for one drive."""
-    watch = Watch.fresh(LIMITS, 1)
+    watch = Watch.fresh(LIMITS, NAMES[:1])
     missing = slack = loose = over = 0
     for following, tension, lost in cycles:
         seen = Observation(following, (0.0,), (tension,), (lost,), (), 0.0)
@@ -308,6 +309,6 @@ def test_counts_are_runs_of_what_was_seen(cycles):
 
 
 def test_looking_leaves_the_watch_before_unchanged():
-    watch = Watch.fresh(LIMITS, 3)
+    watch = Watch.fresh(LIMITS, NAMES)
     watch.look(_with("missing", 0, True))
-    assert watch == Watch.fresh(LIMITS, 3)
+    assert watch == Watch.fresh(LIMITS, NAMES)

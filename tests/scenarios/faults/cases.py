@@ -277,7 +277,7 @@ TABLE: dict[str, Fault] = {
     "F6 drives miss 20 % of SYNC": Fault(
         deaf_drives(0.2, 6), within=PATH_STOP, words=("did not answer",), rows=2.0, spread=3.0
     ),
-    "F7 a drive falls silent": Fault(broken(3, by=silence), words=("drive 4 did not answer",)),
+    "F7 a drive falls silent": Fault(broken(3, by=silence), words=("(drive 4) did not answer",)),
     "F7 a drive and the master fall silent": Fault(
         broken(3, by=without_sync_watch), ends=None, within=11.0, mixed=12.0, spread=4.0
     ),
@@ -287,7 +287,7 @@ TABLE: dict[str, Fault] = {
     "F9 a drive starts anew": Fault(
         broken(0, by=lambda bench: bench.drives[0].power_on()),
         within=3.0,
-        words=("drive 1 restarted",),
+        words=("(drive 1) restarted",),
     ),
     "F10 bus-off": Fault(then(bus_off), words=("bus-off",), within=5.0),
     "F10 error-passive": Fault(then(passive), words=("error-passive",)),
@@ -306,16 +306,16 @@ TABLE: dict[str, Fault] = {
         outgoing(lambda: spoil(REPLY_4, mirrored)), words=("drive 4", "jumped")
     ),
     "F12 a frozen position": Fault(
-        outgoing(lambda: spoil(REPLY_4, frozen())), words=("drive 4 stood still",)
+        outgoing(lambda: spoil(REPLY_4, frozen())), words=("(drive 4) stood still",)
     ),
     "F12 a short set-point": Fault(
         incoming(lambda: spoil(SET_POINT_4, lambda d: d[:7], 1)), words=("drive 4", "length")
     ),
     "F13 replies come twice": Fault(
-        outgoing(lambda: repeat(REPLY_4)), words=("drive 4 answers twice",), within=5.0
+        outgoing(lambda: repeat(REPLY_4)), words=("(drive 4) answers twice",), within=5.0
     ),
     "F13 old replies": Fault(
-        outgoing(lambda: delay(REPLY_4, 0.02)), words=("drive 4 did not answer",)
+        outgoing(lambda: delay(REPLY_4, 0.02)), words=("(drive 4) did not answer",)
     ),
     "F13 another SYNC": Fault(then(comes(SYNC_ID)), words=("another program sends SYNC",)),
     "F13 another master's set-point": Fault(
@@ -324,7 +324,7 @@ TABLE: dict[str, Fault] = {
     "F13 another master's heartbeat": Fault(
         then(comes(HEARTBEAT_BASE + MASTER_NODE, b"\x05")), words=("master's heartbeat",)
     ),
-    "F17 a winch jams": Fault(broken(1, by=jam), words=("drive 2 stood still",)),
+    "F17 a winch jams": Fault(broken(1, by=jam), words=("(drive 2) stood still",)),
     "F17 a winch jams, its drive tells": Fault(
         broken(1, by=jam_seen_by_the_drive), words=("drive 2", "following error")
     ),
@@ -336,7 +336,7 @@ TABLE: dict[str, Fault] = {
         then(feels(6.0)), within=PATH_STOP, words=("cable 6", "more than 102.0 N")
     ),
     "F18 a winch at its torque limit": Fault(
-        broken(1, by=at_torque_limit), words=("drive 2 stood still",)
+        broken(1, by=at_torque_limit), words=("(drive 2) stood still",)
     ),
     "F19 a cable breaks": Fault(then(feels(0.0)), within=5.0, words=("cable 6", "no tension")),
     "F20 the operator stops": Fault(
@@ -377,7 +377,7 @@ def complaints(
 
 def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
     """This computer held the simulated drives up, before or while the fault happened."""
-    silent = "drive 1 did not answer" in cause and not any(word in cause for word in fault.words)
+    silent = "(drive 1) did not answer" in cause and not any(word in cause for word in fault.words)
     return bench.since is None or silent or "cycles late; stopped" in cause
 
 
