@@ -45,7 +45,7 @@ def cases() -> Iterator[object]:
             yield pytest.param(name, marks=marks)
 
 
-@pytest.mark.parametrize("name", cases())
+@pytest.mark.parametrize("name", list(cases()))
 def test_a_fault(
     prepared: PreparedRun,
     masters: Masters,
