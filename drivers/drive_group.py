@@ -17,6 +17,9 @@ Counts = NDArray[np.int64]
 Pump = Callable[[], None]
 """Lets drives that live in the caller's process work off what the bus holds for them."""
 
+OnRestarted = Callable[[tuple[int, ...]], None]
+"""Takes note of nodes that were found without this program's set-up; see `DriveGroup.configure`."""
+
 
 WHOLE_BUS = 0
 """In place of a node: the fault is not one drive's."""
@@ -138,11 +141,15 @@ class DriveGroup(Protocol):
         """Targets last sent, shape (m,), [counts]; motion after ENABLING starts from them."""
         ...
 
-    def configure(self, *, to_reset: bool = False) -> tuple[str, ...]:
+    def configure(
+        self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
+    ) -> tuple[str, ...]:
         """Sets every drive up and reads every setting back.
 
         Args:
             to_reset: Also takes drives in fault, which are going to be reset.
+            on_restarted: Called with `restarted` before the first setting is written: the set-up
+                wipes out what tells of it. What it raises leaves the drives as they were.
 
         Returns:
             Remarks for the operator: what drives cannot do although a run would use it.

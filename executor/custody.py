@@ -6,7 +6,7 @@ begin where the rig file says.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from cdpr.errors import Refused
@@ -33,6 +33,7 @@ class Custody:
         settings = BusSettings.of(rig)
         self._is_kept = settings.interface != IN_PROCESS
         self._latch, self.file = Latch(settings), ReferenceFile(settings)
+        self._counted_from: ReferenceDocument | None = None
 
     def require_free(self) -> None:
         """Nothing moves on a bus on which a fault is latched, or a run is under way.
@@ -87,17 +88,63 @@ class Custody:
             raise self._refusal(what, f"the drives were referenced {reference.made}")
         return reference
 
-    def begin(self, record: Path) -> None:
+    def still_counts(self, stands: Sequence[int]) -> ReferenceDocument | None:
+        """The reference, if drives that stand there [counts] still count from it; else None."""
+        reference = self._readable()
+        if reference is None or reference.lost or len(reference.stands_at) != len(stands):
+            return None
+        tolerance = self._rig.motion.start_tolerance
+        winches = zip(self._rig.winches, stands, reference.stands_at, strict=True)
+        off = [abs((at - left) / w.counts_per_metre) for w, at, left in winches if not w.absolute]
+        return reference if max(off, default=0.0) <= tolerance else None
+
+    def found_restarted(self, nodes: Iterable[int]) -> None:
+        """Drives were switched on since they were set up: their reference is lost for good.
+
+        It is kept at once, whatever becomes of what was about to be done: nothing else tells of it
+        once they are set up again.
+
+        Raises:
+            Refused: It cannot be kept.
+        """
+        forgot = {winch.node_id for winch in self._rig.winches if not winch.absolute} & {*nodes}
+        if forgot:
+            names = ", ".join(map(str, sorted(forgot)))
+            self._lose(f"drive {names} was switched on since it was referenced")
+
+    def found_held(self, stands: Sequence[int]) -> None:
+        """All drives held since they were last heard: they still count, and stand there [counts].
+
+        Raises:
+            Refused: It cannot be kept.
+        """
+        reference = self._readable()
+        if reference is not None and not reference.lost and len(reference.stands_at) == len(stands):
+            self.file.write(reference.model_copy(update={"stands_at": list(stands)}))
+
+    def begin(
+        self, record: Path, reference: ReferenceDocument | None, *, anew: bool = False
+    ) -> None:
         """The drives are about to move; if that does not come to its end, the latch tells of it.
 
         Args:
             record: Where the motion is on record.
+            reference: From which the drives count, found to do so; None where it is not known.
+            anew: They are to be referenced again; what they counted from is given up.
 
         Raises:
             Refused: The bus is latched, or cannot be.
         """
-        if self._is_kept:
-            self._latch.engage(self._rig.name, record)
+        if not self._is_kept:
+            return
+        self._latch.engage(self._rig.name, record)
+        self._counted_from = None if anew else reference
+        try:
+            if anew:
+                self._lose("the drives were being referenced again, which did not come to its end")
+        except BaseException:
+            self._latch.release()
+            raise
 
     def prevented(self) -> None:
         """Nothing moved after all."""
@@ -125,13 +172,26 @@ class Custody:
         if not self._is_kept:
             return
         self._latch.settle(self._rig.name, state, cause, record)
-        reference = self.kept_reference()
         if not holding:
-            reference = reference or as_in_the_file(self._rig)
+            reference = self._readable() or as_in_the_file(self._rig)
             lost = f"drives let go of cables under tension ({cause})"
             self.file.write(reference.model_copy(update={"lost": reference.lost or lost}))
-        elif reference is not None and stands_at is not None:
-            self.file.write(reference.model_copy(update={"stands_at": list(stands_at)}))
+        elif self._counted_from is not None and stands_at is not None:
+            stand = {"stands_at": list(stands_at)}
+            self.file.write(self._counted_from.model_copy(update=stand))
+
+    def _lose(self, why: str) -> None:
+        """The reference on file, if any, counts no more; the first reason is kept."""
+        reference = self._readable()
+        if reference is not None and not reference.lost:
+            self.file.write(reference.model_copy(update={"lost": why}))
+
+    def _readable(self) -> ReferenceDocument | None:
+        """What is on file, where it can be read; what cannot is no reference that counts."""
+        try:
+            return self.kept_reference()
+        except Refused:
+            return None
 
     def go_by_the_rig_file(self) -> None:
         """From now on the drives count what the rig file says; no reference is kept.

@@ -83,7 +83,7 @@ def run_in_real_time(
     process = _Process(job, board)
     try:
         denied = process.armed()
-        custody.begin(recorder.folder.path)
+        custody.begin(recorder.folder.path, reference)
         try:
             before_motion(denied)
         except BaseException:

@@ -80,6 +80,7 @@ def move_winches(
     board: WishBoard,
     *,
     record: Path,
+    anew: bool,
     on_cycle: Callable[[CycleRecord], None],
     on_event: Callable[[LoopEvent], None],
 ) -> WinchesStand:
@@ -92,6 +93,7 @@ def move_winches(
         clock: Real or simulated.
         board: What the operator wants.
         record: What the latch names, should this not come to its end.
+        anew: The drives are to be referenced again afterwards.
         on_cycle: Called after every cycle.
         on_event: Called for every event.
 
@@ -111,7 +113,7 @@ def move_winches(
 
     loop = WinchLoop(rig, law, group, clock, wishes=board.read, on_cycle=take, on_event=on_event)
     loop.arm()
-    custody.begin(record)
+    custody.begin(record, custody.still_counts(law.reach[0]), anew=anew)
     try:
         loop.run()
     finally:

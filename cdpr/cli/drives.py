@@ -27,6 +27,8 @@ def open_drives(
 ) -> Iterator[ReadyDrives]:
     """Opens the bus and configures the drives; closes both at the end.
 
+    Drives that are found switched on since their last set-up lose their reference here.
+
     Args:
         rig: The robot and its bus.
         simulated_start: Where the platform stands when the drives are simulated here.
@@ -44,8 +46,10 @@ def open_drives(
     from cdpr.cli.output import err
     from drivers.bus import IN_PROCESS, BusSettings, open_bus
     from drivers.drive_group import make_drive_group
+    from executor.custody import Custody
     from executor.real_time_job import ReadyDrives
 
+    custody = Custody(rig)
     settings = BusSettings.of(rig)
     with ExitStack() as stack:
         bus = open_bus(settings)
@@ -64,12 +68,13 @@ def open_drives(
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)
         if set_up_as is not None:
-            group.configure(to_reset=to_reset)
+            group.configure(to_reset=to_reset, on_restarted=custody.found_restarted)
             limited = set_up_as(group.read_positions().positions.tolist())
             group.close()
             group = make_drive_group(limited, bus, pump)
             stack.callback(group.close)
-        for remark in group.configure(to_reset=to_reset):
+        remarks = group.configure(to_reset=to_reset, on_restarted=custody.found_restarted)
+        for remark in remarks:
             err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
         yield ReadyDrives(group, true_pose, carry)
 

@@ -89,8 +89,9 @@ def jog_cable(
         """Nothing more to see while the drives are there."""
 
     motion = WinchMotion(
-        rig, rig.home, limit, speed_mm_s / 1000.0, make_law, None, fast, without_real_time, as_json
-    )
+        rig, rig.home, limit, speed_mm_s / 1000.0, make_law, None, fast, without_real_time, as_json,
+        anew=False,
+    )  # fmt: skip
     stand = carry_out_by_law(motion, at_rest)
     moved = (stand.counts[cable - 1] - begun[0][cable - 1]) / winch.counts_per_metre * 1000.0
     tensions = [round(float(t), 2) for t in stand.tensions]

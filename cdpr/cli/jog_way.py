@@ -41,13 +41,21 @@ def moved(start: Pose, by_mm: tuple[float, float, float]) -> Pose:
 
 
 def where_it_stands(rig: Rig, scene: Scene) -> Pose:
-    """Asks the drives; none of them is enabled for it."""
+    """Asks the drives; none of them is enabled for it.
+
+    Raises:
+        Refused: Their reference is lost, or their positions fit no pose.
+    """
     import numpy as np
 
     from cdpr.cli.drives import open_drives
+    from executor.arming import require_still_referenced
+    from executor.custody import Custody
     from executor.standing_pose import standing_pose
 
+    reference = Custody(rig).require_ready()
     with open_drives(rig, rig.home, scene.load) as drives:
+        require_still_referenced(rig, reference, drives.group)
         positions = drives.group.read_positions().positions
     return standing_pose(rig, np.array(positions, dtype=np.float64), scene.load)
 

@@ -75,6 +75,9 @@ def _require_bus(rig: Rig) -> None:
 def _drives_reset(rig: Rig) -> list[str]:
     """Sets the drives up, resets those in fault; their states afterwards.
 
+    Where all held all the while, as after a program that was killed, their reference still counts
+    from where they stand.
+
     Raises:
         CdprError: A drive does not answer, may not be reset now, or stays in fault.
     """
@@ -84,6 +87,7 @@ def _drives_reset(rig: Rig) -> list[str]:
     from cdpr.scene_file import LoadDocument
     from drivers.drive_group import GroupCommand, GroupState, drive_states
     from executor.clock import RealClock
+    from executor.custody import Custody
     from executor.safety.watch import MISSING_CYCLES
 
     clock = RealClock(rig.document.bus.cycle_ms / 1000.0)
@@ -92,12 +96,13 @@ def _drives_reset(rig: Rig) -> list[str]:
         status = group.read_positions()
         if status.state is GroupState.FAULT:
             group.command(GroupCommand.RESET_FAULT)
-        silent = [0] * rig.cable_count
+        silent, held = [0] * rig.cable_count, status.holding
         for _ in range(SETTLING_CYCLES):
             clock.next_cycle()
             group.send_cycle(status.positions.tolist())
             status = group.receive(clock.time_left())
             silent = _counted(silent, status)
+            held = held and status.holding
         if status.state is GroupState.FAULT:
             raise Fault(
                 "; ".join(text for _, text in status.faults),
@@ -117,6 +122,8 @@ def _drives_reset(rig: Rig) -> list[str]:
                 why="it lost power or the bus since it was set up",
                 next_step="check power and wiring, then reset again; the latch stays engaged",
             )
+        if held and not group.restarted:
+            Custody(rig).found_held(status.positions.tolist())
         return list(drive_states(rig, status.status_words.tolist()))
 
 

@@ -36,6 +36,7 @@ class WinchMotion:
         fast: Simulated time.
         without_real_time: Move even if real-time scheduling is denied.
         quiet: No progress.
+        anew: The drives are referenced again afterwards.
     """
 
     rig: Rig
@@ -47,6 +48,7 @@ class WinchMotion:
     fast: bool
     without_real_time: bool
     quiet: bool
+    anew: bool
 
 
 def limit_of(rig: Rig, limit_n: float | None) -> float:
@@ -180,6 +182,7 @@ def _moved(
             SimulatedClock(cycle) if motion.fast else RealClock(cycle),
             board,
             record=Custody(rig).file.path,
+            anew=motion.anew,
             on_cycle=on_cycle,
             on_event=on_event,
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import can
 
@@ -26,26 +25,15 @@ from drivers.cia402.objects import (
 )
 from drivers.cia402.sdo import OBJECT_DOES_NOT_EXIST, SetupNetwork
 from drivers.cia402.states import FAULTED, DriveState, state_of
-from drivers.drive_group import Pump
+from drivers.drive_group import OnRestarted, Pump
 
 #: Communication parameters that are 0 in a drive that was just switched on. Source: CiA 301, 7.5.2.
 FORGOTTEN = (0x1006, 0x1017)
 
 
-@dataclass(frozen=True, slots=True)
-class SetUp:
-    """What became of setting the drives up.
-
-    Attributes:
-        remarks: What drives cannot do although a run would use it.
-        restarted: Nodes that did not hold our set-up any more, or never did.
-    """
-
-    remarks: tuple[str, ...]
-    restarted: tuple[int, ...]
-
-
-def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool) -> SetUp:
+def configure_drives(
+    rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool, on_restarted: OnRestarted
+) -> tuple[str, ...]:
     """Writes and reads back every object of every drive, then starts their process data.
 
     Args:
@@ -53,6 +41,11 @@ def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: 
         bus: An open bus.
         pump: As for `drivers.drive_group.make_drive_group`.
         to_reset: Also takes drives in fault, which are going to be reset.
+        on_restarted: Called, before anything is written, with the nodes that do not hold our set-up
+            any more, or never did.
+
+    Returns:
+        Remarks: what drives cannot do although a run would use it.
 
     Raises:
         HardwareMissing: Drives do not answer; with all their nodes.
@@ -68,12 +61,14 @@ def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: 
     network.discard_waiting()
     _find_all(network, nodes, (*BEFORE, *identity(rig)))
     _refuse_duplicates(network)
-    entries, restarted = [], []
+    for node in nodes:
+        _check_idle(network, node, to_reset)
+    on_restarted(
+        tuple(n for n, s in zip(nodes, settings, strict=True) if not _still_set_up(network, n, s))
+    )
+    entries = []
     absent: dict[Setting, list[int]] = {}
     for drive, node in enumerate(nodes):
-        _check_idle(network, node, to_reset)
-        if not _still_set_up(network, node, settings[drive]):
-            restarted.append(node)
         network.command(NmtCommand.PRE_OPERATIONAL, node)
         for setting in _write_all(network, node, settings[drive]):
             absent.setdefault(setting, []).append(node)
@@ -83,8 +78,7 @@ def configure_drives(rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: 
     for node in nodes:
         network.command(NmtCommand.START, node)
     network.take_waiting()
-    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries))
-    return SetUp(remarks, tuple(restarted))
+    return (*_absent(absent), *_unwatched_peers(nodes, entries))
 
 
 def _still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:

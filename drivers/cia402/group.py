@@ -26,6 +26,7 @@ from drivers.drive_group import (
     CycleStatus,
     GroupCommand,
     GroupState,
+    OnRestarted,
     Pump,
 )
 from drivers.own_frames import OwnFrames
@@ -112,7 +113,9 @@ class Cia402Group:
         """Targets last sent, shape (m,), [counts]."""
         return np.array(self._targets, dtype=np.int64)
 
-    def configure(self, *, to_reset: bool = False) -> tuple[str, ...]:
+    def configure(
+        self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
+    ) -> tuple[str, ...]:
         """Sets every drive up and reads every setting back; see `DriveGroup.configure`."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused(
@@ -122,10 +125,17 @@ class Cia402Group:
             )
         self._state = GroupState.OFFLINE
         self._reset_memory()
-        set_up = configure_drives(self._rig, self._bus, self._pump, to_reset=to_reset)
+
+        def take(restarted: tuple[int, ...]) -> None:
+            self._restarted = restarted
+            if on_restarted is not None:
+                on_restarted(restarted)
+
+        remarks = configure_drives(
+            self._rig, self._bus, self._pump, to_reset=to_reset, on_restarted=take
+        )
         self._state = GroupState.CONFIGURED
-        self._restarted = set_up.restarted
-        return set_up.remarks
+        return remarks
 
     def read_positions(self) -> CycleStatus:
         """Sends SYNC until every drive has told its position; see `DriveGroup.read_positions`."""

@@ -30,6 +30,7 @@ from drivers.drive_group import (
     CycleStatus,
     GroupCommand,
     GroupState,
+    OnRestarted,
     Pump,
 )
 from drivers.odrive.configure import configure_drives
@@ -130,7 +131,9 @@ class OdriveGroup:
         """Targets last sent, shape (m,), [counts]."""
         return np.array(self._last(), dtype=np.int64)
 
-    def configure(self, *, to_reset: bool = False) -> tuple[str, ...]:
+    def configure(
+        self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
+    ) -> tuple[str, ...]:
         """Sets every drive up; see `DriveGroup.configure`."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping:
             raise Refused(
@@ -140,6 +143,8 @@ class OdriveGroup:
             )
         self._state = GroupState.OFFLINE
         self._reset_memory()
+        if on_restarted is not None:
+            on_restarted(self.restarted)
         remarks = configure_drives(
             self._rig, self._document, self._layouts, self._bus, self._pump, to_reset=to_reset
         )

@@ -111,6 +111,22 @@ def test_a_drive_that_was_switched_on_since_it_was_set_up_is_told(bench: Bench) 
     assert bench.group.restarted == (5,)
 
 
+def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
+    """The set-up of drives that restarted is the only thing that tells of it."""
+    told: list[tuple[int, ...]] = []
+
+    def not_kept(nodes: tuple[int, ...]) -> None:
+        told.append(nodes)
+        raise Refused("the reference of the drives cannot be kept")
+
+    bench.group.configure()
+    bench.drives[4].power_on()
+    for _ in range(2):
+        with pytest.raises(Refused, match="cannot be kept"):
+            bench.group.configure(on_restarted=not_kept)
+    assert told == [(5,), (5,)]
+
+
 def written_objects(bench: Bench) -> dict[tuple[int, int], int]:
     """What node 6 must hold in the end."""
     settings_of_6 = settings_for(bench.rig, 5, bench.rehearsal.plant.winch_map)

@@ -74,7 +74,7 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
     if encoder == "incremental":
         Custody(rig).file.write(reference_of(rig))
     custody = Custody(rig)
-    custody.begin(Path("run"))
+    custody.begin(Path("run"), None)
     custody.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
     custody.prevented()  # as a reset releases the latch
     for ask in (custody.reference, custody.require_ready):
@@ -85,18 +85,81 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
     assert custody.reference() is not None
 
 
-def test_every_motion_notes_where_the_drives_stand() -> None:
+def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None:
     rig = rig_with("incremental")
     custody = Custody(rig)
     custody.file.write(reference_of(rig))
-    custody.begin(Path("run"))
+    custody.begin(Path("run"), reference_of(rig))
     custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
     kept = custody.kept_reference()
     assert kept is not None
     assert kept.stands_at == list(range(8))
-    custody.begin(Path("run"))
+    custody.begin(Path("run"), kept)
     custody.end(State.LATCHED, "killed", Path("run"), holding=True, stands_at=None)
     assert custody.kept_reference() == kept, "nobody heard anything of the drives"
+
+
+def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
+    """`jog --cable` needs no reference; it must not write the evidence over either."""
+    rig = rig_with("incremental")
+    custody, left = Custody(rig), reference_of(rig)
+    custody.file.write(left)
+    moved = [*left.stands_at[:-1], left.stands_at[-1] + 10**6]
+    assert custody.still_counts(left.stands_at) == left
+    assert custody.still_counts(moved) is None
+    custody.begin(Path("run"), custody.still_counts(moved))
+    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=moved)
+    assert custody.kept_reference() == left
+    absolute = Custody(rig_with("absolute"))
+    assert absolute.still_counts(moved) == left, "it cannot lose count"
+
+
+def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
+    """Setting them up wipes out what tells of it, so the next opening sees nothing any more."""
+    rig = rig_with("incremental")
+    custody = Custody(rig)
+    custody.file.write(reference_of(rig))
+    custody.found_restarted(())
+    assert custody.reference() is not None
+    custody.found_restarted((4,))
+    for ask in (custody.reference, custody.reference, custody.require_ready):
+        with pytest.raises(Refused, match="no more referenced") as caught:
+            ask()
+        assert "drive 4 was switched on" in caught.value.why
+    found = custody.kept_reference()
+    assert found is not None
+    assert custody.still_counts(found.stands_at) is None
+    custody.begin(Path("run"), None)
+    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    custody.found_held(range(8))
+    assert custody.kept_reference() == found, "no motion and no reset brings it back"
+    absolute = Custody(rig_with("absolute"))
+    absolute.file.write(reference_of(rig))
+    absolute.found_restarted((4,))
+    assert absolute.kept_reference() == reference_of(rig)
+
+
+@pytest.mark.parametrize("ended", [State.STOPPED, State.LATCHED])
+def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) -> None:
+    rig = rig_with("incremental")
+    custody = Custody(rig)
+    custody.file.write(reference_of(rig))
+    custody.begin(Path("run"), reference_of(rig), anew=True)
+    custody.end(ended, "stopped", Path("run"), holding=True, stands_at=range(8))
+    custody.prevented()
+    with pytest.raises(Refused, match="no more referenced") as caught:
+        custody.reference()
+    assert "did not come to its end" in caught.value.why
+
+
+def test_drives_that_held_after_a_killed_program_still_count() -> None:
+    rig = rig_with("incremental")
+    custody = Custody(rig)
+    custody.file.write(reference_of(rig))
+    custody.found_held(range(8))
+    kept = custody.kept_reference()
+    assert kept is not None
+    assert (kept.stands_at, kept.lost) == (list(range(8)), "")
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema_version": 2}', "\x00"])
@@ -107,6 +170,13 @@ def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     custody.file.path.write_text(content)
     with pytest.raises(Refused, match="cannot be read"):
         custody.reference()
+    # Homing replaces it; what was moved meanwhile must not stumble over it.
+    custody.found_restarted((1,))
+    custody.begin(Path("run"), custody.still_counts(range(8)), anew=True)
+    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    assert custody.file.path.read_text() == content
+    custody.file.write(reference_of(rig))
+    assert custody.reference() is not None
 
 
 def group_at(rig: Rig, restarted: tuple[int, ...] = (), off_mm: float = 0.0) -> Any:

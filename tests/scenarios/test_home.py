@@ -80,6 +80,7 @@ class Place:
             SimulatedClock(0.01),
             self.board,
             record=Path("nowhere"),
+            anew=True,
             on_cycle=on_cycle,
             on_event=self.events.append,
         )
@@ -338,7 +339,7 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         law = TakeUp(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
         stand = move_winches(
             limited, law, group, SimulatedClock(0.01), OwnBoard(), record=Path("nowhere"),
-            on_cycle=lambda _record: None, on_event=lambda _event: None,
+            anew=True, on_cycle=lambda _record: None, on_event=lambda _event: None,
         )  # fmt: skip
         assert stand.state is State.FINISHED, stand.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0

@@ -51,7 +51,18 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         third = call(*run, "-o", tmp_path / "third")
         assert third.code == 3
         assert "cable 6 (drive 6) is lost: it was switched on" in third.err
+        again = call(*run, "-o", tmp_path / "again")
+        assert again.code == 3
+        assert "no more referenced" in again.err
+        assert call("reset", rig, *bus[:5]).code == 0
+        jogged = call("jog", rig, "--by-mm", "0", "0", "1", "--no-scene", *bus)
+        assert jogged.code == 3
+        assert "drive 6 was switched on" in jogged.err.replace("\n", " ").replace("  ", "")
         assert [drive.motor.position for drive in rehearsal.drives] == stood
+        Path(told["file"]).write_text("{")
+        anew = call("home", rig, "--pose-mm", *start, *bus, "--json")
+        assert anew.code == 0, anew
+        assert json.loads(Path(told["file"]).read_text())["lost"] == ""
 
 
 def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_path: Path) -> None:

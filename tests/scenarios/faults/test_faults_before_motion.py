@@ -29,7 +29,13 @@ def nothing(_bench: object) -> None:
 
 def configure(bench: SimulatedBench) -> None:
     near = bench.stage.group._bus  # type: ignore[attr-defined]
-    configure_drives(bench.prepared.rig, near, bench.rehearsal.pump, to_reset=False)
+    configure_drives(
+        bench.prepared.rig,
+        near,
+        bench.rehearsal.pump,
+        to_reset=False,
+        on_restarted=lambda _nodes: None,
+    )
 
 
 def test_f14_an_object_that_is_never_answered_is_named(
