@@ -224,7 +224,9 @@ def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
     return tuple(state_of(word).value for word in status_words)
 
 
-def make_drive_group(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveGroup:
+def make_drive_group(
+    rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None = None
+) -> DriveGroup:
     """The drives of a rig, not yet configured.
 
     Args:
@@ -232,6 +234,8 @@ def make_drive_group(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> Dri
         bus: An open bus; it stays the caller's.
         pump: Given when the drives are simulated in this process (`Rehearsal.pump`): called
             wherever an answer is waited for, and nothing is waited for after it.
+        max_tension: From which the drives' torque limit comes, [N]; the rig's own if None. One that
+            is below what a drive holds lets its cable slip as soon as `configure` writes it.
 
     Raises:
         Refused: The bus is too slow for the rig's cycle.
@@ -242,7 +246,7 @@ def make_drive_group(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> Dri
     if rig.document.drives.type == "odrive":
         from drivers.odrive.group import OdriveGroup
 
-        return OdriveGroup(rig, bus, pump)
+        return OdriveGroup(rig, bus, pump, max_tension=max_tension)
     from drivers.cia402.group import Cia402Group
 
-    return Cia402Group(rig, bus, pump)
+    return Cia402Group(rig, bus, pump, max_tension=max_tension)

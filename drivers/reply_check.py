@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from cdpr.rig import Rig
+
 BAD_CYCLES = 2
 """Cycles in a row that are one too many: one bad frame may happen, two are a defect."""
 
-JUMP_RESERVE = 4.0
-"""A position that changes this much faster than its winch may turn is no position."""
+JUMP_RESERVE, JUMP_COUNTS = 4.0, 8.0
+"""A position that changes this much faster than its winch may turn is no position; a few counts to
+and fro are, however coarse the encoder."""
+
+
+def largest_steps(rig: Rig, cycle: float) -> tuple[float, ...]:
+    """How far each drive's position can change in a cycle [s], [counts]."""
+    fastest = [w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches]
+    return tuple(max(JUMP_COUNTS, JUMP_RESERVE * step) for step in fastest)
 
 
 class ReplyCheck:

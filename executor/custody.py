@@ -109,8 +109,8 @@ class Custody:
         """
         forgot = {winch.node_id for winch in self._rig.winches if not winch.absolute} & {*nodes}
         if forgot:
-            names = ", ".join(map(str, sorted(forgot)))
-            self._lose(f"drive {names} was switched on since it was referenced")
+            names = [name for node, name in self._rig.drive_names.items() if node in forgot]
+            self._lose(f"{', '.join(names)}: switched on since the reference was made")
 
     def found_held(self, stands: Sequence[int]) -> None:
         """All drives held since they were last heard: they still count, and stand there [counts].

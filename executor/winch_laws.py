@@ -11,9 +11,9 @@ from typing import Protocol
 
 import numpy as np
 
+from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array
 from cdpr.rig import Rig
-from cdpr.winches import WinchMap
 from executor.safety.watch import Finding, Reaction
 
 #: A cable that was taut stays so while its tension is above this share of what was asked for.
@@ -141,6 +141,7 @@ class CableStep:
             speed: At most so fast, [m/s].
         """
         self._begin = tuple(begin)
+        speed = float(_fastest(rig, speed)[cable])
         self._cable, self._counts = cable, way * rig.winches[cable].counts_per_metre
         self._least = rig.min_tension / 2.0
         # A smooth step from rest to rest is 15/8 times as fast in its middle as on average.
@@ -199,10 +200,18 @@ class CableStep:
 
 
 def wind_in_speed(rig: Rig, target: float, limit: float, speed: float) -> Array:
-    """How fast each cable may be wound in while its tension is looked at, shape (m,), [m/s]."""
-    stiffness = rig.cable_stiffness / WinchMap(rig).home_unstrained
-    careful = SHARE_OF_ROOM * (limit - target) / stiffness / _cycle(rig)
-    return np.minimum(speed, careful)
+    """How fast each cable may be wound in while its tension is looked at, shape (m,), [m/s].
+
+    Never faster than its winch; cables are taken to be as stiff as they are at home.
+    """
+    lengths = cable_lengths(rig, rig.home) + [winch.drum_to_outlet for winch in rig.winches]
+    careful = SHARE_OF_ROOM * (limit - target) / (rig.cable_stiffness / lengths) / _cycle(rig)
+    return np.minimum(_fastest(rig, speed), careful)
+
+
+def _fastest(rig: Rig, speed: float) -> Array:
+    """The speed that is wished for, where the winch has it, shape (m,), [m/s]."""
+    return np.minimum(speed, [winch.max_speed for winch in rig.winches])
 
 
 def _cycle(rig: Rig) -> float:

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from cdpr.errors import Refused, StoppedByOperator
 from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, rig_from_document
 from cdpr.winches import WinchMap
-from drivers.drive_group import DriveGroup
+from drivers.drive_group import Counts, CycleStatus, DriveGroup
 from executor.clock import Clock
 from executor.custody import Custody
 from executor.loop import SETTLING
@@ -41,35 +42,80 @@ class WinchesStand:
     tensions: Array
 
 
-def unreferenced(rig: Rig, counts: Sequence[int], pose: Pose, *, limit: float, speed: float) -> Rig:
-    """The rig as drives that were never referenced are set up for: a guess that limits them.
+def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
+    """The rig as drives that were never referenced are set up for: a guess of what they count.
 
     Args:
         rig: The robot.
         counts: Where its drives stand, [counts].
         pose: Where its platform is about, ``world_from_platform``.
-        limit: Largest tension, [N]; the drives' torque limit comes from it.
-        speed: Of the winches, [m/s].
 
     Raises:
-        TensionInfeasible: The platform cannot be held with so little tension.
+        TensionInfeasible: The rig cannot hold its platform at home.
     """
     winches = WinchMap(rig)
     there = winches.unstrained(cable_lengths(rig, pose), np.zeros(rig.cable_count))
     home = winches.home_counts + np.asarray(counts) - winches.counts(there)
+    winches_here = [
+        winch.model_copy(update={"home_counts": round(float(count))})
+        for winch, count in zip(rig.document.winches, home, strict=True)
+    ]
+    return rig_from_document(rig.document.model_copy(update={"winches": winches_here}))
+
+
+def careful(rig: Rig, *, limit: float, speed: float) -> Rig:
+    """The rig as gate and watch see it while winches move by a law; drives are not set up by it.
+
+    With the platform on a jig or not on its cables at all, no tensions need balance it.
+
+    Args:
+        rig: The robot.
+        limit: Largest tension, [N].
+        speed: Fastest winch, [m/s].
+    """
     document = rig.document
     slow = [
-        winch.model_copy(
-            update={
-                "home_counts": round(float(count)),
-                "max_speed_mm_s": min(winch.max_speed_mm_s, speed * 1000.0),
-            }
-        )
-        for winch, count in zip(document.winches, home, strict=True)
+        winch.model_copy(update={"max_speed_mm_s": min(winch.max_speed_mm_s, speed * 1000.0)})
+        for winch in document.winches
     ]
     cables = document.cables.model_copy(update={"max_tension_n": limit})
-    changed = document.model_copy(update={"winches": slow, "cables": cables})
-    return rig_from_document(changed)
+    return rig_from_document(document.model_copy(update={"winches": slow, "cables": cables}))
+
+
+def require_below(rig: Rig, held: CycleStatus, limit: float) -> None:
+    """No drive holds more than it may from now on: written to it, the limit would let it slip.
+
+    What closed brakes hold is not known before the drives are enabled.
+
+    Args:
+        rig: The robot.
+        held: What its drives tell.
+        limit: Largest tension, [N].
+
+    Raises:
+        Refused: One does; with its cable.
+    """
+    tensions = tensions_of(rig, held.torques)
+    over = [
+        f"{name} carries {tension:.1f} N"
+        for name, tension in zip(rig.drive_names.values(), tensions.tolist(), strict=True)
+        if not tension <= limit
+    ]
+    if over:
+        raise Refused(
+            f"{', '.join(over)}, more than the limit of {limit:g} N",
+            where="setting the drives' torque limit",
+            why="a drive whose torque is limited to less than it holds lets its cable slip",
+            next_step="name a higher --limit-n, or take the load off these cables; the drives hold"
+            " as before",
+        )
+
+
+def tensions_of(rig: Rig, torques: Array | Counts) -> Array:
+    """Cable tensions from torques [per mille of rated torque], shape (..., m), [N]."""
+    rated = np.array([winch.torque_constant for winch in rig.winches])
+    tensions: Array = np.asarray(torques, dtype=np.float64) / 1000.0 * rated
+    return tensions
 
 
 def move_winches(
@@ -78,6 +124,7 @@ def move_winches(
     group: DriveGroup,
     clock: Clock,
     board: WishBoard,
+    custody: Custody,
     *,
     record: Path,
     anew: bool,
@@ -87,11 +134,12 @@ def move_winches(
     """Moves by a law and ends with the drives holding by themselves, whatever happens.
 
     Args:
-        rig: The robot as its drives are set up (see `unreferenced`).
+        rig: The robot as its drives count (see `counted_here`), and as it is watched (`careful`).
         law: What the winches are told.
         group: The drives, configured.
         clock: Real or simulated.
         board: What the operator wants.
+        custody: Of the rig as its file is.
         record: What the latch names, should this not come to its end.
         anew: The drives are to be referenced again afterwards.
         on_cycle: Called after every cycle.
@@ -101,8 +149,8 @@ def move_winches(
         Refused: The bus is latched, or the drives do not stand where the law begins; nothing was
             enabled.
         HardwareMissing: A drive does not answer.
+        StoppedByOperator: The operator wanted to stop before anything moved.
     """
-    custody = Custody(rig)
     custody.require_free()
     last: deque[CycleRecord] = deque(maxlen=SETTLING)
 
@@ -113,6 +161,8 @@ def move_winches(
 
     loop = WinchLoop(rig, law, group, clock, wishes=board.read, on_cycle=take, on_event=on_event)
     loop.arm()
+    if board.read().stop:
+        raise StoppedByOperator("stopped before anything moved")
     custody.begin(record, custody.still_counts(law.reach[0]), anew=anew)
     try:
         loop.run()
@@ -124,9 +174,8 @@ def move_winches(
             holding=loop.holding,
             stands_at=last[-1].actual if last else None,
         )
-    rated = np.array([winch.torque_constant for winch in rig.winches])
     unknown = [np.full(rig.cable_count, np.nan)]
     torques = np.array([cycle.torques for cycle in last] or unknown, dtype=np.float64)
     counts = np.array([cycle.actual for cycle in last] or unknown, dtype=np.float64)
-    tensions = torques.mean(axis=0) / 1000.0 * rated
+    tensions = tensions_of(rig, torques.mean(axis=0))
     return WinchesStand(loop.machine.state, loop.cause, counts.mean(axis=0), tensions)

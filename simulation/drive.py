@@ -37,6 +37,9 @@ Frame = bytes | bytearray
 Send = Callable[[int, Frame], None]
 
 MISSED_SYNC_PERIODS = 3
+SLIP_SHARE = 0.005
+"""A motor that is loaded with twice the torque that it can hold slips at this share of its top
+speed, and comes back at no more."""
 
 LIFE_GUARD = 0x8130
 PDO_LENGTH = 0x8210
@@ -114,6 +117,7 @@ class SimulatedDrive:
         self._watched = self._heartbeat_consumers()
         self._to_own_heartbeat = 0.0
         self._error_time = 0.0
+        self._at_limit = False
         self._send(HEARTBEAT_BASE + self.node, make_heartbeat(NmtState.BOOT_UP))
 
     @property
@@ -215,12 +219,22 @@ class SimulatedDrive:
             self.motor.ramp_down(deceleration, elapsed, load)
             if self.motor.speed == 0.0:
                 self._power_off(DriveState.FAULT)
+        if load and self.torque_on:
+            room = 1.0 - abs(self.torque) / max(1, self.objects[0x6072, 0])
+            speed = SLIP_SHARE * self.motor.top_speed * max(-1.0, min(1.0, room))
+            self.motor.yield_to(load, speed * elapsed)
 
     def _limited_direction(self) -> int:
-        """At its torque limit the motor cannot pull further the way it is pulling."""
-        if abs(self.torque) < self.objects[0x6072, 0]:
-            return 0
-        return 1 if self.torque > 0 else -1
+        """At its torque limit the motor cannot pull further the way it is pulling.
+
+        A load above it turns the motor back; it is at its limit until it is where it is to be.
+        """
+        pull = 1 if self.torque > 0 else -1
+        if abs(self.torque) >= self.objects[0x6072, 0]:
+            self._at_limit = True
+        elif self.motor.following_error * pull <= 0.0:
+            self._at_limit = False
+        return pull if self._at_limit else 0
 
     def _check_following(self, elapsed: float) -> None:
         """Following error above 6065h for longer than 6066h."""

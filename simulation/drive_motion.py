@@ -54,6 +54,16 @@ class Motor:
         self.speed = slowed
         self._turn(elapsed, load)
 
+    def yield_to(self, load: int, way: float) -> None:
+        """A motor at its torque limit: the load turns it back, or it comes back against the load.
+
+        Args:
+            load: Sign of the direction in which the motor pulls.
+            way: That way, at most to where the controller wants it, [counts]; negative against it.
+        """
+        if not self.jammed:
+            self.position += load * min(way, max(0.0, self.following_error * load))
+
     def release(self) -> None:
         """Torque off, brake closed: the shaft stays, the demand goes to it."""
         self.demand, self.speed = self.position, 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from cdpr.rig import Rig
     from cdpr.rig_file import RigDocument
     from cdpr.scene import Load
+    from drivers.drive_group import CycleStatus
     from executor.real_time_job import ReadyDrives
     from simulation.power_loss import PowerLoss
 
@@ -23,7 +24,7 @@ def open_drives(
     *,
     to_reset: bool = False,
     lost_power: PowerLoss | None = None,
-    set_up_as: Callable[[Sequence[int]], Rig] | None = None,
+    set_up_as: Callable[[CycleStatus], tuple[Rig, float]] | None = None,
 ) -> Iterator[ReadyDrives]:
     """Opens the bus and configures the drives; closes both at the end.
 
@@ -35,8 +36,8 @@ def open_drives(
         load: What it carries then.
         to_reset: Also takes drives in fault, which are going to be reset.
         lost_power: What became of drives that are simulated here.
-        set_up_as: For drives that are not referenced: the rig whose limits they get, by where they
-            stand [counts].
+        set_up_as: For drives that are not referenced, from what they tell: the rig as they count,
+            and the largest tension [N] that their torque limit allows.
 
     Raises:
         BadInput: python-can has no such interface.
@@ -69,9 +70,9 @@ def open_drives(
         stack.callback(group.close)
         if set_up_as is not None:
             group.configure(to_reset=to_reset, on_restarted=custody.found_restarted)
-            limited = set_up_as(group.read_positions().positions.tolist())
+            counted, max_tension = set_up_as(group.read_positions())
             group.close()
-            group = make_drive_group(limited, bus, pump)
+            group = make_drive_group(counted, bus, pump, max_tension=max_tension)
             stack.callback(group.close)
         remarks = group.configure(to_reset=to_reset, on_restarted=custody.found_restarted)
         for remark in remarks:

@@ -86,7 +86,7 @@ def home(
     from cdpr.cli.home_facts import show_reference, show_wish
     from cdpr.cli.output import show_json
     from cdpr.cli.run import require_own_time, rig_on_bus
-    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of
+    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of, speed_of
     from drivers.bus import IN_PROCESS
     from executor.custody import Custody
     from executor.winch_laws import TakeUp
@@ -101,7 +101,7 @@ def home(
     known = _known_pose(the_rig, at_home, pose_mm, camera, in_process, as_rig_file)
     limit = limit_of(the_rig, limit_n)
     target = _target(the_rig, tension_n, limit)
-    speed, reach = speed_mm_s / 1000.0, reach_mm / 1000.0
+    speed, reach = speed_of(the_rig, speed_mm_s), reach_mm / 1000.0
     custody = Custody(the_rig)
     custody.require_free()
     if not as_json:

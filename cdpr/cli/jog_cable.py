@@ -39,7 +39,7 @@ def jog_cable(
     from cdpr.cli.carry_out import ask_operator
     from cdpr.cli.jog_way import LONGEST_MM
     from cdpr.cli.output import out, show_facts, show_json
-    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of
+    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of, speed_of
     from cdpr.errors import BadInput, Refused
     from drivers.bus import IN_PROCESS
     from executor.custody import Custody
@@ -60,7 +60,7 @@ def jog_cable(
             why="one cable alone is moved in short steps, somebody looking",
             next_step="go there in several steps",
         )
-    limit = limit_of(rig, limit_n)
+    limit, speed = limit_of(rig, limit_n), speed_of(rig, speed_mm_s)
     in_process = rig.document.bus.interface == IN_PROCESS
     Custody(rig).require_free()
     winch = rig.winches[cable - 1]
@@ -70,7 +70,10 @@ def jog_cable(
             [
                 ("rig", rig.name),
                 ("cable", rig.drive_names[winch.node_id]),
-                ("way", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed_mm_s:g} mm/s"),
+                (
+                    "way",
+                    f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed * 1000:g} mm/s",
+                ),
                 ("tension", f"at most {limit:g} N in any cable; none that is taut may go slack"),
             ],
         )
@@ -80,7 +83,6 @@ def jog_cable(
 
     def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
         begun.append(counts)
-        speed = speed_mm_s / 1000.0
         return CableStep(
             as_set_up, counts, cable=cable - 1, way=mm / 1000.0, limit=limit, speed=speed
         )
@@ -89,7 +91,7 @@ def jog_cable(
         """Nothing more to see while the drives are there."""
 
     motion = WinchMotion(
-        rig, rig.home, limit, speed_mm_s / 1000.0, make_law, None, fast, without_real_time, as_json,
+        rig, rig.home, limit, speed, make_law, None, fast, without_real_time, as_json,
         anew=False,
     )  # fmt: skip
     stand = carry_out_by_law(motion, at_rest)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
+    from drivers.drive_group import CycleStatus
     from executor.real_time_job import ReadyDrives
     from executor.records import CycleRecord, LoopEvent
     from executor.winch_laws import WinchLaw
@@ -31,7 +32,7 @@ class WinchMotion:
         pose: Where its platform is about, ``world_from_platform``.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
-        make_law: From the rig as its drives are set up, and where they stand, [counts].
+        make_law: From the rig as its drives count, limited, and where they stand, [counts].
         lost_power: What became of drives that are simulated in this process.
         fast: Simulated time.
         without_real_time: Move even if real-time scheduling is denied.
@@ -72,6 +73,11 @@ def limit_of(rig: Rig, limit_n: float | None) -> float:
     return limit_n
 
 
+def speed_of(rig: Rig, speed_mm_s: float) -> float:
+    """The wished speed of the winches, where the rig allows it, [m/s]."""
+    return min(speed_mm_s / 1000.0, rig.motion.speed)
+
+
 def carry_out_by_law(
     motion: WinchMotion, at_rest: Callable[[WinchesStand, ReadyDrives], None]
 ) -> WinchesStand:
@@ -92,16 +98,18 @@ def carry_out_by_law(
     from executor.command_server import serving
     from executor.machine import State
     from executor.running import announced, stop_requests
-    from executor.winch_motion import unreferenced
+    from executor.winch_motion import careful, counted_here, require_below
     from executor.wishes import OwnBoard
 
-    rig, limited = motion.rig, []
+    rig = motion.rig
+    limited: list[tuple[Rig, list[int]]] = []
 
-    def set_up_as(counts: Sequence[int]) -> Rig:
-        limited.append((unreferenced(
-            rig, counts, motion.pose, limit=motion.limit, speed=motion.speed
-        ), counts))  # fmt: skip
-        return limited[0][0]
+    def set_up_as(told: CycleStatus) -> tuple[Rig, float]:
+        require_below(rig, told, motion.limit)
+        counts = told.positions.tolist()
+        counted = counted_here(rig, counts, motion.pose)
+        limited.append((careful(counted, limit=motion.limit, speed=motion.speed), counts))
+        return counted, motion.limit
 
     board = OwnBoard()
     status = _Status(rig, board)
@@ -149,7 +157,7 @@ def _moved(
     from executor.realtime import real_time
     from executor.winch_motion import move_winches
 
-    cycle = rig.document.bus.cycle_ms / 1000.0
+    cycle, custody = rig.document.bus.cycle_ms / 1000.0, Custody(motion.rig)
     simulated = rig.document.bus.interface == IN_PROCESS
     with (
         nullcontext("") if motion.fast else real_time() as denied,
@@ -181,7 +189,8 @@ def _moved(
             drives.group,
             SimulatedClock(cycle) if motion.fast else RealClock(cycle),
             board,
-            record=Custody(rig).file.path,
+            custody,
+            record=custody.file.path,
             anew=motion.anew,
             on_cycle=on_cycle,
             on_event=on_event,

@@ -32,7 +32,13 @@ FORGOTTEN = (0x1006, 0x1017)
 
 
 def configure_drives(
-    rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool, on_restarted: OnRestarted
+    rig: Rig,
+    bus: can.BusABC,
+    pump: Pump | None,
+    *,
+    max_tension: float | None,
+    to_reset: bool,
+    on_restarted: OnRestarted,
 ) -> tuple[str, ...]:
     """Writes and reads back every object of every drive, then starts their process data.
 
@@ -40,6 +46,7 @@ def configure_drives(
         rig: The robot; its winches name the nodes.
         bus: An open bus.
         pump: As for `drivers.drive_group.make_drive_group`.
+        max_tension: From which the torque limit comes, [N]; the rig's own if None.
         to_reset: Also takes drives in fault, which are going to be reset.
         on_restarted: Called, before anything is written, with the nodes that do not hold our set-up
             any more, or never did.
@@ -55,7 +62,7 @@ def configure_drives(
         Fault: The bus does not take frames.
     """
     winch_map = WinchMap(rig)
-    settings = [settings_for(rig, i, winch_map) for i in range(rig.cable_count)]
+    settings = [settings_for(rig, i, winch_map, max_tension) for i in range(rig.cable_count)]
     nodes = [winch.node_id for winch in rig.winches]
     network = SetupNetwork(bus, pump, nodes)
     network.discard_waiting()

@@ -30,7 +30,7 @@ from drivers.drive_group import (
     Pump,
 )
 from drivers.own_frames import OwnFrames
-from drivers.reply_check import JUMP_RESERVE
+from drivers.reply_check import largest_steps
 from drivers.torque import winding_signs
 
 STEP_TIMEOUT = 1.0
@@ -50,7 +50,9 @@ FIRST_READING_TIMEOUT = 0.1
 class Cia402Group:
     """CiA 402 drives in cyclic synchronous position mode; see `drivers.drive_group.DriveGroup`."""
 
-    def __init__(self, rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> None:
+    def __init__(
+        self, rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None
+    ) -> None:
         """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
         check_bus_load(rig)
         self._rig, self._bus, self._pump = rig, bus, pump
@@ -59,8 +61,8 @@ class Cia402Group:
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
-        steps = [JUMP_RESERVE * w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches]
-        self._max_steps = tuple(steps)
+        self._max_tension = max_tension
+        self._max_steps = largest_steps(rig, cycle)
         self._state = GroupState.OFFLINE
         self._restarted: tuple[int, ...] = ()
         self._reset_memory()
@@ -132,7 +134,12 @@ class Cia402Group:
                 on_restarted(restarted)
 
         remarks = configure_drives(
-            self._rig, self._bus, self._pump, to_reset=to_reset, on_restarted=take
+            self._rig,
+            self._bus,
+            self._pump,
+            max_tension=self._max_tension,
+            to_reset=to_reset,
+            on_restarted=take,
         )
         self._state = GroupState.CONFIGURED
         return remarks

@@ -108,13 +108,16 @@ UNUSED_PDOS = (0x1401, 0x1402, 0x1403, 0x1801, 0x1802, 0x1803)
 HEARTBEAT_CONSUMERS = 0x1016
 
 
-def settings_for(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[Setting, ...]:
+def settings_for(
+    rig: Rig, drive: int, winch_map: WinchMap, max_tension: float | None = None
+) -> tuple[Setting, ...]:
     """The set-up of one drive, in the order of writing.
 
     Args:
         rig: The robot.
         drive: Place of its winch in the rig file, from 0.
         winch_map: The rig's lengths and counts.
+        max_tension: From which the torque limit comes, [N]; the rig's own if None.
 
     Raises:
         BadInput: A value of the rig does not fit its object.
@@ -125,7 +128,7 @@ def settings_for(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[Setting, ..
         *_supervision(cycle),
         *_mode(cycle),
         *_reactions(rig, drive, cycle),
-        *_limits(rig, drive, winch_map),
+        *_limits(rig, drive, winch_map, rig.max_tension if max_tension is None else max_tension),
     )
 
 
@@ -249,12 +252,12 @@ def _reactions(rig: Rig, drive: int, cycle: float) -> tuple[Setting, ...]:
     )
 
 
-def _limits(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[Setting, ...]:
+def _limits(rig: Rig, drive: int, winch_map: WinchMap, max_tension: float) -> tuple[Setting, ...]:
     winch = rig.winches[drive]
-    torque = math.ceil(1000.0 * TORQUE_RESERVE * rig.max_tension / winch.torque_constant)
+    torque = math.ceil(1000.0 * TORQUE_RESERVE * max_tension / winch.torque_constant)
     if torque > _UNSIGNED_MAX["<H"]:
         raise BadInput(
-            f"max_tension_n is {rig.max_tension / winch.torque_constant:.0f} times the tension at"
+            f"max_tension_n is {max_tension / winch.torque_constant:.0f} times the tension at"
             " rated torque",
             where=f"rig {rig.name}: winches[{drive}].torque_constant_n",
             next_step="give the cable tension at rated motor torque",

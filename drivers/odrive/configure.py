@@ -47,9 +47,12 @@ def configure_drives(
     bus: can.BusABC,
     pump: Pump | None,
     *,
+    max_tension: float,
     to_reset: bool,
 ) -> tuple[str, ...]:
     """Sets every drive up; arguments and errors as for `drivers.drive_group.DriveGroup.configure`.
+
+    The torque limit comes from ``max_tension``, [N].
 
     A watchdog that expired while nothing was enabled only tells that a master went away; it is
     cleared, on drives that all hold by their brakes.
@@ -67,7 +70,7 @@ def configure_drives(
                 _set(link, layouts, node, known.by_name[wanted.name], wanted)
     for winch in rig.winches:
         turns = SPEED_RESERVE * winch.max_speed * abs(winch.counts_per_metre)
-        torque = TORQUE_RESERVE * rig.max_tension / winch.torque_constant * winch.rated_torque
+        torque = TORQUE_RESERVE * max_tension / winch.torque_constant * winch.rated_torque
         limits = turns / winch.counts_per_turn, torque / document.motor_torque_constant_nm_a
         link.tell(winch.node_id, layouts.set_limits, *limits)
         mode = ControlMode.POSITION, InputMode.PASSTHROUGH

@@ -40,7 +40,7 @@ from drivers.odrive.link import commanding_ids, foreign_text
 from drivers.odrive.messages import RESULT_TEXTS, AxisState, state_text
 from drivers.odrive.watch import OdriveWatch
 from drivers.own_frames import OwnFrames
-from drivers.reply_check import JUMP_RESERVE
+from drivers.reply_check import largest_steps
 from drivers.torque import winding_signs
 
 STEP_TIMEOUT = 1.0
@@ -67,7 +67,9 @@ class _Stop(Enum):
 class OdriveGroup:
     """ODrives in position control; see `drivers.drive_group.DriveGroup`."""
 
-    def __init__(self, rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> None:
+    def __init__(
+        self, rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None
+    ) -> None:
         """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
         document = rig.document.drives
         if not isinstance(document, OdriveDocument):
@@ -80,9 +82,8 @@ class OdriveGroup:
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
         self._settling = max(1, round(SETTLING / cycle))
-        self._max_steps = tuple(
-            JUMP_RESERVE * w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches
-        )
+        self._max_tension = rig.max_tension if max_tension is None else max_tension
+        self._max_steps = largest_steps(rig, cycle)
         self._per_mille = winding_signs(rig) * 1000.0 / [w.rated_torque for w in rig.winches]
         self._state = GroupState.OFFLINE
         self._reset_memory()
@@ -146,7 +147,13 @@ class OdriveGroup:
         if on_restarted is not None:
             on_restarted(self.restarted)
         remarks = configure_drives(
-            self._rig, self._document, self._layouts, self._bus, self._pump, to_reset=to_reset
+            self._rig,
+            self._document,
+            self._layouts,
+            self._bus,
+            self._pump,
+            max_tension=self._max_tension,
+            to_reset=to_reset,
         )
         self._state = GroupState.CONFIGURED
         return remarks

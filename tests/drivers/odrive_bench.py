@@ -94,4 +94,6 @@ def odrive_bench(rig: Rig | None = None) -> Iterator[OdriveBench]:
     settings = BusSettings("virtual", f"odrive-{next(_CHANNELS)}")
     with open_bus(settings) as master, open_bus(settings) as far, open_bus(settings) as ear:
         rehearsal = OdriveRehearsal(rig, far, rig.home)
-        yield OdriveBench(rig, OdriveGroup(rig, master, rehearsal.pump), rehearsal, ear)
+        yield OdriveBench(
+            rig, OdriveGroup(rig, master, rehearsal.pump, max_tension=None), rehearsal, ear
+        )

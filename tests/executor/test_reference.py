@@ -125,7 +125,7 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     for ask in (custody.reference, custody.reference, custody.require_ready):
         with pytest.raises(Refused, match="no more referenced") as caught:
             ask()
-        assert "drive 4 was switched on" in caught.value.why
+        assert "cable 4 (drive 4): switched on" in caught.value.why
     found = custody.kept_reference()
     assert found is not None
     assert custody.still_counts(found.stands_at) is None

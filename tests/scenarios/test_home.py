@@ -14,7 +14,7 @@ import pytest
 
 from cdpr.cli.jog import no_scene
 from cdpr.cli.jog_way import straight_way
-from cdpr.errors import Refused
+from cdpr.errors import Refused, StoppedByOperator
 from cdpr.plan import plan_from_document
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, load_rig
@@ -23,6 +23,7 @@ from drivers.bus_faults import BusDown
 from drivers.cia402.states import DriveState
 from drivers.drive_group import DriveGroup, make_drive_group
 from executor.clock import SimulatedClock
+from executor.custody import Custody
 from executor.machine import State
 from executor.prepare import PreparedRun, prepare
 from executor.records import CycleRecord, LoopEvent
@@ -30,8 +31,8 @@ from executor.reference import reference_at, referenced
 from executor.rest_pose import rest_pose
 from executor.run_folder import RunFolder
 from executor.standing_pose import standing_pose
-from executor.winch_laws import CableStep, TakeUp, WinchLaw
-from executor.winch_motion import WinchesStand, move_winches, unreferenced
+from executor.winch_laws import CableStep, TakeUp, WinchLaw, wind_in_speed
+from executor.winch_motion import WinchesStand, careful, counted_here, move_winches, require_below
 from executor.wishes import OwnBoard
 from planner.check import verify
 from simulation.camera import SyntheticCamera
@@ -79,6 +80,7 @@ class Place:
             self.group,
             SimulatedClock(0.01),
             self.board,
+            Custody(self.rig),
             record=Path("nowhere"),
             anew=True,
             on_cycle=on_cycle,
@@ -97,7 +99,9 @@ class Place:
 
 
 @contextmanager
-def after_power_loss(loss: PowerLoss | None, rig: Rig | None = None) -> Iterator[Place]:
+def after_power_loss(
+    loss: PowerLoss | None, rig: Rig | None = None, limit: float = LIMIT, speed: float = 0.005
+) -> Iterator[Place]:
     rig = rig or load_rig(RIG)
     settings = BusSettings("virtual", f"home-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
@@ -107,8 +111,9 @@ def after_power_loss(loss: PowerLoss | None, rig: Rig | None = None) -> Iterator
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure()
         counts = group.read_positions().positions.tolist()
-        as_set_up = unreferenced(rig, counts, rig.home, limit=LIMIT, speed=0.005)
-        group = make_drive_group(as_set_up, near, rehearsal.pump)
+        counted = counted_here(rig, counts, rig.home)
+        as_set_up = careful(counted, limit=limit, speed=speed)
+        group = make_drive_group(counted, near, rehearsal.pump, max_tension=limit)
         group.configure()
         yield Place(rig, rehearsal, group, as_set_up, counts)
 
@@ -312,6 +317,79 @@ def test_on_a_taut_platform_one_cable_alone_is_stopped(way: float, cause: str) -
         assert np.max(place.tensions) < 1.3 * LIMIT
 
 
+def test_drives_that_hold_more_are_not_told_to_let_it_slip() -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+        assert place.take_up().state is State.FINISHED
+        held = place.group.read_positions()
+        carried = place.rehearsal.tensions
+        require_below(place.rig, held, float(carried.max()) + 1.0)
+        worst = int(carried.argmax()) + 1
+        with pytest.raises(Refused, match=rf"cable {worst} \(drive {worst}\) carries"):
+            require_below(place.rig, held, float(carried.max()) - 0.5)
+        stood = [drive.motor.position for drive in place.rehearsal.drives]
+        # What would happen otherwise: so it is refused before anything is written.
+        bus = place.group._bus  # type: ignore[attr-defined]
+        place.group.close()
+        weak = make_drive_group(
+            place.as_set_up, bus, place.rehearsal.pump, max_tension=0.5 * float(carried.min())
+        )
+        weak.configure()
+        for _ in range(50):
+            weak.send_cycle([0] * 8)
+            weak.receive(0.0)
+        slipped = [d.motor.position for d in place.rehearsal.drives] - np.array(stood)
+        paid_out = slipped / [w.counts_per_metre for w in place.rig.winches]
+        assert paid_out.max() > 1e-5
+        assert place.rehearsal.tensions.max() < carried.max()
+        weak.close()
+
+
+def test_winches_without_a_platform_move_below_what_would_balance_it() -> None:
+    """40 N hold no platform of this rig; light weights on the cables ask for no more."""
+    rig = load_rig(HALL)
+    loose = PowerLoss(np.zeros(rig.cable_count), np.full(rig.cable_count, 0.02), on_a_stand=True)
+    with after_power_loss(loose, rig, limit=40.0, speed=0.005) as place:
+        law = CableStep(place.as_set_up, place.counts, cable=0, way=0.002, limit=40.0, speed=0.005)
+        stand = place.move(law)
+        assert stand.state is State.FINISHED, stand.cause
+        assert {d.objects[0x6072, 0] for d in place.rehearsal.drives} == {
+            int(np.ceil(1000.0 * 1.2 * 40.0 / w.torque_constant)) for w in rig.winches
+        }
+
+
+@pytest.mark.parametrize("speed", [0.0001, 0.0002])
+def test_the_slowest_motion_is_no_jump_of_a_coarse_encoder(speed: float) -> None:
+    rig = load_rig(HALL)
+    loose = PowerLoss(np.zeros(rig.cable_count), np.full(rig.cable_count, 0.02), on_a_stand=True)
+    with after_power_loss(loose, rig, limit=400.0, speed=speed) as place:
+        law = CableStep(
+            place.as_set_up, place.counts, cable=0, way=-0.00005, limit=400.0, speed=speed
+        )
+        stand = place.move(law)
+        assert stand.state is State.FINISHED, stand.cause
+
+
+def test_no_winch_is_faster_than_its_rig_file_says() -> None:
+    rig = load_rig(RIG)
+    begin = [0] * rig.cable_count
+    fastest = np.array([winch.max_speed for winch in rig.winches])
+    assert (wind_in_speed(rig, TARGET, LIMIT, 10.0) <= fastest).all()
+    law = CableStep(rig, begin, cable=1, way=0.05, limit=LIMIT, speed=10.0)
+    sent, per_metre = [begin], rig.winches[1].counts_per_metre
+    while not law.done:
+        sent.append(list(law.next(1.0, [0.0] * rig.cable_count)[0]))
+    assert np.abs(np.diff(np.array(sent)[:, 1])).max() / per_metre <= fastest[1] * 0.01 + 2e-6
+
+
+def test_a_stop_before_anything_is_enabled_leaves_all_as_it_was() -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+        place.board.ask_stop()
+        with pytest.raises(StoppedByOperator, match="before anything moved"):
+            place.take_up()
+        assert place.states.isdisjoint({DriveState.OPERATION_ENABLED, HOLDING})
+        assert not place.records
+
+
 def test_a_pose_that_is_not_known_well_is_refused() -> None:
     rig = load_rig(RIG)
     home = rig.home
@@ -333,13 +411,15 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure()
         counts: Sequence[int] = group.read_positions().positions.tolist()
-        limited = unreferenced(rig, counts, rig.home, limit=400.0, speed=0.005)
-        group = make_drive_group(limited, near, rehearsal.pump)
+        counted = counted_here(rig, counts, rig.home)
+        limited = careful(counted, limit=400.0, speed=0.005)
+        group = make_drive_group(counted, near, rehearsal.pump, max_tension=400.0)
         group.configure()
         law = TakeUp(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
         stand = move_winches(
-            limited, law, group, SimulatedClock(0.01), OwnBoard(), record=Path("nowhere"),
-            anew=True, on_cycle=lambda _record: None, on_event=lambda _event: None,
+            limited, law, group, SimulatedClock(0.01), OwnBoard(), Custody(rig),
+            record=Path("nowhere"), anew=True,
+            on_cycle=lambda _record: None, on_event=lambda _event: None,
         )  # fmt: skip
         assert stand.state is State.FINISHED, stand.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0

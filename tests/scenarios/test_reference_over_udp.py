@@ -57,7 +57,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         assert call("reset", rig, *bus[:5]).code == 0
         jogged = call("jog", rig, "--by-mm", "0", "0", "1", "--no-scene", *bus)
         assert jogged.code == 3
-        assert "drive 6 was switched on" in jogged.err.replace("\n", " ").replace("  ", "")
+        assert "cable 6 (drive 6): switched on" in jogged.err.replace("\n", " ").replace("  ", "")
         assert [drive.motor.position for drive in rehearsal.drives] == stood
         Path(told["file"]).write_text("{")
         anew = call("home", rig, "--pose-mm", *start, *bus, "--json")

@@ -264,13 +264,33 @@ def test_following_error_trips_after_its_time(line: Line) -> None:
 def test_at_the_torque_limit_the_motor_does_not_wind_in_further(line: Line) -> None:
     line.write(0x6072, 0, "<H", 800)
     line.enable()
-    line.drive.torque = -900.0  # holds a cable whose positive counts pay out
+    line.drive.torque = -800.0  # holds a cable whose positive counts pay out
     line.sync(0x0F, 900)
     line.sync(0x0F)
     assert line.drive.motor.position == 1000  # winding in is refused
     line.sync(0x0F, 1050)
     line.sync(0x0F)
     assert line.drive.motor.position == 1050  # paying out is not
+
+
+def test_above_the_torque_limit_the_load_turns_the_motor_back(line: Line) -> None:
+    line.enable()
+    line.sync(0x0F, 1000)
+    line.drive.torque = -900.0  # holds a cable whose positive counts pay out
+    line.write(0x6072, 0, "<H", 901)
+    line.sync(0x0F)
+    assert line.drive.motor.position == 1000
+    line.write(0x6072, 0, "<H", 890)
+    line.sync(0x0F)
+    slipped = line.drive.motor.position
+    assert slipped > 1000
+    line.drive.torque = -889.0
+    line.sync(0x0F)
+    assert 1000 < line.drive.motor.position < slipped  # comes back, against what it can hold
+    line.drive.torque = 0.0
+    for _ in range(20):
+        line.sync(0x0F)
+    assert line.drive.motor.position == 1000
 
 
 def test_the_motor_is_no_faster_than_it_is(line: Line) -> None:

@@ -33,6 +33,7 @@ def configure(bench: SimulatedBench) -> None:
         bench.prepared.rig,
         near,
         bench.rehearsal.pump,
+        max_tension=None,
         to_reset=False,
         on_restarted=lambda _nodes: None,
     )
