@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -89,9 +90,21 @@ def jog(
     in_process = the_rig.document.bus.interface == IN_PROCESS
     require_own_time(fast, in_process)
     if cable is not None or mm is not None:
-        _one_cable(the_rig, cable, mm, by_mm, limit_n, speed_mm_s, fast, yes, without_real_time,
+        _require_unused(
+            {
+                "--by-mm": by_mm,
+                "--to-home": to_home,
+                "--scene": scene,
+                "--no-scene": no_scene,
+                "--clearance-mm": clearance_mm,
+                "--output": output,
+            },
+            "one cable alone is moved without a path, and nothing in its way is looked at",
+        )
+        _one_cable(the_rig, cable, mm, limit_n, speed_mm_s, fast, yes, without_real_time,
                    as_json)  # fmt: skip
         return
+    _require_unused({"--limit-n": limit_n}, "only with --cable; a path has the rig's own limits")
     if (by_mm is None) != to_home:
         raise BadInput(
             "say how far: --by-mm X Y Z, --to-home, or --cable N --mm X",
@@ -125,7 +138,6 @@ def _one_cable(
     rig: Rig,
     cable: int | None,
     mm: float | None,
-    by_mm: tuple[float, float, float] | None,
     limit_n: float | None,
     speed_mm_s: float,
     fast: bool,
@@ -136,9 +148,9 @@ def _one_cable(
     from cdpr.cli.jog_cable import jog_cable
     from cdpr.errors import BadInput
 
-    if cable is None or mm is None or by_mm is not None:
+    if cable is None or mm is None:
         raise BadInput(
-            "one cable is moved with --cable N and --mm X together, without --by-mm",
+            "one cable is moved with --cable N and --mm X together",
             where="cdpr jog",
             next_step="pass both, or --by-mm X Y Z to move the platform",
         )
@@ -146,6 +158,24 @@ def _one_cable(
         rig, cable, mm, limit_n=limit_n, speed_mm_s=speed_mm_s, fast=fast, yes=yes,
         without_real_time=without_real_time, as_json=as_json,
     )  # fmt: skip
+
+
+def _require_unused(options: Mapping[str, object], why: str) -> None:
+    """Refuses options that would have no effect: whoever gave one expects something else.
+
+    Raises:
+        BadInput: One was given; with the names of all.
+    """
+    from cdpr.errors import BadInput
+
+    given = [name for name, value in options.items() if value is not None and value is not False]
+    if given:
+        raise BadInput(
+            f"no effect here: {', '.join(given)}",
+            where="cdpr jog",
+            why=why,
+            next_step="leave them out, or see `cdpr jog --help`",
+        )
 
 
 def _slow(rig: Rig, speed_mm_s: float) -> Rig:

@@ -48,14 +48,7 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: P
         (("--fast",), 2, "say how far"),
         (("--to-home", *WAY), 2, "say how far"),
         (("--to-home",), 2, "say what is in the way"),
-        (("--cable", "3"), 2, "together"),
-        (("--mm", "3"), 2, "together"),
-        (("--cable", "3", "--mm", "1", *WAY), 2, "together"),
-        (("--cable", "9", "--mm", "1"), 2, "no cable 9"),
-        (("--cable", "3", "--mm", "0"), 2, "no way to go"),
-        (("--cable", "3", "--mm", "nan"), 2, "no way to go"),
-        (("--cable", "3", "--mm", "51"), 3, "more than 50 mm"),
-        (("--cable", "3", "--mm", "1", "--limit-n", "101"), 3, "limit of 101 N"),
+        ((*WAY, "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),
     ],
 )
 def test_what_is_not_clearly_allowed_is_denied(
@@ -64,6 +57,31 @@ def test_what_is_not_clearly_allowed_is_denied(
     run = tmp_path / "jog"
     one_message(call("jog", RIG, *options, "-o", run), code, part)
     assert not run.exists()
+
+
+ONE = ("--cable", "3", "--mm", "1")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "part"),
+    [
+        (("--cable", "3"), 2, "together"),
+        (("--mm", "3"), 2, "together"),
+        (("--cable", "9", "--mm", "1"), 2, "no cable 9"),
+        (("--cable", "3", "--mm", "0"), 2, "no way to go"),
+        (("--cable", "3", "--mm", "nan"), 2, "no way to go"),
+        (("--cable", "3", "--mm", "51"), 3, "more than 50 mm"),
+        ((*ONE, "--limit-n", "101"), 3, "limit of 101 N"),
+        ((*ONE, *WAY), 2, "no effect here: --by-mm"),
+        ((*ONE, "--to-home", "--scene", "none.yaml"), 2, "no effect here: --to-home, --scene"),
+        ((*ONE, "--no-scene", "--clearance-mm", "0"), 2, "--no-scene, --clearance-mm"),
+        ((*ONE, "-o", "run"), 2, "no effect here: --output"),
+    ],
+)
+def test_what_is_not_clearly_meant_moves_no_cable(
+    options: tuple[str, ...], code: int, part: str
+) -> None:
+    one_message(call("jog", RIG, *options, "--fast"), code, part)
 
 
 def test_a_jog_into_an_obstacle_is_denied(tmp_path: Path) -> None:
