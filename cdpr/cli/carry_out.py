@@ -47,7 +47,7 @@ def carry_out(
         start: Where the simulated platform stands; None at the plan's start.
         yes: Do not ask.
         without_real_time: Move drives on a bus even if real-time scheduling is denied.
-        as_json: The summary as JSON, and nothing else.
+        as_json: The summary as JSON, and nothing else on standard output.
 
     Raises:
         Refused: The bus is latched, or the drives cannot be armed; nothing moved.
@@ -58,9 +58,10 @@ def carry_out(
     from drivers.bus import IN_PROCESS
 
     in_process = prepared.rig.document.bus.interface == IN_PROCESS
-    if not as_json:
-        show_prepared(prepared, in_process)
-    if not (in_process or yes):
+    asks = not (in_process or yes)
+    if asks or not as_json:
+        show_prepared(prepared, in_process, as_json)
+    if asks:
         ask_operator("Move the platform now?", "nothing was moved")
     summary = run_prepared(
         prepared,

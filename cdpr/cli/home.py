@@ -104,9 +104,10 @@ def home(
     speed, reach = speed_of(the_rig, speed_mm_s), reach_mm / 1000.0
     custody = Custody(the_rig)
     custody.require_free()
-    if not as_json:
-        show_wish(the_rig, target, limit, reach, speed, camera)
-    if not (in_process or yes):
+    asks = not (in_process or yes)
+    if asks or not as_json:
+        show_wish(the_rig, target, limit, reach, speed, camera, as_json)
+    if asks:
         ask_operator("Wind the cables in now?", "nothing was moved")
     made: list[ReferenceDocument] = []
 

@@ -10,10 +10,19 @@ if TYPE_CHECKING:
 
 
 def show_wish(
-    rig: Rig, target: float, limit: float, reach: float, speed: float, camera: str | None
+    rig: Rig,
+    target: float,
+    limit: float,
+    reach: float,
+    speed: float,
+    camera: str | None,
+    as_json: bool,
 ) -> None:
-    """What is going to happen; tensions in N, lengths in m."""
-    from cdpr.cli.output import show_facts
+    """What is going to happen; tensions in N, lengths in m.
+
+    On standard error where a program reads the other.
+    """
+    from cdpr.cli.output import err, out, show_facts
     from executor.winch_laws import wind_in_speed
 
     fastest = wind_in_speed(rig, target, limit, speed).max() * 1000.0
@@ -27,6 +36,7 @@ def show_wish(
             ("pose", "stated, held by a jig" if camera is None else f"measured, camera {camera}"),
             ("bus", f"{bus.interface} {bus.channel}".strip()),
         ],
+        err if as_json else out,
     )
 
 

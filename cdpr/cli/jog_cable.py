@@ -38,7 +38,7 @@ def jog_cable(
 
     from cdpr.cli.carry_out import ask_operator
     from cdpr.cli.jog_way import LONGEST_MM
-    from cdpr.cli.output import out, show_facts, show_json
+    from cdpr.cli.output import err, out, show_facts, show_json
     from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of, speed_of
     from cdpr.errors import BadInput, Refused
     from drivers.bus import IN_PROCESS
@@ -64,7 +64,8 @@ def jog_cable(
     in_process = rig.document.bus.interface == IN_PROCESS
     Custody(rig).require_free()
     winch = rig.winches[cable - 1]
-    if not as_json:
+    asks = not (in_process or yes)
+    if asks or not as_json:
         show_facts(
             "ready to move one cable",
             [
@@ -76,8 +77,9 @@ def jog_cable(
                 ),
                 ("tension", f"at most {limit:g} N in any cable; none that is taut may go slack"),
             ],
+            err if as_json else out,
         )
-    if not (in_process or yes):
+    if asks:
         ask_operator("Move this cable now?", "nothing was moved")
     begun: list[Sequence[int]] = []
 

@@ -44,12 +44,18 @@ def show_json(document: Any) -> None:
     typer.echo(json.dumps(document, indent=1, allow_nan=False))
 
 
-def show_facts(title: str, facts: list[tuple[str, str]]) -> None:
-    """A result for people: names on the left, values on the right; a line each in a file."""
-    if not out.is_terminal:
+def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> None:
+    """A result for people: names on the left, values on the right; a line each in a file.
+
+    Args:
+        title: What they are about.
+        facts: Names and values.
+        on: `out`, or `err` where standard output is for a program.
+    """
+    if not on.is_terminal:
         width = max(len(name) for name, _ in facts)
         lines = [f"  {name:<{width}}  {value}" for name, value in facts]
-        typer.echo("\n".join([title, *lines]))
+        typer.echo("\n".join([title, *lines]), err=on is err)
         return
     table = Table(
         title=escape(title), show_header=False, box=None, title_justify="left", padding=(0, 2)
@@ -58,7 +64,7 @@ def show_facts(title: str, facts: list[tuple[str, str]]) -> None:
     table.add_column(overflow="fold")
     for name, value in facts:
         table.add_row(escape(name), escape(value))
-    out.print(table)
+    on.print(table)
 
 
 @contextmanager

@@ -34,7 +34,7 @@ def reset(
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
     from cdpr.cli.carry_out import ask_operator
-    from cdpr.cli.output import out, show_json
+    from cdpr.cli.output import err, out, show_json
     from cdpr.cli.run import rig_on_bus
     from drivers.bus import BusSettings
     from executor.latch import Latch
@@ -44,9 +44,10 @@ def reset(
     latch = Latch(BusSettings.of(the_rig))
     latched = latch.read()
     latch.require_no_run()
-    if not as_json:
+    if not (yes and as_json):
         cause = f"latched since {latched.since}: {latched.cause}" if latched else "no fault latched"
-        out.print(f"bus {BusSettings.of(the_rig)}: {cause}", soft_wrap=True, markup=False)
+        shown = err if as_json else out
+        shown.print(f"bus {BusSettings.of(the_rig)}: {cause}", soft_wrap=True, markup=False)
     if not yes:
         ask_operator("Is the cause gone and the platform safe?", "nothing was reset")
     with latch.held_for_reset(the_rig.name, latched):

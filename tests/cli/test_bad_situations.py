@@ -229,8 +229,10 @@ def test_a_real_bus_moves_only_after_a_yes(folder: Path, answers: str) -> None:
         answer = call(
             *("run", folder / "plan.json", "--rig", RIG, "-o", folder / "run", "--no-camera"),
             *bus,
+            "--json",
             answers=answers,
         )
+    assert 0 <= answer.err.index("ready to run") < answer.err.index("[y/N]")
     code, part = (2, "--yes") if not answers else (130, "nothing was moved")
     assert answer.code == code, answer
     assert part in answer.said

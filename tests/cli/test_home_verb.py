@@ -53,6 +53,21 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.json"))
 
 
+def test_nobody_is_asked_without_being_told_what_for(tmp_path: Path) -> None:
+    """With --json too: what is about to happen is on standard error, before the question."""
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990", "--json")
+    asked = {
+        "pretension": ("home", RIG, "--at-home", *bus),
+        "cable 1 (drive 1)": ("jog", RIG, "--cable", "1", "--mm", "1", *bus),
+        "no fault latched": ("reset", RIG, *bus),
+    }
+    for told, arguments in asked.items():
+        answer = call(*arguments, answers="n\n")
+        assert (answer.code, json.loads(answer.out)["error"]) == (130, "stopped")
+        assert 0 <= answer.err.index(told) < answer.err.index("[y/N]")
+    assert not list(tmp_path.rglob("*.json"))
+
+
 def test_a_rehearsal_tells_the_reference_and_keeps_nothing(tmp_path: Path) -> None:
     answer = call("home", RIG, "--camera", "synthetic", "--pictures", "5", "--fast", "--json")
     assert answer.code == 0, answer
