@@ -53,11 +53,11 @@ class WinchLoop(Loop):
         self._status: CycleStatus | None = None
 
     def _follow(self) -> None:
-        """One cycle by the law, or at rest where it is."""
+        """One cycle by the law, or at rest where it is; a stop has no way on which to slow down."""
         state = self.machine.state
         if self._status is None or (self._feed.at_rest and state is State.HOLDING):
             self._status = self._send(Purpose.HOLD, self._exchange.resting_targets)
-        elif self._feed.at_rest or (self._law.done and state is State.MOVING):
+        elif state is State.STOPPING or (self._law.done and state is State.MOVING):
             self.machine.on(Event.AT_REST)
         else:
             before = self._feed.index
@@ -66,7 +66,7 @@ class WinchLoop(Loop):
             targets, findings = self._law.next(pace, tensions.tolist())
             if findings:
                 self._judge(findings, "")
-            if self.machine.state is not State.LATCHED:
+            if self.machine.state is state:
                 self._status = self._send(Purpose.MOVE, targets)
 
     def _judge(self, findings: tuple[Finding, ...], lost: str) -> None:

@@ -72,6 +72,39 @@ def test_a_step_raises_no_tension_beyond_what_is_left_before_it_is_seen():
         assert (2.0 * 2.0 * step * stiffness <= limit - target + 1e-9).all()
 
 
+@pytest.mark.parametrize("wrong", [61.0, float("nan")])
+def test_beyond_the_limit_no_winch_goes_on(wrong):
+    rig = RIGS[0]
+    for law in (
+        TakeUp(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002),
+        CableStep(rig, [0] * 8, cable=1, way=-0.02, limit=60.0, speed=0.005),
+    ):
+        for _ in range(200):
+            begun, found = law.next(1.0, [0.0] * 8)
+        assert found == ()
+        assert any(begun)
+        for _ in range(4):
+            targets, found = law.next(1.0, [0.0] * 7 + [wrong])
+            assert (targets, found) == (begun, ())
+        targets, found = law.next(1.0, [0.0] * 7 + [wrong])
+        assert targets == begun
+        assert [(f.code, f.drive, f.reaction) for f in found] == [
+            ("over_tension", 8, Reaction.PATH_STOP)
+        ]
+
+
+def test_near_the_limit_all_go_on_more_slowly():
+    rig, ways = RIGS[0], []
+    for tension in (10.0, 35.0, 59.9):
+        law = TakeUp(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002)
+        targets, _ = law.next(1.0, [0.0] * 7 + [tension])
+        for _ in range(99):
+            targets, _ = law.next(1.0, [0.0] * 7 + [tension])
+        ways.append(abs(targets[0]))
+    assert ways[1] == pytest.approx(0.5 * ways[0], rel=0.01)
+    assert ways[2] == pytest.approx(0.05 * ways[0], rel=0.05)
+
+
 def test_a_cable_that_stays_slack_is_told():
     rig = RIGS[0]
     law = TakeUp(rig, [0] * 8, target=10.0, limit=60.0, reach=1e-5, speed=0.002)

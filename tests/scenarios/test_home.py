@@ -45,6 +45,7 @@ from tracking.tracker import Tracker
 _CHANNELS = itertools.count()
 HOLDING = DriveState.QUICK_STOP_ACTIVE
 TARGET, LIMIT = 10.0, 60.0
+FINDINGS = {"over_tension", "went_slack"}
 
 
 @dataclass
@@ -291,6 +292,8 @@ def test_a_cable_that_stays_slack_after_its_reach_stops_all() -> None:
         assert "cable 5 carries" in stand.cause
         assert "off its drum" in stand.cause
         assert np.abs(np.sum(place.steps(), axis=0)).max() <= 0.004 + 1e-5
+        found = next(e.cycle for e in place.events if e.code == "not_taut")
+        assert len({r.targets for r in place.records if r.cycle >= found - 1}) == 1, "none goes on"
         assert place.states == {HOLDING}
 
 
@@ -314,7 +317,11 @@ def test_on_a_taut_platform_one_cable_alone_is_stopped(way: float, cause: str) -
         assert stand.state is State.LATCHED
         assert cause in stand.cause
         assert place.states == {HOLDING}
-        assert np.max(place.tensions) < 1.3 * LIMIT
+        assert np.max(place.tensions) < 1.02 * LIMIT
+        stopped = next(r.cycle for r in place.records if r.state is State.SECURING)
+        assert stopped <= next(e.cycle for e in place.events if e.code in FINDINGS) + 1
+        after = [r.targets for r in place.records if r.cycle >= stopped - 1]
+        assert len(set(after)) == 1, "it stops where it is"
 
 
 def test_drives_that_hold_more_are_not_told_to_let_it_slip() -> None:
