@@ -6,7 +6,8 @@ speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``
 ``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``drives`` [{``node``, ``state``,
 ``position_counts``, ``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``,
 ``text``}], the newest last. A number that is not known is null; before the first cycle ``state``
-is ``preparing`` and ``drives`` is empty.
+is ``preparing`` and ``drives`` is empty. Winches that move without a path (`cdpr home`, `cdpr jog
+--cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a percentage.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from cdpr.rig import Rig
 from drivers.drive_group import drive_states
 from executor.prepare import PreparedRun
-from executor.records import CycleRecord
+from executor.records import CycleRecord, LoopEvent
 from executor.run_folder import RunEvent
 from executor.wishes import WishBoard
 
@@ -29,85 +31,55 @@ from executor.wishes import WishBoard
 EVENTS_TOLD = 12
 
 
-class RunStatus:
-    """Takes in what happens; tells it to whoever asks, from any thread."""
+class CyclesSoFar:
+    """What the cycles tell, whatever they are sent for."""
 
-    def __init__(
-        self, prepared: PreparedRun, folder: Path, board: WishBoard, *, simulated_time: bool
-    ) -> None:
-        """A run that is being prepared."""
-        self._prepared, self._folder, self._board = prepared, folder, board
-        self._simulated_time = simulated_time
-        self._record: CycleRecord | None = None
-        self._began = 0.0
+    def __init__(self, rig: Rig, *, simulated_time: bool) -> None:
+        """None so far."""
+        self.began = 0.0
+        """Time of the first one, [s]."""
+        self.last: CycleRecord | None = None
+        self._rig, self._simulated_time = rig, simulated_time
         self._worst_lateness = 0.0
         self._lost = 0
-        self._events: deque[RunEvent] = deque(maxlen=EVENTS_TOLD)
 
-    def take_cycle(self, record: CycleRecord) -> None:
-        """A cycle is over."""
-        if self._record is None:
-            self._began = record.at
+    def take(self, record: CycleRecord) -> None:
+        """One more is over."""
+        if self.last is None:
+            self.began = record.at
         self._worst_lateness = max(self._worst_lateness, record.lateness)
         self._lost += record.missing
-        self._record = record
-
-    def take_event(self, event: RunEvent) -> None:
-        """Something happened."""
-        self._events.append(event)
+        self.last = record
 
     def as_dict(self) -> dict[str, Any]:
-        """See the head of this file."""
-        prepared, wishes, bus = self._prepared, self._board.read(), self._prepared.rig.document.bus
-        return {
-            "process": os.getpid(),
-            "rig": prepared.rig.name,
-            "bus": f"{bus.interface} {bus.channel}".strip(),
-            "folder": str(self._folder),
-            "simulated_time": self._simulated_time,
-            **self._motion(self._record),
-            "rows": len(prepared.checked.table),
-            "path_length_mm": round(prepared.length * 1e3, 3),
-            "wished": {
-                "stop": wishes.stop,
-                "hold": wishes.hold,
-                "speed_percent": round(wishes.speed * 100.0),
-            },
-            "lost_replies": self._lost,
-            "events": [asdict(event) for event in list(self._events)],
-        }
-
-    def _motion(self, record: CycleRecord | None) -> dict[str, Any]:
+        """State, times, replies and drives; see the head of this file."""
+        told = {"simulated_time": self._simulated_time, "lost_replies": self._lost}
+        record = self.last
         if record is None:
-            return {
-                "state": "preparing",
-                **dict.fromkeys(("elapsed_s", "cycle", "row", "path_mm", "feed_percent")),
-                **dict.fromkeys(("lateness_ms", "worst_lateness_ms", "following_error_mm")),
-                "drives": [],
-            }
-        table = self._prepared.checked.table
-        path = float(np.interp(record.index, np.arange(len(table)), table.travelled))
-        late = 1e3 * table.cycle
+            unknown = ("elapsed_s", "cycle", "feed_percent", "lateness_ms", "worst_lateness_ms")
+            nothing = dict.fromkeys((*unknown, "following_error_mm"))
+            return {**told, "state": "preparing", **nothing, "drives": []}
         error = record.following_error * 1e3
         return {
+            **told,
             "state": record.state.value,
-            "elapsed_s": round(record.at - self._began, 3),
+            "elapsed_s": round(record.at - self.began, 3),
             "cycle": record.cycle,
-            "row": round(record.index, 2),
-            "path_mm": round(path * 1e3, 3),
             "feed_percent": round(record.rate * 100.0, 1),
-            "lateness_ms": None if self._simulated_time else round(record.lateness * late, 3),
-            "worst_lateness_ms": (
-                None if self._simulated_time else round(self._worst_lateness * late, 3)
-            ),
+            "lateness_ms": self._lateness_ms(record.lateness),
+            "worst_lateness_ms": self._lateness_ms(self._worst_lateness),
             "following_error_mm": round(error, 4) if np.isfinite(error) else None,
             "drives": self._drives(record),
         }
 
+    def _lateness_ms(self, cycles: float) -> float | None:
+        late = round(cycles * self._rig.document.bus.cycle_ms, 3)
+        return None if self._simulated_time else late
+
     def _drives(self, record: CycleRecord) -> list[dict[str, Any]]:
         columns = zip(
-            self._prepared.rig.winches,
-            drive_states(self._prepared.rig, record.words),
+            self._rig.winches,
+            drive_states(self._rig, record.words),
             record.actual,
             record.targets,
             record.torques,
@@ -123,3 +95,96 @@ class RunStatus:
             }
             for winch, state, actual, target, torque in columns
         ]
+
+
+def whose(rig: Rig, folder: Path | None) -> dict[str, Any]:
+    """What is moved, by whom, and where it is on record."""
+    bus = rig.document.bus
+    return {
+        "process": os.getpid(),
+        "rig": rig.name,
+        "bus": f"{bus.interface} {bus.channel}".strip(),
+        "folder": "" if folder is None else str(folder),
+    }
+
+
+def wished(board: WishBoard) -> dict[str, Any]:
+    """What the operator wants."""
+    wishes = board.read()
+    speed = round(wishes.speed * 100.0)
+    return {"wished": {"stop": wishes.stop, "hold": wishes.hold, "speed_percent": speed}}
+
+
+class RunStatus:
+    """Takes in what happens; tells it to whoever asks, from any thread."""
+
+    def __init__(
+        self, prepared: PreparedRun, folder: Path, board: WishBoard, *, simulated_time: bool
+    ) -> None:
+        """A run that is being prepared."""
+        self._prepared, self._folder, self._board = prepared, folder, board
+        self._cycles = CyclesSoFar(prepared.rig, simulated_time=simulated_time)
+        self._events: deque[RunEvent] = deque(maxlen=EVENTS_TOLD)
+
+    def take_cycle(self, record: CycleRecord) -> None:
+        """A cycle is over."""
+        self._cycles.take(record)
+
+    def take_event(self, event: RunEvent) -> None:
+        """Something happened."""
+        self._events.append(event)
+
+    def as_dict(self) -> dict[str, Any]:
+        """See the head of this file."""
+        return {
+            **whose(self._prepared.rig, self._folder),
+            **self._cycles.as_dict(),
+            **self._place(self._cycles.last),
+            **wished(self._board),
+            "events": [asdict(event) for event in list(self._events)],
+        }
+
+    def _place(self, record: CycleRecord | None) -> dict[str, Any]:
+        table = self._prepared.checked.table
+        whole = {"rows": len(table), "path_length_mm": round(self._prepared.length * 1e3, 3)}
+        if record is None:
+            return {"row": None, "path_mm": None, **whole}
+        path = float(np.interp(record.index, np.arange(len(table)), table.travelled))
+        return {"row": round(record.index, 2), "path_mm": round(path * 1e3, 3), **whole}
+
+
+class WinchStatus:
+    """As `RunStatus`, of winches that move without a path."""
+
+    def __init__(self, rig: Rig, board: WishBoard, *, simulated_time: bool) -> None:
+        """A motion that is being prepared."""
+        self._rig, self._board = rig, board
+        self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
+        self._progress = 0.0
+        self._events: deque[LoopEvent] = deque(maxlen=EVENTS_TOLD)
+
+    def take_cycle(self, record: CycleRecord, progress: float) -> None:
+        """A cycle is over, and so much of the motion, 0 to 1."""
+        self._cycles.take(record)
+        self._progress = progress
+
+    def take_event(self, event: LoopEvent) -> None:
+        """Something happened."""
+        self._events.append(event)
+
+    def as_dict(self) -> dict[str, Any]:
+        """See the head of this file."""
+        began = self._cycles.began
+        return {
+            **whose(self._rig, None),
+            **self._cycles.as_dict(),
+            "row": None if self._cycles.last is None else round(100.0 * self._progress, 1),
+            "rows": 100,
+            "path_mm": None,
+            "path_length_mm": None,
+            **wished(self._board),
+            "events": [
+                {"time_s": round(event.at - began, 3), "code": event.code, "text": event.text}
+                for event in list(self._events)
+            ],
+        }

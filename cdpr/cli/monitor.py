@@ -119,13 +119,19 @@ def _head(status: dict[str, Any]) -> str:
     parts = [
         f"{status['elapsed_s']:9.3f} s",
         status["state"],
-        f"{status['path_mm']:.1f} of {status['path_length_mm']:.1f} mm",
+        _progress(status),
         f"{status['feed_percent']:.0f} % of {status['wished']['speed_percent']} %",
         _lateness(status),
         f"following error {_number(status['following_error_mm'], '.3f')} mm",
         f"{status['lost_replies']} lost replies",
     ]
     return "  ".join(parts)
+
+
+def _progress(status: dict[str, Any]) -> str:
+    if status["path_mm"] is None:
+        return f"{status['row']:.0f} % done"
+    return f"{status['path_mm']:.1f} of {status['path_length_mm']:.1f} mm"
 
 
 def _lateness(status: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from drivers.drive_group import CycleStatus
     from executor.real_time_job import ReadyDrives
     from executor.records import CycleRecord, LoopEvent
+    from executor.status import WinchStatus
     from executor.winch_laws import WinchLaw
     from executor.winch_motion import WinchesStand
     from executor.wishes import WishBoard
@@ -98,6 +99,7 @@ def carry_out_by_law(
     from executor.command_server import serving
     from executor.machine import State
     from executor.running import announced, stop_requests
+    from executor.status import WinchStatus
     from executor.winch_motion import careful, counted_here, require_below
     from executor.wishes import OwnBoard
 
@@ -112,7 +114,7 @@ def carry_out_by_law(
         return counted, motion.limit
 
     board = OwnBoard()
-    status = _Status(rig, board)
+    status = WinchStatus(rig, board, simulated_time=motion.fast)
     load = no_scene(rig).load
     with (
         stop_requests(board),
@@ -145,7 +147,7 @@ def _moved(
     law: WinchLaw,
     drives: ReadyDrives,
     board: WishBoard,
-    status: _Status,
+    status: WinchStatus,
 ) -> WinchesStand:
     from contextlib import nullcontext
 
@@ -179,7 +181,7 @@ def _moved(
                 advance(100.0 * law.progress)
 
         def on_event(event: LoopEvent) -> None:
-            status.events.append(event)
+            status.take_event(event)
             if not (motion.quiet or event.code in _OF_COURSE):
                 err.print(f"{event.code}: {event.text}", markup=False, soft_wrap=True)
 
@@ -195,40 +197,3 @@ def _moved(
             on_cycle=on_cycle,
             on_event=on_event,
         )
-
-
-class _Status:
-    """How the motion stands, for `cdpr stop`, `hold`, `resume`, `speed` and `monitor`."""
-
-    def __init__(self, rig: Rig, board: WishBoard) -> None:
-        self._rig, self._board = rig, board
-        self._record: CycleRecord | None = None
-        self._began, self._progress = 0.0, 0.0
-        self.events: list[LoopEvent] = []
-
-    def take_cycle(self, record: CycleRecord, progress: float) -> None:
-        """A cycle is over."""
-        self._began = record.at if self._record is None else self._began
-        self._record, self._progress = record, progress
-
-    def as_dict(self) -> dict[str, Any]:
-        """See `executor.status`; what only a path has is null."""
-        import os
-
-        record, bus = self._record, self._rig.document.bus
-        return {
-            "process": os.getpid(),
-            "rig": self._rig.name,
-            "bus": f"{bus.interface} {bus.channel}".strip(),
-            "folder": "",
-            "state": record.state.value if record else "preparing",
-            "cycle": None,
-            "row": round(100.0 * self._progress, 1),
-            "rows": 100,
-            "wished": {"hold": self._board.read().hold},
-            "drives": [],
-            "events": [
-                {"time_s": round(event.at - self._began, 3), "code": event.code, "text": event.text}
-                for event in list(self.events)
-            ],
-        }

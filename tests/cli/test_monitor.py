@@ -9,6 +9,12 @@ import pytest
 from rich.console import Console
 
 from cdpr.cli.monitor import _plain, _view
+from cdpr.rig import load_rig
+from executor.machine import State
+from executor.records import CycleRecord, LoopEvent
+from executor.status import WinchStatus
+from executor.wishes import OwnBoard
+from tests.cli.plans import RIG
 
 
 def status(**changes: Any) -> dict[str, Any]:
@@ -68,3 +74,42 @@ def test_a_run_that_is_prepared_or_in_simulated_time_is_shown_too(shown: Any) ->
     nothing = dict.fromkeys(("elapsed_s", "cycle", "row", "path_mm", "feed_percent", "lateness_ms"))
     assert "preparing" in shown(status(state="preparing", drives=[], events=[], **nothing))
     assert "simulated time" in shown(status(simulated_time=True, lateness_ms=None))
+
+
+@pytest.mark.parametrize("shown", [live, _plain])
+def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> None:
+    rig = load_rig(RIG)
+    told = WinchStatus(rig, OwnBoard(), simulated_time=False)
+    before = told.as_dict()
+    assert before.keys() == status().keys()
+    assert "preparing" in shown(before)
+    for cycle in range(3):
+        told.take_cycle(_record(cycle), progress=0.25)
+    told.take_event(LoopEvent(1, 50.01, "moving", "winding in"))
+    now = told.as_dict()
+    assert now.keys() == status().keys()
+    assert {key for key, value in now.items() if value is None} == {"path_mm", "path_length_mm"}
+    assert now["elapsed_s"] == pytest.approx(0.02)
+    assert now["events"] == [{"time_s": 0.01, "code": "moving", "text": "winding in"}]
+    assert now["lateness_ms"] == pytest.approx(0.5)
+    text = shown(now).lower()
+    for part in ("moving", "25 % done", "operation enabled", "-4711", "-3", "1 lost", "100 %"):
+        assert part in text, part
+    assert f"{rig.winches[7].torque_constant / 2:.2f}" in text
+
+
+def _record(cycle: int) -> CycleRecord:
+    return CycleRecord(
+        cycle=cycle,
+        at=50.0 + 0.01 * cycle,
+        state=State.MOVING,
+        index=float(cycle),
+        rate=1.0,
+        targets=(-4708,) * 8,
+        actual=(-4711,) * 8,
+        torques=(500,) * 8,
+        words=(0x0637,) * 8,
+        missing=cycle % 2,
+        following_error=0.001,
+        lateness=0.05,
+    )
