@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.errors import Refused, StoppedByOperator
+from cdpr.errors import Fault, Refused, StoppedByOperator
 from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, rig_from_document
@@ -23,6 +23,9 @@ from executor.records import CycleRecord, LoopEvent
 from executor.winch_laws import WinchLaw
 from executor.winch_loop import WinchLoop
 from executor.wishes import WishBoard
+
+#: Drives that hold move by no more than this share of the rig's start tolerance.
+HELD_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +112,37 @@ def require_below(rig: Rig, held: CycleStatus, limit: float) -> None:
             next_step="name a higher --limit-n, or take the load off these cables; the drives hold"
             " as before",
         )
+
+
+def require_held(rig: Rig, stand: WinchesStand, told: CycleStatus) -> None:
+    """The drives stand where the motion left them, and hold: nobody commanded them meanwhile.
+
+    Args:
+        rig: The robot.
+        stand: Where the motion ended.
+        told: What the drives tell now.
+
+    Raises:
+        Fault: One moved, or does not hold.
+    """
+    per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
+    moved = np.abs((told.positions - stand.counts) / per_metre)
+    worst = int(moved.argmax())
+    name = list(rig.drive_names.values())[worst]
+    if not moved[worst] <= HELD_SHARE * rig.motion.start_tolerance:
+        what = f"{name} moved by {moved[worst] * 1000:.2f} mm after all winches were at rest"
+    elif told.faults:
+        what = "; ".join(text for _, text in told.faults)
+    elif not told.holding:
+        what = "not all drives hold any more"
+    else:
+        return
+    raise Fault(
+        what,
+        where="winches",
+        why="a drive let go, slipped or was moved by hand; counts and pose do not belong together",
+        next_step="look at the platform and the drives, then begin anew",
+    )
 
 
 def tensions_of(rig: Rig, torques: Array | Counts) -> Array:

@@ -96,7 +96,11 @@ def open_camera(
 
 
 def look_at_rest(
-    rig: Rig, name: str, pictures: int, true_pose: Callable[[], Pose] | None
+    rig: Rig,
+    name: str,
+    pictures: int,
+    true_pose: Callable[[], Pose] | None,
+    before_each: Callable[[], None],
 ) -> list[Observation]:
     """Pictures of a platform that stands still, each measured.
 
@@ -105,6 +109,7 @@ def look_at_rest(
         name: From `choose_camera`.
         pictures: How many.
         true_pose: Where the simulated platform is.
+        before_each: Called before each picture; what it raises ends the looking.
     """
     import time
 
@@ -117,6 +122,7 @@ def look_at_rest(
     try:
         looks = []
         for frame in range(pictures):
+            before_each()
             asked = time.monotonic()
             pose = true_pose() if true_pose is not None else None
             image, _ = source.picture(Trigger(frame, frame / camera.rate, asked, pose))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from executor.reference import ReferenceDocument
     from executor.winch_laws import WinchLaw
     from executor.winch_motion import WinchesStand
+    from executor.wishes import WishBoard
 
 #: A cable is taken up no further than this, [mm], and no faster than that, [mm/s].
 FURTHEST_MM, FASTEST_MM_S = 200.0, 10.0
@@ -104,6 +105,8 @@ def home(
     speed, reach = speed_of(the_rig, speed_mm_s), reach_mm / 1000.0
     custody = Custody(the_rig)
     custody.require_free()
+    if camera is not None:
+        _require_picture(the_rig, camera)
     asks = not (in_process or yes)
     if asks or not as_json:
         show_wish(the_rig, target, limit, reach, speed, camera, as_json)
@@ -114,8 +117,8 @@ def home(
     def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
         return TakeUp(as_set_up, counts, target=target, limit=limit, reach=reach, speed=speed)
 
-    def at_rest(stand: WinchesStand, drives: ReadyDrives) -> None:
-        made.append(_referenced(the_rig, stand, drives, known, camera, pictures))
+    def at_rest(stand: WinchesStand, drives: ReadyDrives, board: WishBoard) -> None:
+        made.append(_referenced(the_rig, stand, drives, board, known, camera, pictures))
 
     lost = PowerLoss.drawn(
         the_rig, 0, simulated_slack_mm / 1000.0, on_a_stand=camera is None
@@ -133,6 +136,13 @@ def home(
         show_json({"file": where, **reference.model_dump(mode="json")})
     else:
         show_reference(reference, where)
+
+
+def _require_picture(rig: Rig, camera: str) -> None:
+    """The camera is there and gives pictures, before anything is moved for it."""
+    from cdpr.cli.cameras import look_at_rest
+
+    look_at_rest(rig, camera, 1, lambda: rig.home, lambda: None)
 
 
 def _known_pose(
@@ -210,18 +220,34 @@ def _referenced(
     rig: Rig,
     stand: WinchesStand,
     drives: ReadyDrives,
+    board: WishBoard,
     known: Pose | None,
     camera: str | None,
     pictures: int,
 ) -> ReferenceDocument:
-    """The reference at the pose where the platform is held now."""
+    """The reference at the pose where the platform is held now.
+
+    Raises:
+        StoppedByOperator: The operator stopped it while the camera looked.
+        Refused: The pose is not known well enough.
+    """
     from cdpr.cli.cameras import look_at_rest
+    from cdpr.errors import StoppedByOperator
     from executor.reference import reference_at
     from executor.rest_pose import rest_pose
 
     if known is not None:
         return reference_at(rig, known, stand.counts, stand.tensions, "stated pose", 0.0)
     assert camera is not None
-    found = rest_pose(rig, look_at_rest(rig, camera, pictures, drives.true_pose))
+
+    def unless_stopped() -> None:
+        if board.read().stop:
+            raise StoppedByOperator(
+                "stopped before the pose was measured; the cables are taut and held",
+                next_step="home again when all is well",
+            )
+
+    looks = look_at_rest(rig, camera, pictures, drives.true_pose, unless_stopped)
+    found = rest_pose(rig, looks)
     how = f"tags in {found.pictures} of {pictures} pictures, camera {rig.cameras[0].name!r}"
     return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)

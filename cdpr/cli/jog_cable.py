@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from executor.real_time_job import ReadyDrives
     from executor.winch_laws import WinchLaw
     from executor.winch_motion import WinchesStand
+    from executor.wishes import WishBoard
 
 
 def jog_cable(
@@ -89,7 +90,7 @@ def jog_cable(
             as_set_up, counts, cable=cable - 1, way=mm / 1000.0, limit=limit, speed=speed
         )
 
-    def at_rest(_stand: WinchesStand, _drives: ReadyDrives) -> None:
+    def at_rest(_stand: WinchesStand, _drives: ReadyDrives, _board: WishBoard) -> None:
         """Nothing more to see while the drives are there."""
 
     motion = WinchMotion(

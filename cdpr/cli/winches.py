@@ -80,13 +80,14 @@ def speed_of(rig: Rig, speed_mm_s: float) -> float:
 
 
 def carry_out_by_law(
-    motion: WinchMotion, at_rest: Callable[[WinchesStand, ReadyDrives], None]
+    motion: WinchMotion, at_rest: Callable[[WinchesStand, ReadyDrives, WishBoard], None]
 ) -> WinchesStand:
     """Moves, in this process; ends with the drives holding by themselves.
 
     Args:
         motion: What is wished.
-        at_rest: Called after a motion that came to its end, while the drives are still there.
+        at_rest: Called after a motion that came to its end, while the drives are still there; they
+            must have held all the while.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
@@ -100,7 +101,7 @@ def carry_out_by_law(
     from executor.machine import State
     from executor.running import announced, stop_requests
     from executor.status import WinchStatus
-    from executor.winch_motion import careful, counted_here, require_below
+    from executor.winch_motion import careful, counted_here, require_below, require_held
     from executor.wishes import OwnBoard
 
     rig = motion.rig
@@ -128,7 +129,8 @@ def carry_out_by_law(
         law = motion.make_law(as_set_up, counts)
         stand = _moved(motion, as_set_up, law, drives, board, status)
         if stand.state is State.FINISHED:
-            at_rest(stand, drives)
+            at_rest(stand, drives, board)
+            require_held(rig, stand, drives.group.read_positions())
     if stand.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="begin anew when all is well")
     if stand.state is not State.FINISHED:

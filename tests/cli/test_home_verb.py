@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from cdpr.cli.run import rig_on_bus
 from cdpr.errors import Refused
+from cdpr.poses import Pose
 from executor.custody import Custody
 from executor.reference import as_in_the_file
+from simulation.camera import SyntheticCamera
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
 
@@ -77,6 +81,31 @@ def test_a_rehearsal_tells_the_reference_and_keeps_nothing(tmp_path: Path) -> No
     assert len(told["home_counts"]) == 8
     assert min(told["tensions_n"]) >= 7.5
     assert not list(tmp_path.rglob("*.json"))
+
+
+def test_a_camera_that_is_not_there_is_found_out_before_anything_moves(
+    tmp_path: Path,
+) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41992")
+    answer = call("home", RIG, "--camera", str(tmp_path / "none"), *bus, answers="y\n")
+    assert answer.code in (2, 4)
+    assert "Wind the cables in" not in answer.err
+    assert "none" in answer.err.replace("\n", "")
+
+
+def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    render, shown = SyntheticCamera.render, []
+
+    def looked_at(camera: SyntheticCamera, pose: Pose, frame: int) -> object:
+        shown.append(frame)
+        if shown == [0, 0, 1]:  # the first before anything moved
+            os.kill(os.getpid(), signal.SIGINT)
+        return render(camera, pose, frame)
+
+    monkeypatch.setattr(SyntheticCamera, "render", looked_at)
+    answer = call("home", RIG, "--camera", "synthetic", "--pictures", "20", "--fast")
+    assert answer.code == 130, answer
+    assert shown == [0, 0, 1]
 
 
 def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from cdpr.cli.jog import no_scene
 from cdpr.cli.jog_way import straight_way
-from cdpr.errors import Refused, StoppedByOperator
+from cdpr.errors import Fault, Refused, StoppedByOperator
 from cdpr.plan import plan_from_document
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, load_rig
@@ -32,7 +32,14 @@ from executor.rest_pose import rest_pose
 from executor.run_folder import RunFolder
 from executor.standing_pose import standing_pose
 from executor.winch_laws import CableStep, TakeUp, WinchLaw, wind_in_speed
-from executor.winch_motion import WinchesStand, careful, counted_here, move_winches, require_below
+from executor.winch_motion import (
+    WinchesStand,
+    careful,
+    counted_here,
+    move_winches,
+    require_below,
+    require_held,
+)
 from executor.wishes import OwnBoard
 from planner.check import verify
 from simulation.camera import SyntheticCamera
@@ -386,6 +393,34 @@ def test_no_winch_is_faster_than_its_rig_file_says() -> None:
     while not law.done:
         sent.append(list(law.next(1.0, [0.0] * rig.cable_count)[0]))
     assert np.abs(np.diff(np.array(sent)[:, 1])).max() / per_metre <= fastest[1] * 0.01 + 2e-6
+
+
+def moved_by_hand(place: Place) -> None:
+    place.rehearsal.drives[3].motor.position += 0.0002 * place.rig.winches[3].counts_per_metre
+    place.rehearsal.drives[3].motor.demand = place.rehearsal.drives[3].motor.position
+
+
+@pytest.mark.parametrize(
+    ("happens", "told"),
+    [
+        (lambda _place: None, None),
+        (moved_by_hand, r"cable 4 \(drive 4\) moved by 0.20 mm"),
+        (loses_all_torque, "not all drives hold"),
+        (fails, "drive 7"),
+    ],
+)
+def test_what_happens_while_the_camera_looks_is_noticed(
+    happens: Callable[[Place], None], told: str | None
+) -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+        stand = place.take_up()
+        assert stand.state is State.FINISHED
+        happens(place)
+        if told is None:
+            require_held(place.rig, stand, place.group.read_positions())
+            return
+        with pytest.raises(Fault, match=told):
+            require_held(place.rig, stand, place.group.read_positions())
 
 
 def test_a_stop_before_anything_is_enabled_leaves_all_as_it_was() -> None:
