@@ -4,12 +4,17 @@ It is a file in this computer's state folder (`executor.state_folder`). It is en
 anything moves and released when the motion ended well; a fault leaves it engaged with its cause,
 and a program that died or a computer that lost power leaves it engaged too. Only `cdpr reset`
 releases it then.
+
+Whoever moves the drives, or resets them, holds a lock on a file beside it. The system gives it
+back when that program ends, however it ends; so every user can tell a run from what a run left.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -53,6 +58,8 @@ class Latch:
         """Looks at nothing yet."""
         self._bus = str(settings)
         self.path = state_file("latched", settings)
+        self._lock = self.path.with_suffix(".lock")
+        self._held: weakref.finalize[[int], Latch] | None = None
 
     def read(self) -> Latched | None:
         """Why it is engaged; None when it is not. A file that cannot be read counts as engaged."""
@@ -81,7 +88,7 @@ class Latch:
             Refused: One is.
         """
         latched = self.read()
-        if latched is not None and _runs(latched.process):
+        if latched is not None and self._held_by_another():
             raise self._refusal(latched)
 
     @contextmanager
@@ -99,18 +106,21 @@ class Latch:
         """
         if shown is None:
             self.engage(rig, self.path.parent, "a reset did not come to its end")
-        elif self.read() != shown:
-            raise Refused(
-                "what is latched changed since it was shown",
-                where=f"bus {self._bus}",
-                why="somebody else reset this bus, or ran it",
-                next_step="look at it again: `cdpr reset RIG`; nothing was reset",
-            )
+        else:
+            self._hold()
         try:
+            if shown is not None and self.read() != shown:
+                raise Refused(
+                    "what is latched changed since it was shown",
+                    where=f"bus {self._bus}",
+                    why="somebody else reset this bus, or ran it",
+                    next_step="look at it again: `cdpr reset RIG`; nothing was reset",
+                )
             yield
         except BaseException:
             if shown is None:
                 self.release()
+            self._let_go()
             raise
         self.release()
 
@@ -132,6 +142,7 @@ class Latch:
             raise self._refusal(self.read()) from None
         except OSError as error:
             raise self._not_kept(error.strerror or str(error)) from None
+        self._hold()
         self._write(self._latched(rig, cause, folder))
 
     def settle(self, rig: str, state: State, cause: str, folder: Path) -> None:
@@ -140,6 +151,7 @@ class Latch:
             self.release()
         else:
             self._write(self._latched(rig, cause, folder))
+            self._let_go()
 
     def release(self) -> None:
         """Drives may be moved again."""
@@ -147,6 +159,41 @@ class Latch:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             raise self._not_kept(error.strerror or str(error)) from None
+        self._let_go()
+
+    def _hold(self) -> None:
+        """Until it is let go, or this program ends; waits for those who only look."""
+        if self._held is not None:
+            return
+        try:
+            lock = os.open(self._lock, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise self._not_kept(error.strerror or str(error)) from None
+        self._held = weakref.finalize(self, os.close, lock)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+
+    def _let_go(self) -> None:
+        if self._held is not None:
+            self._held()
+            self._held = None
+
+    def _held_by_another(self) -> bool:
+        """Somebody moves or resets the drives at this moment."""
+        if self._held is not None:
+            return False
+        try:
+            lock = os.open(self._lock, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise self._not_kept(error.strerror or str(error)) from None
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(lock)
+        return False
 
     def _latched(self, rig: str, cause: str, folder: Path) -> Latched:
         now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -166,11 +213,12 @@ class Latch:
             raise self._not_kept(error.strerror or str(error)) from None
 
     def _refusal(self, latched: Latched | None) -> Refused:
-        if latched is not None and _runs(latched.process):
+        if latched is not None and self._held_by_another():
             return Refused(
-                f"a run (process {latched.process}) is under way on this bus",
+                f"a run or a reset (process {latched.process}) is under way on this bus",
                 where=f"bus {self._bus}",
-                next_step="wait for its end, or stop it with `cdpr stop`",
+                next_step="wait for its end, or stop it with `cdpr stop` (`sudo cdpr stop` where it"
+                " is another user's)",
             )
         cause = latched.cause if latched else "another run is about to move it"
         since = f" since {latched.since}" if latched else ""
@@ -189,11 +237,3 @@ class Latch:
             why=why,
             next_step="make the folder writable for those who run the rig",
         )
-
-
-def _runs(process: int) -> bool:
-    """Whether it is a run that can be reached; a number alone may be anybody's by now."""
-    from executor.running import reached_runs
-
-    with reached_runs() as runs:
-        return any(run.process == process for run in runs)

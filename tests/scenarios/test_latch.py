@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 from pathlib import Path
@@ -16,7 +17,7 @@ from executor.command_client import ask_all
 from executor.latch import Latch
 from executor.machine import State
 from executor.prepare import PreparedRun
-from executor.running import announced, reached_runs
+from executor.running import reached_runs
 from tests.cli.plans import RIG
 from tests.cli.program import call
 from tests.scenarios.test_real_time import drives_on, moving_over_udp, wait_until_gone
@@ -62,9 +63,34 @@ def test_a_run_that_never_came_to_its_end_is_a_fault(tmp_path: Path) -> None:
 
 
 def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
-    Latch(BUS).engage("rig", tmp_path)
-    with announced(), pytest.raises(Refused, match=f"process {os.getpid()}.*under way"):
+    """To every user of the folder, who may not reach the other's run; and only until it ends."""
+    running = Latch(BUS)
+    running.engage("rig", tmp_path)
+    for ask in (Latch(BUS).require_released, Latch(BUS).require_no_run):
+        with pytest.raises(Refused, match=f"process {os.getpid()}.*under way"):
+            ask()
+    running.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
+    Latch(BUS).require_no_run()
+    with pytest.raises(Refused, match="cable 6 is slack"):
         Latch(BUS).require_released()
+
+
+def test_a_program_that_was_killed_runs_no_more(tmp_path: Path) -> None:
+    killed = multiprocessing.get_context("spawn").Process(
+        target=_engaged_and_killed, args=(tmp_path,)
+    )
+    killed.start()
+    killed.join()
+    assert killed.exitcode == -signal.SIGKILL
+    Latch(BUS).require_no_run()
+    with pytest.raises(Refused, match="did not come to its end"):
+        Latch(BUS).require_released()
+
+
+def _engaged_and_killed(folder: Path) -> None:
+    latch = Latch(BUS)
+    latch.engage("rig", folder)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_each_bus_has_its_own(tmp_path: Path) -> None:
@@ -89,7 +115,7 @@ def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
     tmp_path: Path,
 ) -> None:
     latch = Latch(BUS)
-    with pytest.raises(Refused, match="a reset did not"), latch.held_for_reset("rig", None):
+    with pytest.raises(Refused, match=r"reset .*under way"), latch.held_for_reset("rig", None):
         Latch(BUS).engage("rig", tmp_path)
     latch.require_released()
     latch.engage("rig", tmp_path, "cable 3 is slack")
@@ -134,8 +160,8 @@ def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Pat
 
 def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41998")
+    Latch(BusSettings("udp_multicast", "239.74.163.23:41998")).engage("rig", tmp_path)
     latch = Latch(BusSettings("udp_multicast", "239.74.163.23:41998"))
-    latch.engage("rig", tmp_path)
     for answers, code in (("n\n", 130), ("", 2)):
         assert call("reset", RIG, *bus, answers=answers).code == code
         assert latch.read() is not None
@@ -144,8 +170,8 @@ def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
 
 def test_reset_of_drives_that_do_not_answer_leaves_it_engaged(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41997")
+    Latch(BusSettings("udp_multicast", "239.74.163.23:41997")).engage("rig", tmp_path)
     latch = Latch(BusSettings("udp_multicast", "239.74.163.23:41997"))
-    latch.engage("rig", tmp_path)
     assert call("reset", RIG, *bus, "--yes").code == 4
     assert latch.read() is not None
 
@@ -156,8 +182,8 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
 ) -> None:
     channel = f"239.74.163.23:{20000 + (os.getpid() * 11) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
+    Latch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
     latch = Latch(BusSettings("udp_multicast", channel))
-    latch.engage("rig", tmp_path)
     with drives_on(channel, prepared) as rehearsal:
         stood = [drive.motor.position for drive in rehearsal.drives]
         rehearsal.drives[2].fail(0x2310)
@@ -177,8 +203,8 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.23:{20000 + (os.getpid() * 17) % 20000}"
+    Latch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
     latch = Latch(BusSettings("udp_multicast", channel))
-    latch.engage("rig", tmp_path)
     with drives_on(channel, prepared) as rehearsal:
         answered = rehearsal.drives[4].on_sync
 
