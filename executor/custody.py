@@ -168,10 +168,21 @@ class Custody:
             record: Where it is on record.
             holding: Every cable was held to the end.
             stands_at: Where the drives stand, [counts]; None when nobody heard it.
+
+        Raises:
+            Refused: The reference cannot be kept, then the bus stays latched; or the latch cannot.
         """
         if not self._is_kept:
             return
+        try:
+            self._note_end(cause, holding, stands_at)
+        except Refused as error:
+            self._latch.settle(self._rig.name, State.LATCHED, cause or error.what, record)
+            raise
         self._latch.settle(self._rig.name, state, cause, record)
+
+    def _note_end(self, cause: str, holding: bool, stands_at: Sequence[int] | None) -> None:
+        """What the end of a motion means for the reference."""
         if not holding:
             reference = self._readable() or as_in_the_file(self._rig)
             lost = f"drives let go of cables under tension ({cause})"

@@ -91,13 +91,16 @@ def run_in_real_time(
             raise
         started = datetime.now(UTC)
         ended = process.supervise(recorder)
-        custody.end(
-            ended.state,
-            ended.cause,
-            recorder.folder.path,
-            holding=ended.holding,
-            stands_at=recorder.log.last_positions,
-        )
+        try:
+            custody.end(
+                ended.state,
+                ended.cause,
+                recorder.folder.path,
+                holding=ended.holding,
+                stands_at=recorder.log.last_positions,
+            )
+        except CdprError as error:  # the motion is over: its record is finished all the same
+            ended = process.not_kept(recorder, ended, error)
         return Outcome(ended.state, ended.cause, recorder.log, ended.holding, started)
     finally:
         process.close()
@@ -152,6 +155,13 @@ class _Process:
         error = said.error if isinstance(said, Failed) else self._died()
         self._record(partial(recorder.take_event, _lost(recorder, error)))
         return Ended(State.LATCHED, error.what, holding=True)  # by themselves, as SYNC stays away
+
+    def not_kept(self, recorder: Recorder, ended: Ended, error: CdprError) -> Ended:
+        """The end of a motion whose latch or reference could not be written: it is a fault."""
+        text = f"{error.what} ({error.where}: {error.why})"
+        event = LoopEvent(len(recorder.log), recorder.last, "recorder", text)
+        self._record(partial(recorder.take_event, event))
+        return Ended(State.LATCHED, ended.cause or text, ended.holding)
 
     def close(self) -> None:
         """Waits for the process; whatever it does, it comes to rest and ends."""

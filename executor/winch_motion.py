@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.errors import Fault, Refused, StoppedByOperator
+from cdpr.errors import CdprError, Fault, Refused, StoppedByOperator
 from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, rig_from_document
@@ -201,15 +201,25 @@ def move_winches(
     try:
         loop.run()
     finally:
-        custody.end(
-            loop.machine.state,
-            loop.cause,
-            record,
-            holding=loop.holding,
-            stands_at=last[-1].actual if last else None,
-        )
+        not_kept = _kept(custody, loop, record, last)
+    if not_kept:
+        on_event(LoopEvent(last[-1].cycle if last else 0, clock.time, "recorder", not_kept))
+    state, cause = loop.machine.state, loop.cause
+    state, cause = (State.LATCHED, cause or not_kept) if not_kept else (state, cause)
     unknown = [np.full(rig.cable_count, np.nan)]
     torques = np.array([cycle.torques for cycle in last] or unknown, dtype=np.float64)
     counts = np.array([cycle.actual for cycle in last] or unknown, dtype=np.float64)
     tensions = tensions_of(rig, torques.mean(axis=0))
-    return WinchesStand(loop.machine.state, loop.cause, counts.mean(axis=0), tensions)
+    return WinchesStand(state, cause, counts.mean(axis=0), tensions)
+
+
+def _kept(custody: Custody, loop: WinchLoop, record: Path, last: Sequence[CycleRecord]) -> str:
+    """Keeps how it ended; why it could not, if so: the motion is over, and is told all the same."""
+    stands_at = last[-1].actual if last else None
+    try:
+        custody.end(
+            loop.machine.state, loop.cause, record, holding=loop.holding, stands_at=stands_at
+        )
+    except CdprError as error:
+        return f"{error.what} ({error.where}: {error.why})"
+    return ""

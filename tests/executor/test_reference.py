@@ -152,6 +152,24 @@ def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) 
     assert "did not come to its end" in caught.value.why
 
 
+def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = rig_with("incremental")
+    custody = Custody(rig)
+    custody.file.write(reference_of(rig))
+    custody.begin(Path("run"), reference_of(rig))
+
+    def full(_reference: object) -> None:
+        raise Refused("the reference of the drives cannot be kept")
+
+    monkeypatch.setattr(custody.file, "write", full)
+    with pytest.raises(Refused, match="cannot be kept"):
+        custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    with pytest.raises(Refused, match=r"latched.*cannot be kept"):
+        custody.require_free()
+
+
 def test_drives_that_held_after_a_killed_program_still_count() -> None:
     rig = rig_with("incremental")
     custody = Custody(rig)

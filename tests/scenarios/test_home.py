@@ -395,6 +395,21 @@ def test_no_winch_is_faster_than_its_rig_file_says() -> None:
     assert np.abs(np.diff(np.array(sent)[:, 1])).max() / per_metre <= fastest[1] * 0.01 + 2e-6
 
 
+def test_an_end_that_cannot_be_kept_is_a_fault_that_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(*_args: object, **_more: object) -> None:
+        raise Refused("the latch cannot be written", where="latched.json", why="disk full")
+
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+        monkeypatch.setattr(Custody, "end", full)
+        stand = place.take_up()
+        assert stand.state is State.LATCHED
+        assert "disk full" in stand.cause
+        assert np.isfinite(stand.counts).all()
+        assert (place.events[-1].code, place.states) == ("recorder", {HOLDING})
+
+
 def moved_by_hand(place: Place) -> None:
     place.rehearsal.drives[3].motor.position += 0.0002 * place.rig.winches[3].counts_per_metre
     place.rehearsal.drives[3].motor.demand = place.rehearsal.drives[3].motor.position

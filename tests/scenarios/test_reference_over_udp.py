@@ -12,6 +12,7 @@ import pytest
 from cdpr.errors import Refused
 from cdpr.rig import rig_from_document
 from drivers.bus import BusSettings
+from executor.custody import Custody
 from executor.latch import Latch
 from executor.prepare import PreparedRun, prepare
 from executor.real_time_process import run_in_real_time
@@ -47,6 +48,14 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         assert told["file"] in second.out.replace("\n", "").replace("  ", "")
         assert rehearsal.pose.distance_to(prepared.scene.goal) < 0.1e-3
         stood = [drive.motor.position for drive in rehearsal.drives]
+        # A program that was killed noted nothing; a reset does, where all drives held.
+        kept = json.loads(Path(told["file"]).read_text())
+        elsewhere = {**kept, "stands_at": [count + 10**6 for count in kept["stands_at"]]}
+        Path(told["file"]).write_text(json.dumps(elsewhere))
+        killed = call(*run, "-o", tmp_path / "killed")
+        assert (killed.code, "away from where it was left" in killed.err) == (3, True)
+        assert call("reset", rig, *bus[:5]).code == 0
+        assert json.loads(Path(told["file"]).read_text()) == kept
         rehearsal.drives[5].power_on()
         third = call(*run, "-o", tmp_path / "third")
         assert third.code == 3
@@ -63,6 +72,26 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         anew = call("home", rig, "--pose-mm", *start, *bus, "--json")
         assert anew.code == 0, anew
         assert json.loads(Path(told["file"]).read_text())["lost"] == ""
+
+
+@pytest.mark.slow
+def test_a_run_whose_end_cannot_be_kept_leaves_its_whole_record(
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_args: object, **_more: object) -> None:
+        raise Refused("the latch cannot be written", where="latched.json", why="disk full")
+
+    monkeypatch.setattr(Custody, "end", full)
+    channel = f"239.74.163.27:{20000 + (os.getpid() * 19) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
+    folder = tmp_path / "run"
+    with drives_on(channel, prepared):
+        answer = call("run", short_plan, "--rig", RIG, "--no-camera", *bus, "-o", folder)
+    assert answer.code == 1, answer
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["passed"] is False
+    assert "disk full" in json.dumps(summary)
+    assert (folder / "report.html").is_file()
 
 
 def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_path: Path) -> None:
