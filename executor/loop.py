@@ -34,6 +34,9 @@ SETTLING = 10
 class Loop:
     """One run of one checked course on one drive group."""
 
+    way = "along the path"
+    """How the drives move and stop, in messages."""
+
     def __init__(
         self,
         course: Course,
@@ -145,7 +148,7 @@ class Loop:
             if self.machine.state is not State.APPROACHING:
                 return
         self.machine.on(Event.AT_START)
-        self._tell("moving", "at the start; moving along the path")
+        self._tell("moving", f"at the start; moving {self.way}")
 
     def _follow(self) -> None:
         """One cycle along the table, or on one place of it."""
@@ -231,20 +234,20 @@ class Loop:
         """Does what the operator wants, as far as the state allows it."""
         state = self.machine.state
         if wishes.stop and state in _STOPPABLE:
-            self._tell_cause("stop", "stop requested; slowing down along the path")
+            self._tell_cause("stop", f"stop requested; slowing down {self.way}")
             self._feed.stop()
             self.machine.on(Event.STOP)
         elif wishes.hold and state is State.MOVING:
             self._feed.stop()
             self.machine.on(Event.HOLD)
-            self._tell("hold", "feed hold; slowing down along the path")
+            self._tell("hold", f"feed hold; slowing down {self.way}")
         elif state is State.HOLDING and not wishes.hold:
             self._feed.go_to(wishes.speed)
             self.machine.on(Event.RESUME)
-            self._tell("resume", f"going on along the path at {wishes.speed:.0%} of its speed")
+            self._tell("resume", f"going on {self.way} at {wishes.speed:.0%} of the planned speed")
         elif state is State.MOVING and self._feed.wanted != wishes.speed:
             self._feed.go_to(wishes.speed)
-            self._tell("speed", f"speed along the path: {wishes.speed:.0%} of the planned")
+            self._tell("speed", f"speed {self.way}: {wishes.speed:.0%} of the planned")
 
     def _tell_once(self, finding: Finding) -> None:
         """What is wrong in every cycle is told in the first."""
@@ -256,7 +259,7 @@ class Loop:
 
     def _react(self, finding: Finding) -> None:
         if finding.reaction is Reaction.PATH_STOP and self.machine.state in _WITHOUT_QUICK_STOP:
-            self.cause = self.cause or f"{finding.text}; stopped along the path"
+            self.cause = self.cause or f"{finding.text}; stopped {self.way}"
             self._feed.stop()
             self.machine.on(Event.PATH_FAULT)
         elif finding.reaction is not Reaction.NOTE:

@@ -31,6 +31,8 @@ _ENDLESS = 10**9
 class WinchLoop(Loop):
     """One motion by a law on one drive group; the gate allows what lies in the law's reach."""
 
+    way = "together"
+
     def __init__(
         self,
         rig: Rig,

@@ -57,7 +57,8 @@ def reset(
         show_json({"released": latched is not None, "cause": cause_before, "drives": states})
         return
     out.print(f"drives: {', '.join(sorted(set(states)))}", soft_wrap=True)
-    out.print("released; the next run starts only from where the platform stands now")
+    freed = "released" if latched else "nothing was latched"
+    out.print(f"{freed}; the next run starts only from where the platform stands now")
 
 
 def _require_bus(rig: Rig) -> None:

@@ -97,6 +97,7 @@ def carry_out_by_law(
     from cdpr.cli.drives import open_drives
     from cdpr.cli.jog import no_scene
     from cdpr.errors import Fault, StoppedByOperator
+    from drivers.bus import IN_PROCESS
     from executor.command_server import serving
     from executor.machine import State
     from executor.running import announced, stop_requests
@@ -138,7 +139,9 @@ def carry_out_by_law(
             stand.cause,
             where="winches",
             why="the motion was stopped, all drives together; they hold",
-            next_step="find the cause and look at the platform, then `cdpr reset RIG`",
+            next_step="find the cause and look at the platform, then `cdpr reset RIG`"
+            if rig.document.bus.interface != IN_PROCESS
+            else "find the cause; simulated drives begin anew",
         )
     return stand
 

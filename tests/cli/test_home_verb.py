@@ -113,6 +113,8 @@ def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:
     assert answer.code == 1
     assert "more than" in answer.err
     assert "stopped, all drives together" in answer.err
+    assert "along the path" not in answer.err, "winches have none"
+    assert "cdpr reset" not in answer.err, "nothing is latched on simulated drives"
     answer = call("jog", RIG, "--cable", "3", "--mm", "0.01", "--fast", "--json")
     assert answer.code == 0, answer
     assert json.loads(answer.out)["moved_mm"] == pytest.approx(0.01, abs=0.002)
