@@ -125,7 +125,7 @@ def home(
     ) if in_process else None  # fmt: skip
     motion = WinchMotion(
         the_rig, known or the_rig.home, limit, speed, make_law, lost, fast, without_real_time,
-        as_json, anew=True,
+        as_json, anew=True, name="home",
     )  # fmt: skip
     carry_out_by_law(motion, at_rest)
     (reference,) = made

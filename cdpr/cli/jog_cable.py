@@ -95,7 +95,7 @@ def jog_cable(
 
     motion = WinchMotion(
         rig, rig.home, limit, speed, make_law, None, fast, without_real_time, as_json,
-        anew=False,
+        anew=False, name="jog-cable",
     )  # fmt: skip
     stand = carry_out_by_law(motion, at_rest)
     moved = (stand.counts[cable - 1] - begun[0][cable - 1]) / winch.counts_per_metre * 1000.0

@@ -39,6 +39,7 @@ class WinchMotion:
         without_real_time: Move even if real-time scheduling is denied.
         quiet: No progress.
         anew: The drives are referenced again afterwards.
+        name: Of the folder below ``runs`` where a motion on a bus is on record.
     """
 
     rig: Rig
@@ -51,6 +52,7 @@ class WinchMotion:
     without_real_time: bool
     quiet: bool
     anew: bool
+    name: str
 
 
 def limit_of(rig: Rig, limit_n: float | None) -> float:
@@ -156,6 +158,7 @@ def _moved(
 ) -> WinchesStand:
     from contextlib import nullcontext
 
+    from cdpr.cli.demo import free_folder
     from cdpr.cli.output import err, progress_bar
     from cdpr.errors import Refused
     from drivers.bus import IN_PROCESS
@@ -163,11 +166,13 @@ def _moved(
     from executor.custody import Custody
     from executor.realtime import real_time
     from executor.winch_motion import move_winches
+    from executor.winch_record import recording
 
     cycle, custody = rig.document.bus.cycle_ms / 1000.0, Custody(motion.rig)
     simulated = rig.document.bus.interface == IN_PROCESS
     with (
         nullcontext("") if motion.fast else real_time() as denied,
+        nullcontext() if simulated else recording(free_folder(motion.name)) as kept,
         progress_bar("moving, %", 100.0, not motion.quiet) as advance,
     ):
         if denied and not (simulated or motion.without_real_time):
@@ -182,11 +187,15 @@ def _moved(
 
         def on_cycle(record: CycleRecord) -> None:
             status.take_cycle(record, law.progress)
+            if kept is not None:
+                kept.take_cycle(record)
             if record.cycle % 10 == 0:
                 advance(100.0 * law.progress)
 
         def on_event(event: LoopEvent) -> None:
             status.take_event(event)
+            if kept is not None:
+                kept.take_event(event)
             if not (motion.quiet or event.code in _OF_COURSE):
                 err.print(f"{event.code}: {event.text}", markup=False, soft_wrap=True)
 
@@ -197,7 +206,7 @@ def _moved(
             SimulatedClock(cycle) if motion.fast else RealClock(cycle),
             board,
             custody,
-            record=custody.file.path,
+            record=kept.folder if kept is not None else custody.file.path,
             anew=motion.anew,
             on_cycle=on_cycle,
             on_event=on_event,

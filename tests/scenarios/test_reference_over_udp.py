@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from pathlib import Path
@@ -24,8 +25,9 @@ from tests.scenarios.test_real_time import drives_on
 
 @pytest.mark.slow
 def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     rig = tmp_path / "rig.yaml"
     rig.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
     channel = f"239.74.163.26:{20000 + (os.getpid() * 19) % 20000}"
@@ -41,6 +43,13 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         homed = call("home", rig, "--pose-mm", *start, *bus, "--json")
         assert homed.code == 0, homed
         told = json.loads(homed.out)
+        events = (tmp_path / "runs/home/events.jsonl").read_text().splitlines()
+        assert json.loads(events[-1])["code"] == "held"
+        with (tmp_path / "runs/home/winches.csv").open() as stream:
+            rows = list(csv.DictReader(stream))
+        moved = [int(rows[-1][f"counts_{k}"]) - int(rows[0][f"counts_{k}"]) for k in range(1, 9)]
+        assert any(moved)
+        assert all(int(rows[-1][f"torque_per_mille_{k}"]) > 0 for k in range(1, 9))
         assert Path(told["file"]).is_file()
         assert told["home_counts"] != [0] * 8
         second = call(*run, "-o", tmp_path / "second")
