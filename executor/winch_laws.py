@@ -15,15 +15,12 @@ from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from executor.safety.watch import Finding, Reaction
+from executor.tension_room import TensionRoom
 
 #: A cable that was taut stays so while its tension is above this share of what was asked for.
 STAYS_TAUT = 0.8
 #: Cycles in which all cables must be taut, and in which one that was taut must not be slack.
 TAUT_CYCLES, SLACK_CYCLES = 20, 5
-#: Cycles in a row beyond the limit, all winches at rest, that end the motion.
-OVER_CYCLES = 5
-#: Near the limit all go on more slowly, down to this share of their speed; beyond it none goes on.
-CREEP = 0.05
 #: A step may raise a tension by this share of what is left to the limit: its effect is seen only
 #: two cycles later, and the cables opposite may be wound in meanwhile, too.
 SHARE_OF_ROOM = 0.125
@@ -62,38 +59,6 @@ class WinchLaw(Protocol):
         ...
 
 
-class _Room:
-    """What is left to the limit of the tension, and whether it is used up."""
-
-    def __init__(self, target: float, limit: float) -> None:
-        self._target, self._limit = target, limit
-        self._cycles = 0
-
-    def share(self, tensions: Sequence[float]) -> float:
-        """Of their speed at which winches go on, by the tensions [N] now; asked once a cycle."""
-        most = float(np.max(tensions))
-        # "Not at most", so that a tension that is no number counts as too large.
-        over = not most <= self._limit
-        self._cycles = self._cycles + 1 if over else 0
-        room = (self._limit - most) / (self._limit - self._target)
-        return 0.0 if over else min(1.0, max(CREEP, room))
-
-    def used_up(self, tensions: Sequence[float]) -> list[Finding]:
-        """Cables that carry more than the limit, and did so for too long."""
-        if self._cycles < OVER_CYCLES:
-            return []
-        return [
-            Finding(
-                Reaction.PATH_STOP,
-                "over_tension",
-                f"cable {cable} carries {tension:.1f} N, more than {self._limit:.1f} N",
-                cable,
-            )
-            for cable, tension in enumerate(tensions, start=1)
-            if not tension <= self._limit
-        ]
-
-
 class TakeUp:
     """Winds all cables in, slowly and together, each until it is taut."""
 
@@ -113,7 +78,7 @@ class TakeUp:
         """
         self._rig, self._begin = rig, np.array(begin, dtype=np.float64)
         self._target, self._reach = target, reach
-        self._room = _Room(target, limit)
+        self._room = TensionRoom(target, limit)
         self._per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
         self._step = wind_in_speed(rig, target, limit, speed) * _cycle(rig)
         self._wound = np.zeros(rig.cable_count)
@@ -183,7 +148,7 @@ class CableStep:
         speed = float(_fastest(rig, speed)[cable])
         self._cable, self._counts = cable, way * rig.winches[cable].counts_per_metre
         self._least = rig.min_tension / 2.0
-        self._room = _Room(self._least, limit)
+        self._room = TensionRoom(self._least, limit)
         # A smooth step from rest to rest is 15/8 times as fast in its middle as on average.
         self._duration = max(1.0, 1.875 * abs(way) / (speed * _cycle(rig)))
         # A cable that is taut is moved as carefully as it would be wound in.
