@@ -13,10 +13,6 @@ class Clock(Protocol):
     """Gives the loop its rhythm."""
 
     @property
-    def simulated(self) -> bool:
-        """True when time advances with the cycles only."""
-
-    @property
     def time(self) -> float:
         """When the cycle under way began, [s]; only differences have a meaning."""
 
@@ -29,8 +25,6 @@ class Clock(Protocol):
 
 class SimulatedClock:
     """Time that advances by one cycle a call and costs nothing."""
-
-    simulated = True
 
     def __init__(self, cycle: float) -> None:
         """Begins at 0 with the first call of `next_cycle`."""
@@ -57,8 +51,6 @@ class RealClock:
     A late cycle moves all later ones: the path is delayed, cycles are never skipped or bunched.
     Only the scheduler's small delays are caught up with, so that they do not add up.
     """
-
-    simulated = False
 
     #: Of each cycle, kept free for deciding and sending, [s].
     RESERVE = 0.0005

@@ -82,6 +82,7 @@ def camera(
     from cdpr.documents import write_atomic
     from drivers.picture_folder import OneCamerasPictures
 
+    _require_file_name(name)
     sizes = {"square": square_mm, "marker": marker_mm, "tag": tag_mm, "gap": gap_mm}
     the_board = board_of(board, columns, rows, sizes, dictionary, legacy, family, first)
     pictures = OneCamerasPictures(folder)
@@ -102,6 +103,22 @@ def camera(
         show_facts(f"camera {name}", _facts(result, verdict, output))
     if not verdict.good:
         raise typer.Exit(3)
+
+
+def _require_file_name(name: str) -> None:
+    """The camera's name becomes part of a file's; told before the long fit, not after it.
+
+    Raises:
+        BadInput: It cannot.
+    """
+    from cdpr.errors import BadInput
+
+    if not name or "/" in name or "\0" in name:
+        raise BadInput(
+            f"{name!r} cannot be part of a file name",
+            where="--name",
+            next_step="name the camera as in the rig file, without a slash",
+        )
 
 
 def _told(

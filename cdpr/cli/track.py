@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from tracking.pose_log import LoggedPicture
     from tracking.track import Picture
 
-SYNTHETIC = "synthetic"
 #: A live camera that shows no tag for so many pictures is given up.
 PATIENCE = 50
 
@@ -125,6 +124,7 @@ def _source(
     rig: Rig, scene: Scene | None, camera: Camera, source: str, plan: Path | None
 ) -> tuple[Iterable[Picture], int | None]:
     """The pictures, and how many there are where that is known."""
+    from cdpr.cli.cameras import SYNTHETIC
     from cdpr.cli.output import err
     from cdpr.errors import BadInput
     from drivers.cameras import LiveCamera, VideoFile

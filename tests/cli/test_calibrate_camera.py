@@ -112,6 +112,7 @@ def test_a_poor_set_with_small_errors_is_not_good_enough(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("options", "named"),
     [
+        ((*BOARD, "--name", "front/left"), "--name"),
         (("--columns", "9", "--rows", "6"), "needs --square-mm"),
         ((*BOARD, "--tag-mm", "30"), "knows no --tag-mm"),
         (("--columns", "8", "--rows", "5", "--square-mm", "25"), "is to be seen in 0 of"),

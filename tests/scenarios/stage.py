@@ -40,7 +40,6 @@ class Stage:
         board: What the executor sees as the operator's wishes.
         status: What it tells those who ask.
         lateness: What the clock tells, in cycles.
-        simulated: This clock costs no time.
     """
 
     prepared: PreparedRun
@@ -51,7 +50,6 @@ class Stage:
     cycle: int = -1
     board: OwnBoard = field(default_factory=OwnBoard)
     lateness: float = 0.0
-    simulated: bool = True
     status: RunStatus | None = None
     drive_states: list[tuple[DriveState, ...]] = field(default_factory=list)
 
