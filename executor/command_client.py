@@ -70,14 +70,20 @@ def _heard(run: Reached) -> Answer:
     return Answer(run.process, None, str(what or "its answer says nothing"))
 
 
+def last_word(run: Reached) -> dict[str, Any] | None:
+    """What a run that ended said when it did; None when it could not say anything."""
+    return _heard(run).status
+
+
 def _line(link: socket.socket) -> bytes:
+    """The newest line: a run that ends says once more how it stands."""
     got = b""
     while not got.endswith(b"\n"):
         chunk = link.recv(_CHUNK)
         if not chunk:
             raise ConnectionError("the run ended")
         got += chunk
-    return got
+    return got.splitlines()[-1]
 
 
 def the_one(runs: Sequence[Reached], process: int | None, verb: str) -> Reached:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import selectors
 import socket
 import struct
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 
-from executor.commands import Told, answer_to
+from executor.commands import Told, answer_to, word_of
 from executor.wishes import WishBoard
 
 #: A question is a line no longer than this, [bytes].
@@ -19,7 +19,7 @@ LONGEST_QUESTION = 1024
 MOST_CLIENTS = 16
 
 
-@contextmanager
+@contextlib.contextmanager
 def serving(listeners: Sequence[socket.socket], board: WishBoard, status: Told) -> Iterator[None]:
     """Answers every question on the sockets while the block runs.
 
@@ -64,6 +64,7 @@ class _Server:
         try:
             while self._serve_the_ready():
                 pass
+            self._say_the_last_word()
         except BaseException:
             self._board.ask_stop()
             raise
@@ -71,6 +72,12 @@ class _Server:
             for client in list(self._begun):
                 self._let_go(client)
             self._selector.close()
+
+    def _say_the_last_word(self) -> None:
+        """How the run ended, to those who watch it and may have looked just before."""
+        for client in self._begun:
+            with contextlib.suppress(OSError):  # it went away, or does not read
+                client.sendall(word_of(self._status))
 
     def _serve_the_ready(self) -> bool:
         """Waits for those that want something, and serves them; False when all is over."""

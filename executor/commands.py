@@ -74,12 +74,17 @@ def answer_to(line: bytes, board: WishBoard, status: Told) -> bytes:
     """
     try:
         _put_up(parse_command(line), board)
-        return _line({"ok": True, "status": status.as_dict()})
+        return word_of(status)
     except NotACommand as error:
         return _line({"ok": False, "what": f"not a command: {error}"})
     except Exception as error:
         what = f"the run cannot tell how it stands: {type(error).__name__}: {error}"
         return _line({"ok": False, "what": what})
+
+
+def word_of(status: Told) -> bytes:
+    """How it stands, as an answer is sent."""
+    return _line({"ok": True, "status": status.as_dict()})
 
 
 def _line(answer: dict[str, Any]) -> bytes:

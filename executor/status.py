@@ -1,13 +1,14 @@
 """How a run stands at this moment, for `cdpr monitor` and the programs that read its JSON.
 
-Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, ``elapsed_s``,
-``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``feed_percent`` (of the planned
-speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
+Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, ``cause``,
+``elapsed_s``, ``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``feed_percent`` (of
+the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
 ``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``drives`` [{``node``, ``state``,
 ``position_counts``, ``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``,
 ``text``}], the newest last. A number that is not known is null; before the first cycle ``state``
-is ``preparing`` and ``drives`` is empty. Winches that move without a path (`cdpr home`, `cdpr jog
---cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a percentage.
+is ``preparing`` and ``drives`` is empty; at the end ``cause`` says why it did not end well. Winches
+that move without a path (`cdpr home`, `cdpr jog --cable`) have no ``path_mm`` and
+``path_length_mm``; their ``row`` of 100 ``rows`` is a percentage.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 
 from cdpr.rig import Rig
 from drivers.drive_group import drive_states
+from executor.machine import State
 from executor.prepare import PreparedRun
 from executor.records import CycleRecord, LoopEvent
 from executor.run_folder import RunEvent
@@ -42,6 +44,7 @@ class CyclesSoFar:
         self._rig, self._simulated_time = rig, simulated_time
         self._worst_lateness = 0.0
         self._lost = 0
+        self._end: tuple[State, str] | None = None
 
     def take(self, record: CycleRecord) -> None:
         """One more is over."""
@@ -51,18 +54,27 @@ class CyclesSoFar:
         self._lost += record.missing
         self.last = record
 
+    def take_end(self, state: State, cause: str) -> None:
+        """The motion is over; nothing is told of it but this."""
+        self._end = state, cause
+
     def as_dict(self) -> dict[str, Any]:
         """State, times, replies and drives; see the head of this file."""
-        told = {"simulated_time": self._simulated_time, "lost_replies": self._lost}
+        state, cause = self._end or (self.last.state if self.last else None, None)
+        told = {
+            "state": state.value if state else "preparing",
+            "cause": cause or None,
+            "simulated_time": self._simulated_time,
+            "lost_replies": self._lost,
+        }
         record = self.last
         if record is None:
             unknown = ("elapsed_s", "cycle", "feed_percent", "lateness_ms", "worst_lateness_ms")
             nothing = dict.fromkeys((*unknown, "following_error_mm"))
-            return {**told, "state": "preparing", **nothing, "drives": []}
+            return {**told, **nothing, "drives": []}
         error = record.following_error * 1e3
         return {
             **told,
-            "state": record.state.value,
             "elapsed_s": round(record.at - self.began, 3),
             "cycle": record.cycle,
             "feed_percent": round(record.rate * 100.0, 1),
@@ -130,6 +142,10 @@ class RunStatus:
         """A cycle is over."""
         self._cycles.take(record)
 
+    def take_end(self, state: State, cause: str) -> None:
+        """The motion is over."""
+        self._cycles.take_end(state, cause)
+
     def take_event(self, event: RunEvent) -> None:
         """Something happened."""
         self._events.append(event)
@@ -167,6 +183,10 @@ class WinchStatus:
         """A cycle is over, and so much of the motion, 0 to 1."""
         self._cycles.take(record)
         self._progress = progress
+
+    def take_end(self, state: State, cause: str) -> None:
+        """The motion is over."""
+        self._cycles.take_end(state, cause)
 
     def take_event(self, event: LoopEvent) -> None:
         """Something happened."""

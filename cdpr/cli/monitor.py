@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
     from rich.console import Group
 
+#: Of a run that ended so; what ends without a word was killed.
+_EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
 _STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latched": "bold red"}
 
 
@@ -29,7 +31,7 @@ def monitor(
     """Watch a run: its state, every drive, tension, lateness, progress and events, to its end.
 
     It only looks; `cdpr stop`, `hold`, `resume` and `speed` act. Ctrl-C ends the monitor, not the
-    run.
+    run. Exit code: 0 when the motion came to its end, 130 when it was stopped, 1 otherwise.
 
     [dim]Examples:[/dim]
 
@@ -62,7 +64,7 @@ def _looks(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
     """
     import time
 
-    from executor.command_client import ask_all, no_answer, the_one
+    from executor.command_client import ask_all, last_word, no_answer, the_one
     from executor.running import reached_runs
 
     with reached_runs() as runs:
@@ -70,6 +72,9 @@ def _looks(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
         while True:
             (answer,) = ask_all([run], "status")
             if answer.ended:
+                last = last_word(run)
+                if last is not None:
+                    yield last
                 return
             if answer.status is None:
                 raise no_answer("monitor", [answer])
@@ -82,6 +87,7 @@ def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
     import json
 
     seen: list[dict[str, Any]] = []
+    status: dict[str, Any] = {"state": "gone"}
     try:
         for status in looks:
             if as_json:
@@ -94,6 +100,7 @@ def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
             typer.echo(_head(status))
     except KeyboardInterrupt:
         return
+    _tell_end(status, as_json)
 
 
 def _live(looks: Iterator[dict[str, Any]]) -> None:
@@ -101,15 +108,25 @@ def _live(looks: Iterator[dict[str, Any]]) -> None:
 
     from cdpr.cli.output import out
 
-    state = "gone"
+    status: dict[str, Any] = {"state": "gone"}
     try:
         with Live(console=out, auto_refresh=False, transient=False) as live:
             for status in looks:
                 live.update(_view(status), refresh=True)
-                state = status["state"]
     except KeyboardInterrupt:
         return
-    out.print(f"the run ended; last seen {state}")
+    _tell_end(status, False)
+
+
+def _tell_end(status: dict[str, Any], as_json: bool) -> None:
+    """The last word, and an exit code as that of the run."""
+    state, cause = status["state"], status.get("cause")
+    if not as_json:
+        if state not in _EXIT_CODES:
+            typer.echo(f"the run ended without a last word; last seen {state}")
+        else:
+            typer.echo(f"the run ended: {state}{f', {cause}' if cause else ''}")
+    raise typer.Exit(_EXIT_CODES.get(state, 1))
 
 
 def _head(status: dict[str, Any]) -> str:

@@ -143,6 +143,7 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
                 announce=lambda text: None if job.quiet else err.print(text, markup=False),
             )
             outcome = _move(job, board, recorder, before_motion)
+            status.take_end(outcome.state, outcome.cause)
         return outcome, _looks(camera, recorder, job) if camera else []
 
 

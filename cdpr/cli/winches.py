@@ -131,6 +131,7 @@ def carry_out_by_law(
         as_set_up, counts = limited[0]
         law = motion.make_law(as_set_up, counts)
         stand = _moved(motion, as_set_up, law, drives, board, status)
+        status.take_end(stand.state, stand.cause)
         if stand.state is State.FINISHED:
             at_rest(stand, drives, board)
             require_held(rig, stand, drives.group.read_positions())

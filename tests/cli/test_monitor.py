@@ -6,9 +6,10 @@ import io
 from typing import Any
 
 import pytest
+import typer
 from rich.console import Console
 
-from cdpr.cli.monitor import _plain, _view
+from cdpr.cli.monitor import _lines, _plain, _view
 from cdpr.rig import load_rig
 from executor.machine import State
 from executor.records import CycleRecord, LoopEvent
@@ -25,6 +26,7 @@ def status(**changes: Any) -> dict[str, Any]:
         "folder": "runs/[first]",
         "simulated_time": False,
         "state": "holding",
+        "cause": None,
         "elapsed_s": 1.2,
         "cycle": 120,
         "row": 100.5,
@@ -88,7 +90,9 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     told.take_event(LoopEvent(1, 50.01, "moving", "winding in"))
     now = told.as_dict()
     assert now.keys() == status().keys()
-    assert {key for key, value in now.items() if value is None} == {"path_mm", "path_length_mm"}
+    assert {key for key, value in now.items() if value is None} == {
+        *("path_mm", "path_length_mm", "cause")
+    }
     assert now["elapsed_s"] == pytest.approx(0.02)
     assert now["events"] == [{"time_s": 0.01, "code": "moving", "text": "winding in"}]
     assert now["lateness_ms"] == pytest.approx(0.5)
@@ -113,3 +117,21 @@ def _record(cycle: int) -> CycleRecord:
         following_error=0.001,
         lateness=0.05,
     )
+
+
+@pytest.mark.parametrize(
+    ("last", "code", "told"),
+    [
+        ({"state": "finished"}, 0, "ended: finished"),
+        ({"state": "stopped", "cause": "stop requested"}, 130, "ended: stopped, stop requested"),
+        ({"state": "latched", "cause": "cable 6 is slack"}, 1, "latched, cable 6 is slack"),
+        ({}, 1, "without a last word; last seen holding"),
+    ],
+)
+def test_the_monitor_ends_as_the_run_did(
+    last: dict[str, Any], code: int, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(typer.Exit) as ended:
+        _lines(iter([status(), status(**last)]), as_json=False)
+    assert ended.value.exit_code == code
+    assert told in capsys.readouterr().out.splitlines()[-1]

@@ -7,8 +7,9 @@ import socket
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cdpr.errors import BadInput, Fault
-from executor.command_client import ask_all, no_answer, the_one
+from executor.command_client import ask_all, last_word, no_answer, the_one
 from executor.command_server import LONGEST_QUESTION, MOST_CLIENTS, serving
 from executor.commands import NotACommand, answer_to, make_line, parse_command
 from executor.running import Reached, announced, reached_runs
@@ -232,3 +233,22 @@ def test_which_run_is_meant_must_be_clear():
             the_one([one, other], 9, "hold")
         with pytest.raises(Fault, match="no run of yours"):
             the_one([], None, "hold")
+
+
+@pytest.mark.parametrize("asked", [0, 1])
+def test_a_run_that_ends_says_once_more_how_it_stands(
+    asked: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """To those who watch it; who looks a few times a second may have missed the end."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    now = {"state": "moving"}
+    status: Any = SimpleNamespace(as_dict=lambda: now)
+    with ExitStack() as watching:
+        with announced() as listeners, serving(listeners, OwnBoard(), status):
+            runs = watching.enter_context(reached_runs())
+            for _ in range(1 + asked):
+                assert ask_all(runs, "status")[0].status == {"state": "moving"}
+            now = {"state": "latched", "cause": "cable 6 is slack"}
+        assert ask_all(runs, "status")[0].ended
+        assert last_word(runs[0]) == now
+        assert last_word(runs[0]) is None
