@@ -177,6 +177,8 @@ class WinchStatus:
         self._rig, self._board = rig, board
         self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
         self._progress = 0.0
+        self.folder: Path | None = None
+        """Where it is on record, if anywhere."""
         self._events: deque[LoopEvent] = deque(maxlen=EVENTS_TOLD)
 
     def take_cycle(self, record: CycleRecord, progress: float) -> None:
@@ -196,7 +198,7 @@ class WinchStatus:
         """See the head of this file."""
         began = self._cycles.began
         return {
-            **whose(self._rig, None),
+            **whose(self._rig, self.folder),
             **self._cycles.as_dict(),
             "row": None if self._cycles.last is None else round(100.0 * self._progress, 1),
             "rows": 100,

@@ -29,6 +29,7 @@ def demo(
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.output import out, show_facts
     from cdpr.cli.plan import planned, sentences_of
+    from cdpr.cli.run_folders import free_folder
     from cdpr.plan import plan_from_document
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
@@ -54,23 +55,3 @@ def configs() -> Path:
     package = Path(cdpr.__file__).resolve().parent
     inside = package / "configs"
     return inside if inside.is_dir() else package.parent / "configs"
-
-
-def free_folder(name: str) -> Path:
-    """``runs/NAME``, or with the first free number; makes ``runs`` where it is missing."""
-    from itertools import count
-
-    from cdpr.errors import BadInput
-
-    runs = Path("runs")
-    try:
-        runs.mkdir(exist_ok=True)
-    except OSError as error:
-        raise BadInput(
-            "the folder for runs cannot be made",
-            where=str(runs),
-            why=error.strerror or str(error),
-            next_step="change to a folder that you may write to, or name one with -o",
-        ) from None
-    names = (runs / (name if n == 1 else f"{name}-{n}") for n in count(1))
-    return next(path for path in names if not path.exists())

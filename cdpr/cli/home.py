@@ -85,8 +85,8 @@ def home(
     """
     from cdpr.cli.carry_out import ask_operator
     from cdpr.cli.home_facts import show_reference, show_wish
+    from cdpr.cli.named_bus import require_own_time, rig_on_bus
     from cdpr.cli.output import show_json
-    from cdpr.cli.run import require_own_time, rig_on_bus
     from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of, speed_of
     from drivers.bus import IN_PROCESS
     from executor.custody import Custody

@@ -77,9 +77,9 @@ def jog(
       cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
     """
     from cdpr.cli.carry_out import carry_out, prepared_run
-    from cdpr.cli.demo import free_folder
     from cdpr.cli.jog_way import moved, require_short, straight_way, where_it_stands
-    from cdpr.cli.run import require_own_time, rig_on_bus
+    from cdpr.cli.named_bus import require_own_time, rig_on_bus
+    from cdpr.cli.run_folders import free_folder
     from cdpr.errors import BadInput
     from cdpr.plan import plan_from_document
     from drivers.bus import IN_PROCESS

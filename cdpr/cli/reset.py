@@ -34,8 +34,8 @@ def reset(
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
     from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.output import err, out, show_json
-    from cdpr.cli.run import rig_on_bus
     from drivers.bus import BusSettings
     from executor.latch import Latch
 

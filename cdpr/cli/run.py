@@ -9,7 +9,6 @@ import typer
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
-    from cdpr.rig import Rig
 
 
 def run(
@@ -56,6 +55,7 @@ def run(
     """
     from cdpr.cli.cameras import choose_camera
     from cdpr.cli.carry_out import carry_out, prepared_run
+    from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.plan_for_rig import require_same_rig
     from cdpr.plan import load_plan
     from drivers.bus import IN_PROCESS
@@ -84,37 +84,10 @@ def run(
     raise typer.Exit(code)
 
 
-def rig_on_bus(path: Path, interface: str | None, channel: str | None) -> Rig:
-    """The rig of a file, on another bus when one is named."""
-    from cdpr.rig import load_rig, rig_from_document
-
-    document = load_rig(path).document
-    changes = {"interface": interface, "channel": channel}
-    given = {key: value for key, value in changes.items() if value is not None}
-    bus = document.bus.model_copy(update=given)
-    return rig_from_document(document.model_copy(update={"bus": bus}))
-
-
-def require_own_time(fast: bool, in_process: bool) -> None:
-    """Only drives that are simulated in this process can go faster than time.
-
-    Raises:
-        BadInput: Others were to.
-    """
-    from cdpr.errors import BadInput
-
-    if fast and not in_process:
-        raise BadInput(
-            "--fast needs drives that are simulated in this process",
-            where="--fast",
-            why="time on a real bus cannot be made faster",
-            next_step="leave --fast out, or use the interface 'virtual'",
-        )
-
-
 def _simulated_start(
     start_mm: tuple[float, float, float] | None, in_process: bool, fast: bool
 ) -> Pose | None:
+    from cdpr.cli.named_bus import require_own_time
     from cdpr.document_types import millimetres
     from cdpr.errors import BadInput
     from cdpr.poses import Pose

@@ -51,8 +51,8 @@ def sim(
       --channel 239.74.163.2 --no-camera -o runs/udp --yes
       --without-real-time
     """
+    from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.output import err, out
-    from cdpr.cli.run import rig_on_bus
     from cdpr.errors import BadInput
     from drivers.bus import IN_PROCESS, BusSettings, open_bus
     from executor.realtime import real_time

@@ -159,8 +159,8 @@ def _moved(
 ) -> WinchesStand:
     from contextlib import nullcontext
 
-    from cdpr.cli.demo import free_folder
     from cdpr.cli.output import err, progress_bar
+    from cdpr.cli.run_folders import free_folder
     from cdpr.errors import Refused
     from drivers.bus import IN_PROCESS
     from executor.clock import RealClock, SimulatedClock
@@ -176,6 +176,7 @@ def _moved(
         nullcontext() if simulated else recording(free_folder(motion.name)) as kept,
         progress_bar("moving, %", 100.0, not motion.quiet) as advance,
     ):
+        status.folder = None if kept is None else kept.folder
         if denied and not (simulated or motion.without_real_time):
             raise Refused(
                 f"no real-time scheduling: {denied}",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.cli.run import rig_on_bus
+from cdpr.cli.named_bus import rig_on_bus
 from cdpr.errors import Refused
 from cdpr.poses import Pose
 from executor.custody import Custody

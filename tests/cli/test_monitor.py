@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -83,6 +84,7 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     rig = load_rig(RIG)
     told = WinchStatus(rig, OwnBoard(), simulated_time=False)
     before = told.as_dict()
+    told.folder = Path("runs/[first]")
     assert before.keys() == status().keys()
     assert "preparing" in shown(before)
     for cycle in range(3):
@@ -97,7 +99,16 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     assert now["events"] == [{"time_s": 0.01, "code": "moving", "text": "winding in"}]
     assert now["lateness_ms"] == pytest.approx(0.5)
     text = shown(now).lower()
-    for part in ("moving", "25 % done", "operation enabled", "-4711", "-3", "1 lost", "100 %"):
+    for part in (
+        "moving",
+        "25 % done",
+        "operation enabled",
+        "-4711",
+        "-3",
+        "1 lost",
+        "100 %",
+        "runs/[first]",
+    ):
         assert part in text, part
     assert f"{rig.winches[7].torque_constant / 2:.2f}" in text
 
