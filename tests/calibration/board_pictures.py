@@ -10,7 +10,7 @@ from cdpr.poses import Array, Pose, matrix_from_rotation_vector
 SIZE = (640, 480)
 MATRIX = np.array([[600.0, 0.0, 322.0], [0.0, 603.0, 238.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([-0.12, 0.05, 0.0008, -0.0006, 0.0])
-_SUB = 3
+_SUB = 2
 
 
 def poses_before_the_camera(

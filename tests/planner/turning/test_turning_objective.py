@@ -86,7 +86,7 @@ def test_moves_are_worth_what_dense_poses_say(rig: Rig, name: str) -> None:
     world, load, objective = problem.world, problem.load, problem.objective
     kinematic = KinematicCost(rig, scene.start.rotation)
     rng = np.random.default_rng(7)
-    for _ in range(12):
+    for _ in range(6):
         start, end = random_pose(rng, rig, scene), random_pose(rng, rig, scene)
         length = float(move_length(row(start), row(end), objective.radian))
         only_length = problem_of(rig, scene).objective
@@ -115,7 +115,7 @@ def test_a_change_is_worth_the_same_as_measuring_all_anew() -> None:
     line.counts[0] = 6
     cost = measure(problem, line)
     made = 0
-    for _ in range(400):
+    for _ in range(150):
         before, length = copied(line), line_length(problem, line)
         first = int(rng.integers(0, line.counts[0] - 2))
         new = line.poses[first + 1 : first + 3].copy()
@@ -139,7 +139,7 @@ def test_a_change_is_worth_the_same_as_measuring_all_anew() -> None:
     assert made >= 2
 
 
-def planned(name: str, rounds: int = 40, **options: float) -> PlanDocument:
+def planned(name: str, rounds: int = 25, **options: float) -> PlanDocument:
     settings = TurningSettings(weights=OBJECTIVES[name], rounds=rounds, **options)
     return make_plan(GACHON, WIDE, settings)
 
@@ -177,11 +177,11 @@ def test_the_best_path_that_is_no_longer_keeps_the_limit(
     by_objective: dict[str, PlanDocument],
 ) -> None:
     shortest = way(by_objective["length"])
-    limited = planned("kinematic", 100, longest=1.02 * shortest)
+    limited = planned("kinematic", 60, longest=1.02 * shortest)
     assert shortest < way(limited) <= 1.02 * shortest + 1e-9
     assert limited.planner.longest_mm == pytest.approx(1.02e3 * shortest)
     with pytest.raises(NoSolution, match="no path of at most"):
-        planned("kinematic", 30, longest=0.95 * shortest)
+        planned("kinematic", 20, longest=0.95 * shortest)
 
 
 def test_a_longest_path_must_be_a_length() -> None:
