@@ -14,7 +14,7 @@ from planner.turning.problem import Problem, move_allowed
 from tests.planner.exact.sampled_oracle import random_scene
 from tests.planner.turning.turning_scenes import GACHON, HALL, Judge, problem_of, random_pose, row
 
-SCENES, MOVES, SAMPLES = 24, 30, 15
+SCENES, MOVES, SAMPLES = 14, 30, 15
 
 
 def pose_of(found: Array) -> Pose:
@@ -63,5 +63,5 @@ def test_no_allowed_move_violates_anything_anywhere(rig: Rig) -> None:
             looked_at += 1
             assert min(judge.room(pose) for pose in poses) >= 0.0
             assert min(judge.margin(pose) for pose in poses) >= 0.0
-    assert looked_at > 60
-    assert touching > 40
+    assert looked_at > 35
+    assert touching > 23
