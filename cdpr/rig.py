@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cdpr.document_types import millimetres
 from cdpr.documents import content_hash, key_path, load_yaml
@@ -157,6 +158,15 @@ class Rig:
         """
         nodes = [winch.node_id for winch in self.winches]
         return {node: f"cable {k} (drive {node})" for k, node in enumerate(nodes, start=1)}
+
+    def tensions_by(self, torques: ArrayLike) -> Array:
+        """Cable tensions at rest, shape (..., m), [N], from torques [per mille of rated torque]."""
+        tensions: Array = np.asarray(torques, dtype=np.float64) / 1000.0 * self._rated_tensions
+        return tensions
+
+    @cached_property
+    def _rated_tensions(self) -> Array:
+        return np.array([winch.torque_constant for winch in self.winches])
 
     @cached_property
     def plan_hash(self) -> str:

@@ -9,7 +9,7 @@ from cdpr.poses import Array
 from cdpr.rig import Rig
 from drivers.drive_group import Capabilities, DriveGroup
 from executor.course import Course
-from executor.reference import ReferenceDocument
+from executor.reference import ReferenceDocument, moved_since
 
 WATCHDOG_CYCLES = 3
 """Cycles that a drive's watchdog must last at least: one late cycle is no reason to disarm."""
@@ -111,13 +111,10 @@ def require_still_referenced(
     """
     if reference is None:
         return
-    stands = group.read_positions().positions
-    for drive, winch in enumerate(rig.winches):
-        if winch.absolute:
-            continue
-        if winch.node_id in group.restarted:
+    moved = moved_since(rig, reference, group.read_positions().positions.tolist())
+    for drive, (winch, off) in enumerate(zip(rig.winches, moved, strict=True)):
+        if not winch.absolute and winch.node_id in group.restarted:
             raise _lost(rig, drive, "it was switched on since it was referenced")
-        off = abs((int(stands[drive]) - reference.stands_at[drive]) / winch.counts_per_metre)
         if not off <= rig.motion.start_tolerance:
             raise _lost(
                 rig, drive, f"it stands {off * 1000:.1f} mm of cable away from where it was left"

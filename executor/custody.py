@@ -20,6 +20,7 @@ from executor.reference import (
     ReferenceFile,
     as_in_the_file,
     counting_hash,
+    moved_since,
     referenced,
 )
 
@@ -93,10 +94,8 @@ class Custody:
         reference = self._readable()
         if reference is None or reference.lost or len(reference.stands_at) != len(stands):
             return None
-        tolerance = self._rig.motion.start_tolerance
-        winches = zip(self._rig.winches, stands, reference.stands_at, strict=True)
-        off = [abs((at - left) / w.counts_per_metre) for w, at, left in winches if not w.absolute]
-        return reference if max(off, default=0.0) <= tolerance else None
+        moved = max(moved_since(self._rig, reference, stands))
+        return reference if moved <= self._rig.motion.start_tolerance else None
 
     def found_restarted(self, nodes: Iterable[int]) -> None:
         """Drives were switched on since they were set up: their reference is lost for good.

@@ -48,9 +48,8 @@ class Exchange:
     def __init__(self, course: Course, group: DriveGroup, clock: Clock) -> None:
         """Nothing is sent yet."""
         rig = course.rig
-        self._group, self._clock = group, clock
+        self._rig, self._group, self._clock = rig, group, clock
         self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
-        self._rated = np.array([w.torque_constant for w in rig.winches])
         self._limits = gate_limits(rig, course.setpoints, course.cycle)
         names = tuple(rig.drive_names.values())
         self._numbers = {node: k for k, node in enumerate(rig.drive_names, start=1)}
@@ -124,7 +123,7 @@ class Exchange:
         seen = Observation(
             following=following,
             following_errors=errors.tolist(),
-            tensions=(np.asarray(status.torques) / 1000.0 * self._rated).tolist(),
+            tensions=self._rig.tensions_by(status.torques).tolist(),
             missing=missing,
             faults=[(self._numbers.get(node, 0), text) for node, text in status.faults],
             lateness=lateness,

@@ -23,6 +23,7 @@ from executor.machine import ON_PATH, Event, Machine, State
 from executor.records import CycleRecord, LoopEvent
 from executor.safety.gate import Purpose
 from executor.safety.watch import Finding, Reaction
+from executor.smooth_step import smooth_step
 from executor.wishes import Wishes
 
 #: Within which all drives must hold by themselves after they were told to, [s].
@@ -142,7 +143,7 @@ class Loop:
         way, speed = self._exchange.largest_way(begin, end), self._course.rig.motion.speed
         steps = SETTLING + int(np.ceil(4.0 * way / (speed * self._course.cycle)))
         for step in range(1, steps + 1):
-            share = _smooth(step / steps)
+            share = smooth_step(step / steps)
             targets = tuple(int(v) for v in np.rint(begin + share * (end - begin)))
             self._send(Purpose.MOVE, targets)
             if self.machine.state is not State.APPROACHING:
@@ -317,8 +318,3 @@ _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.H
 _HELD = "at rest; the drives hold by themselves under torque"
 _BRAKED = "at rest; the brakes of the winches hold"
 _NEVER_ENABLED = "stopped before all drives were enabled; none of them follows set-points"
-
-
-def _smooth(share: float) -> float:
-    """0 to 1 with zero speed and acceleration at both ends."""
-    return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)

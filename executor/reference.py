@@ -7,6 +7,7 @@ ends by noting in it where the drives stand, and by declaring it lost when cable
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Literal
 
@@ -93,6 +94,23 @@ def referenced(rig: Rig, reference: ReferenceDocument) -> Rig:
         for winch, home in zip(rig.document.winches, reference.home_counts, strict=True)
     ]
     return rig_from_document(rig.document.model_copy(update={"winches": winches}))
+
+
+def moved_since(rig: Rig, reference: ReferenceDocument, stands: Sequence[int]) -> list[float]:
+    """How far drives were moved since the last motion, of cable, [m], one a drive.
+
+    None of those with absolute encoders, which count on whoever moves them.
+
+    Args:
+        rig: The robot.
+        reference: Of its drives.
+        stands: Where they stand now, [counts].
+    """
+    rows = zip(rig.winches, stands, reference.stands_at, strict=True)
+    return [
+        0.0 if winch.absolute else abs((at - left) / winch.counts_per_metre)
+        for winch, at, left in rows
+    ]
 
 
 class ReferenceFile:

@@ -43,8 +43,7 @@ class RunLog:
         index = np.array([0.0, *(r.index for r in records[:-1])])[: len(records)]
         rows = np.rint(index).astype(np.int64)
         actual = _matrix([r.actual for r in records], rig.cable_count)
-        rated = np.array([w.torque_constant for w in rig.winches])
-        tensions = _matrix([r.torques for r in records], rig.cable_count) / 1000.0 * rated
+        tensions = rig.tensions_by(_matrix([r.torques for r in records], rig.cable_count))
         # Only drives that follow their set-points tell the cables' tensions by their torques.
         taut = np.isfinite([r.following_error for r in records])
         stretch = np.where(taut[:, None], tensions, planned.tensions[rows])

@@ -94,7 +94,7 @@ class CyclesSoFar:
             drive_states(self._rig, record.words),
             record.actual,
             record.targets,
-            record.torques,
+            self._rig.tensions_by(record.torques).tolist(),
             strict=True,
         )
         return [
@@ -103,9 +103,9 @@ class CyclesSoFar:
                 "state": state,
                 "position_counts": actual,
                 "set_counts": target,
-                "tension_n": round(torque / 1000.0 * winch.torque_constant, 2),
+                "tension_n": round(tension, 2),
             }
-            for winch, state, actual, target, torque in columns
+            for winch, state, actual, target, tension in columns
         ]
 
 

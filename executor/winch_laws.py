@@ -15,6 +15,7 @@ from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array
 from cdpr.rig import Rig
 from executor.safety.watch import Finding, Reaction
+from executor.smooth_step import PEAK, smooth_step
 from executor.tension_room import TensionRoom
 
 #: A cable that was taut stays so while its tension is above this share of what was asked for.
@@ -149,8 +150,7 @@ class CableStep:
         self._cable, self._counts = cable, way * rig.winches[cable].counts_per_metre
         self._least = rig.min_tension / 2.0
         self._room = TensionRoom(self._least, limit)
-        # A smooth step from rest to rest is 15/8 times as fast in its middle as on average.
-        self._duration = max(1.0, 1.875 * abs(way) / (speed * _cycle(rig)))
+        self._duration = max(1.0, PEAK * abs(way) / (speed * _cycle(rig)))
         # A cable that is taut is moved as carefully as it would be wound in.
         careful = wind_in_speed(rig, self._least, limit, speed)[cable]
         self._pace_if_taut = float(careful) / speed
@@ -178,8 +178,7 @@ class CableStep:
         taut = tensions[self._cable] >= self._least
         pace *= (self._pace_if_taut if taut else 1.0) * self._room.share(tensions)
         self._time = min(self._time + pace, self._duration)
-        share = self._time / self._duration
-        smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        smooth = smooth_step(self._time / self._duration)
         return self._at(smooth), (*self._room.used_up(tensions), *self._made_slack(tensions))
 
     def _at(self, share: float) -> Targets:

@@ -51,7 +51,6 @@ class WinchLoop(Loop):
         super().__init__(course, group, clock, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
         self._law = law
         self._feed = Feed(_ENDLESS, cycle, rig.motion)
-        self._rated = np.array([winch.torque_constant for winch in rig.winches])
         self._status: CycleStatus | None = None
 
     def _follow(self) -> None:
@@ -64,7 +63,7 @@ class WinchLoop(Loop):
         else:
             before = self._feed.index
             pace = self._feed.advance() - before
-            tensions = np.asarray(self._status.torques) / 1000.0 * self._rated
+            tensions = self._course.rig.tensions_by(self._status.torques)
             targets, findings = self._law.next(pace, tensions.tolist())
             if findings:
                 self._judge(findings, "")

@@ -14,7 +14,7 @@ from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, rig_from_document
 from cdpr.winches import WinchMap
-from drivers.drive_group import Counts, CycleStatus, DriveGroup
+from drivers.drive_group import CycleStatus, DriveGroup
 from executor.clock import Clock
 from executor.custody import Custody
 from executor.loop import SETTLING
@@ -98,7 +98,7 @@ def require_below(rig: Rig, held: CycleStatus, limit: float) -> None:
     Raises:
         Refused: One does; with its cable.
     """
-    tensions = tensions_of(rig, held.torques)
+    tensions = rig.tensions_by(held.torques)
     over = [
         f"{name} carries {tension:.1f} N"
         for name, tension in zip(rig.drive_names.values(), tensions.tolist(), strict=True)
@@ -143,13 +143,6 @@ def require_held(rig: Rig, stand: WinchesStand, told: CycleStatus) -> None:
         why="a drive let go, slipped or was moved by hand; counts and pose do not belong together",
         next_step="look at the platform and the drives, then begin anew",
     )
-
-
-def tensions_of(rig: Rig, torques: Array | Counts) -> Array:
-    """Cable tensions from torques [per mille of rated torque], shape (..., m), [N]."""
-    rated = np.array([winch.torque_constant for winch in rig.winches])
-    tensions: Array = np.asarray(torques, dtype=np.float64) / 1000.0 * rated
-    return tensions
 
 
 def move_winches(
@@ -209,7 +202,7 @@ def move_winches(
     unknown = [np.full(rig.cable_count, np.nan)]
     torques = np.array([cycle.torques for cycle in last] or unknown, dtype=np.float64)
     counts = np.array([cycle.actual for cycle in last] or unknown, dtype=np.float64)
-    tensions = tensions_of(rig, torques.mean(axis=0))
+    tensions = rig.tensions_by(torques.mean(axis=0))
     return WinchesStand(state, cause, counts.mean(axis=0), tensions)
 
 
