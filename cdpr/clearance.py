@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cdpr.cables import Cables, cables_at
+from cdpr.cables import Cables, cables_at, cables_to
 from cdpr.convex import ConvexBody, Separation, box_body, convex_bodies, segment_body, separation
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
@@ -203,6 +203,20 @@ class ClearanceModel:
         first, second = (self._body_names[int(i)] for i in self._self.pairs[k])
         between = _nearest_of(gaps, k, first, second)
         return min(between, to_platform, key=lambda n: n.distance)
+
+    def self_clearances(self, positions: Array, rotations: Array) -> Array:
+        """The smallest such distances at many poses, shape (k,), [m].
+
+        Args:
+            positions: Of the platform, shape (k, 3), [m].
+            rotations: ``world_from_platform``, shape (k, 3, 3).
+        """
+        anchors = positions[:, None, :] + self.rig.anchors @ np.swapaxes(rotations, -1, -2)
+        cables = cables_to(self.rig, anchors)
+        to_platform = self._self.to_platform(cables, positions, rotations).distances
+        between = self._self.cable_pairs(cables).distances
+        smallest: Array = np.concatenate([to_platform, between], axis=-1).min(axis=-1)
+        return smallest
 
     def _smallest_to_platform(self, cables: Cables, pose: Pose) -> Nearest:
         gaps = self._self.to_platform(cables, pose.position, pose.rotation)

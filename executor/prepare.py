@@ -88,8 +88,9 @@ def _keeps_clearance(rig: Rig, scene: Scene) -> IsAllowed:
             near = model.smallest(pose)
             if near is not None and near.distance < scene.obstacle_clearance + half_way:
                 return False
-            if model.self_clearance(pose).distance < scene.self_clearance + 2.0 * half_way:
-                return False
-        return True
+        positions = np.array([pose.position for pose in poses])
+        rotations = np.array([pose.rotation for pose in poses])
+        own = float(model.self_clearances(positions, rotations).min())
+        return own >= scene.self_clearance + 2.0 * half_way
 
     return is_allowed

@@ -234,7 +234,11 @@ class _Check:
 
         required = self.scene.obstacle_clearance
         if self.track.turns or self.rig.pulley_radius > 0.0:
-            closest, proof = self._closest(nearest, 1.0, required)
+
+            def distances(poses: Sequence[Pose]) -> Array:
+                return np.array([nearest(pose).distance for pose in poses])
+
+            closest, proof = self._closest(nearest, distances, 1.0, required)
         else:
             proof = smallest_over_stretches(self.model, self.track, required, CLEARANCE_TOLERANCE)
             pose = self.track.pose(proof.at)
@@ -243,8 +247,13 @@ class _Check:
         return closest, proof
 
     def _self_clearance(self) -> tuple[Closest, Smallest]:
-        required = self.scene.self_clearance
-        closest, proof = self._closest(self.model.self_clearance, self._self_slope(), required)
+        def distances(poses: Sequence[Pose]) -> Array:
+            positions = np.array([pose.position for pose in poses])
+            rotations = np.array([pose.rotation for pose in poses])
+            return self.model.self_clearances(positions, rotations)
+
+        required, slope = self.scene.self_clearance, self._self_slope()
+        closest, proof = self._closest(self.model.self_clearance, distances, slope, required)
         self._clearance_violation("self clearance", closest, proof, required)
         return closest, proof
 
@@ -263,10 +272,16 @@ class _Check:
         return slope
 
     def _closest(
-        self, nearest: Callable[[Pose], Nearest], slope: float, required: float
+        self,
+        nearest: Callable[[Pose], Nearest],
+        distances: Callable[[Sequence[Pose]], Array],
+        slope: float,
+        required: float,
     ) -> tuple[Closest, Smallest]:
+        """Where ``nearest`` is closest, of ``distances``, which are those of many poses at once."""
+
         def evaluate(places: Array) -> Array:
-            return np.array([nearest(self._pose(p)).distance for p in places.tolist()])
+            return distances([self._pose(p) for p in places.tolist()])
 
         proof = smallest_along(self.places, evaluate, slope, required, CLEARANCE_TOLERANCE)
         pose = self._pose(proof.at)

@@ -258,6 +258,25 @@ def test_a_scene_without_obstacles_has_no_smallest_distance() -> None:
     assert model.smallest(GACHON.home) is None
 
 
+@pytest.mark.parametrize("rig", [GACHON, HALL], ids=lambda rig: rig.name)
+def test_self_clearances_of_many_poses_are_those_of_each(rig) -> None:
+    rng = np.random.default_rng(8)
+    turn = np.radians(20.0)
+    poses = [
+        Pose(
+            rng.uniform(rig.workspace_lower, rig.workspace_upper),
+            Rotation.from_rotvec(rng.uniform(-turn, turn, 3)).as_matrix(),
+        )
+        for _ in range(40)
+    ]
+    model = ClearanceModel(rig, scene_with())
+    at_once = model.self_clearances(
+        np.array([p.position for p in poses]), np.array([p.rotation for p in poses])
+    )
+    each = [model.self_clearance(p).distance for p in poses]
+    assert np.allclose(at_once, each, rtol=0.0, atol=1e-12)
+
+
 def test_a_cable_along_a_face_of_the_platform_has_no_self_clearance() -> None:
     """Turned far about z, cables lie across the platform: they pass through its edges."""
     turned = Pose(GACHON.home.position, Rotation.from_euler("z", 150, degrees=True).as_matrix())
