@@ -20,8 +20,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from calibration.boards import Chessboard
 from calibration.camera import calibrate_camera
+from calibration.camera_verdict import judge_camera
 from calibration.uncertainty import NAMES
-from calibration.verdict import judge
 from tests.calibration.board_pictures import (
     DISTORTION,
     MATRIX,
@@ -67,11 +67,11 @@ def main() -> None:
     for trial in range(arguments.trials):
         pictures = rendered(arguments.pictures, 100 + trial)
         found = calibrate_camera(pictures, BOARD)
-        off = np.array(list(found.values.values())) - TRUTH
+        off = np.array([interval.value for interval in found.intervals.values()]) - TRUTH
         inside.append(np.abs(off) <= found.uncertainty.half_widths)
         errors.append(off)
         peers.append(plain(pictures) - TRUTH)
-        verdicts.append(judge(found, 1e-3).good)
+        verdicts.append(judge_camera(found, 1e-3).verdict.good)
     ours, theirs = (np.sqrt(np.mean(np.square(part), axis=0)) for part in (errors, peers))
     print(
         f"{arguments.trials} trials of {arguments.pictures} pictures; good enough for 1 mm:", end=""

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdpr.errors import BadInput
-from cdpr.poses import Array
+from cdpr.poses import Array, Pose
 from cdpr.rig import Camera
-from tracking.detector import TagDetector
+from tracking.detector import Image, TagDetector
 from tracking.edges import refine
 from tracking.marks import CORNER_SIGNS, FAMILIES, modules_across
-
-Image = NDArray[np.uint8]
 
 LEAST_POINTS = 8
 """Of a board in a picture: fewer say too little about its pose."""
@@ -276,8 +274,6 @@ def _in_a_line(points: Array) -> bool:
 
 
 def _plain_camera(image: Image) -> Camera:
-    from cdpr.poses import Pose
-
     height, width = image.shape
     matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
     return Camera("plain", width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 1.0)

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.boards import Board, Seen, mirrored
-from calibration.uncertainty import Uncertainty, uncertainty_of
+from calibration.interval import Interval
+from calibration.uncertainty import NAMES, Uncertainty, uncertainty_of
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
-
-Image = NDArray[np.uint8]
+from tracking.detector import Image
 
 LEAST_VIEWS = 4
 """Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
@@ -57,9 +56,14 @@ class CameraCalibration:
         return float(np.sqrt(np.average(squares, weights=counts)))
 
     @property
-    def values(self) -> dict[str, float]:
+    def intervals(self) -> dict[str, Interval]:
         """The nine numbers by the names of `calibration.uncertainty.NAMES`."""
-        return values_of(self.matrix, self.distortion)
+        m, widths = self.matrix, self.uncertainty.half_widths
+        numbers = [m[0, 0], m[1, 1], m[0, 2], m[1, 2], *self.distortion]
+        return {
+            name: Interval(float(number), float(width))
+            for name, number, width in zip(NAMES, numbers, widths, strict=True)
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,14 +73,6 @@ class _Fit:
     turns: dict[str, Array]
     places: dict[str, Array]
     errors: dict[str, float] = field(default_factory=dict)
-
-
-def values_of(matrix: Array, distortion: Array) -> dict[str, float]:
-    """The nine numbers of a camera by name."""
-    from calibration.uncertainty import NAMES
-
-    numbers = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion]
-    return {name: float(number) for name, number in zip(NAMES, numbers, strict=True)}
 
 
 def calibrate_camera(

@@ -1,66 +1,61 @@
-"""The report of a camera calibration: one page that needs neither a server nor a network."""
+"""The report of a camera calibration."""
 
 from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
-from html import escape
-from importlib.resources import files
-from string import Template
 
 import numpy as np
 
 from calibration.camera import CameraCalibration
+from calibration.camera_verdict import CameraQuality
+from calibration.page import Section, interval_rows, page_of, table_of
 from calibration.uncertainty import NAMES
-from calibration.verdict import Verdict
 
 _WIDTH = 560.0
 
 
-def camera_page(result: CameraCalibration, verdict: Verdict, name: str, date: str) -> str:
+def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, date: str) -> str:
     """The whole page."""
-    template = files("calibration").joinpath("camera_page.template").read_text(encoding="utf-8")
-    return Template(template).substitute(
-        title=escape(f"Calibration of camera {name}"),
-        lead=escape(
-            f"{date}, {result.size[0]} × {result.size[1]} px, {len(result.views)} pictures used,"
-            f" {len(result.unused)} not"
-        ),
-        mark="good" if verdict.good else "bad",
-        verdict=escape(str(verdict)),
-        steps="".join(f"<li>{escape(step)}</li>" for step in verdict.next_steps),
-        numbers=_numbers(result, verdict),
-        map=_map(result, verdict),
-        coverage=escape(f"{verdict.covered:.0%} of the picture's cells have seen corners"),
-        tilts=_tilts(verdict),
-        pictures=_pictures(result),
-        unused=_rows((name, reason) for name, reason in result.unused.items())
-        or _rows([("none",)]),
+    lead = (
+        f"{date}, {result.size[0]} × {result.size[1]} px, {len(result.views)} pictures used,"
+        f" {len(result.unused)} not"
+    )
+    covered = f"{quality.covered:.0%} of the picture's cells have seen corners"
+    tilted = "A dot for each picture: forward and backward up and down, left and right across."
+    used = "Error, corners, and how fx changes without the picture."
+    return page_of(
+        f"Calibration of camera {name}",
+        lead,
+        quality.verdict,
+        [
+            Section("Numbers, with 95 % intervals", _numbers(result, quality)),
+            Section("Where the board was seen", _map(result, quality), covered),
+            Section("How the board was tilted", _tilts(quality), tilted),
+            Section("Pictures used", _pictures(result), used),
+            Section("Pictures not used", table_of(result.unused.items())),
+        ],
     )
 
 
-def _numbers(result: CameraCalibration, verdict: Verdict) -> str:
-    widths = result.uncertainty.half_widths
-    rows = [
-        (key, f"{value:.5g} ± {width:.2g}")
-        for (key, value), width in zip(result.values.items(), widths, strict=True)
-    ]
-    rows += [
-        ("corners off, RMS", f"{result.error:.3f} px"),
-        (f"a point at {verdict.distance:.2f} m", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
-        ("two halves of the pictures", f"{verdict.halves * 1e3:.2g} mm apart there"),
-        ("data", result.data_hash[:16]),
-    ]
-    return _rows(rows)
+def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
+    verdict = quality.verdict
+    return table_of(
+        [
+            *interval_rows(result.intervals),
+            ("corners off, RMS", f"{result.error:.3f} px"),
+            (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
+            ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
+            ("data", result.data_hash[:16]),
+        ]
+    )
 
 
-def _map(result: CameraCalibration, verdict: Verdict) -> str:
+def _map(result: CameraCalibration, quality: CameraQuality) -> str:
     """Corners seen, on cells that are darker the more corners they have."""
     width, height = result.size
     scale = _WIDTH / width
-    columns, rows = verdict.coverage.shape
-    most = max(float(verdict.coverage.max()), 1.0)
+    columns, rows = quality.coverage.shape
+    most = max(float(quality.coverage.max()), 1.0)
     shapes = []
-    for (i, j), count in np.ndenumerate(verdict.coverage):
+    for (i, j), count in np.ndenumerate(quality.coverage):
         shade = 0.0 if count == 0 else 0.15 + 0.45 * float(count) / most
         shapes.append(
             f'<rect x="{i * _WIDTH / columns:.1f}" y="{j * height * scale / rows:.1f}"'
@@ -77,12 +72,12 @@ def _map(result: CameraCalibration, verdict: Verdict) -> str:
     )
 
 
-def _tilts(verdict: Verdict) -> str:
+def _tilts(quality: CameraQuality) -> str:
     """Tilt of each picture's board, about both axes, ± 50°."""
     dots = "".join(
         f'<circle cx="{140 + 2.4 * np.clip(y, -50, 50):.1f}"'
         f' cy="{140 - 2.4 * np.clip(x, -50, 50):.1f}" r="4"/>'
-        for x, y in verdict.tilts
+        for x, y in quality.tilts
     )
     rings = "".join(
         f'<circle cx="140" cy="140" r="{2.4 * ring}" fill="none" stroke="#dde2e8"/>'
@@ -98,18 +93,9 @@ def _tilts(verdict: Verdict) -> str:
 def _pictures(result: CameraCalibration) -> str:
     """Error of each picture, and how much of the focal length hangs on it."""
     change = result.uncertainty.without[:, NAMES.index("fx_px")]
-    return _rows(
+    return table_of(
         (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+.2f} px")
         for (name, error), seen, without in zip(
             result.view_errors.items(), result.views.values(), change, strict=True
         )
     )
-
-
-def _rows(rows: Iterable[Sequence[str]]) -> str:
-    text = []
-    for row in rows:
-        first, *rest = row
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in rest)
-        text.append(f'<tr><th scope="row">{escape(first)}</th>{cells}</tr>')
-    return "".join(text)

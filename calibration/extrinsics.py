@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, read_only
 from cdpr.rig import Camera, Rig
 from tracking.bundle import TagView
 from tracking.camera_check import check_camera, measured_camera
-from tracking.detector import TagDetector
+from tracking.detector import Image, TagDetector
 from tracking.edges import refine
 from tracking.marks import modules_across
 
@@ -44,9 +43,7 @@ class ExtrinsicCalibration:
         return self.camera.world_from_camera
 
 
-def locate_camera(
-    rig: Rig, camera: Camera, images: Iterable[NDArray[np.uint8]]
-) -> ExtrinsicCalibration:
+def locate_camera(rig: Rig, camera: Camera, images: Iterable[Image]) -> ExtrinsicCalibration:
     """Finds the camera's place from pictures taken while it stood still.
 
     Args:
@@ -83,15 +80,7 @@ def locate_camera(
             next_step="free them, or turn the camera until it sees some of them",
         )
     pose, covariance = found
-    moved = Camera(
-        camera.name,
-        camera.width,
-        camera.height,
-        camera.matrix,
-        camera.distortion,
-        pose,
-        camera.rate,
-    )
+    moved = replace(camera, world_from_camera=pose)
     return ExtrinsicCalibration(
         moved, read_only(covariance), _tag_errors(moved, views), pictures, _hash(views)
     )

@@ -22,12 +22,12 @@ import numpy as np
 from scipy.stats import t as student
 
 from calibration.boards import Seen
+from calibration.interval import CONFIDENCE
 from cdpr.errors import BadInput
 from cdpr.poses import Array, read_only
 
 NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 """The camera's numbers, in the order of every array here."""
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from cdpr.document_types import Document, Finding
 from cdpr.errors import BadInput, InvalidFile, Problem
 from cdpr.file_problems import key_path, model_in, place_of, problems_of
-from cdpr.yaml_tree import KeyPath, Places, YamlSyntaxError, parse_yaml
+from cdpr.yaml_tree import KeyPath, Places, YamlSyntaxError, YamlTree, parse_yaml
 
 __all__ = [
     "check_version",
@@ -25,6 +25,7 @@ __all__ = [
     "load_yaml",
     "problems_of",
     "read_text",
+    "read_yaml",
     "write_atomic",
 ]
 
@@ -53,6 +54,21 @@ def read_text(path: Path) -> str:
     raise BadInput(what, where=str(path), why=why, next_step=hint)
 
 
+def read_yaml(path: Path) -> YamlTree:
+    """The plain data of a YAML file, with the place of every key.
+
+    Raises:
+        BadInput: The file cannot be read.
+        InvalidFile: It is not YAML.
+    """
+    try:
+        return parse_yaml(read_text(path))
+    except YamlSyntaxError as error:
+        hint = "check the indentation, colons, quotes and brackets there"
+        problem = Problem("", error.what, error.line, error.column)
+        raise InvalidFile(str(path), [problem], hint) from None
+
+
 def load_yaml(path: Path, model: type[Model]) -> Model:
     """Reads a YAML file into ``model``, or tells every problem with file:line:column.
 
@@ -60,12 +76,7 @@ def load_yaml(path: Path, model: type[Model]) -> Model:
         BadInput: The file cannot be read.
         InvalidFile: It is not YAML, has a key twice, or does not fit the model.
     """
-    try:
-        tree = parse_yaml(read_text(path))
-    except YamlSyntaxError as error:
-        hint = "check the indentation, colons, quotes and brackets there"
-        problem = Problem("", error.what, error.line, error.column)
-        raise InvalidFile(str(path), [problem], hint) from None
+    tree = read_yaml(path)
     problems = [Problem(key_path(f.key), f.what, f.line, f.column) for f in tree.faults]
     if isinstance(tree.data, dict):
         check_version(tree.data, model, path, tree.places)

@@ -23,12 +23,13 @@ from cdpr.cli.board_options import (
     TagOption,
     board_of,
 )
+from cdpr.cli.calibration_output import FolderOption, ForceOption, JsonOption, WantedOption
 
 if TYPE_CHECKING:
-    from calibration.boards import Image
     from calibration.camera import CameraCalibration
-    from calibration.verdict import Verdict
+    from calibration.camera_verdict import CameraQuality
     from drivers.picture_folder import OneCamerasPictures
+    from tracking.detector import Image
 
 
 def camera(
@@ -47,18 +48,14 @@ def camera(
     family: FamilyOption = "tag36h11",
     first: FirstOption = 0,
     name: Annotated[str, typer.Option(help="of the camera in the rig file")] = "camera",
-    wanted_mm: Annotated[
-        float, typer.Option(min=0.001, help="how well points must be seen to be good enough")
-    ] = 1.0,
+    wanted_mm: WantedOption = 1.0,
     distance_m: Annotated[
         float | None,
         typer.Option(min=0.01, help="from which the camera measures, else the boards'"),
     ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder for the result and its report")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace what the folder holds")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
+    output: FolderOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Find a camera's matrix and lens distortion, and say whether they are good enough.
 
@@ -75,14 +72,15 @@ def camera(
 
     from calibration.camera import calibrate_camera
     from calibration.camera_page import camera_page
-    from calibration.result_file import camera_result, write_result
-    from calibration.verdict import judge
-    from cdpr.cli.output import progress_bar, show_facts, show_json
+    from calibration.camera_result import camera_result
+    from calibration.camera_verdict import judge_camera
+    from calibration.result_file import require_file_name
+    from cdpr.cli.calibration_output import finish
+    from cdpr.cli.output import progress_bar
     from cdpr.cli.workers import make_folder
-    from cdpr.documents import write_atomic
     from drivers.picture_folder import OneCamerasPictures
 
-    _require_file_name(name)
+    require_file_name(name, "--name")
     sizes = {"square": square_mm, "marker": marker_mm, "tag": tag_mm, "gap": gap_mm}
     the_board = board_of(board, columns, rows, sizes, dictionary, legacy, family, first)
     pictures = OneCamerasPictures(folder)
@@ -90,35 +88,10 @@ def camera(
         make_folder(output, force)
     with progress_bar("looking for the board", len(pictures.names), not as_json) as advance:
         result = calibrate_camera(_told(pictures, advance), the_board, pictures.unused)
-    verdict = judge(result, wanted_mm / 1000.0, distance_m)
-    today = datetime.now(UTC).date()
-    document = camera_result(result, verdict, name, today)
-    if output is not None:
-        write_result(output / f"calibration_camera_{name}_{today}.yaml", document)
-        page = camera_page(result, verdict, name, today.isoformat())
-        write_atomic(output / "report.html", page)
-    if as_json:
-        show_json(document)
-    else:
-        show_facts(f"camera {name}", _facts(result, verdict, output))
-    if not verdict.good:
-        raise typer.Exit(3)
-
-
-def _require_file_name(name: str) -> None:
-    """The camera's name becomes part of a file's; told before the long fit, not after it.
-
-    Raises:
-        BadInput: It cannot.
-    """
-    from cdpr.errors import BadInput
-
-    if not name or "/" in name or "\0" in name:
-        raise BadInput(
-            f"{name!r} cannot be part of a file name",
-            where="--name",
-            next_step="name the camera as in the rig file, without a slash",
-        )
+    quality = judge_camera(result, wanted_mm / 1000.0, distance_m)
+    document = camera_result(result, quality, name, datetime.now(UTC).date())
+    page = camera_page(result, quality, name, document.date)
+    finish(document, page, _facts(result, quality), output, as_json)
 
 
 def _told(
@@ -130,26 +103,14 @@ def _told(
         advance(number)
 
 
-def _facts(
-    result: CameraCalibration, verdict: Verdict, output: Path | None
-) -> list[tuple[str, str]]:
-    """What was found, for people."""
-    widths = result.uncertainty.half_widths
-    facts = [("verdict", str(verdict)), *(("next", step) for step in verdict.next_steps)]
-    facts += [
-        (key, f"{value:.5g} ± {width:.2g}")
-        for (key, value), width in zip(result.values.items(), widths, strict=True)
-    ]
-    facts += [
+def _facts(result: CameraCalibration, quality: CameraQuality) -> list[tuple[str, str]]:
+    """What was found beside the numbers, for people."""
+    return [
         ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
-        ("covered", f"{verdict.covered:.0%} of the picture"),
+        ("covered", f"{quality.covered:.0%} of the picture"),
         (
             "precision",
-            f"{verdict.error * 1e3:.2g} mm at {verdict.distance:.2f} m (95 %); two halves of the"
-            f" pictures are {verdict.halves * 1e3:.2g} mm apart",
+            f"{quality.verdict.error * 1e3:.2g} mm at {quality.distance:.2f} m (95 %); two halves"
+            f" of the pictures are {quality.halves * 1e3:.2g} mm apart",
         ),
     ]
-    facts += [("not used", f"{name} {reason}") for name, reason in result.unused.items()]
-    if output is not None:
-        facts.append(("report", str(output / "report.html")))
-    return facts

@@ -12,8 +12,10 @@ import yaml
 
 from calibration.boards import Chessboard, Seen
 from calibration.camera import CameraCalibration, calibrate_camera, calibrate_from_views
-from calibration.result_file import camera_result, write_result
-from calibration.verdict import judge
+from calibration.camera_result import camera_result
+from calibration.camera_verdict import judge_camera
+from calibration.kinds import load_result
+from calibration.result_file import write_result
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, matrix_from_rotation_vector
 
@@ -86,8 +88,8 @@ def test_noisy_corners_stay_within_the_stated_intervals() -> None:
     for seed in range(30):
         found = calibrate_from_views(views(14, 0.1, seed), SIZE)
         assert 0.05 < found.error < 0.25
-        off = np.abs(np.array(list(found.values.values())) - TRUTH)
-        inside.append(off <= found.uncertainty.half_widths)
+        bounds = np.array([interval.bounds for interval in found.intervals.values()])
+        inside.append((bounds[:, 0] <= TRUTH) & (bounds[:, 1] >= TRUTH))
     shares = np.mean(inside, axis=0)
     assert (shares[:4] >= 0.85).all()
     assert shares.mean() >= 0.9
@@ -150,8 +152,10 @@ def test_pictures_of_two_sizes_are_refused_by_name() -> None:
 
 def test_the_result_file_is_dated_and_has_the_keys_of_the_rig_file(tmp_path: Path) -> None:
     found = calibrate_from_views(views(8, 0.05), SIZE)
-    path = tmp_path / "calibration_camera.yaml"
-    write_result(path, camera_result(found, judge(found, 1e-3), "front", date(2026, 3, 1)))
+    result = camera_result(found, judge_camera(found, 1e-3), "front", date(2026, 3, 1))
+    path = write_result(tmp_path, result)
+    assert path.name == "calibration_camera_front_2026-03-01.yaml"
+    assert load_result(path) == result
     read = yaml.safe_load(path.read_text())
     assert read["date"] == "2026-03-01"
     assert read["fx_px"] == pytest.approx(found.matrix[0, 0])

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from calibration.extrinsics import locate_camera
-from calibration.result_file import extrinsic_result, write_result
 from cdpr.errors import BadInput
 from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from cdpr.rig import Rig, load_rig
@@ -98,18 +95,3 @@ def test_a_picture_without_frame_tags_is_refused(rig: Rig) -> None:
 def test_a_rig_without_frame_tags_is_refused(rig: Rig) -> None:
     with pytest.raises(BadInput, match="no frame tags"):
         locate_camera(replace(rig, frame_tags=()), rig.cameras[0], [])
-
-
-def test_the_result_file_has_the_keys_of_the_rig_file(
-    tmp_path: Path, rig: Rig, pictures: tuple[Pose, list[np.ndarray]]
-) -> None:
-    found = locate_camera(rig, rig.cameras[0], pictures[1][:1])
-    path = tmp_path / "calibration_extrinsics.yaml"
-    write_result(path, extrinsic_result(found, date(2026, 3, 2)))
-    read = yaml.safe_load(path.read_text())
-    again = Pose.from_quaternion(
-        np.array(read["world_from_camera"]["position_mm"]) / 1e3,
-        read["world_from_camera"]["rotation_wxyz"],
-    )
-    assert again.distance_to(found.world_from_camera) < 1e-9
-    assert read["date"] == "2026-03-02"

@@ -79,7 +79,7 @@ def test_a_folder_is_calibrated_and_what_is_of_no_use_is_named(folder, tmp_path)
     assert found["rms_px"] < 0.2
     low, high = found["intervals"]["fx_px"]
     assert low < found["fx_px"] < high
-    assert set(found["unused_pictures"]) == {"wall.png", "small.png", "broken.jpg"}
+    assert set(found["unused"]) == {"wall.png", "small.png", "broken.jpg"}
     assert found["verdict"].startswith("good enough for" if answer.code == 0 else "not good enough")
     (saved,) = (tmp_path / "out").glob("calibration_camera_camera_*.yaml")
     assert yaml.safe_load(saved.read_text()) == found

@@ -1,0 +1,39 @@
+"""A number and how far off it may be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+CONFIDENCE = 0.95
+"""Of every interval that a calibration states."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """The range that holds a number with 95 % confidence.
+
+    Attributes:
+        value: What was found.
+        half_width: How far off it may be, in the same unit.
+    """
+
+    value: float
+    half_width: float
+
+    @classmethod
+    def between(cls, low: float, high: float) -> Interval:
+        """The interval with these ends."""
+        return cls((low + high) / 2.0, (high - low) / 2.0)
+
+    @property
+    def bounds(self) -> list[float]:
+        """Its ends."""
+        return [self.value - self.half_width, self.value + self.half_width]
+
+    def __str__(self) -> str:
+        """Value and half width, to two digits of the half width."""
+        if not 0.0 < self.half_width < math.inf:
+            return f"{self.value:.6g} ± {self.half_width:g}"
+        decimals = max(0, 1 - math.floor(math.log10(self.half_width)))
+        return f"{self.value:.{decimals}f} ± {self.half_width:.{decimals}f}"

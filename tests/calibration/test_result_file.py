@@ -1,0 +1,122 @@
+"""Result files: read as written, refused for other rigs, numbers shown with their widths."""
+
+from __future__ import annotations
+
+from datetime import date
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.camera_result import CameraResult
+from calibration.interval import Interval
+from calibration.kinds import calibrated, load_result
+from calibration.result_file import common_keys, write_result
+from calibration.verdict import Lack, Verdict
+from cdpr.errors import BadInput
+from cdpr.rig import Rig, load_rig
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+def camera_result_of(name: str = "front", fx: float = 905.0, size=(1280, 720)) -> CameraResult:
+    verdict = Verdict.of(0.4e-3, 1e-3, "at 1.5 m", [])
+    intervals = {"fx_px": Interval(fx, 0.5), "cx_px": Interval(640.0, 0.7)}
+    return CameraResult(
+        **common_keys(name, date(2026, 3, 1), "ab" * 32, intervals, verdict, {"a.png": "is bad"}),
+        width_px=size[0],
+        height_px=size[1],
+        fx_px=fx,
+        fy_px=906.0,
+        cx_px=640.0,
+        cy_px=361.0,
+        distortion=[-0.1, 0.04, 0.0, 0.0, 0.0],
+        rms_px=0.1,
+        distance_m=1.5,
+        halves_apart_mm=0.2,
+        covered=0.9,
+        pictures_used=20,
+        view_errors_px={"b.png": 0.1},
+    )
+
+
+def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
+    result = camera_result_of()
+    path = write_result(tmp_path, result)
+    assert path.name == "calibration_camera_front_2026-03-01.yaml"
+    assert load_result(path) == result
+
+
+def test_a_camera_result_takes_the_place_of_the_rig_files_numbers(rig: Rig) -> None:
+    better = calibrated(rig, [camera_result_of()])
+    assert better.cameras[0].matrix[0, 0] == 905.0
+    assert better.cameras[0].distortion.tolist() == [-0.1, 0.04, 0.0, 0.0, 0.0]
+    old, new = rig.cameras[0], better.cameras[0]
+    assert new.world_from_camera.distance_to(old.world_from_camera) == 0.0
+    assert rig.cameras[0].matrix[0, 0] == 900.0  # the rig itself is as it was
+    assert better.plan_hash == rig.plan_hash
+
+
+@pytest.mark.parametrize(
+    ("result", "named"),
+    [
+        (camera_result_of("side"), "no camera 'side'"),
+        (camera_result_of(size=(640, 480)), "640 x 480 px, camera 'front' takes 1280 x 720 px"),
+    ],
+)
+def test_a_result_for_another_camera_is_refused(rig: Rig, result, named: str) -> None:
+    with pytest.raises(BadInput, match=named):
+        calibrated(rig, [result])
+
+
+def test_two_results_of_one_camera_are_refused(rig: Rig) -> None:
+    with pytest.raises(BadInput, match="two results of kind camera for 'front'"):
+        calibrated(rig, [camera_result_of(), camera_result_of(fx=901.0)])
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("kind: rigg\n", "no calibration result"),
+        ("- 1\n", "no calibration result"),
+        ("kind: camera\n", "fx_px"),
+        ("kind: [\n", "yaml"),
+    ],
+)
+def test_files_that_are_no_results_are_told_by_name(tmp_path: Path, text: str, named: str) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(BadInput) as caught:
+        load_result(path)
+    assert named in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_result_tells_how_far_it_is_from_another() -> None:
+    one, two = camera_result_of(), camera_result_of(fx=908.0)
+    assert one.changes_to(two)["fx_px"] == pytest.approx(3.0)
+    assert one.apart_mm(one) == 0.0
+    # Points of a picture lie up to 0.7 of the distance off its axis; 3 of 905 px is 0.33 %.
+    assert 0.5 < one.apart_mm(two) < 3.5
+
+
+@given(value=st.floats(-1e4, 1e4), width=st.floats(1e-6, 1e3))
+def test_a_number_is_shown_to_two_digits_of_its_width(value: float, width: float) -> None:
+    shown, half = (float(part) for part in str(Interval(value, width)).split(" ± "))
+    assert abs(shown - value) <= 0.051 * width + 0.5 * (width > 10.0)
+    assert half == pytest.approx(width, rel=0.06)
+
+
+def test_a_verdict_says_each_next_step_once() -> None:
+    lacks = [Lack("few", "take more"), Lack("wide", "take more"), Lack("flat", "tilt")]
+    verdict = Verdict.of(2e-3, 1e-3, "at 1 m", lacks)
+    assert not verdict.good
+    assert verdict.next_steps == ("take more", "tilt")
+    assert str(verdict) == "not good enough: few; wide; flat"
+    assert str(Verdict.of(5e-4, 1e-3, "at 1 m", [])) == "good enough for 0.5 mm at 1 m"
