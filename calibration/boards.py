@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose
 from cdpr.rig import Camera
-from tracking.detector import Image, TagDetector
+from cdpr.tag_families import FAMILIES
+from tracking.detector import TagDetector
 from tracking.edges import refine
-from tracking.marks import CORNER_SIGNS, FAMILIES, modules_across
+from tracking.marks import CORNER_SIGNS, modules_across
+from tracking.picture import Image
 
 LEAST_POINTS = 8
 """Of a board in a picture: fewer say too little about its pose."""
@@ -197,7 +199,7 @@ class TagGrid:
         rows: Tags along a column.
         tag: Side of a tag's black square, [m].
         gap: Between neighbouring black squares, [m].
-        family: One of `tracking.marks.FAMILIES`.
+        family: One of `cdpr.tag_families.FAMILIES`.
         first: Number of the tag at the top left.
     """
 

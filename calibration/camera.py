@@ -14,7 +14,7 @@ from calibration.interval import Interval
 from calibration.uncertainty import NAMES, Uncertainty, uncertainty_of
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
-from tracking.detector import Image
+from tracking.picture import Image
 
 LEAST_VIEWS = 4
 """Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""

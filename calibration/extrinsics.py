@@ -13,9 +13,10 @@ from cdpr.poses import Array, Pose, read_only
 from cdpr.rig import Camera, Rig
 from tracking.bundle import TagView
 from tracking.camera_check import check_camera, measured_camera
-from tracking.detector import Image, TagDetector
+from tracking.detector import TagDetector
 from tracking.edges import refine
 from tracking.marks import modules_across
+from tracking.picture import Image
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -135,6 +135,7 @@ class Rig:
     winches: tuple[Winch, ...]
     motion: Motion
     tag_family: str
+    tag_detector: str
     platform_tags: tuple[Tag, ...]
     frame_tags: tuple[Tag, ...]
     cameras: tuple[Camera, ...]
@@ -227,6 +228,7 @@ def rig_from_document(document: RigDocument) -> Rig:
         winches=tuple(_winch(w) for w in document.winches),
         motion=_motion(document.motion),
         tag_family=tags.family if tags else "",
+        tag_detector=tags.detector if tags else "",
         platform_tags=tuple(_tag(t) for t in tags.platform) if tags else (),
         frame_tags=tuple(_tag(t) for t in tags.frame) if tags else (),
         cameras=tuple(_camera(c) for c in document.cameras),

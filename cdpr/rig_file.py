@@ -19,6 +19,7 @@ from cdpr.document_types import (
     Vector,
 )
 from cdpr.drives_file import ODRIVE_LAST_NODE, Cia402Document, DrivesDocument
+from cdpr.tag_families import TagDetectorName, TagFamily, tags_in
 
 
 class PlatformDocument(Document):
@@ -131,7 +132,10 @@ class TagDocument(PoseDocument):
 class TagsDocument(Document):
     """The tags on the platform (platform frame) and, optionally, on the frame (world)."""
 
-    family: Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"] = "tag36h11"
+    family: TagFamily = "tag36h11"
+    detector: TagDetectorName = Field(
+        default="opencv", description="apriltag: pyapriltags, of the extra `apriltag`"
+    )
     platform: Annotated[list[TagDocument], Field(min_length=1)]
     frame: list[TagDocument] = []
 
@@ -189,6 +193,7 @@ class RigDocument(Document):
             self._nodes_once,
             self._nodes_of_odrives,
             self._tags_once,
+            self._tags_of_the_family,
             self._cameras_once,
             self._home_inside,
         )
@@ -228,15 +233,24 @@ class RigDocument(Document):
         ]
 
     def _tags_once(self) -> list[Finding]:
+        return _repeated("tag id", self._tag_ids())
+
+    def _tags_of_the_family(self) -> list[Finding]:
+        if self.tags is None:
+            return []
+        count = tags_in(self.tags.family)
+        what = f"{self.tags.family} has the tags 0 to {count - 1}"
+        return [(place, what) for place, number in self._tag_ids() if number >= count]
+
+    def _tag_ids(self) -> list[tuple[tuple[str | int, ...], int]]:
         if self.tags is None:
             return []
         groups = {"platform": self.tags.platform, "frame": self.tags.frame}
-        ids = [
+        return [
             (("tags", group, i, "id"), tag.id)
             for group, tags in groups.items()
             for i, tag in enumerate(tags)
         ]
-        return _repeated("tag id", ids)
 
     def _cameras_once(self) -> list[Finding]:
         names = [(("cameras", i, "name"), camera.name) for i, camera in enumerate(self.cameras)]
@@ -261,7 +275,9 @@ class RigDocument(Document):
 
 
 def _repeated(
-    kind: str, values: Sequence[tuple[tuple[str | int, ...], int | str]]
+    kind: str,
+    values: Sequence[tuple[tuple[str | int, ...], int]]
+    | Sequence[tuple[tuple[str | int, ...], str]],
 ) -> list[Finding]:
     seen: set[int | str] = set()
     found: list[Finding] = []

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdpr.poses import Array, read_only
 from cdpr.rig import Camera
-from tracking.detector import Image
+from tracking.picture import Image
 from tracking.projection import ideal_from_pixels, pixels_from_ideal
 
 #: Taps along a profile.

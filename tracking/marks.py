@@ -1,7 +1,8 @@
-"""Tag families: their official pictures and the corners of a tag.
+"""Tag families: their pictures and the corners of a tag.
 
 OpenCV draws every AprilTag family turned by 180° against the pictures of the AprilTag project,
-which labs print. A tag's frame here is that of the official picture: x right, y up, z out of it.
+which labs print; ArUco markers are printed as OpenCV draws them. A tag's frame here is that of the
+printed picture: x right, y up, z out of it.
 """
 
 from __future__ import annotations
@@ -15,15 +16,8 @@ from numpy.typing import NDArray
 from cdpr.errors import BadInput
 from cdpr.poses import Array
 from cdpr.rig import Tag
+from cdpr.tag_families import FAMILIES, drawn_upside_down, opencv_dictionary
 
-_DICTIONARIES = {
-    "tag16h5": cv2.aruco.DICT_APRILTAG_16H5,
-    "tag25h9": cv2.aruco.DICT_APRILTAG_25H9,
-    "tag36h10": cv2.aruco.DICT_APRILTAG_36H10,
-    "tag36h11": cv2.aruco.DICT_APRILTAG_36H11,
-}
-#: Families that can be detected.
-FAMILIES = tuple(_DICTIONARIES)
 #: Top left, top right, bottom right, bottom left of the upright picture, in half sides.
 CORNER_SIGNS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 
@@ -34,12 +28,12 @@ def dictionary(family: str) -> cv2.aruco.Dictionary:
     Raises:
         BadInput: The family is not known.
     """
-    if family not in _DICTIONARIES:
+    if family not in FAMILIES:
         raise BadInput(
             f"unknown tag family {family!r}",
             next_step=f"use one of {', '.join(FAMILIES)}",
         )
-    return cv2.aruco.getPredefinedDictionary(_DICTIONARIES[family])
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, opencv_dictionary(family)))
 
 
 def modules_across(family: str) -> int:
@@ -49,15 +43,15 @@ def modules_across(family: str) -> int:
 
 @lru_cache(maxsize=256)
 def official_modules(family: str, number: int) -> NDArray[np.bool_]:
-    """White modules of the official picture, black border included, rows from the top."""
+    """White modules of the printed picture, black border included, rows from the top."""
     side = modules_across(family)
     picture = cv2.aruco.generateImageMarker(dictionary(family), number, side)
-    return np.asarray(picture[::-1, ::-1] > 127)
+    return np.asarray((picture[::-1, ::-1] if drawn_upside_down(family) else picture) > 127)
 
 
-def upright_corners(opencv_corners: Array) -> Array:
+def upright_corners(family: str, opencv_corners: Array) -> Array:
     """OpenCV's detected corners, shape (4, 2), in the order of `CORNER_SIGNS`."""
-    return np.roll(opencv_corners, 2, axis=0)
+    return np.roll(opencv_corners, 2, axis=0) if drawn_upside_down(family) else opencv_corners
 
 
 def tag_corners(tag: Tag) -> Array:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from cdpr.errors import BadInput
-from tracking.detector import Image, what_else_is_seen
 from tracking.measurement import NoPose, PoseMeasurement
+from tracking.other_tags import what_else_is_seen
+from tracking.picture import Image
 from tracking.pose_log import LoggedPicture
 from tracking.tracker import Tracker
 

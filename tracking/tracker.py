@@ -13,10 +13,12 @@ from cdpr.rig import Camera, Rig, Tag
 from tracking.bits import carries_tag
 from tracking.bundle import BundlePose, TagView, polish_bundle, solve_bundle
 from tracking.camera_check import CameraCheck, refuse_moved_camera
-from tracking.detector import Detection, Image, Region, TagDetector
+from tracking.detector import Detection
+from tracking.detectors import make_detector
 from tracking.edges import refine
 from tracking.marks import modules_across, tag_corners
 from tracking.measurement import NoPose, Observation, PoseMeasurement
+from tracking.picture import Image, Region
 from tracking.projection import pixels_from_ideal, pixels_of
 
 
@@ -73,7 +75,7 @@ class Tracker:
         self.rig, self.camera = rig, camera
         self.settings = settings or TrackerSettings()
         self.camera_check: CameraCheck | None = None
-        self._detector = TagDetector(rig.tag_family)
+        self._detector = make_detector(rig.tag_detector, rig.tag_family)
         self._modules = modules_across(rig.tag_family)
         self._platform = {tag.id: tag for tag in rig.platform_tags}
         self._frame = {tag.id: tag for tag in rig.frame_tags}
@@ -134,7 +136,12 @@ class Tracker:
         return found
 
     def _search(self, image: Image, time: float) -> Observation:
-        detections = self._detector.detect(image)
+        """The pose by a search of the whole picture, once more thoroughly when it finds none."""
+        found = self._searched(image, time, thorough=False)
+        return self._searched(image, time, thorough=True) if isinstance(found, NoPose) else found
+
+    def _searched(self, image: Image, time: float, thorough: bool) -> Observation:
+        detections = self._detector.detect(image, thorough=thorough)
         self._check_camera(image, detections)
         return self._measure(image, time, detections, None, "found")
 

@@ -55,11 +55,15 @@ def test_a_declared_dependency_has_a_lower_bound_and_a_pin_that_meets_it(
 
 
 def installed_pins() -> set[str]:
-    """Every pinned package; those of the extra `dask`, the last paragraph, only where it is."""
-    always, _, extra = (ROOT / "constraints.txt").read_text().partition("\n# The extra `dask`")
-    assert extra
-    with_dask = find_spec("distributed") is not None
-    return set(pins() if with_dask else pins_of(always))
+    """Every pinned package; those of the extras at the end of the file only where they are."""
+    text = (ROOT / "constraints.txt").read_text()
+    always, dask, apriltag = re.split(r"\n# The extra `(?:dask|apriltag)`", text)
+    found = set(pins_of(always))
+    if find_spec("distributed") is not None:
+        found |= set(pins_of(dask.partition("\n")[2]))
+    if find_spec("pyapriltags") is not None:
+        found |= set(pins_of(apriltag.partition("\n")[2]))
+    return found
 
 
 def test_the_pins_are_closed_under_dependencies() -> None:

@@ -1,0 +1,101 @@
+"""Tags that are small, blurred or faint, and squares that are none."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.tracking.hard_pictures import Condition, HardPrinter
+from tests.tracking.tag_pictures import FAMILY
+from tracking.bits import carries_tag
+from tracking.decoding import TagDecoder
+from tracking.detector import TagDetector
+from tracking.marks import CORNER_SIGNS, official_modules
+from tracking.picture import Region
+
+HARD = {
+    "small": Condition(side_px=12.5),
+    "in motion": Condition(side_px=60, motion_px=10.0),
+    "out of focus": Condition(side_px=48, blur_px=2.8),
+    "faint": Condition(side_px=40, contrast=12.0),
+}
+
+
+@pytest.fixture(scope="module")
+def printer() -> HardPrinter:
+    return HardPrinter(FAMILY, 587)
+
+
+@pytest.fixture(scope="module")
+def detector() -> TagDetector:
+    return TagDetector(FAMILY)
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_a_thorough_look_finds_what_a_plain_one_misses(
+    printer: HardPrinter, detector: TagDetector, name: str
+) -> None:
+    rng, plain, thorough = np.random.default_rng(4), 0, 0
+    for _ in range(6):
+        picture = printer.picture(HARD[name], rng)
+        plain += len(detector.detect(picture.image))
+        found = detector.detect(picture.image, thorough=True)
+        assert [d.id for d in found] in ([], [picture.number])
+        for d in found:
+            thorough += 1
+            assert np.abs(d.corners - picture.corners).max() < 3.0
+    assert thorough == 6
+    assert plain < 6
+
+
+def test_a_tag_found_both_ways_is_told_once(printer: HardPrinter, detector: TagDetector) -> None:
+    picture = printer.picture(Condition(side_px=60), np.random.default_rng(1))
+    assert len(detector.detect_all(picture.image, thorough=True)) == 1
+
+
+def test_a_region_is_searched_thoroughly_too(printer: HardPrinter, detector: TagDetector) -> None:
+    picture = printer.picture(Condition(side_px=40, contrast=12.0), np.random.default_rng(1))
+    region = Region(40, 20, 280, 220)
+    (found,) = detector.detect(picture.image, region, thorough=True)
+    assert np.abs(found.corners - picture.corners).max() < 3.0
+
+
+def square_picture(modules: np.ndarray) -> np.ndarray:
+    """A square of modules of 10 px, with its border, on white."""
+    small = np.where(np.pad(modules, 2, constant_values=True), 230, 30).astype(np.uint8)
+    return np.asarray(cv2.resize(small, None, fx=10, fy=10, interpolation=cv2.INTER_NEAREST))
+
+
+def test_squares_with_any_other_pattern_are_no_tags(detector: TagDetector) -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        pattern = np.pad(rng.random((6, 6)) < 0.5, 1)
+        assert detector.detect(square_picture(pattern), thorough=True) == []
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_decoder_says_which_corner_is_which(turns: int) -> None:
+    image = square_picture(official_modules(FAMILY, 301))
+    corners = (CORNER_SIGNS * [1, -1] + 1) * 40.0 + 19.5
+    reading = TagDecoder(FAMILY).read(image, np.roll(corners, turns, axis=0))
+    assert reading is not None
+    assert reading.id == 301
+    np.testing.assert_array_equal(reading.corners, corners)
+
+
+def test_a_tag_without_white_around_it_or_without_contrast_is_not_read() -> None:
+    decoder, corners = TagDecoder(FAMILY), (CORNER_SIGNS * [1, -1] + 1) * 40.0 + 19.5
+    image = square_picture(official_modules(FAMILY, 301))
+    image[:20] = image[-20:] = 30
+    image[:, :20] = image[:, -20:] = 30
+    assert decoder.read(image, corners) is None
+    assert decoder.read(np.full_like(image, 128), corners) is None
+
+
+def test_the_pattern_of_a_given_tag_is_told_from_all_others() -> None:
+    image = square_picture(official_modules(FAMILY, 301))
+    corners = (CORNER_SIGNS * [1, -1] + 1) * 40.0 + 19.5
+    assert carries_tag(image, corners, FAMILY, 301)
+    assert [n for n in range(587) if n != 301 and carries_tag(image, corners, FAMILY, n)] == []
+    assert not carries_tag(image, np.roll(corners, 1, axis=0), FAMILY, 301)
