@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from calibration.camera import CameraCalibration
     from calibration.camera_verdict import CameraQuality
     from drivers.picture_folder import OneCamerasPictures
-    from tracking.detector import Image
+    from tracking.picture import Image
 
 
 def camera(
