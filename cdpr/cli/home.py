@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
+
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
@@ -35,6 +37,7 @@ def home(
         str | None,
         typer.Option(help="it hangs free, and this camera measures it ('synthetic', or an index)"),
     ] = None,
+    calibration: CalibrationOption = None,
     as_rig_file: Annotated[
         bool,
         typer.Option(
@@ -83,6 +86,7 @@ def home(
 
       cdpr home configs/gachon_8_6.yaml --camera synthetic --fast
     """
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.carry_out import ask_operator
     from cdpr.cli.home_facts import show_reference, show_wish
     from cdpr.cli.named_bus import require_own_time, rig_on_bus
@@ -93,7 +97,7 @@ def home(
     from executor.winch_laws import TakeUp
     from simulation.power_loss import PowerLoss
 
-    the_rig = rig_on_bus(rig, interface, channel)
+    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     in_process = the_rig.document.bus.interface == IN_PROCESS
     require_own_time(fast, in_process)
     if as_rig_file and not (at_home or pose_mm or camera):

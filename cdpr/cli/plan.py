@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.plan_options import (
     BudgetOption,
     CostOption,
@@ -54,6 +55,7 @@ def plan(
     scene: Annotated[Path, typer.Argument(help="scene file (YAML)", metavar="SCENE")],
     output: Annotated[Path, typer.Option("-o", "--output", help="plan file to write (JSON)")],
     seed: Annotated[int, typer.Option(min=0, help="random seed; the same seed, the same plan")] = 0,
+    calibration: CalibrationOption = None,
     clearance_mm: Annotated[
         float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
     ] = None,
@@ -98,6 +100,7 @@ def plan(
       cdpr plan configs/gachon_8_6.yaml configs/pick_and_place.yaml -o rest.json
       --from-run runs/stopped
     """
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.from_run import require_room, scene_after
     from cdpr.cli.output import show_facts, show_json
     from cdpr.cli.stop_facts import by_way_of
@@ -107,7 +110,7 @@ def plan(
     from cdpr.scene import load_scene
     from planner.paper.readings import Readings
 
-    the_rig = load_rig(rig)
+    the_rig = calibrated_rig(load_rig(rig), calibration)
     if from_run is not None and start_mm is not None:
         raise BadInput("--from-run and --start-mm both say where to begin", next_step="give one")
     the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
+
 if TYPE_CHECKING:
     from cdpr.poses import Pose
 
@@ -26,6 +28,7 @@ def run(
             help="'synthetic' (the default with the interface 'virtual'), or a camera's index"
         ),
     ] = None,
+    calibration: CalibrationOption = None,
     no_camera: Annotated[bool, typer.Option("--no-camera", help="run without a camera")] = False,
     interface: Annotated[
         str | None, typer.Option(help="python-can interface instead of the rig file's")
@@ -53,6 +56,7 @@ def run(
 
       cdpr run plan.json --rig rig.yaml -o runs/second --camera 0
     """
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.cameras import choose_camera
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.named_bus import rig_on_bus
@@ -62,7 +66,7 @@ def run(
     from executor.custody import Custody
     from executor.run_folder import RunFolder
 
-    the_rig = rig_on_bus(rig, interface, channel)
+    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     in_process = the_rig.document.bus.interface == IN_PROCESS
     camera_name = choose_camera(the_rig, camera, no_camera, in_process)
     start = _simulated_start(simulated_start_mm, in_process, fast)

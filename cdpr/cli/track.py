@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
+
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
@@ -34,6 +36,7 @@ def track(
     camera: Annotated[
         str | None, typer.Option(help="name of the camera in the rig file (default: the first)")
     ] = None,
+    calibration: CalibrationOption = None,
     scene: Annotated[
         Path | None, typer.Option(help="also measure the clearance to this scene's obstacles")
     ] = None,
@@ -58,6 +61,7 @@ def track(
     """
     from itertools import islice
 
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
     from cdpr.rig import load_rig
@@ -68,7 +72,7 @@ def track(
     from tracking.tracker import Tracker
 
     check_output(output, force)
-    the_rig = load_rig(rig)
+    the_rig = calibrated_rig(load_rig(rig), calibration)
     the_camera = _camera(the_rig, camera)
     the_scene = _scene(scene, plan)
     frames, total = _source(the_rig, the_scene, the_camera, source, plan)

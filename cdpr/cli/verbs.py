@@ -8,6 +8,7 @@ from collections.abc import Callable
 import typer
 
 from cdpr.cli import bench, calibrate
+from cdpr.cli.calibrate_diff import diff
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
@@ -50,7 +51,7 @@ def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
         app.command()(_interruptible(verb))
-    _add_group(app, "calibrate", "Calibrate cameras.", calibrate.camera)
+    _add_group(app, "calibrate", "Calibrate and compare.", calibrate.camera, diff)
     _add_group(app, "bench", "Measure the planner.", bench.paper)
 
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from datetime import date
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.camera_result import CameraResult
 from calibration.interval import Interval
 from calibration.kinds import calibrated, load_result
-from calibration.result_file import common_keys, write_result
+from calibration.result_file import write_result
 from calibration.verdict import Lack, Verdict
 from cdpr.errors import BadInput
 from cdpr.rig import Rig, load_rig
+from tests.calibration.results import camera_result_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -23,27 +22,6 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return load_rig(CONFIGS / "gachon_8_6.yaml")
-
-
-def camera_result_of(name: str = "front", fx: float = 905.0, size=(1280, 720)) -> CameraResult:
-    verdict = Verdict.of(0.4e-3, 1e-3, "at 1.5 m", [])
-    intervals = {"fx_px": Interval(fx, 0.5), "cx_px": Interval(640.0, 0.7)}
-    return CameraResult(
-        **common_keys(name, date(2026, 3, 1), "ab" * 32, intervals, verdict, {"a.png": "is bad"}),
-        width_px=size[0],
-        height_px=size[1],
-        fx_px=fx,
-        fy_px=906.0,
-        cx_px=640.0,
-        cy_px=361.0,
-        distortion=[-0.1, 0.04, 0.0, 0.0, 0.0],
-        rms_px=0.1,
-        distance_m=1.5,
-        halves_apart_mm=0.2,
-        covered=0.9,
-        pictures_used=20,
-        view_errors_px={"b.png": 0.1},
-    )
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:

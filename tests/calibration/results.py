@@ -1,0 +1,31 @@
+"""Results as if found by a calibration."""
+
+from __future__ import annotations
+
+from datetime import date
+
+from calibration.camera_result import CameraResult
+from calibration.interval import Interval
+from calibration.result_file import common_keys
+from calibration.verdict import Verdict
+
+
+def camera_result_of(name: str = "front", fx: float = 905.0, size=(1280, 720)) -> CameraResult:
+    verdict = Verdict.of(0.4e-3, 1e-3, "at 1.5 m", [])
+    intervals = {"fx_px": Interval(fx, 0.5), "cx_px": Interval(640.0, 0.7)}
+    return CameraResult(
+        **common_keys(name, date(2026, 3, 1), "ab" * 32, intervals, verdict, {"a.png": "is bad"}),
+        width_px=size[0],
+        height_px=size[1],
+        fx_px=fx,
+        fy_px=906.0,
+        cx_px=640.0,
+        cy_px=361.0,
+        distortion=[-0.1, 0.04, 0.0, 0.0, 0.0],
+        rms_px=0.1,
+        distance_m=1.5,
+        halves_apart_mm=0.2,
+        covered=0.9,
+        pictures_used=20,
+        view_errors_px={"b.png": 0.1},
+    )

@@ -1,0 +1,57 @@
+"""`--calibration` and `cdpr calibrate diff`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from calibration.result_file import write_result
+from tests.calibration.results import camera_result_of
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import call, nothing_written, one_message
+
+SCENE = CONFIGS / "environment_1.yaml"
+
+
+def test_a_plan_is_made_for_the_calibrated_rig(tmp_path: Path) -> None:
+    result = write_result(tmp_path, camera_result_of())
+    answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", "--calibration", result)
+    assert answer.code == 0, answer
+    rig = json.loads((tmp_path / "plan.json").read_text())["rig"]
+    assert rig["cameras"][0]["fx_px"] == 905.0
+
+
+@pytest.mark.parametrize("verb", ["plan", "run", "home", "track"])
+def test_results_about_another_camera_are_refused_by_name(tmp_path: Path, verb: str) -> None:
+    result = write_result(tmp_path, camera_result_of("side"))
+    options = {
+        "plan": (RIG, SCENE, "-o", tmp_path / "plan.json"),
+        "run": (tmp_path / "plan.json", "--rig", RIG, "-o", tmp_path / "run"),
+        "home": (RIG, "--at-home", "--fast"),
+        "track": (RIG, tmp_path, "-o", tmp_path / "poses.csv"),
+    }[verb]
+    with nothing_written(tmp_path):
+        answer = call(verb, *options, "--calibration", result)
+    one_message(answer, 2, "no camera 'side'", "front")
+
+
+def test_a_file_that_is_no_result_is_refused(tmp_path: Path) -> None:
+    answer = call("track", RIG, tmp_path, "-o", tmp_path / "a.csv", "--calibration", RIG)
+    one_message(answer, 2, "no calibration result", "gachon_8_6.yaml")
+
+
+def test_results_are_compared(tmp_path: Path) -> None:
+    one = write_result(tmp_path, camera_result_of())
+    (tmp_path / "later").mkdir()
+    same = write_result(tmp_path / "later", camera_result_of(fx=905.3))
+    answer = call("calibrate", "diff", one, same)
+    assert answer.code == 0, answer
+    assert answer.out.splitlines()[1].split()[:3] == ["verdict", "they", "agree:"]
+    other = write_result(tmp_path / "later", camera_result_of(fx=925.0))
+    answer = call("calibrate", "diff", one, other, "--json")
+    assert answer.code == 3
+    found = json.loads(answer.out)
+    assert found["changes"]["fx_px"]["beyond"]
+    assert found["apart_mm"] > found["stated_mm"]
