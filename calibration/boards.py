@@ -174,6 +174,19 @@ class Charuco:
             return None
         return Seen(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
+    def markers(self) -> list[tuple[Array, NDArray[np.bool_]]]:
+        """Top left corner in the board's plane, shape (2,), [m], and white modules of each."""
+        dictionary = self._board.getDictionary()
+        side = dictionary.markerSize + 2
+        numbers = [int(number) for number in np.ravel(self._board.getIds())]
+        return [
+            (
+                np.asarray(corners, dtype=np.float64)[0, :2],
+                np.asarray(cv2.aruco.generateImageMarker(dictionary, number, side) > 127),
+            )
+            for number, corners in zip(numbers, self._board.getObjPoints(), strict=True)
+        ]
+
     @cached_property
     def _board(self) -> cv2.aruco.CharucoBoard:
         board = cv2.aruco.CharucoBoard(

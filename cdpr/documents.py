@@ -27,6 +27,7 @@ __all__ = [
     "read_text",
     "read_yaml",
     "write_atomic",
+    "write_bytes_atomic",
 ]
 
 Model = TypeVar("Model", bound=Document)
@@ -167,6 +168,15 @@ def content_hash(document: Any) -> str:
 
 
 def write_atomic(path: Path, text: str) -> None:
+    """Writes a whole text file or nothing.
+
+    Raises:
+        BadInput: The folder is missing, cannot be written to or is full.
+    """
+    write_bytes_atomic(path, text.encode())
+
+
+def write_bytes_atomic(path: Path, data: bytes) -> None:
     """Writes a whole file or nothing.
 
     Raises:
@@ -180,8 +190,8 @@ def write_atomic(path: Path, text: str) -> None:
         hint = "choose a folder that exists and that you may write to"
         raise _not_written(path, error, hint) from None
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
             stream.flush()
             os.fsync(handle)  # or a power cut could leave the new name on an empty file
         Path(temporary).chmod(0o644)

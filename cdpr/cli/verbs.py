@@ -9,6 +9,7 @@ import typer
 
 from cdpr.cli import bench, calibrate
 from cdpr.cli.calibrate_diff import diff
+from cdpr.cli.calibrate_print import print_
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
@@ -51,14 +52,14 @@ def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
         app.command()(_interruptible(verb))
-    _add_group(app, "calibrate", "Calibrate and compare.", calibrate.camera, diff)
+    _add_group(app, "calibrate", "Calibrate and compare.", calibrate.camera, print_, diff)
     _add_group(app, "bench", "Measure the planner.", bench.paper)
 
 
 def _add_group(app: typer.Typer, name: str, text: str, *verbs: Callable[..., None]) -> None:
     group = typer.Typer(help=text, no_args_is_help=True)
     for verb in verbs:
-        group.command()(_interruptible(verb))
+        group.command(verb.__name__.rstrip("_"))(_interruptible(verb))
     app.add_typer(group, name=name)
 
 

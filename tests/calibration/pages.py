@@ -1,0 +1,36 @@
+"""Reads our PDF pages back by an independent route: the operators of their content streams."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from calibration.pdf import POINTS_A_MM
+from cdpr.poses import Array
+
+
+def pages_in(data: bytes) -> list[tuple[Array, Array, list[str]]]:
+    """Of every page: size [mm], shape (2,); black rectangles in mm from the top left; texts."""
+    found = []
+    boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", data)
+    streams = re.findall(rb"stream\n(.*?)\nendstream", data, re.DOTALL)
+    for box, stream in zip(boxes, streams, strict=True):
+        size = np.array([float(x) for x in box]) / POINTS_A_MM
+        text = stream.decode()
+        a, b, c, d, e, f = map(float, re.search(r"([-\d. ]+) cm", text).group(1).split())
+        assert b == c == e == 0.0
+        sizes = np.array([[float(x) for x in m.split()] for m in re.findall(r"(.+) re", text)])
+        left, top = sizes[:, 0] * a, size[1] * POINTS_A_MM - (sizes[:, 1] * d + f)
+        rectangles = np.column_stack([left, top, sizes[:, 2] * a, -sizes[:, 3] * d]) / POINTS_A_MM
+        found.append((size, rectangles, re.findall(r"\((.*)\) Tj", text)))
+    return found
+
+
+def drawn(size_mm: Array, rectangles: Array, per_mm: float) -> np.ndarray:
+    """A grey picture of a page, ink 20 and paper 235."""
+    width, height = np.round(size_mm * per_mm).astype(int)
+    picture = np.full((height, width), 235, np.uint8)
+    for x, y, w, h in rectangles * per_mm:
+        picture[round(y) : round(y + h), round(x) : round(x + w)] = 20
+    return picture

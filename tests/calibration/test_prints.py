@@ -1,0 +1,139 @@
+"""Printed boards and tags: exact to the micrometre, and found by our own detectors."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.boards import Board, Charuco, Chessboard, TagGrid
+from calibration.pdf import pdf_of
+from calibration.prints import board_print, tag_print
+from calibration.sheets import MARGIN_MM, PAPERS, sheet_of, sheets_of
+from cdpr.errors import BadInput
+from tests.calibration.pages import drawn, pages_in
+from tracking.detector import TagDetector
+
+BOARDS = [
+    Chessboard(9, 6, 0.025),
+    Charuco(7, 5, 0.035, 0.026, "4X4_50"),
+    Charuco(5, 8, 0.030, 0.022, "5X5_100", legacy=True),
+    TagGrid(6, 4, 0.030, 0.009, "tag36h11", first=40),
+]
+PER_MM = 6.0
+
+
+def page_of(board: Board, paper: str = "a4"):
+    return pages_in(pdf_of([sheet_of(board_print(board), paper)], "a board"))[0]
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=str)
+def test_a_printed_board_is_found_in_its_size(board: Board) -> None:
+    size, rectangles, texts = page_of(board)
+    seen = board.find(drawn(size, rectangles, PER_MM))
+    assert seen is not None
+    # The corners as found on paper, [mm], must be the board's points turned and shifted only.
+    on_paper, points = (seen.corners + 0.5) / PER_MM, seen.points[:, :2] * 1e3
+    spread = np.linalg.norm(points - points.mean(axis=0))
+    assert np.linalg.norm(on_paper - on_paper.mean(axis=0)) / spread == pytest.approx(1.0, abs=5e-4)
+    expected = {Chessboard: 54, Charuco: 24 if not getattr(board, "legacy", 0) else 28, TagGrid: 96}
+    assert len(points) == expected[type(board)]
+    assert any("This side down" in text for text in texts)
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=str)
+def test_a_printed_board_keeps_white_around_it_and_inside_the_paper(board: Board) -> None:
+    size, rectangles, _ = page_of(board)
+    print_ = board_print(board)
+    ink = rectangles[len(rectangles) - len(print_.black) :]
+    quiet = print_.quiet * 1e3 - 1e-6
+    left_top, right_bottom = ink[:, :2].min(axis=0), (ink[:, :2] + ink[:, 2:]).max(axis=0)
+    assert (left_top >= quiet).all()
+    assert (right_bottom <= size - quiet).all()
+    ruler = rectangles[: len(rectangles) - len(print_.black)]
+    assert ruler[:, 1].min() >= right_bottom[1] + quiet
+    assert ((ruler[:, 1] + ruler[:, 3]) <= size[1] - MARGIN_MM).all()
+
+
+def test_edges_are_exact_to_a_micrometre() -> None:
+    _, rectangles, _ = page_of(BOARDS[0])
+    squares = rectangles[rectangles[:, 2] > 20.0]
+    squares = squares[squares[:, 3] > 20.0]
+    assert len(squares) == 35
+    assert np.abs(squares[:, 2:] - 25.0).max() < 1e-3
+    steps = (squares[:, :2] - squares[:, :2].min(axis=0)) / 25.0
+    assert np.abs(steps - np.round(steps)).max() * 25.0 < 1e-3
+
+
+def test_the_ruler_is_a_hundred_millimetres_with_a_tick_each() -> None:
+    _, rectangles, texts = page_of(BOARDS[0])
+    ticks = rectangles[np.abs(rectangles[:, 2] - 0.1) < 1e-6]
+    assert len(ticks) == 101
+    middles = np.sort(ticks[:, 0] + ticks[:, 2] / 2.0)
+    assert np.abs(np.diff(middles) - 1.0).max() < 1e-4
+    assert any("100 mm" in text for text in texts)
+
+
+def test_single_tags_are_printed_in_their_sizes_with_their_names() -> None:
+    prints = [tag_print("tag36h11", k, size) for k, size in ((301, 0.096), (7, 0.030), (8, 0.030))]
+    pages = pages_in(pdf_of(sheets_of(prints, "a4"), "tags"))
+    found, named = {}, []
+    for size, rectangles, texts in pages:
+        named += texts
+        for seen in TagDetector("tag36h11").detect(drawn(size, rectangles, 4.0)):
+            sides = np.linalg.norm(seen.corners - np.roll(seen.corners, 1, axis=0), axis=1) / 4.0
+            found[seen.id] = float(sides.mean())
+    assert found == {
+        301: pytest.approx(96.0, abs=0.5),
+        7: pytest.approx(30.0, abs=0.5),
+        8: pytest.approx(30.0, abs=0.5),
+    }
+    assert any("tag36h11 301, black square 96 mm" in text for text in named)
+
+
+def test_a_board_that_does_not_fit_is_refused_with_the_paper_that_would_do() -> None:
+    with pytest.raises(BadInput) as caught:
+        sheet_of(board_print(Chessboard(9, 6, 0.035)), "a4")
+    assert caught.value.next_step == "use --paper a3"
+    assert "a4 has 210 x 297 mm" in caught.value.what
+    with pytest.raises(BadInput, match="needs paper of") as caught:
+        sheet_of(board_print(Chessboard(9, 6, 0.070)), "a3")
+    assert "smaller" in caught.value.next_step
+    with pytest.raises(BadInput, match="needs paper of"):
+        sheets_of([tag_print("tag36h11", 0, 0.25)], "a4")
+
+
+def test_tags_whose_white_borders_would_be_lost_are_refused() -> None:
+    with pytest.raises(BadInput, match="less than a module"):
+        board_print(TagGrid(3, 2, 0.040, 0.002, "tag36h11"))
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_the_table_of_a_file_points_at_its_objects(paper: str) -> None:
+    data = pdf_of([sheet_of(board_print(Chessboard(4, 3, 0.03)), paper)] * 2, "two (2) pages")
+    start = int(re.search(rb"startxref\n(\d+)", data).group(1))
+    assert data[start : start + 4] == b"xref"
+    places = re.findall(rb"(\d{10}) 00000 n ", data)
+    for number, place in enumerate(places, 1):
+        assert data[int(place) :].startswith(b"%d 0 obj" % number)
+    assert rb"two \(2\) pages" in data
+
+
+@pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="needs poppler's pdftoppm")
+def test_a_foreign_renderer_draws_what_we_meant(tmp_path: Path) -> None:
+    page = sheet_of(board_print(BOARDS[1]), "a4")
+    (tmp_path / "board.pdf").write_bytes(pdf_of([page], "board"))
+    command = ["pdftoppm", "-r", "150", "-gray", "-singlefile", "board.pdf", "board"]
+    subprocess.run(command, cwd=tmp_path, check=True, timeout=60)
+    picture = cv2.imread(str(tmp_path / "board.pgm"), cv2.IMREAD_GRAYSCALE)
+    seen = BOARDS[1].find(picture)
+    assert seen is not None
+    assert len(seen.points) == 24
+    on_paper, points = seen.corners / 150.0 * 25.4, seen.points[:, :2] * 1e3
+    gap = np.linalg.norm(on_paper[0] - on_paper[-1]) / np.linalg.norm(points[0] - points[-1])
+    assert gap == pytest.approx(1.0, abs=1e-3)

@@ -1,0 +1,58 @@
+"""`cdpr calibrate print`: a file in exact size, or one clear message."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.calibration.pages import pages_in
+from tests.cli.plans import RIG
+from tests.cli.program import call, nothing_written, one_message
+
+BOARD = ("--columns", "9", "--rows", "6", "--square-mm", "25")
+
+
+def test_a_board_is_printed(tmp_path: Path) -> None:
+    answer = call("calibrate", "print", tmp_path / "board.pdf", *BOARD, "--json")
+    assert answer.code == 0, answer
+    told = json.loads(answer.out)
+    assert (told["pages"], told["width_mm"], told["height_mm"]) == (1, 297.0, 210.0)
+    assert "measure the ruler" in told["next_steps"][0]
+    ((size, _, _),) = pages_in((tmp_path / "board.pdf").read_bytes())
+    assert size.round(2).tolist() == [297.0, 210.0]
+
+
+def test_the_tags_of_a_rig_are_printed(tmp_path: Path) -> None:
+    answer = call("calibrate", "print", tmp_path / "tags.pdf", "--rig", RIG)
+    assert answer.code == 0, answer
+    texts = [text for page in pages_in((tmp_path / "tags.pdf").read_bytes()) for text in page[2]]
+    for number in (301, 306, 401, 404):
+        assert any(f"tag36h11 {number}," in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ((*BOARD[:-1], "35"), "use --paper a3"),
+        ((*BOARD, "--rig", RIG), "--rig prints the rig's tags"),
+        ((), "needs --columns and --rows"),
+        (("--columns", "9", "--rows", "6"), "needs --square-mm"),
+        (
+            ("--board", "tags", "--columns", "3", "--rows", "2", "--tag-mm", "40", "--gap-mm", "2"),
+            "less than a module",
+        ),
+    ],
+)
+def test_prints_that_cannot_be_are_refused(tmp_path: Path, options, named: str) -> None:
+    with nothing_written(tmp_path):
+        answer = call("calibrate", "print", tmp_path / "board.pdf", *options)
+    one_message(answer, 2, named)
+
+
+def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "board.pdf").write_text("mine")
+    answer = call("calibrate", "print", tmp_path / "board.pdf", *BOARD)
+    one_message(answer, 2, "exists already")
+    assert (tmp_path / "board.pdf").read_text() == "mine"
