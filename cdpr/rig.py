@@ -22,7 +22,10 @@ from cdpr.rig_file import (
 )
 
 #: Parts of a rig file that a plan's proof does not rest on; they may change under a plan.
-NOT_IN_PLAN_HASH = ("description", "bus", "drives", "tags", "cameras", "motion", "winches")
+NOT_IN_PLAN_HASH = (
+    *("description", "bus", "drives", "tags", "cameras", "motion", "winches"),
+    "simulation",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,6 +19,7 @@ from cdpr.document_types import (
     Vector,
 )
 from cdpr.drives_file import ODRIVE_LAST_NODE, Cia402Document, DrivesDocument
+from cdpr.simulation_file import SimulationDocument
 from cdpr.tag_families import TagDetectorName, TagFamily, tags_in
 
 
@@ -182,6 +183,7 @@ class RigDocument(Document):
     drives: DrivesDocument = Cia402Document(type="cia402")
     tags: TagsDocument | None = None
     cameras: list[CameraDocument] = []
+    simulation: SimulationDocument | None = None
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Counts that do not agree, numbers given twice, a home pose outside the workspace."""
@@ -196,6 +198,7 @@ class RigDocument(Document):
             self._tags_of_the_family,
             self._cameras_once,
             self._home_inside,
+            self._simulation_fits,
         )
 
     def _enough_cables(self) -> list[Finding]:
@@ -272,6 +275,12 @@ class RigDocument(Document):
             for axis, low, value, high in box
             if not low <= value <= high
         ]
+
+    def _simulation_fits(self) -> list[Finding]:
+        if self.simulation is None:
+            return []
+        names = [camera.name for camera in self.cameras]
+        return self.simulation.misfits(len(self.outlets_mm), self.pulleys is not None, names)
 
 
 def _repeated(

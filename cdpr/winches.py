@@ -19,13 +19,17 @@ from cdpr.statics.working import working_tensions
 class WinchMap:
     """Unstrained cable lengths, strained lengths and drive counts of one rig."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, stiffness: Array | None = None) -> None:
         """Computes the reference at home.
+
+        Args:
+            rig: The robot.
+            stiffness: E·A of each cable where they differ, shape (m,), [N].
 
         Raises:
             TensionInfeasible: The rig cannot hold its platform at home.
         """
-        self.stiffness = rig.cable_stiffness
+        self.stiffness = rig.cable_stiffness if stiffness is None else stiffness
         self.behind_outlet = read_only([w.drum_to_outlet for w in rig.winches])
         self.counts_per_metre = read_only([w.counts_per_metre for w in rig.winches])
         self.home_counts = read_only([w.home_counts for w in rig.winches])

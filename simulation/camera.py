@@ -6,8 +6,6 @@ What stands still is drawn once; a picture redraws the platform's surroundings a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -29,26 +27,12 @@ from simulation.camera_canvas import (
     region_of,
     sample_rays,
 )
+from simulation.optics import Optics
 
 #: Brightness of the platform's faces in full light.
 PLATFORM = 168.0
 #: Slack of the precomputed noise, in which each picture takes another place, [px].
 NOISE_SLACK = 96
-
-
-@dataclass(frozen=True, slots=True)
-class Optics:
-    """What the sensor and the lens do to brightness.
-
-    Attributes:
-        noise: Standard deviation, [grey levels of 255].
-        vignetting: Light lost in the corners of the picture, share of 1.
-        blur: Standard deviation of the lens's and focus's blur, [px].
-    """
-
-    noise: float = 1.5
-    vignetting: float = 0.25
-    blur: float = 0.0
 
 
 class SyntheticCamera:
@@ -79,7 +63,7 @@ class SyntheticCamera:
         self._camera_from_world = camera.world_from_camera.inverse()
         self._background = Canvas.blank(camera, sample_rays(camera), ROOM)
         draw_background(self._background, rig, scene, self._camera_from_world)
-        self._light = _vignette(camera, self.optics.vignetting)
+        self._light = _vignette(camera, self.optics.vignetting) * np.float32(self.optics.light)
         self._still = self._exposed(self._background, self._light)
         self._depth = self._background.depth[1::SAMPLES, 1::SAMPLES].copy()
         self._noise = _noise(camera, self.optics.noise, seed)
@@ -103,9 +87,9 @@ class SyntheticCamera:
             picture[rows, columns] = self._exposed(canvas, self._light[rows, columns])
             depth = depth.copy()
             depth[rows, columns] = canvas.depth[1::SAMPLES, 1::SAMPLES]
-        cables = cables_at(self.rig, pose)
-        radius = self.rig.cable_radius
-        draw_cables(picture, depth, self.camera, cables, self._camera_from_world, radius)
+        if self.optics.cables:
+            cables, radius = cables_at(self.rig, pose), self.rig.cable_radius
+            draw_cables(picture, depth, self.camera, cables, self._camera_from_world, radius)
         return self._with_noise(picture, frame)
 
     def _platform_region(self, pose: Pose) -> Region:

@@ -31,19 +31,23 @@ class Plant:
     EA · max(0, (l + d) / L0 − 1), l from outlet to anchor and d from drum to outlet.
     """
 
-    def __init__(self, rig: Rig, pose: Pose, load: Load | None = None) -> None:
+    def __init__(
+        self, rig: Rig, pose: Pose, load: Load | None = None, stiffness: Array | None = None
+    ) -> None:
         """Puts the platform at a pose under its working tensions.
 
         Args:
             rig: The robot.
             pose: ``world_from_platform``.
             load: What the platform carries.
+            stiffness: E·A of each cable where they differ, shape (m,), [N].
 
         Raises:
             TensionInfeasible: The cables cannot hold the platform there.
         """
         self._rig = rig
-        self.winch_map = WinchMap(rig)
+        self.winch_map = WinchMap(rig, stiffness)
+        self._axial = np.broadcast_to(self.winch_map.stiffness, rig.cable_count)
         self._behind = self.winch_map.behind_outlet
         self._weight, self._centre = _weight(rig, load)
         self._reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
@@ -117,7 +121,7 @@ class Plant:
             except ValueError:  # an anchor inside its pulley
                 return False
             strain = (cables.lengths + self._behind) / self._unstrained - 1.0
-            tensions = self._rig.cable_stiffness * strain
+            tensions = self._axial * strain
             columns = _columns(pose, cables)
             gradient = self._gradient(pose, columns, tensions)
             if self._small(gradient):
@@ -125,7 +129,7 @@ class Plant:
                     return False
                 self.pose, self.tensions = pose, read_only(tensions)
                 return True
-            axial = self._rig.cable_stiffness / self._unstrained
+            axial = self._axial / self._unstrained
             stiffness = self._stiffness(pose, cables, axial, np.maximum(tensions, 0.0))
             try:
                 pose = _moved(pose, np.asarray(np.linalg.solve(stiffness, -gradient)))
@@ -163,11 +167,11 @@ class Plant:
         except ValueError as error:  # an anchor inside its pulley
             raise self._lost(str(error), self._unstrained) from error
         strain = (cables.lengths + self._behind) / self._unstrained - 1.0
-        tensions: Array = self._rig.cable_stiffness * np.maximum(strain, 0.0)
+        tensions: Array = self._axial * np.maximum(strain, 0.0)
         return cables, tensions
 
     def _energy(self, pose: Pose, tensions: Array) -> float:
-        elastic = (tensions * tensions) @ self._unstrained / (2.0 * self._rig.cable_stiffness)
+        elastic = (tensions * tensions) @ (self._unstrained / (2.0 * self._axial))
         height = pose.position[2] + pose.rotation[2] @ self._centre
         return float(elastic + self._weight * height)
 
@@ -186,7 +190,7 @@ class Plant:
 
     def _newton_step(self, pose: Pose, cables: Cables, tensions: Array, gradient: Array) -> Array:
         """A descent direction; damped until the stiffness is positive definite."""
-        taut = np.where(tensions > 0.0, self._rig.cable_stiffness / self._unstrained, 0.0)
+        taut = np.where(tensions > 0.0, self._axial / self._unstrained, 0.0)
         stiffness = self._stiffness(pose, cables, taut, tensions)
         scale = np.array([1.0, 1.0, 1.0, self._reach, self._reach, self._reach])
         damping = 0.0

@@ -1,15 +1,19 @@
-"""The simulated rig for the drives that a rig file names."""
+"""The simulated rig for the drives that a rig file names, and its camera."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import can
 
 from cdpr.poses import Pose
-from cdpr.rig import Rig
-from cdpr.scene import Load
+from cdpr.rig import Camera, Rig
+from cdpr.scene import Load, Scene
+from simulation.as_built import camera_as_built, rig_as_built, simulation_of
 from simulation.simulated_rig import SimulatedRig
+
+if TYPE_CHECKING:
+    from simulation.camera import SyntheticCamera
 
 
 def make_rehearsal(
@@ -24,3 +28,20 @@ def make_rehearsal(
     from simulation.rehearsal import Rehearsal
 
     return Rehearsal(rig, bus, start_pose, load)
+
+
+def make_synthetic_camera(rig: Rig, scene: Scene, camera: Camera) -> SyntheticCamera:
+    """The camera as it truly is, before the rig as it was truly built.
+
+    Args:
+        rig: The robot, with the ``simulation`` section of its file.
+        scene: Its obstacles.
+        camera: One of the rig's, as the rig file describes it.
+
+    Raises:
+        BadInput: The rig has no tags, or the true lens cannot be.
+    """
+    from simulation.camera import SyntheticCamera
+
+    truth, optics = camera_as_built(rig, camera)
+    return SyntheticCamera(rig_as_built(rig), scene, truth, simulation_of(rig).seed, optics)

@@ -13,13 +13,23 @@ from typing import Generic, Protocol, TypeVar
 import can
 import numpy as np
 
+from cdpr.cables import cables_at
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 from cdpr.scene import Load
+from cdpr.statics.working import working_tensions
+from cdpr.winches import WinchMap
 from drivers.bus import SentFrame, take, transmit
 from drivers.bus_faults import BusDown
+from simulation.as_built import (
+    rig_as_built,
+    simulation_of,
+    stiffness_as_built,
+    winches_as_built,
+)
 from simulation.drive_motion import Motor
 from simulation.plant import Plant
+from simulation.transmission import Transmission
 
 Frame = bytes | bytearray
 
@@ -88,7 +98,10 @@ class SimulatedRig(ABC, Generic[Drive]):
     def __init__(
         self, rig: Rig, bus: can.BusABC, start_pose: Pose, load: Load | None = None
     ) -> None:
-        """Switches the drives on with the platform hanging at a pose under working tensions.
+        """Switches the drives on where the rig file says that they stand at a pose.
+
+        There the platform hangs under working tensions, if the rig is built as its file says; if
+        not, near it.
 
         Args:
             rig: The robot.
@@ -102,11 +115,17 @@ class SimulatedRig(ABC, Generic[Drive]):
         """
         self._rig, self._bus = rig, bus
         self._cycle = rig.document.bus.cycle_ms / 1000.0
-        self.plant = Plant(rig, start_pose, load)
+        self.plant = Plant(rig_as_built(rig), start_pose, load, stiffness_as_built(rig))
         self.cycles = 0
         self._per_newton = self._torque_per_newton()
-        self._counts = np.rint(self.plant.counts_for(start_pose, self.plant.tensions))
-        self.plant.settle_counts(self._counts)
+        self._counts = _counts_as_told(rig, start_pose, load)
+        winches = winches_as_built(rig)
+        per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
+        play = per_metre * winches.backlash_mm / 1000.0
+        self._transmission = Transmission(play, winches.step_counts, self._counts)
+        self.plant.settle_counts(self._transmission.drums(self._counts))
+        self._tension_noise = winches.tension_noise_n
+        self._random = np.random.default_rng([simulation_of(rig).seed, 0x7E45])
         self.drives: tuple[Drive, ...] = ()
         self.drives = tuple(
             self._make_drive(number, float(counts), self._top_speed(number))
@@ -227,7 +246,10 @@ class SimulatedRig(ABC, Generic[Drive]):
     def _feel(self) -> None:
         """The drives feel the cables as they are now."""
         self._settle()
-        torques = self.plant.tensions * self._per_newton
+        told = self.plant.tensions
+        if self._tension_noise > 0.0:
+            told = told + self._tension_noise * self._random.standard_normal(len(told))
+        torques = told * self._per_newton
         for drive, torque in zip(self.drives, torques.tolist(), strict=True):
             drive.torque = torque if drive.torque_on else 0.0
 
@@ -235,9 +257,16 @@ class SimulatedRig(ABC, Generic[Drive]):
         """The platform goes where the drums let it; nothing to do while none has turned."""
         counts = np.array([drive.motor.position for drive in self.drives])
         if not np.array_equal(counts, self._counts):
-            self.plant.settle_counts(counts)
+            self.plant.settle_counts(self._transmission.drums(counts))
             self._counts = counts
 
     def _send(self, can_id: int, data: Frame) -> None:
         with suppress(BusDown):  # nobody is reached
             transmit(self._bus, SentFrame(can_id, data))
+
+
+def _counts_as_told(rig: Rig, pose: Pose, load: Load | None) -> Array:
+    """Whole drive positions that hold a pose, by the rig file, shape (m,), [counts]."""
+    winches = WinchMap(rig)
+    tensions = working_tensions(rig, pose, load).tensions
+    return np.rint(winches.counts(winches.unstrained(cables_at(rig, pose).lengths, tensions)))

@@ -153,9 +153,9 @@ def make_observer(
 
 def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
     if name == SYNTHETIC:
-        from simulation.camera import SyntheticCamera
+        from simulation.simulate import make_synthetic_camera
 
-        return RenderedPictures(SyntheticCamera(rig, scene, camera))
+        return RenderedPictures(make_synthetic_camera(rig, scene, camera))
     from drivers.cameras import LiveCamera
 
     return LivePictures(LiveCamera(name, camera))

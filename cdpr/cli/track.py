@@ -185,9 +185,9 @@ def _rendered(
     rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
 ) -> Iterable[Picture]:
     from drivers.cameras import Frame
-    from simulation.camera import SyntheticCamera
+    from simulation.simulate import make_synthetic_camera
 
-    synthetic = SyntheticCamera(rig, scene, camera)
+    synthetic = make_synthetic_camera(rig, scene, camera)
     for number, (time, pose) in enumerate(looks):
         yield Frame(time, synthetic.render(pose, number), f"rendered {number}")
 
