@@ -1,22 +1,22 @@
-"""Where the camera stands, from surveyed tags on the frame."""
+"""Where a camera stands, how sure that is, and what it is good for."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
 
 import numpy as np
+from scipy.stats import t as student
 
-from cdpr.errors import BadInput
-from cdpr.poses import Array, Pose, read_only
+from calibration.interval import CONFIDENCE
+from calibration.verdict import Lack, Verdict
+from cdpr.poses import Array, Pose, skew
 from cdpr.rig import Camera, Rig
-from tracking.bundle import TagView
-from tracking.camera_check import check_camera, measured_camera
-from tracking.detector import TagDetector
-from tracking.edges import refine
-from tracking.marks import modules_across
-from tracking.picture import Image
+
+SURE = 1.96
+"""Deviations of a normal error that hold 95 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,17 +25,26 @@ class ExtrinsicCalibration:
 
     Attributes:
         camera: The camera at its new place.
-        covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6);
-            it does not hold errors of the tags' survey.
-        tag_errors: RMS corner error of each frame tag over the pictures, by number, [px].
+        by: ``frame tags`` or ``rig motion``.
+        covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6).
+        half_widths: Of the 95 % intervals of the same, shape (6,).
+        points: Places in the world that matter, shape (n, 3), [m].
+        tag_errors: RMS corner error of each tag, by number, [px].
         pictures: How many pictures it rests on.
-        data_hash: Of the corners it rests on.
+        unused: Why each of the others is not used, by name.
+        lacks: What it lacks, beside precision.
+        data_hash: Of what was seen.
     """
 
     camera: Camera
+    by: Literal["frame tags", "rig motion"]
     covariance: Array
-    tag_errors: dict[int, float]
+    half_widths: Array
+    points: Array
+    tag_errors: Mapping[int, float]
     pictures: int
+    unused: Mapping[str, str]
+    lacks: tuple[Lack, ...]
     data_hash: str
 
     @property
@@ -43,61 +52,57 @@ class ExtrinsicCalibration:
         """The pose."""
         return self.camera.world_from_camera
 
+    @property
+    def error(self) -> float:
+        """How far off points of the work space are seen, 95 %, RMS, [m]."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        grown = self.covariance * np.outer(*2 * [self.half_widths / deviations])
+        arms = self.points - self.world_from_camera.position
+        slopes = [np.hstack([np.eye(3), -skew(arm)]) for arm in arms]
+        return float(np.sqrt(np.mean([np.trace(s @ grown @ s.T) for s in slopes])))
 
-def locate_camera(rig: Rig, camera: Camera, images: Iterable[Image]) -> ExtrinsicCalibration:
-    """Finds the camera's place from pictures taken while it stood still.
+
+def workspace_corners(rig: Rig) -> Array:
+    """Corners of the box that the platform's origin keeps to, shape (8, 3), [m]."""
+    ends = zip(rig.workspace_lower, rig.workspace_upper, strict=True)
+    return np.array(list(product(*ends)))
+
+
+def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Verdict:
+    """Judges a camera's place.
 
     Args:
-        rig: Its frame tags are the surveyed ones.
-        camera: Its matrix and distortion hold; its place in the rig file does not matter.
-        images: Grey pictures of the camera's size.
-
-    Raises:
-        BadInput: The rig has no frame tags, or none of them is to be seen whole.
+        result: What was found.
+        wanted: What is good enough, in the work space, [m].
     """
-    if not rig.frame_tags:
-        raise BadInput(
-            "the rig has no frame tags to find the camera's place by",
-            where=f"rig {rig.name}",
-            next_step="survey tags on the frame and add them to the rig file under tags: frame",
+    lacks, error = list(result.lacks), result.error
+    if not error <= wanted:
+        more = "survey more tags, all around what the camera sees"
+        if result.by == "rig motion":
+            more = "take pictures at more poses, far apart and turned up to 20° every way"
+        what = (
+            f"points of the work space are seen within {error * 1e3:.2g} mm,"
+            f" {wanted * 1e3:.2g} mm are wanted"
         )
-    tags = {tag.id: tag for tag in rig.frame_tags}
-    detector, modules = TagDetector(rig.tag_family), modules_across(rig.tag_family)
-    views: list[TagView] = []
-    pictures = 0
-    for image in images:
-        mine = [d for d in detector.detect(image) if d.id in tags]
-        corners = np.array([d.corners for d in mine]).reshape(-1, 4, 2)
-        squares = refine(image, camera, corners, modules)
-        pairs = zip(mine, squares, strict=True)
-        new = [TagView(tags[d.id], s) for d, s in pairs if s is not None and s.whole]
-        views += new
-        pictures += bool(new)
-    found = measured_camera(camera, views) if views else None
-    if found is None:
-        raise BadInput(
-            f"none of the frame tags {', '.join(map(str, tags))} is to be seen whole",
-            where=f"camera {camera.name}",
-            next_step="free them, or turn the camera until it sees some of them",
-        )
-    pose, covariance = found
-    moved = replace(camera, world_from_camera=pose)
-    return ExtrinsicCalibration(
-        moved, read_only(covariance), _tag_errors(moved, views), pictures, _hash(views)
-    )
+        lacks.append(Lack(what, more))
+    return Verdict.of(error, wanted, "in the work space", lacks)
 
 
-def _tag_errors(camera: Camera, views: list[TagView]) -> dict[int, float]:
-    check = check_camera(camera, views)
-    numbers = np.array(check.tags)
-    return {
-        number: float(np.sqrt(np.mean(check.errors[numbers == number] ** 2)))
-        for number in sorted(set(check.tags))
-    }
+def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
+    """Half widths of 95 % intervals: by scatter, or by what leaving a part of the data out changes.
 
+    Args:
+        covariance: By the scatter, shape (k, k).
+        without: Changes of the k numbers when each part is left out (the jackknife over parts).
 
-def _hash(views: list[TagView]) -> str:
-    digest = hashlib.sha256()
-    for view in views:
-        digest.update(f"{view.tag.id}".encode() + np.round(view.seen.corners, 6).tobytes())
-    return digest.hexdigest()
+    Returns:
+        The larger of both, shape (k,).
+    """
+    by_scatter = SURE * np.sqrt(np.diag(covariance))
+    count = len(without)
+    if count < 3:
+        return np.asarray(by_scatter)
+    spread = np.array(without) - np.mean(without, axis=0)
+    by_parts = np.sqrt((count - 1) / count * np.sum(spread**2, axis=0))
+    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
+    return np.asarray(np.maximum(by_scatter, quantile * by_parts))

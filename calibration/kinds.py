@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calibration.camera_result import CameraResult
+from calibration.extrinsics_result import ExtrinsicsResult
 from calibration.result_file import ResultDocument, in_order
 from cdpr.documents import load_yaml, read_yaml
 from cdpr.errors import BadInput
@@ -13,6 +14,7 @@ from cdpr.rig import Rig, rig_from_document
 
 KINDS: dict[str, type[ResultDocument]] = {
     "camera": CameraResult,
+    "extrinsics": ExtrinsicsResult,
 }
 
 

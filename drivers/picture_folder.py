@@ -75,6 +75,7 @@ class OneCamerasPictures:
 
     Args:
         folder: Where they are.
+        wanted: Width and height of the camera that took them, [px]; left out, that of most.
 
     Attributes:
         size: Width and height, [px].
@@ -83,10 +84,11 @@ class OneCamerasPictures:
         upright: Whether pictures are turned as their files say.
 
     Raises:
-        BadInput: The folder is missing, has no pictures, or none that can be read.
+        BadInput: The folder is missing, has no pictures, or none that can be read or is of the
+            wanted size.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, wanted: tuple[int, int] | None = None) -> None:
         files = picture_files(folder)
         self.unused: dict[str, str] = {}
         sizes: dict[Path, tuple[int, int]] = {}
@@ -99,17 +101,20 @@ class OneCamerasPictures:
         if not sizes:
             raise _no_picture(folder, len(files))
         self.upright = True
-        if len(set(sizes.values())) > 1:
+        if set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
             as_stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
-            if len(set(as_stored.values())) == 1:
+            if set(as_stored.values()) == {wanted or next(iter(as_stored.values()))}:
                 sizes, self.upright = as_stored, False
         counted = Counter(sizes.values())
-        self.size = max(counted, key=lambda size: (counted[size], size))
+        self.size = wanted or max(counted, key=lambda size: (counted[size], size))
+        whose = "the camera has" if wanted else "most have"
         for path, size in sizes.items():
             if size != self.size:
                 self.unused[path.name] = (
-                    f"has {size[0]} x {size[1]} px, most have {self.size[0]} x {self.size[1]} px"
+                    f"has {size[0]} x {size[1]} px, {whose} {self.size[0]} x {self.size[1]} px"
                 )
+        if self.size not in counted:
+            raise _wrong_sizes(folder, self.unused, self.size)
         self._files = [path for path in sizes if path.name not in self.unused]
         self.names = tuple(path.name for path in self._files)
 
@@ -171,6 +176,15 @@ def _no_picture(folder: Path, count: int) -> BadInput:
         f"none of the {count} files is a picture that can be read",
         where=str(folder),
         next_step="check that the files were copied whole",
+    )
+
+
+def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) -> BadInput:
+    return BadInput(
+        f"none of the {len(unused)} pictures has the camera's {wanted[0]} x {wanted[1]} px",
+        where=str(folder),
+        why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4]),
+        next_step="use full pictures of this camera, or calibrate it in this size",
     )
 
 

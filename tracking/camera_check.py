@@ -70,14 +70,21 @@ def measured_camera(camera: Camera, views: Sequence[TagView]) -> tuple[Pose, Arr
     found = solve_bundle(camera, views, camera.world_from_camera.inverse())
     if found is None or not np.all(np.isfinite(found.covariance)):
         return None
-    pose = found.camera_from_body.inverse()
-    # When camera_from_world (R, p) shifts and turns along the camera's axes, world_from_camera
-    # turns by −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift − Rᵀ (p × turn).
-    back = pose.rotation
+    change = change_of_inverse(found.camera_from_body)
+    return found.camera_from_body.inverse(), read_only(change @ found.covariance @ change.T)
+
+
+def change_of_inverse(pose: Pose) -> Array:
+    """How the inverse of a pose shifts and turns when the pose does, shape (6, 6).
+
+    Each shifts [m] and turns [rad] along the axes of its own outer frame: when (R, p) does, its
+    inverse turns by −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift − Rᵀ (p × turn).
+    """
+    back = pose.rotation.T
     change = np.zeros((6, 6))
     change[:3, :3] = change[3:, 3:] = -back
-    change[:3, 3:] = -back @ skew(found.camera_from_body.position)
-    return pose, read_only(change @ found.covariance @ change.T)
+    change[:3, 3:] = -back @ skew(pose.position)
+    return change
 
 
 def refuse_moved_camera(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,8 +27,6 @@ from cdpr.cli.calibration_output import FolderOption, ForceOption, JsonOption, W
 if TYPE_CHECKING:
     from calibration.camera import CameraCalibration
     from calibration.camera_verdict import CameraQuality
-    from drivers.picture_folder import OneCamerasPictures
-    from tracking.picture import Image
 
 
 def camera(
@@ -77,30 +74,23 @@ def camera(
     from calibration.result_file import require_file_name
     from cdpr.cli.calibration_output import finish
     from cdpr.cli.output import progress_bar
+    from cdpr.cli.picture_sources import Pictures, told
     from cdpr.cli.workers import make_folder
     from drivers.picture_folder import OneCamerasPictures
 
     require_file_name(name, "--name")
     sizes = {"square": square_mm, "marker": marker_mm, "tag": tag_mm, "gap": gap_mm}
     the_board = board_of(board, columns, rows, sizes, dictionary, legacy, family, first)
-    pictures = OneCamerasPictures(folder)
+    images = OneCamerasPictures(folder)
+    pictures = Pictures(images, len(images.names), images.unused)
     if output is not None:
         make_folder(output, force)
-    with progress_bar("looking for the board", len(pictures.names), not as_json) as advance:
-        result = calibrate_camera(_told(pictures, advance), the_board, pictures.unused)
+    with progress_bar("looking for the board", pictures.count, not as_json) as advance:
+        result = calibrate_camera(told(pictures, advance), the_board, pictures.unused)
     quality = judge_camera(result, wanted_mm / 1000.0, distance_m)
     document = camera_result(result, quality, name, datetime.now(UTC).date())
     page = camera_page(result, quality, name, document.date)
     finish(document, page, _facts(result, quality), output, as_json)
-
-
-def _told(
-    pictures: OneCamerasPictures, advance: Callable[[float], None]
-) -> Iterator[tuple[str, Image]]:
-    """Pictures, each told when it was looked at."""
-    for number, picture in enumerate(pictures, 1):
-        yield picture
-        advance(number)
 
 
 def _facts(result: CameraCalibration, quality: CameraQuality) -> list[tuple[str, str]]:

@@ -31,6 +31,26 @@ SYNTHETIC = "synthetic"
 KEPT_PICTURES = 12
 
 
+def named_camera(rig: Rig, name: str | None) -> Camera:
+    """The rig's camera of a name; its first when no name is given.
+
+    Raises:
+        BadInput: The rig has none of this name, or none at all.
+    """
+    names = [camera.name for camera in rig.cameras]
+    if not names:
+        raise BadInput(
+            "the rig file has no camera", where=rig.name, next_step="add a `cameras` section"
+        )
+    if name is None:
+        return rig.cameras[0]
+    if name not in names:
+        raise BadInput(
+            f"no camera {name!r}", where=rig.name, next_step=f"name one of: {', '.join(names)}"
+        )
+    return rig.cameras[names.index(name)]
+
+
 def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool) -> str | None:
     """Where pictures come from: ``synthetic``, a camera's index or address, or None.
 

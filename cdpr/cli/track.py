@@ -62,6 +62,7 @@ def track(
     from itertools import islice
 
     from cdpr.cli.calibrations import calibrated_rig
+    from cdpr.cli.cameras import named_camera
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
     from cdpr.rig import load_rig
@@ -73,7 +74,7 @@ def track(
 
     check_output(output, force)
     the_rig = calibrated_rig(load_rig(rig), calibration)
-    the_camera = _camera(the_rig, camera)
+    the_camera = named_camera(the_rig, camera)
     the_scene = _scene(scene, plan)
     frames, total = _source(the_rig, the_scene, the_camera, source, plan)
     logged: list[LoggedPicture] = []
@@ -98,23 +99,6 @@ def track(
         show_facts(f"poses in {output}", [(k.replace("_", " "), str(v)) for k, v in facts.items()])
 
 
-def _camera(rig: Rig, name: str | None) -> Camera:
-    from cdpr.errors import BadInput
-
-    names = [camera.name for camera in rig.cameras]
-    if not names:
-        raise BadInput(
-            "the rig file has no camera", where=rig.name, next_step="add a `cameras` section"
-        )
-    if name is None:
-        return rig.cameras[0]
-    if name not in names:
-        raise BadInput(
-            f"no camera {name!r}", where=rig.name, next_step=f"name one of: {', '.join(names)}"
-        )
-    return rig.cameras[names.index(name)]
-
-
 def _scene(scene: Path | None, plan: Path | None) -> Scene | None:
     from cdpr.plan import load_plan
     from cdpr.scene import load_scene
@@ -130,6 +114,7 @@ def _source(
     """The pictures, and how many there are where that is known."""
     from cdpr.cli.cameras import SYNTHETIC
     from cdpr.cli.output import err
+    from cdpr.cli.picture_sources import require_camera_source
     from cdpr.errors import BadInput
     from drivers.cameras import LiveCamera, VideoFile
     from drivers.picture_folder import ImageFolder
@@ -158,12 +143,7 @@ def _source(
     if path.is_file():
         video = VideoFile(path, camera)
         return video, len(video)
-    if not source.isdigit() and "://" not in source and not source.startswith("/dev/"):
-        raise BadInput(
-            "neither a folder of pictures, nor a video file, nor a camera",
-            where=source,
-            next_step="check the path; a camera is an index such as 0, /dev/video0 or an address",
-        )
+    require_camera_source(source)
     return LiveCamera(source, camera), None
 
 

@@ -9,6 +9,7 @@ import typer
 
 from cdpr.cli import bench, calibrate
 from cdpr.cli.calibrate_diff import diff
+from cdpr.cli.calibrate_extrinsics import extrinsics
 from cdpr.cli.calibrate_print import print_
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
@@ -52,7 +53,9 @@ def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
         app.command()(_interruptible(verb))
-    _add_group(app, "calibrate", "Calibrate and compare.", calibrate.camera, print_, diff)
+    _add_group(
+        app, "calibrate", "Calibrate and compare.", calibrate.camera, extrinsics, print_, diff
+    )
     _add_group(app, "bench", "Measure the planner.", bench.paper)
 
 

@@ -1,19 +1,28 @@
-"""The camera's place from surveyed tags on the frame."""
+"""The camera's place from surveyed tags on the frame, and how honest its intervals are."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibration.extrinsics import locate_camera
+from calibration.extrinsics import judge_extrinsics
+from calibration.extrinsics_result import extrinsics_result
+from calibration.kinds import calibrated, load_result
+from calibration.result_file import write_result
+from calibration.surveyed_tags import locate_camera, require_frame_tags
+from calibration.tag_sights import sights_of
 from cdpr.errors import BadInput
 from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from cdpr.rig import Rig, load_rig
+from cdpr.rig import Rig, Tag, load_rig
 from cdpr.scene import load_scene
 from simulation.camera import SyntheticCamera
+from tests.calibration.exact_sights import sights_at
+from tracking.bundle import moved
+from tracking.camera_check import change_of_inverse
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -23,55 +32,124 @@ def rig() -> Rig:
     return load_rig(CONFIGS / "gachon_8_6.yaml")
 
 
-@pytest.fixture(scope="module")
-def pictures(rig: Rig) -> tuple[Pose, list[np.ndarray]]:
-    """Pictures of a camera that stands elsewhere than the rig file says, and its true place."""
-    scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())
+def elsewhere(rig: Rig) -> Pose:
+    """Where the camera truly stands: not where the rig file says."""
     named = rig.cameras[0].world_from_camera
     turn = matrix_from_rotation_vector([0.02, -0.01, 0.015])
-    truth = Pose(named.position + np.array([0.03, -0.02, 0.01]), turn @ named.rotation)
-    camera = SyntheticCamera(rig, scene, replace(rig.cameras[0], world_from_camera=truth), seed=2)
-    return truth, [camera.render(Pose.level([0.0, 0.0, 0.55]), k) for k in range(3)]
+    return Pose(named.position + np.array([0.03, -0.02, 0.01]), turn @ named.rotation)
 
 
-def test_a_camera_is_located_to_half_a_millimetre(
-    rig: Rig, pictures: tuple[Pose, list[np.ndarray]]
-) -> None:
-    truth, images = pictures
-    found = locate_camera(rig, rig.cameras[0], images)
+@pytest.fixture(scope="module")
+def pictures(rig: Rig) -> list[tuple[str, np.ndarray]]:
+    scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())
+    there = replace(rig.cameras[0], world_from_camera=elsewhere(rig))
+    camera = SyntheticCamera(rig, scene, there, seed=2)
+    return [(f"{k}.png", camera.render(Pose.level([0.0, 0.0, 0.55]), k)) for k in range(3)]
+
+
+def numbers(rig: Rig) -> list[int]:
+    return [tag.id for tag in rig.frame_tags]
+
+
+def test_a_camera_is_located_to_half_a_millimetre(rig: Rig, pictures) -> None:
+    truth, camera = elsewhere(rig), rig.cameras[0]
+    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 0.1e-3)
     pose = found.world_from_camera
     assert pose.distance_to(truth) < 0.5e-3
     assert np.degrees(pose.angle_to(truth)) < 0.02
     turn = rotation_vector_from_matrix(pose.rotation @ truth.rotation.T)
     error = np.concatenate([pose.position - truth.position, turn])
-    # The same picture apart from noise, so the error of drawing does not average out.
-    assert np.all(np.abs(error) < 8.0 * np.sqrt(np.diag(found.covariance)))
+    assert np.all(np.abs(error) < found.half_widths)
     assert found.pictures == 3
     assert set(found.tag_errors) <= {401, 402, 403, 404}
     assert len(found.tag_errors) >= 3
     assert max(found.tag_errors.values()) < 0.1
+    assert judge_extrinsics(found, 2e-3).good
 
 
-def test_the_covariance_is_that_of_the_world_pose(
-    rig: Rig, pictures: tuple[Pose, list[np.ndarray]]
-) -> None:
-    """Against numeric propagation of the pose in the camera's frame."""
-    from tracking.bundle import TagView, moved, solve_bundle
-    from tracking.detector import TagDetector
-    from tracking.edges import refine
+def crooked(tags: tuple[Tag, ...], survey: float, rng: np.random.Generator) -> tuple[Tag, ...]:
+    """Tags where they truly are: off from their survey by so much along each axis."""
+    return tuple(
+        replace(
+            tag,
+            pose=Pose(
+                tag.pose.position + survey * rng.standard_normal(3),
+                matrix_from_rotation_vector(2.0 * survey / tag.size * rng.standard_normal(3))
+                @ tag.pose.rotation,
+            ),
+        )
+        for tag in tags
+    )
 
-    camera, tags = rig.cameras[0], {tag.id: tag for tag in rig.frame_tags}
-    image = pictures[1][0]
-    mine = [d for d in TagDetector(rig.tag_family).detect(image) if d.id in tags]
-    squares = refine(image, camera, np.array([d.corners for d in mine]), 8)
-    views = [
-        TagView(tags[d.id], s)
-        for d, s in zip(mine, squares, strict=True)
-        if s is not None and s.whole
-    ]
-    bundle = solve_bundle(camera, views)
-    assert bundle is not None
-    base = bundle.camera_from_body
+
+@pytest.mark.parametrize("survey", [0.5e-3, 2e-3])
+def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) -> None:
+    truth, camera, inside, errors, stated = elsewhere(rig), rig.cameras[0], [], [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        tags = crooked(rig.frame_tags, survey, rng)
+        poses = {str(k): truth.inverse() for k in range(3)}
+        found = locate_camera(rig, camera, sights_at(camera, tags, poses, 0.03, rng), survey)
+        pose = found.world_from_camera
+        turn = rotation_vector_from_matrix(pose.rotation @ truth.rotation.T)
+        off = np.concatenate([pose.position - truth.position, turn])
+        inside.append(np.abs(off) <= found.half_widths)
+        back = pose.apply(truth.inverse().apply(found.points)) - found.points
+        errors.append(np.sqrt(np.mean(np.sum(back**2, axis=1))))
+        stated.append(found.error)
+    assert np.mean(inside) >= 0.9
+    assert np.mean(np.array(errors) <= stated) >= 0.9
+    assert np.median(stated) < 8.0 * np.median(errors)  # and not by promising nothing
+
+
+def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) -> None:
+    camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
+    places = [(0.42, 0), (0, 0.42), (-0.42, 0), (0, -0.42), (0.3, 0.3), (-0.3, 0.3)]
+    tags = [Tag(401 + k, 0.12, Pose.level([x, y, 0.0])) for k, (x, y) in enumerate(places)]
+    rig = replace(rig, frame_tags=tuple(tags))
+    knocked = [replace(tags[0], pose=Pose.level([0.44, 0.0, 0.0])), *tags[1:]]
+    sights = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
+    found = locate_camera(rig, camera, sights, 0.2e-3)
+    assert list(found.unused) == ["tag 401"]
+    away = float(found.unused["tag 401"].split()[2])
+    assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, seen aslant
+    assert found.world_from_camera.distance_to(truth) < 3e-3
+
+
+def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
+    camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
+    tags = crooked(rig.frame_tags, 10e-3, rng)
+    found = locate_camera(
+        rig, camera, sights_at(camera, tags, {"a": truth.inverse()}, 0.02, rng), 1e-4
+    )
+    verdict = judge_extrinsics(found, 1.0)
+    assert not verdict.good
+    assert any("from where the rig file puts it" in reason for reason in verdict.reasons)
+    assert any("again, or take it out of the rig file" in step for step in verdict.next_steps)
+
+
+def test_a_single_tag_is_not_good_enough(rig: Rig) -> None:
+    camera, truth = rig.cameras[0], elsewhere(rig)
+    rng = np.random.default_rng(3)
+    sights = sights_at(camera, rig.frame_tags[:1], {"a": truth.inverse()}, 0.02, rng)
+    found = locate_camera(rig, camera, sights, 0.5e-3)
+    verdict = judge_extrinsics(found, 1e-3)
+    assert "1 frame tag is seen, 3 are needed" in verdict.reasons
+    assert "survey more tags, all around what the camera sees" in verdict.next_steps
+
+
+def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> None:
+    camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
+    poses = {f"{k}.png": truth.inverse() for k in range(4)}
+    poses["3.png"] = moved(truth.inverse(), np.array([0.01, 0, 0, 0, 0, 0]))
+    found = locate_camera(rig, camera, sights_at(camera, rig.frame_tags, poses, 0.02, rng), 1e-4)
+    assert list(found.unused) == ["3.png"]
+    assert "the camera moved" in found.unused["3.png"]
+    assert found.pictures == 3
+
+
+def test_the_inverse_of_a_pose_changes_as_told() -> None:
+    base = Pose(np.array([0.1, -0.3, 1.2]), matrix_from_rotation_vector([0.4, 2.0, -0.7]))
     change = np.zeros((6, 6))
     for k in range(6):
         ends = []
@@ -81,17 +159,89 @@ def test_the_covariance_is_that_of_the_world_pose(
             ends.append(moved(base, step).inverse())
         turn = rotation_vector_from_matrix(ends[0].rotation @ ends[1].rotation.T)
         change[:, k] = np.concatenate([ends[0].position - ends[1].position, turn]) / 2e-6
-    expected = change @ bundle.covariance @ change.T
-    found = locate_camera(rig, camera, [image])
-    np.testing.assert_allclose(found.covariance, expected, rtol=1e-2, atol=1e-12)
+    np.testing.assert_allclose(change_of_inverse(base), change, atol=1e-6)
 
 
-def test_a_picture_without_frame_tags_is_refused(rig: Rig) -> None:
+def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_path: Path) -> None:
+    camera = rig.cameras[0]
+    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 5e-4)
+    verdict = judge_extrinsics(found, 1e-3)
+    result = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
+    path = write_result(tmp_path, result)
+    assert path.name == "calibration_extrinsics_front_2026-03-02.yaml"
+    read = load_result(path)
+    assert read == result
+    better = calibrated(rig, [read])
+    assert better.cameras[0].world_from_camera.distance_to(found.world_from_camera) < 1e-8
+    assert result.apart_mm(result) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictures) -> None:
+    camera = rig.cameras[0]
+    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 5e-4)
+    result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
+    other = rig.document.cameras[0].model_copy(update={"fx_px": 901.0})
+    changed = replace(rig, document=rig.document.model_copy(update={"cameras": [other]}))
+    with pytest.raises(BadInput, match="rests on other numbers of the camera or frame tags"):
+        calibrated(changed, [result])
+
+
+def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pictures) -> None:
+    camera = rig.cameras[0]
+    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 5e-4)
+    verdict = judge_extrinsics(found, 1e-3)
+    one = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
+    pose = found.world_from_camera
+    turned = Pose(
+        pose.position + np.array([0.001, 0.0, 0.0]),
+        matrix_from_rotation_vector([0, 0, 0.002]) @ pose.rotation,
+    )
+    there = replace(found, camera=replace(found.camera, world_from_camera=turned))
+    two = extrinsics_result(there, verdict, rig.document, date(2026, 3, 3))
+    changes = one.changes_to(two)
+    assert changes["x_mm"] == pytest.approx(1.0, abs=1e-6)
+    assert changes["turn_z_deg"] == pytest.approx(np.degrees(0.002), abs=1e-6)
+    arms = found.points - pose.position
+    by_hand = np.array([0.001, 0, 0]) + np.cross([0, 0, 0.002], arms)
+    expected = np.sqrt(np.mean(np.sum(by_hand**2, axis=1))) * 1e3
+    assert one.apart_mm(two) == pytest.approx(expected, rel=2e-3)
+
+
+def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
+    camera = rig.cameras[0]
     blank = np.full((720, 1280), 100, np.uint8)
-    with pytest.raises(BadInput, match="none of the frame tags 401, 402, 403, 404"):
-        locate_camera(rig, rig.cameras[0], [blank])
+    sights = sights_of([*pictures, ("blank.png", blank)], rig, camera, numbers(rig))
+    assert sights.unused == {"blank.png": "shows none of the tags whole"}
+    with pytest.raises(BadInput, match="none of the tag36h11 tags 401, 402, 403, 404"):
+        sights_of([("blank.png", blank)], rig, camera, numbers(rig))
+
+
+def test_mirrored_pictures_and_other_tags_are_told(rig: Rig, pictures) -> None:
+    camera, (name, image) = rig.cameras[0], pictures[0]
+    flipped = np.ascontiguousarray(image[:, ::-1])
+    with pytest.raises(BadInput) as caught:
+        sights_of([(name, flipped)], rig, camera, numbers(rig))
+    assert "mirrored" in caught.value.why
+    with pytest.raises(BadInput) as caught:
+        sights_of([(name, image)], rig, camera, [411, 412])
+    assert "shows tag36h11" in caught.value.why
+    assert "401" in caught.value.why
+
+
+def test_a_number_that_is_seen_twice_is_left_out_by_name(rig: Rig, pictures) -> None:
+    camera, (name, image) = rig.cameras[0], pictures[0]
+    seen = sights_of(pictures[:1], rig, camera, numbers(rig)).squares[name]
+    corners = seen[402].corners
+    low, high = corners.min(axis=0).astype(int) - 8, corners.max(axis=0).astype(int) + 9
+    patch = image[low[1] : high[1], low[0] : high[0]]
+    doubled = image.copy()
+    doubled[4 : 4 + patch.shape[0], 4 : 4 + patch.shape[1]] = patch
+    sights = sights_of([(name, doubled)], rig, camera, numbers(rig))
+    assert sights.unused == {f"{name}, tag 402": "is seen more than once"}
+    assert 402 not in sights.squares[name]
+    assert sights.squares[name].keys() == seen.keys() - {402}
 
 
 def test_a_rig_without_frame_tags_is_refused(rig: Rig) -> None:
     with pytest.raises(BadInput, match="no frame tags"):
-        locate_camera(replace(rig, frame_tags=()), rig.cameras[0], [])
+        require_frame_tags(replace(rig, frame_tags=()))

@@ -1,0 +1,112 @@
+"""The result file of a camera's place in the world."""
+
+from __future__ import annotations
+
+from datetime import date
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from calibration.camera_result import camera_named, with_camera
+from calibration.extrinsics import ExtrinsicCalibration
+from calibration.interval import Interval
+from calibration.result_file import ResultDocument, common_keys
+from calibration.verdict import Verdict
+from cdpr.document_types import NonNegative, PoseDocument, Vector
+from cdpr.poses import rotation_vector_from_matrix
+from cdpr.rig_file import RigDocument
+
+AXES = ("x_mm", "y_mm", "z_mm", "turn_x_deg", "turn_y_deg", "turn_z_deg")
+"""Of a pose: its position, and turns about the outer frame's axes from the stated rotation."""
+_SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
+
+
+class ExtrinsicsResult(ResultDocument):
+    """A camera's place, in the keys of the rig file's ``cameras`` section."""
+
+    order: ClassVar[int] = 2
+
+    kind: Literal["extrinsics"] = "extrinsics"
+    by: Literal["frame tags", "rig motion"]
+    world_from_camera: PoseDocument
+    points_mm: Annotated[list[Vector], Field(min_length=1)] = Field(
+        description="places in the world for which error_mm is stated"
+    )
+    tag_errors_px: dict[str, NonNegative] = Field(description="RMS corner error of each tag")
+    pictures: int
+
+    def changes_to(self, other: Self) -> dict[str, float]:
+        """How far the other camera stands off, and how it is turned about the world's axes."""
+        mine, theirs = self.world_from_camera.pose(), other.world_from_camera.pose()
+        turn = rotation_vector_from_matrix(theirs.rotation @ mine.rotation.T)
+        numbers = np.concatenate([theirs.position - mine.position, turn]) * _SCALES
+        return dict(zip(AXES, numbers.tolist(), strict=True))
+
+    def apart_mm(self, other: Self) -> float:
+        """How far apart both put what is seen at `points_mm`, RMS, [mm]."""
+        points = np.array(self.points_mm) / 1e3
+        seen = self.world_from_camera.pose().inverse().apply(points)
+        gaps = other.world_from_camera.pose().apply(seen) - points
+        return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))) * 1e3
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with the camera at this place.
+
+        Raises:
+            BadInput: The rig has no such camera, or other tags or camera numbers.
+        """
+        camera = camera_named(rig, self.name)
+        self.require_basis(_basis(rig, self.name, self.by), f"numbers of the camera or {self.by}")
+        return with_camera(
+            rig, camera.model_copy(update={"world_from_camera": self.world_from_camera})
+        )
+
+
+def extrinsics_result(
+    result: ExtrinsicCalibration, verdict: Verdict, rig: RigDocument, on: date
+) -> ExtrinsicsResult:
+    """The result with its quality.
+
+    Args:
+        result: What was found.
+        verdict: What it is good for.
+        rig: The rig file's content that it was found with.
+        on: The date.
+    """
+    name = result.camera.name
+    return ExtrinsicsResult(
+        **common_keys(
+            name,
+            on,
+            result.data_hash,
+            pose_intervals(result),
+            verdict,
+            result.unused,
+            _basis(rig, name, result.by),
+        ),
+        by=result.by,
+        world_from_camera=PoseDocument.of(result.world_from_camera),
+        points_mm=[[float(x) * 1e3 for x in point] for point in result.points],
+        tag_errors_px={str(k): float(v) for k, v in result.tag_errors.items()},
+        pictures=result.pictures,
+    )
+
+
+def pose_intervals(result: ExtrinsicCalibration) -> dict[str, Interval]:
+    """The pose's numbers; turns are about the world's axes, from the stated rotation."""
+    values = np.concatenate([result.world_from_camera.position, np.zeros(3)]) * _SCALES
+    widths = result.half_widths * _SCALES
+    return {
+        name: Interval(float(value), float(width))
+        for name, value, width in zip(AXES, values, widths, strict=True)
+    }
+
+
+def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
+    """What the result takes as known."""
+    camera = camera_named(rig, name).model_dump(mode="json")
+    of_camera = {k: v for k, v in camera.items() if k not in ("world_from_camera", "rate_hz")}
+    tags = rig.tags.model_dump(mode="json") if rig.tags else {}
+    which = "frame" if by == "frame tags" else "platform"
+    return {"camera": of_camera, "family": tags.get("family"), "tags": tags.get(which)}

@@ -1,0 +1,124 @@
+"""The tags of a rig in many pictures of one camera, and why others are of no use."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpr.errors import BadInput
+from cdpr.rig import Camera, Rig
+from tracking.detector import Detection, TagDetector
+from tracking.detectors import make_detector
+from tracking.edges import RefinedTag, refine
+from tracking.marks import modules_across
+from tracking.other_tags import what_else_is_seen
+from tracking.picture import Image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagSights:
+    """Whole tags that were seen.
+
+    Attributes:
+        squares: Of every picture that shows some, by its name: the tags' squares by number.
+        unused: Why a picture, or a tag in it, is not used, by name.
+    """
+
+    squares: Mapping[str, Mapping[int, RefinedTag]]
+    unused: Mapping[str, str]
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of the tags that were seen."""
+        return tuple(sorted({number for squares in self.squares.values() for number in squares}))
+
+    def without(self, unused: Mapping[str, str]) -> TagSights:
+        """The sights without some more pictures, and why."""
+        left = {name: squares for name, squares in self.squares.items() if name not in unused}
+        return TagSights(left, {**self.unused, **unused})
+
+    def data_hash(self) -> str:
+        """Hash of what was seen."""
+        digest = hashlib.sha256()
+        for name, squares in self.squares.items():
+            digest.update(name.encode())
+            for number, square in sorted(squares.items()):
+                digest.update(f"{number}".encode() + np.round(square.corners, 6).tobytes())
+        return digest.hexdigest()
+
+
+def sights_of(
+    pictures: Iterable[tuple[str, Image]],
+    rig: Rig,
+    camera: Camera,
+    wanted: Collection[int],
+    unused: Mapping[str, str] | None = None,
+) -> TagSights:
+    """Looks for tags.
+
+    A number that is seen twice in a picture is left out there: nobody knows which is the rig's.
+
+    Args:
+        pictures: Names and grey pictures of the camera's size.
+        rig: Its family of tags, and what finds them.
+        camera: Its matrix and distortion hold.
+        wanted: Their numbers.
+        unused: Pictures that were left out before, with the reasons.
+
+    Raises:
+        BadInput: No picture shows any of them whole.
+    """
+    family = rig.tag_family
+    detector, modules = make_detector(rig.tag_detector, family), modules_across(family)
+    found: dict[str, Mapping[int, RefinedTag]] = {}
+    left_out = dict(unused or {})
+    example: tuple[str, Image] | None = None
+    for name, image in pictures:
+        mine = [d for d in detector.detect_all(image) if d.id in wanted]
+        twice = [number for number, count in Counter(d.id for d in mine).items() if count > 1]
+        left_out |= {f"{name}, tag {number}": "is seen more than once" for number in twice}
+        squares = _whole(image, camera, [d for d in mine if d.id not in twice], modules)
+        if squares:
+            found[name] = squares
+        elif not twice:
+            left_out[name] = "shows none of the tags whole"
+            example = example or (name, image)
+    if not found:
+        raise _nothing_seen(camera, family, wanted, left_out, example)
+    return TagSights(found, left_out)
+
+
+def _whole(
+    image: Image, camera: Camera, detections: list[Detection], modules: int
+) -> dict[int, RefinedTag]:
+    corners = np.array([d.corners for d in detections]).reshape(-1, 4, 2)
+    squares = refine(image, camera, corners, modules)
+    pairs = zip(detections, squares, strict=True)
+    return {d.id: square for d, square in pairs if square is not None and square.whole}
+
+
+def _nothing_seen(
+    camera: Camera,
+    family: str,
+    wanted: Collection[int],
+    unused: Mapping[str, str],
+    example: tuple[str, Image] | None,
+) -> BadInput:
+    why = "; ".join(f"{name} {reason}" for name, reason in list(unused.items())[:4])
+    if example is not None:
+        name, image = example
+        why += f"; {name} shows {what_else_is_seen(image, family, list(wanted))}"
+        flipped = np.ascontiguousarray(image[:, ::-1])
+        if any(d.id in wanted for d in TagDetector(family).detect(flipped)):
+            why += "; flipped over they are there, so the pictures are mirrored"
+    return BadInput(
+        f"none of the {family} tags {', '.join(map(str, wanted))} is to be seen whole",
+        where=f"camera {camera.name}",
+        why=why,
+        next_step="check that the camera sees them, that the light suffices, and that the rig file"
+        " names the family and numbers of the printed tags",
+    )

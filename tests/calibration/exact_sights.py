@@ -1,0 +1,46 @@
+"""Sights of tags as a perfect detector with known noise would have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calibration.tag_sights import TagSights
+from cdpr.poses import Pose
+from cdpr.rig import Camera, Tag
+from tracking.edges import RefinedTag
+from tracking.marks import tag_corners
+from tracking.projection import ideal_of
+
+
+def seen_tag(
+    camera: Camera, camera_from_carrier: Pose, tag: Tag, noise: float, rng: np.random.Generator
+) -> RefinedTag | None:
+    """The square of a tag; None where it shows its back or is out of the picture."""
+    points = camera_from_carrier.apply(tag_corners(tag))
+    normal = camera_from_carrier.rotation @ tag.pose.rotation[:, 2]
+    middle = points.mean(axis=0)
+    if middle[2] < 0.1 or normal @ middle > -0.3 * np.linalg.norm(middle):
+        return None
+    pixels = ideal_of(camera, points)
+    if (pixels < 5).any() or (pixels > [camera.width - 5, camera.height - 5]).any():
+        return None
+    corners = pixels + noise * rng.standard_normal((4, 2))
+    whitening = np.eye(8) / max(noise, 1e-4)
+    return RefinedTag(corners, whitening, whitening @ corners.ravel(), np.ones(4, bool), noise)
+
+
+def sights_at(
+    camera: Camera,
+    tags: Sequence[Tag],
+    poses: Mapping[str, Pose],
+    noise: float,
+    rng: np.random.Generator,
+) -> TagSights:
+    """Tags of a carrier at poses ``camera_from_carrier``, by picture."""
+    squares = {}
+    for name, pose in poses.items():
+        seen = {tag.id: seen_tag(camera, pose, tag, noise, rng) for tag in tags}
+        squares[name] = {number: square for number, square in seen.items() if square is not None}
+    return TagSights({name: found for name, found in squares.items() if found}, {})

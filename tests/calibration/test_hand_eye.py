@@ -1,0 +1,133 @@
+"""The camera's place from the rig's own motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.extrinsics import judge_extrinsics
+from calibration.hand_eye import locate_by_motion
+from calibration.pose_file import read_poses
+from cdpr.errors import BadInput, InvalidFile
+from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from cdpr.rig import Camera, Rig, load_rig
+from tests.calibration.exact_sights import sights_at
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+def shaken(pose: Pose, noise: float, rng: np.random.Generator) -> Pose:
+    turn = matrix_from_rotation_vector(2.0 * noise * rng.standard_normal(3))
+    return Pose(pose.position + noise * rng.standard_normal(3), turn @ pose.rotation)
+
+
+def session(
+    rig: Rig, count: int, turn: float, noise: float, seed: int, tags_off: Pose | None = None
+):
+    """Pictures of a platform that the drives put near where they tell: sights and told poses."""
+    rng = np.random.default_rng(seed)
+    camera, told, seen = rig.cameras[0], {}, {}
+    off = tags_off or Pose.level(np.zeros(3))
+    for k in range(count):
+        place = rng.uniform([-0.2, -0.2, 0.25], [0.2, 0.2, 0.6])
+        pose = Pose(place, matrix_from_rotation_vector(rng.uniform(-turn, turn, 3)))
+        told[f"{k}.png"] = shaken(pose, noise, rng)
+        seen[f"{k}.png"] = camera.world_from_camera.inverse().compose(pose).compose(off)
+    return sights_at(camera, rig.platform_tags, seen, 0.03, rng), told
+
+
+def unaware(camera: Camera) -> Camera:
+    """The camera as of a rig file that knows nothing of its place."""
+    return replace(camera, world_from_camera=Pose.level([0.0, 0.0, 1.0]))
+
+
+def test_exact_poses_give_the_exact_place(rig: Rig) -> None:
+    off = Pose(np.array([4e-4, -3e-4, 2e-4]), matrix_from_rotation_vector([0.002, 0.001, -0.003]))
+    sights, told = session(rig, 30, 0.3, 1e-6, seed=1, tags_off=off)
+    found = locate_by_motion(rig, unaware(rig.cameras[0]), sights, told)
+    truth = rig.cameras[0].world_from_camera
+    assert found.world_from_camera.distance_to(truth) < 1e-3
+    assert np.degrees(found.world_from_camera.angle_to(truth)) < 0.05
+    assert found.by == "rig motion"
+
+
+@pytest.mark.parametrize("turn", [0.3, 0.0])
+def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, turn: float) -> None:
+    truth, inside = rig.cameras[0].world_from_camera, []
+    for seed in range(12):
+        rng = np.random.default_rng(1000 + seed)
+        off = shaken(Pose.level(np.zeros(3)), 1e-3, rng)
+        sights, told = session(rig, 16, turn, 0.5e-3, seed, off)
+        result = locate_by_motion(rig, unaware(rig.cameras[0]), sights, told)
+        pose = result.world_from_camera
+        turned = rotation_vector_from_matrix(pose.rotation @ truth.rotation.T)
+        gap = np.concatenate([pose.position - truth.position, turned])
+        inside.append(np.abs(gap) <= result.half_widths)
+    assert np.mean(inside) >= 0.9
+
+
+def test_motion_without_rotation_leaves_the_drawing_and_says_so(rig: Rig) -> None:
+    """Where the tags are on the platform cannot be told from where the camera stands."""
+    still = locate_by_motion(rig, rig.cameras[0], *session(rig, 20, 0.0, 1e-5, seed=4))
+    turning = locate_by_motion(rig, rig.cameras[0], *session(rig, 20, 0.3, 1e-5, seed=4))
+    assert (still.half_widths[:3] > 1.5e-3).all()
+    assert (turning.half_widths[:3] < 1.0e-3).all()
+    verdict = judge_extrinsics(still, 1e-3)
+    assert not verdict.good
+    assert "turned up to 20°" in " ".join(verdict.next_steps)
+
+
+def test_a_pose_that_was_written_wrongly_counts_little(rig: Rig) -> None:
+    sights, told = session(rig, 16, 0.3, 1e-4, seed=5)
+    told["3.png"] = Pose(told["3.png"].position + np.array([0.05, 0, 0]), told["3.png"].rotation)
+    found = locate_by_motion(rig, unaware(rig.cameras[0]), sights, told)
+    assert found.world_from_camera.distance_to(rig.cameras[0].world_from_camera) < 2e-3
+
+
+def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> None:
+    sights, told = session(rig, 6, 0.3, 1e-4, seed=6)
+    del told["2.png"]
+    found = locate_by_motion(rig, rig.cameras[0], sights, told)
+    assert found.unused == {"2.png": "has no pose"}
+    assert any("5 poses were seen, 8 are needed" in lack.reason for lack in found.lacks)
+    few = {name: told[name] for name in ("0.png", "1.png")}
+    with pytest.raises(BadInput, match="2 pictures show the platform at a pose that is known"):
+        locate_by_motion(rig, rig.cameras[0], sights, few)
+
+
+HEAD = "picture,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"
+
+
+def test_poses_are_read_by_picture_and_rows_without_one_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(HEAD + "a.png,1,2,3,1,0,0,0\nb.png,,,,,,,\npictures/c.png,0,0,500,0,1,0,0\n")
+    poses = read_poses(path)
+    assert list(poses) == ["a.png", "c.png"]
+    assert poses["a.png"].position.tolist() == pytest.approx([0.001, 0.002, 0.003])
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("picture,x_mm\n", "no column y_mm, z_mm, qw, qx, qy, qz"),
+        (HEAD + "a.png,1,2,x,1,0,0,0\n", "2:1: a.png: 1, 2, x, 1, 0, 0, 0 are not seven numbers"),
+        (HEAD + "a.png,1,2,nan,1,0,0,0\n", "not finite"),
+        (HEAD + "a.png,1,2,3,1,1,0,0\n", "length 1"),
+        (HEAD + "a.png,1,2,3,1,0,0,0\n" * 2, "stands twice"),
+        (HEAD + ",1,2,3,1,0,0,0\n", "no picture is named"),
+    ],
+)
+def test_files_of_poses_that_cannot_be_used_are_told(tmp_path: Path, text: str, named: str) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    with pytest.raises(InvalidFile) as caught:
+        read_poses(path)
+    assert named in str(caught.value)

@@ -1,0 +1,150 @@
+"""`cdpr calibrate extrinsics`: cameras that stand elsewhere than the rig file says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from cdpr.document_types import PoseDocument
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from cdpr.rig import load_rig
+from cdpr.scene import load_scene
+from simulation.camera import SyntheticCamera
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import call, nothing_written, one_message
+
+TURNS = ((0.2, 0, 0), (0, 0.25, 0), (0, 0, 0.3), (-0.2, 0.1, 0), (0.1, -0.2, -0.3), (0, 0, -0.3))
+
+
+def poses() -> list[Pose]:
+    """Of the platform, far apart and turned."""
+    places = [(0, 0, 0.45), (0.15, 0, 0.5), (-0.1, 0.1, 0.4), (0, -0.15, 0.55), (0.1, 0.1, 0.35)]
+    return [
+        Pose(places[k % 5] + np.array([0, 0, 0.01 * k]), matrix_from_rotation_vector(TURNS[k % 6]))
+        for k in range(10)
+    ]
+
+
+@pytest.fixture(scope="module")
+def truth() -> Pose:
+    named = load_rig(RIG).cameras[0].world_from_camera
+    turn = matrix_from_rotation_vector([0.02, -0.01, 0.015])
+    return Pose(named.position + np.array([0.03, -0.02, 0.01]), turn @ named.rotation)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, truth: Pose) -> Path:
+    """Ten pictures, a file of the platform's poses, and files that are of no use."""
+    folder = tmp_path_factory.mktemp("rig pictures")
+    rig = load_rig(RIG)
+    scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())
+    camera = SyntheticCamera(rig, scene, replace(rig.cameras[0], world_from_camera=truth), seed=5)
+    rows = ["picture,x_mm,y_mm,z_mm,qw,qx,qy,qz"]
+    for k, pose in enumerate(poses()):
+        cv2.imwrite(str(folder / f"{k}.png"), camera.render(pose, k))
+        place = ",".join(f"{1e3 * x:.6f}" for x in pose.position)
+        rows.append(f"{k}.png,{place}," + ",".join(f"{q:.9f}" for q in pose.quaternion))
+    (folder / "poses.csv").write_text("\n".join(rows) + "\n")
+    cv2.imwrite(str(folder / "wall.png"), np.full((720, 1280), 128, np.uint8))
+    cv2.imwrite(str(folder / "small.png"), np.full((240, 320), 128, np.uint8))
+    (folder / "broken.jpg").write_bytes(b"not a picture")
+    return folder
+
+
+def far(found: dict, truth: Pose) -> float:
+    """How far off the found place is, [mm]."""
+    pose = PoseDocument.model_validate(found["world_from_camera"]).pose()
+    return pose.distance_to(truth) * 1e3
+
+
+def test_a_camera_is_found_by_frame_tags_and_the_result_used(folder, truth, tmp_path) -> None:
+    out = tmp_path / "out"
+    options = ("--survey-mm", "0.1", "--wanted-mm", "2", "-o", out, "--json")
+    answer = call("calibrate", "extrinsics", RIG, folder, *options)
+    assert answer.code == 0, answer
+    found = json.loads(answer.out)
+    assert far(found, truth) < 1.0
+    assert found["by"] == "frame tags"
+    assert found["pictures"] == 10
+    assert set(found["unused"]) == {"wall.png", "small.png", "broken.jpg"}
+    assert found["unused"]["small.png"] == "has 320 x 240 px, the camera has 1280 x 720 px"
+    assert found["verdict"].startswith("good enough for")
+    (saved,) = out.glob("calibration_extrinsics_front_*.yaml")
+    assert yaml.safe_load(saved.read_text()) == found
+    page = (out / "report.html").read_text()
+    assert "good enough for" in page
+    assert "broken.jpg" in page
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "0.png").write_bytes((folder / "0.png").read_bytes())
+    log = tmp_path / "poses.csv"
+    wrong = call("track", RIG, tmp_path / "one", "-o", log)
+    assert wrong.code == 1  # the camera does not stand where the rig file says
+    answer = call("track", RIG, tmp_path / "one", "-o", log, "--calibration", saved)
+    assert answer.code == 0, answer
+    x, y, z = (float(v) for v in log.read_text().splitlines()[1].split(",")[3:6])
+    assert np.linalg.norm(np.array([x, y, z]) - poses()[0].position * 1e3) < 1.5
+
+
+def test_a_camera_is_found_by_the_rigs_motion(folder, truth) -> None:
+    options = ("--poses", folder / "poses.csv", "--wanted-mm", "5", "--json")
+    answer = call("calibrate", "extrinsics", RIG, folder, *options)
+    assert answer.code == 0, answer
+    found = json.loads(answer.out)
+    assert found["by"] == "rig motion"
+    assert far(found, truth) < 3.0
+
+
+def test_a_run_tells_its_poses_by_the_drives(short_plan: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert call("run", short_plan, "--rig", RIG, "-o", run, "--fast").code == 0
+    answer = call("calibrate", "extrinsics", RIG, run / "pictures", "--poses", run, "--json")
+    assert answer.code == 3, answer  # a short straight path does not tell much
+    found = json.loads(answer.out)
+    assert found["pictures"] >= 8
+    named = load_rig(RIG).cameras[0].world_from_camera
+    for axis, place in zip("xyz", named.position * 1e3, strict=True):
+        low, high = found["intervals"][f"{axis}_mm"]
+        assert low <= place <= high
+
+
+def test_people_read_the_verdict_first(folder) -> None:
+    answer = call("calibrate", "extrinsics", RIG, folder, "--survey-mm", "5")
+    assert answer.code == 3
+    lines = answer.out.splitlines()
+    assert lines[0] == "extrinsics front"
+    assert lines[1].split()[:4] == ["verdict", "not", "good", "enough:"]
+    assert lines[2].split()[0] == "next"
+    assert "moved" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--camera", "side"), "no camera 'side'"),
+        (("--poses", "missing.csv"), "no such file"),
+        (("--calibration", RIG), "no calibration result"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: str) -> None:
+    with nothing_written(tmp_path):
+        answer = call("calibrate", "extrinsics", RIG, folder, "-o", tmp_path / "out", *options)
+    one_message(answer, 2, named)
+
+
+def test_folders_that_cannot_be_used_are_told(folder, tmp_path) -> None:
+    answer = call("calibrate", "extrinsics", RIG, tmp_path / "nowhere")
+    one_message(answer, 2, "neither a folder of pictures")
+    (tmp_path / "small").mkdir()
+    (tmp_path / "small" / "a.png").write_bytes((folder / "small.png").read_bytes())
+    answer = call("calibrate", "extrinsics", RIG, tmp_path / "small")
+    one_message(answer, 2, "none of the 1 pictures has the camera's 1280 x 720 px", "320 x 240")
+    (tmp_path / "walls").mkdir()
+    (tmp_path / "walls" / "a.png").write_bytes((folder / "wall.png").read_bytes())
+    answer = call("calibrate", "extrinsics", RIG, tmp_path / "walls")
+    one_message(answer, 2, "none of the tag36h11 tags 401, 402, 403, 404", "no tag of any known")
