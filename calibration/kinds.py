@@ -8,6 +8,7 @@ from pathlib import Path
 from calibration.camera_result import CameraResult
 from calibration.extrinsics_result import ExtrinsicsResult
 from calibration.result_file import ResultDocument, in_order
+from calibration.rig_result import RigResult
 from cdpr.documents import load_yaml, read_yaml
 from cdpr.errors import BadInput
 from cdpr.rig import Rig, rig_from_document
@@ -15,6 +16,7 @@ from cdpr.rig import Rig, rig_from_document
 KINDS: dict[str, type[ResultDocument]] = {
     "camera": CameraResult,
     "extrinsics": ExtrinsicsResult,
+    "rig": RigResult,
 }
 
 

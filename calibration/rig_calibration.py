@@ -1,0 +1,244 @@
+"""Finds a rig's numbers from drive positions at rest, and how well they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from calibration.interval import Interval
+from calibration.rig_fit import RigFit, RigFitter, poses_from_lengths
+from calibration.rig_measurements import RigMeasurements
+from calibration.rig_model import RigModel
+from calibration.rig_observability import Observability, sentences
+from calibration.rig_parameters import Parameters, RigGeometry, rig_with
+from cdpr.cables import cables_to
+from cdpr.errors import BadInput
+from cdpr.kinematics import poses_near
+from cdpr.poses import Array
+from cdpr.rig import Rig
+from cdpr.statics.working import working_tensions
+from cdpr.winches import WinchMap
+
+FEWEST_PLACES = 10
+"""Fewer say too little to be fitted at all."""
+FOLDS = 5
+_SIGMAS = 1.959964
+"""Half the width of a 95 % interval in standard deviations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Places that a fit has not seen, each left out once.
+
+    Attributes:
+        before: How far off they are by the drawing, shape (n,), [m].
+        after: By the fits that did not see them, shape (n,), [m].
+        poses: Distances of positions; else of cables from any pose, for lengths alone.
+    """
+
+    before: Array
+    after: Array
+    poses: bool
+
+
+@dataclass(frozen=True, eq=False)
+class RigCalibration:
+    """A rig's numbers from measurements.
+
+    Attributes:
+        parameters: The unknowns and the drawing.
+        measured: What they are from.
+        fit: The best fit that leaves what cannot be identified as in the drawing.
+        observability: What the data tell.
+        covariance: Of the unknowns, shape (p, p), [m] or share; what is not identified has that of
+            the drawing.
+        held_out: Places left out of fits.
+    """
+
+    parameters: Parameters
+    measured: RigMeasurements
+    fit: RigFit
+    observability: Observability
+    covariance: Array
+    held_out: HeldOut
+
+    @property
+    def rig(self) -> Rig:
+        """The drawing."""
+        return self.parameters.rig
+
+    @cached_property
+    def geometry(self) -> RigGeometry:
+        """The rig as found."""
+        return self.parameters.geometry(self.fit.values)
+
+    @cached_property
+    def at_home_counts(self) -> Array:
+        """Unstrained cable at the drawing's home counts, shape (m,), [m]."""
+        return RigModel(self.parameters, self.measured).counted.at_home(self.geometry)
+
+    @cached_property
+    def not_identified(self) -> list[str]:
+        """What the data do not tell, in words."""
+        return sentences(self.observability, self.parameters)
+
+    @cached_property
+    def deviations(self) -> Array:
+        """Standard deviations of the unknowns, shape (p,), [m] or share."""
+        deviations: Array = np.sqrt(np.diag(self.covariance))
+        return deviations
+
+    @cached_property
+    def intervals(self) -> dict[str, Interval]:
+        """What was found, by name with unit, 95 %."""
+        geometry, m = self.geometry, self.rig.cable_count
+        found: dict[str, Interval] = {}
+        drums = np.array([w.drum_mm_per_rev for w in self.rig.document.winches])
+        tables: dict[str, tuple[Array, str, Array]] = {
+            "outlets": (geometry.outlets.ravel() * 1e3, "_mm", np.full(3 * m, 1e3)),
+            "anchors": (geometry.anchors.ravel() * 1e3, "_mm", np.full(3 * m, 1e3)),
+            "pulleys": (np.array([geometry.pulley_radius * 1e3]), "_mm", np.array([1e3])),
+            "drum_scale": (drums * (1.0 + geometry.drum_scale), "_mm_per_rev", drums),
+            "offsets": (geometry.offsets * 1e3, "_mm", np.full(m, 1e3)),
+        }
+        for group, place in self.parameters.slices().items():
+            values, unit, scale = tables[group]
+            widths = _SIGMAS * self.deviations[place] * scale
+            rows = zip(self.parameters.names[place], values, widths, strict=True)
+            found |= {f"{n}{unit}": Interval(float(v), float(w)) for n, v, w in rows}
+        return found
+
+    def position_error(self, positions: Array, rotations: Array) -> Array:
+        """How far off the platform may be where its drives are told to bring it, 95 %.
+
+        Args:
+            positions: World frame, shape (k, 3), [m].
+            rotations: ``world_from_platform``, shape (k, 3, 3).
+
+        Returns:
+            Along the worst direction, shape (k,), [m].
+        """
+        counts = _counts_at(self.rig, positions, rotations)
+        tensions = np.full_like(counts, np.nan)
+        there = RigMeasurements(
+            names=("",) * len(positions),
+            counts=counts,
+            tensions=tensions,
+            positions=positions,
+            rotations=rotations,
+            covariances=np.zeros((len(positions), 6, 6)),
+        )
+        line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
+        moved = -np.linalg.pinv(line.by_pose) @ line.by_values
+        covariances = np.einsum("kip,pq,kjq->kij", moved[:, :3], self.covariance, moved[:, :3])
+        worst: Array = _SIGMAS * np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
+        return worst
+
+
+def calibrate_rig(
+    rig: Rig,
+    measured: RigMeasurements,
+    deviations: Mapping[str, float],
+    length_deviation: float,
+) -> RigCalibration:
+    """Finds the numbers of a rig.
+
+    Args:
+        rig: The drawing.
+        measured: Places at rest.
+        deviations: How far off the drawing may be by group of numbers; groups left out are taken as
+            known.
+        length_deviation: Of a cable's length as a drive tells it, [m].
+
+    Raises:
+        BadInput: Too few places, or nothing to look for.
+        Fault: The measurements cannot be fitted.
+    """
+    if len(measured) < FEWEST_PLACES:
+        raise BadInput(
+            f"only {len(measured)} places at rest, {FEWEST_PLACES} are needed and 60 are good",
+            where="calibrate rig",
+            next_step="measure in more places: `cdpr calibrate poses` plans them",
+        )
+    parameters = Parameters.of(rig, deviations)
+    if not len(parameters):
+        raise BadInput(
+            "there is nothing to look for",
+            where="calibrate rig",
+            why="every group of numbers is taken as known",
+            next_step="leave out --known for one of them",
+        )
+    fit, observability = _identified(parameters, measured, length_deviation)
+    return RigCalibration(
+        parameters,
+        measured,
+        fit,
+        observability,
+        _covariance(parameters, measured, fit, observability, length_deviation),
+        _held_out(parameters, measured, length_deviation),
+    )
+
+
+def _identified(
+    parameters: Parameters, measured: RigMeasurements, length_deviation: float
+) -> tuple[RigFit, Observability]:
+    """The fit in the directions that the data tell, and which those are."""
+    fitter = RigFitter(parameters, measured, length_deviation)
+    observability = Observability.of(fitter.fit().information)
+    return fitter.fit(observability.known), observability
+
+
+def _covariance(
+    parameters: Parameters,
+    measured: RigMeasurements,
+    fit: RigFit,
+    observability: Observability,
+    length_deviation: float,
+) -> Array:
+    """Larger than the deviations that were stated say where the residuals are."""
+    known, unknown = observability.known, observability.unknown
+    told = known.T @ fit.information @ known + np.eye(known.shape[1])
+    squares = float(np.sum((fit.residuals / length_deviation) ** 2))
+    freedom = fit.residuals.size - known.shape[1] - 6 * int((~measured.posed).sum())
+    larger = max(1.0, squares / max(freedom, 1))
+    inner = larger * known @ np.linalg.solve(told, known.T) + unknown @ unknown.T
+    spread = parameters.deviations
+    covariance: Array = inner * np.outer(spread, spread)
+    return covariance
+
+
+def _held_out(
+    parameters: Parameters, measured: RigMeasurements, length_deviation: float
+) -> HeldOut:
+    n = len(measured)
+    posed = bool(measured.posed.all())
+    before, after = np.empty(n), np.empty(n)
+    zero = np.zeros(len(parameters))
+    for fold in range(FOLDS):
+        out = np.arange(n) % FOLDS == fold
+        rest, left_out = measured.part(~out), measured.part(out)
+        fit, _ = _identified(parameters, rest, length_deviation)
+        for errors, values in ((before, zero), (after, fit.values)):
+            errors[out] = _errors(parameters, values, left_out, posed)
+    return HeldOut(before, after, posed)
+
+
+def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
+    """How far off places are that a fit has not seen, shape (n,), [m]."""
+    model, geometry = RigModel(parameters, measured), parameters.geometry(values)
+    lengths, rig = model.counted.by(geometry), rig_with(parameters.rig, geometry)
+    if not posed:
+        found = poses_from_lengths(rig, lengths)
+        return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in found])
+    positions, _ = poses_near(rig, lengths, measured.positions, measured.rotations, steps=8)
+    return np.asarray(np.linalg.norm(positions - measured.positions, axis=1))
+
+
+def _counts_at(rig: Rig, positions: Array, rotations: Array) -> Array:
+    """Drive positions at poses, by the drawing and under the tensions of home, (k, m)."""
+    anchors = positions[:, None, :] + np.einsum("kij,mj->kmi", rotations, rig.anchors)
+    winches, tensions = WinchMap(rig), working_tensions(rig, rig.home).tensions
+    return winches.counts(winches.unstrained(cables_to(rig, anchors).lengths, tensions))

@@ -1,0 +1,167 @@
+"""The numbers of a rig that a calibration finds, in named groups, and what the drawing says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from cdpr.kinematics import cable_lengths
+from cdpr.poses import Array, read_only
+from cdpr.rig import Rig
+from cdpr.statics.working import working_tensions
+from cdpr.winches import WinchMap
+
+AXES = ("x", "y", "z")
+
+DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
+    {
+        "outlets": 4e-3,
+        "anchors": 1e-3,
+        "pulleys": 0.5e-3,
+        "drum_scale": 0.005,
+        "offsets": 2e-3,
+    }
+)
+"""How far off a drawing may be, one standard deviation: [m], drum_scale as a share."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigGeometry:
+    """What decides how long cables are and what drives count, for m cables.
+
+    Attributes:
+        outlets: World frame, shape (m, 3), [m].
+        anchors: Platform frame, shape (m, 3), [m].
+        pulley_radius: [m]; 0 for point exits.
+        drum_scale: Cable paid out for a count, as a share of the drawing's, less 1, shape (m,).
+        offsets: Unstrained cable at the home counts beyond what reaches the home pose, shape (m,),
+            [m]: by how much the reference was off.
+    """
+
+    outlets: Array
+    anchors: Array
+    pulley_radius: float
+    drum_scale: Array
+    offsets: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parameters:
+    """The layout of the vector of unknowns; each is a deviation from the drawing.
+
+    Attributes:
+        rig: The drawing.
+        groups: Names of the groups that are looked for, in order.
+        deviations: How far off each unknown may be, standard deviation, shape (p,), [m] or share.
+        names: Of the unknowns, such as ``outlet_3_x``; p texts.
+    """
+
+    rig: Rig
+    groups: tuple[str, ...]
+    deviations: Array
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, rig: Rig, deviations: Mapping[str, float]) -> Parameters:
+        """The unknowns of a rig.
+
+        Args:
+            rig: The drawing.
+            deviations: How far off it may be, by group; groups left out are taken as known.
+        """
+        groups = tuple(
+            group
+            for group in DEFAULT_DEVIATIONS
+            if group in deviations and (group != "pulleys" or rig.pulley_radius > 0.0)
+        )
+        names = tuple(name for group in groups for name in _names(group, rig.cable_count))
+        spread = [deviations[group] for group in groups for _ in _names(group, rig.cable_count)]
+        return cls(rig, groups, read_only(spread), names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def slices(self) -> dict[str, slice]:
+        """Where each group is in the vector."""
+        found, begin = {}, 0
+        for group in self.groups:
+            end = begin + len(_names(group, self.rig.cable_count))
+            found[group], begin = slice(begin, end), end
+        return found
+
+    def geometry(self, values: Array) -> RigGeometry:
+        """The rig with the unknowns having values, shape (p,), [m] or share."""
+        m, found = self.rig.cable_count, self.slices()
+
+        def of(group: str, size: int) -> Array:
+            return values[found[group]] if group in found else np.zeros(size)
+
+        return RigGeometry(
+            outlets=self.rig.outlets + of("outlets", 3 * m).reshape(m, 3),
+            anchors=self.rig.anchors + of("anchors", 3 * m).reshape(m, 3),
+            pulley_radius=self.rig.pulley_radius + float(of("pulleys", 1)[0]),
+            drum_scale=of("drum_scale", m),
+            offsets=of("offsets", m),
+        )
+
+
+def _names(group: str, m: int) -> list[str]:
+    if group == "pulleys":
+        return ["pulley_radius"]
+    what = {"outlets": "outlet", "anchors": "anchor", "drum_scale": "drum", "offsets": "offset"}
+    if group in ("outlets", "anchors"):
+        return [f"{what[group]}_{i}_{axis}" for i in range(1, m + 1) for axis in AXES]
+    return [f"{what[group]}_{i}" for i in range(1, m + 1)]
+
+
+def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
+    """The drawing's rig with other outlets, anchors and pulleys; its winches stay."""
+    return replace(
+        rig,
+        outlets=read_only(geometry.outlets),
+        anchors=read_only(geometry.anchors),
+        pulley_radius=geometry.pulley_radius,
+    )
+
+
+class CountedLengths:
+    """Cable lengths that drive positions and tensions tell.
+
+    Attributes:
+        stretch: 1 + tension / stiffness, shape (n, m).
+        paid_out: Unstrained cable since the home counts by the drawing's drums, shape (n, m), [m].
+        stretch_at_home: 1 + tension / stiffness at the home pose, shape (m,).
+    """
+
+    def __init__(self, rig: Rig, counts: Array, tensions: Array) -> None:
+        """Takes the drawing's winches.
+
+        Args:
+            rig: The drawing.
+            counts: Shape (n, m), [counts].
+            tensions: Shape (n, m), [N].
+
+        Raises:
+            TensionInfeasible: The rig cannot hold its platform at home.
+        """
+        winches = WinchMap(rig)
+        self.stretch: Array = 1.0 + tensions / rig.cable_stiffness
+        self.paid_out: Array = (counts - winches.home_counts) / winches.counts_per_metre
+        at_home = working_tensions(rig, rig.home).tensions
+        self.stretch_at_home: Array = 1.0 + at_home / rig.cable_stiffness
+        self._rig, self._behind = rig, winches.behind_outlet
+
+    def at_home(self, geometry: RigGeometry) -> Array:
+        """Unstrained cable at the home counts, shape (m,), [m]."""
+        lengths = cable_lengths(rig_with(self._rig, geometry), self._rig.home)
+        unstrained: Array = (lengths + self._behind) / self.stretch_at_home + geometry.offsets
+        return unstrained
+
+    def by(self, geometry: RigGeometry) -> Array:
+        """Lengths from outlet to anchor with other numbers of the rig, shape (n, m), [m]."""
+        paid_out = self.paid_out * (1.0 + geometry.drum_scale)
+        lengths: Array = (self.at_home(geometry) + paid_out) * self.stretch - self._behind
+        return lengths

@@ -1,0 +1,106 @@
+"""What a rig's calibration is good for, and what to do where it is not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from calibration.interval import CONFIDENCE
+from calibration.rig_calibration import RigCalibration
+from calibration.verdict import Lack, Verdict
+from cdpr.poses import Array, matrix_from_rotation_vector
+
+_INSET = 0.15
+"""The workspace is judged at its centre and this share inside its corners."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigQuality:
+    """How good a rig's calibration is.
+
+    Attributes:
+        verdict: Of all of it.
+        before: How far off places are by the drawing, RMS, [m].
+        held_out: By fits that did not see them, RMS, [m].
+        level: How far off the platform may be at the orientation of home, 95 %, [m].
+        turned: Turned by `tilt`, 95 %, [m].
+        tilt: About any horizontal axis, [rad].
+    """
+
+    verdict: Verdict
+    before: float
+    held_out: float
+    level: float
+    turned: float
+    tilt: float
+
+
+def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
+    """The verdict.
+
+    Args:
+        result: What was found.
+        wanted: What is good enough, 95 %, [m].
+        tilt: By how much the platform will be turned from its orientation at home, [rad].
+    """
+    level = float(result.position_error(*_places(result, 0.0)).max())
+    turned = float(result.position_error(*_places(result, tilt)).max()) if tilt else level
+    out = result.held_out
+    missed = float(np.quantile(out.after, CONFIDENCE))
+    before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
+    lacks = []
+    if missed > wanted:
+        what = "places" if out.poses else "lengths of cables at places"
+        lacks.append(
+            Lack(
+                f"{what} left out of the fit are up to {missed * 1e3:.2g} mm off",
+                "calibrate the camera and its place, and look for worn guides, slack cables and"
+                " outliers in the report's list of places",
+            )
+        )
+    if after > before:
+        lacks.append(
+            Lack(
+                f"the rig file as it is fits better ({before * 1e3:.2g} mm)",
+                "check units, the order of the cables and the reference of the drives",
+            )
+        )
+    if level > wanted:
+        lacks.append(
+            Lack(
+                f"the platform may be {level * 1e3:.2g} mm off where it was not measured",
+                "measure in more places all over the workspace"
+                + ("" if out.poses else ", and with a camera"),
+            )
+        )
+    if turned > max(wanted, level):
+        lacks.append(
+            Lack(
+                f"turned by {math.degrees(tilt):.3g}° it may be {turned * 1e3:.2g} mm off",
+                f"measure with the platform turned by {math.degrees(tilt):.3g}° and more both ways"
+                " (`cdpr calibrate poses` plans it), or pass --tilt-deg 0 if it is never turned",
+            )
+        )
+    error = max(missed, level, turned)
+    verdict = Verdict.of(error, wanted, f"turned by up to {math.degrees(tilt):.3g}°", lacks)
+    return RigQuality(verdict, before, after, level, turned, tilt)
+
+
+def _places(result: RigCalibration, tilt: float) -> tuple[Array, Array]:
+    """Centre and corners of the workspace, turned about x and y both ways."""
+    rig = result.rig
+    centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
+    half = (0.5 - _INSET) * (rig.workspace_upper - rig.workspace_lower)
+    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
+    positions = centre + np.concatenate([np.zeros((1, 3)), corners])
+    axes = [(1, 0), (-1, 0), (0, 1), (0, -1)] if tilt else [(0, 0)]
+    turns = [matrix_from_rotation_vector((tilt * x, tilt * y, 0.0)) for x, y in axes]
+    rotations = np.array(turns) @ rig.home.rotation
+    pairs = list(product(range(len(positions)), range(len(rotations))))
+    return (
+        np.array([positions[i] for i, _ in pairs]),
+        np.array([rotations[j] for _, j in pairs]),
+    )

@@ -1,0 +1,87 @@
+"""Places at rest of a rig that is not built as its file says, with exact truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.rig_measurements import RigMeasurements
+from cdpr.cables import cables_at
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+from cdpr.rig import Rig
+from cdpr.statics.tension_solution import TensionInfeasible
+from cdpr.statics.working import working_tensions
+from cdpr.winches import WinchMap
+from simulation.as_built import rig_as_built
+from simulation.plant import Plant
+
+POSITION_NOISE, TURN_NOISE = 0.2e-3, 0.5e-3
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Measurements and what is true of them."""
+
+    measured: RigMeasurements
+    positions: Array
+    rotations: Array
+
+
+def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) -> Truth:
+    """Where a simulated rig comes to rest when its drives are told to go to random poses."""
+    random = np.random.default_rng(seed)
+    winches, plant = WinchMap(rig), Plant(rig_as_built(rig), rig.home)
+    span = rig.workspace_upper - rig.workspace_lower
+    rows: list[tuple[Array, Array, Pose]] = []
+    while len(rows) < count:
+        position = rig.workspace_lower + random.uniform(0.1, 0.9, 3) * span
+        angle, amount = random.uniform(0.0, 2.0 * np.pi), tilt * np.sqrt(random.uniform())
+        turn = amount * np.array([np.cos(angle), np.sin(angle), 0.0])
+        pose = Pose(position, matrix_from_rotation_vector(turn))
+        try:
+            tensions = working_tensions(rig, pose).tensions
+        except TensionInfeasible:
+            continue
+        lengths = cables_at(rig, pose).lengths
+        counts = np.rint(winches.counts(winches.unstrained(lengths, tensions)))
+        plant.settle_counts(counts)
+        if plant.tensions.min() > rig.min_tension / 2.0:
+            rows.append((counts, plant.tensions, plant.pose))
+    shaken = [
+        (
+            pose.position + noise * POSITION_NOISE * random.standard_normal(3),
+            matrix_from_rotation_vector(noise * TURN_NOISE * random.standard_normal(3))
+            @ pose.rotation,
+        )
+        for _, _, pose in rows
+    ]
+    covariance = np.diag([POSITION_NOISE**2] * 3 + [TURN_NOISE**2] * 3)
+    measured = RigMeasurements(
+        names=tuple(f"place {k}" for k in range(count)),
+        counts=np.array([counts for counts, _, _ in rows]),
+        tensions=np.array([t for _, t, _ in rows]),
+        positions=np.array([p for p, _ in shaken]),
+        rotations=np.array([r for _, r in shaken]),
+        covariances=np.tile(covariance, (count, 1, 1)),
+    )
+    return Truth(
+        measured,
+        np.array([pose.position for _, _, pose in rows]),
+        np.array([pose.rotation for _, _, pose in rows]),
+    )
+
+
+def write_places(path: Path, measured: RigMeasurements, *, poses: bool = True) -> None:
+    """As a CSV file of docs/data-formats.md."""
+    m = measured.counts.shape[1]
+    names = [f"actual_{i}_counts" for i in range(1, m + 1)]
+    names += [f"tension_{i}_n" for i in range(1, m + 1)]
+    table = [measured.counts, measured.tensions]
+    if poses:
+        names += ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
+        turned = [Pose(np.zeros(3), r).quaternion for r in measured.rotations]
+        table += [measured.positions * 1e3, np.array(turned)]
+    rows = [",".join(f"{x:.9g}" for x in row) for row in np.concatenate(table, axis=1)]
+    path.write_text("\n".join([",".join(names), *rows]) + "\n", encoding="utf-8")

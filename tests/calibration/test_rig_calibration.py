@@ -1,0 +1,340 @@
+"""A rig's numbers from places at rest, against the truth that only the simulation knows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from calibration.kinds import calibrated
+from calibration.rig_calibration import RigCalibration, calibrate_rig
+from calibration.rig_fit import RigFitter
+from calibration.rig_measurements import Recording, RigMeasurements, at_rest, joined
+from calibration.rig_model import RigModel
+from calibration.rig_observability import Observability, sentences
+from calibration.rig_page import rig_page
+from calibration.rig_parameters import DEFAULT_DEVIATIONS, Parameters
+from calibration.rig_result import RigResult, require_one_drawing, rig_result
+from calibration.rig_verdict import judge_rig
+from cdpr.errors import BadInput
+from cdpr.kinematics import poses_near
+from cdpr.poses import Array, matrix_from_rotation_vector, rotation_vector_from_matrix
+from cdpr.rig import Rig, load_rig, rig_from_document
+from cdpr.winches import WinchMap
+from simulation.as_built import rig_as_built
+from tests.calibration.rig_places import Truth, places
+
+ROOT = Path(__file__).resolve().parents[2]
+LENGTH_DEVIATION = 0.1e-3
+TODAY = date(2026, 3, 14)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(ROOT / "configs/gachon_8_6_rehearsal.yaml")
+
+
+@pytest.fixture(scope="module")
+def turned(rig: Rig) -> Truth:
+    return places(rig, 60, tilt=np.radians(8.0), seed=1)
+
+
+@pytest.fixture(scope="module")
+def level(rig: Rig) -> Truth:
+    return places(rig, 60, tilt=0.0, seed=2)
+
+
+@pytest.fixture(scope="module")
+def found(rig: Rig, turned: Truth) -> RigCalibration:
+    return calibrate_rig(rig, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+
+
+@pytest.fixture(scope="module")
+def found_level(rig: Rig, level: Truth) -> RigCalibration:
+    return calibrate_rig(rig, level.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+
+
+def told_by(rig: Rig, truth: Truth) -> Array:
+    """Where forward kinematics of a rig puts the platform, by its own winches, (n, 3), [m]."""
+    winches, data = WinchMap(rig), truth.measured
+    lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
+    return poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)[0]
+
+
+def errors_of(rig: Rig, truth: Truth) -> Array:
+    """How far off that is, shape (n,), [m]."""
+    return np.asarray(np.linalg.norm(told_by(rig, truth) - truth.positions, axis=1))
+
+
+def errors_of_shape(rig: Rig, truth: Truth) -> Array:
+    """The same, with all places moved and turned as one to where they fit best, (n,), [m]."""
+    told = told_by(rig, truth)
+    centres = told.mean(axis=0), truth.positions.mean(axis=0)
+    turn, _ = Rotation.align_vectors(truth.positions - centres[1], told - centres[0])
+    moved = turn.apply(told - centres[0]) + centres[1]
+    return np.asarray(np.linalg.norm(moved - truth.positions, axis=1))
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=6)
+@pytest.mark.parametrize("name", ["gachon_8_6_rehearsal", "hall_10_6"])
+def test_derivatives_are_those_of_finite_differences(name: str, seed: int) -> None:
+    """All groups, point exits and pulleys, stretched cables."""
+    rig = load_rig(ROOT / f"configs/{name}.yaml")
+    random = np.random.default_rng(seed)
+    parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
+    m, span = rig.cable_count, rig.workspace_upper - rig.workspace_lower
+    data = RigMeasurements(
+        names=("a", "b"),
+        counts=random.uniform(-1e5, 1e5, (2, m)),
+        tensions=random.uniform(5.0, 100.0, (2, m)),
+        positions=rig.workspace_lower + random.uniform(0.2, 0.8, (2, 3)) * span,
+        rotations=np.array([matrix_from_rotation_vector(random.normal(0, 0.1, 3))] * 2),
+        covariances=np.tile(np.eye(6), (2, 1, 1)),
+    )
+    model = RigModel(parameters, data)
+    values = parameters.deviations * random.normal(0.0, 1.0, len(parameters))
+    at = (data.positions, data.rotations)
+    line, step = model.linearised(values, *at), 1e-6
+    for k in range(len(parameters)):
+        nudge = np.zeros(len(parameters))
+        nudge[k] = step
+        change = model.residuals(values + nudge, *at) - model.residuals(values - nudge, *at)
+        assert line.by_values[:, :, k] == pytest.approx(change / (2.0 * step), abs=2e-6)
+    for k in range(3):
+        shift, turn = np.zeros(3), np.zeros(3)
+        shift[k] = turn[k] = step
+        forth, back = matrix_from_rotation_vector(turn), matrix_from_rotation_vector(-turn)
+        moved = model.residuals(values, at[0] + shift, at[1])
+        change = moved - model.residuals(values, at[0] - shift, at[1])
+        assert line.by_pose[:, :, k] == pytest.approx(change / (2.0 * step), abs=2e-6)
+        moved = model.residuals(values, at[0], forth @ at[1])
+        change = moved - model.residuals(values, at[0], back @ at[1])
+        assert line.by_pose[:, :, 3 + k] == pytest.approx(change / (2.0 * step), abs=2e-6)
+
+
+def test_the_fit_is_the_one_that_scipy_finds(rig: Rig, turned: Truth) -> None:
+    """Unknowns and poses in one dense problem of another solver; no outlier, so plain squares."""
+    data = turned.measured.part(np.arange(60) < 12)
+    parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
+    fit = RigFitter(parameters, data, LENGTH_DEVIATION).fit()
+    model, n, p = RigModel(parameters, data), len(data), len(parameters)
+    scale = np.sqrt(np.diagonal(data.covariances, axis1=1, axis2=2))
+
+    def residuals(x: Array) -> Array:
+        twists = x[p:].reshape(n, 6) * scale
+        turns = np.array([matrix_from_rotation_vector(t) for t in twists[:, 3:]])
+        at = (data.positions + twists[:, :3], turns @ data.rotations)
+        cables = model.residuals(parameters.deviations * x[:p], *at) / LENGTH_DEVIATION
+        return np.concatenate([x, cables.ravel()])
+
+    other = least_squares(residuals, np.zeros(p + 6 * n), x_scale="jac", xtol=1e-14, ftol=1e-14)
+    assert np.abs(fit.residuals / LENGTH_DEVIATION).max() < 3.0
+    assert fit.values / parameters.deviations == pytest.approx(other.x[:p], abs=2e-3)
+
+
+def test_places_that_were_not_measured_are_told_ten_times_better(
+    rig: Rig, found: RigCalibration
+) -> None:
+    quality = judge_rig(found, 1e-3, np.radians(5.0))
+    result = rig_result(found, quality, "rig", TODAY)
+    others = places(rig, 40, tilt=np.radians(8.0), seed=9)
+    corrected = calibrated(rig, [result])
+    before, after = rms(errors_of(rig, others)), rms(errors_of(corrected, others))
+    assert before > 1e-3
+    assert after < 0.3e-3
+    assert after < before / 10.0
+    assert quality.held_out == pytest.approx(np.sqrt(3) * 0.2e-3, rel=0.4)  # the poses' own noise
+    assert quality.before > 1e-3
+    assert quality.verdict.good
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say(
+    rig: Rig, found: RigCalibration
+) -> None:
+    truth = rig_as_built(rig)
+    true = {
+        f"{what}_{i}_{axis}_mm": 1e3 * value
+        for what, points in (("outlet", truth.outlets), ("anchor", truth.anchors))
+        for i, point in enumerate(points, start=1)
+        for axis, value in zip("xyz", point, strict=True)
+    }
+    drums = [w.drum_mm_per_rev for w in truth.document.winches]
+    true |= {f"drum_{i}_mm_per_rev": drum for i, drum in enumerate(drums, start=1)}
+    inside = [
+        abs(found.intervals[k].value - v) < found.intervals[k].half_width for k, v in true.items()
+    ]
+    assert len(inside) == 56
+    assert sum(inside) >= 50
+
+
+def test_without_turning_it_names_what_cannot_be_told_and_leaves_it_as_drawn(
+    rig: Rig, found_level: RigCalibration
+) -> None:
+    """A cable of a platform that never turns tells outlet and anchor only as a sum."""
+    assert found_level.observability.unknown.shape[1] == 24
+    assert found_level.not_identified == [
+        "outlet and anchor of one cable moved together: every cable along x, y and z"
+    ]
+    spread = found_level.parameters.deviations
+    moved = found_level.fit.values / spread
+    assert np.abs(found_level.observability.unknown.T @ moved).max() < 1e-9
+    turned_error = judge_rig(found_level, 0.5e-3, np.radians(15.0))
+    assert turned_error.turned > 2.0 * turned_error.level
+    assert not turned_error.verdict.good
+    assert any("turned" in step for step in turned_error.verdict.next_steps)
+
+
+def test_one_cable_that_is_told_badly_does_not_spoil_the_rest(rig: Rig, turned: Truth) -> None:
+    """Two of sixty places with a cable 5 mm and a pose 20 mm off: outliers that weigh little."""
+    data = turned.measured
+    counts, positions = data.counts.copy(), data.positions.copy()
+    counts[7, 3] += 0.005 * rig.winches[3].counts_per_metre
+    positions[20] += [0.02, 0.0, 0.0]
+    spoiled = replace(data, counts=counts, positions=positions)
+    result = calibrate_rig(rig, spoiled, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    quality = judge_rig(result, 1e-3, 0.0)
+    corrected = calibrated(rig, [rig_result(result, quality, "rig", TODAY)])
+    assert rms(errors_of(corrected, places(rig, 20, tilt=0.1, seed=4))) < 0.3e-3
+
+
+def test_lengths_alone_make_cables_agree_and_tell_that_the_world_is_unknown(
+    rig: Rig, turned: Truth
+) -> None:
+    """As without a camera: eight lengths of a pose of six numbers must fit each other."""
+    alone = turned.measured.without_poses()
+    result = calibrate_rig(rig, alone, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    quality = judge_rig(result, 1e-3, 0.0)
+    assert not result.held_out.poses
+    assert quality.held_out < quality.before / 10.0
+    assert any("all outlets" in line for line in result.not_identified)
+    assert not quality.verdict.good
+    assert any("with a camera" in step for step in quality.verdict.next_steps)
+    corrected = calibrated(rig, [rig_result(result, quality, "rig", TODAY)])
+    assert rms(errors_of_shape(corrected, turned)) < 0.75 * rms(errors_of_shape(rig, turned))
+
+
+def test_groups_that_are_known_stay_as_drawn(rig: Rig, turned: Truth) -> None:
+    only = {"drum_scale": 0.005, "offsets": 2e-3}
+    result = calibrate_rig(rig, turned.measured, only, LENGTH_DEVIATION)
+    assert np.array_equal(result.geometry.outlets, rig.outlets)
+    assert result.parameters.groups == ("drum_scale", "offsets")
+    assert set(result.intervals) == {
+        *(f"drum_{i}_mm_per_rev" for i in range(1, 9)),
+        *(f"offset_{i}_mm" for i in range(1, 9)),
+    }
+
+
+def test_pulleys_are_looked_for_only_where_the_rig_has_them(rig: Rig) -> None:
+    hall = load_rig(ROOT / "configs/hall_10_6.yaml")
+    assert "pulley_radius" in Parameters.of(hall, DEFAULT_DEVIATIONS).names
+    assert "pulley_radius" not in Parameters.of(rig, DEFAULT_DEVIATIONS).names
+
+
+def test_unknown_directions_without_a_name_are_told_by_their_largest_parts(rig: Rig) -> None:
+    parameters = Parameters.of(rig, {"outlets": 1e-3, "offsets": 1e-3})
+    direction = np.zeros(len(parameters))
+    direction[[0, 30]] = np.sqrt(0.5)
+    information = 100.0 * (np.eye(len(parameters)) - np.outer(direction, direction))
+    (told,) = sentences(Observability.of(information), parameters)
+    assert told.startswith("1 sums of several numbers")
+    assert "outlet_1_x" in told
+    assert "offset_7" in told
+
+
+def test_a_result_file_is_applied_to_its_own_rig_only(
+    rig: Rig, found: RigCalibration, tmp_path: Path
+) -> None:
+    quality = judge_rig(found, 1e-3, 0.0)
+    result = rig_result(found, quality, "rig", TODAY)
+    corrected = calibrated(rig, [RigResult.model_validate(result.model_dump())])
+    assert corrected.outlets == pytest.approx(found.geometry.outlets, abs=1e-9)
+    assert corrected.anchors == pytest.approx(found.geometry.anchors, abs=1e-9)
+    assert corrected.document.simulation == rig.document.simulation
+    with pytest.raises(BadInput, match="rests on other outlets"):
+        calibrated(load_rig(ROOT / "configs/gachon_8_6.yaml"), [result])
+    assert result.apart_mm(result) == 0.0
+    page = rig_page(found, quality, "rig", "2026-03-14")
+    assert "good enough" in page
+    assert "cable 8" in page
+
+
+def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(
+    rig: Rig, found: RigCalibration
+) -> None:
+    """Its winches pay out for a count what the fit says, to a count."""
+    result = rig_result(found, judge_rig(found, 1e-3, 0.0), "rig", TODAY)
+    corrected, data = calibrated(rig, [result]), found.measured
+    winches = WinchMap(corrected)
+    lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
+    by_fit = RigModel(found.parameters, data).counted.by(found.geometry)
+    assert lengths == pytest.approx(by_fit, abs=3e-6)
+
+
+def test_runs_of_another_rig_or_of_two_references_are_refused(rig: Rig) -> None:
+    other = load_rig(ROOT / "configs/gachon_8_6.yaml")
+    with pytest.raises(BadInput, match="this run was made with other"):
+        require_one_drawing(rig, [("runs/a", other)])
+    winches = [w.model_copy(update={"home_counts": 5}) for w in rig.document.winches]
+    again = rig_from_document(rig.document.model_copy(update={"winches": winches}))
+    with pytest.raises(BadInput, match="referenced again"):
+        require_one_drawing(rig, [("runs/a", rig), ("runs/b", again)])
+    assert require_one_drawing(rig, [("runs/b", again)]) is again
+    assert require_one_drawing(rig, []) is rig
+
+
+def test_too_few_places_and_nothing_to_look_for_are_refused(rig: Rig, turned: Truth) -> None:
+    few = turned.measured.part(np.arange(60) < 9)
+    with pytest.raises(BadInput, match="only 9 places"):
+        calibrate_rig(rig, few, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    with pytest.raises(BadInput, match="nothing to look for"):
+        calibrate_rig(rig, turned.measured, {}, LENGTH_DEVIATION)
+
+
+def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
+    """Standing for 1 s, moving for 1 s, standing for 1 s; a picture every 0.1 s."""
+    time = np.arange(0.0, 3.0, 0.01)
+    way = np.clip(time - 1.0, 0.0, 1.0)
+    counts = np.rint(1000.0 * np.stack([way, -way], axis=1))
+    seen = np.arange(0.0, 2.5, 0.1)  # none after 2.5 s
+    turns = [matrix_from_rotation_vector((0.0, 0.0, 1e-3 * (-1) ** k)) for k in range(len(seen))]
+    run = Recording(
+        time=time,
+        asked=counts,
+        counts=counts,
+        tensions=np.full((len(time), 2), 20.0),
+        seen=seen,
+        positions=np.stack([np.clip(seen - 1.0, 0.0, 1.0), 0 * seen, 0 * seen], axis=1),
+        rotations=np.array(turns),
+        covariances=np.tile(np.eye(6) * 1e-8, (len(seen), 1, 1)),
+    )
+    found = at_rest("run", run)
+    assert found.names == ("run, rest 1", "run, rest 2")
+    assert found.counts == pytest.approx(np.array([[0.0, 0.0], [1000.0, -1000.0]]), abs=10.1)
+    assert found.positions[:, 0] == pytest.approx([0.0, 1.0], abs=1e-9)
+    for rotation in found.rotations:
+        assert np.linalg.norm(rotation_vector_from_matrix(rotation)) < 5e-4
+        assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
+    blind = at_rest(
+        "blind",
+        replace(
+            run,
+            seen=seen[:8],
+            positions=run.positions[:8],
+            rotations=run.rotations[:8],
+            covariances=run.covariances[:8],
+        ),
+    )
+    assert blind.unused == {"blind, rest 2": "no picture taken there gave a pose"}
+    assert len(joined([found, blind])) == 3

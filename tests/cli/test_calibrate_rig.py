@@ -1,0 +1,132 @@
+"""`cdpr calibrate rig` on files as people have them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpr.rig import Rig, load_rig
+from tests.calibration.rig_places import places, write_places
+from tests.cli.program import call
+
+ROOT = Path(__file__).resolve().parents[2]
+RIG = ROOT / "configs/gachon_8_6_rehearsal.yaml"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(RIG)
+
+
+@pytest.fixture(scope="module")
+def file(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("my data") / "places.csv"
+    write_places(path, places(rig, 40, tilt=0.1, seed=5).measured)
+    return path
+
+
+def test_a_result_and_its_report_are_written_and_applied(file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "calibration"
+    done = call("calibrate", "rig", RIG, file, "-o", folder, "--json")
+    assert done.code == 0, done
+    told = json.loads(done.out)
+    assert told["good_enough"]
+    assert told["held_out_mm"] < told["before_mm"] / 3.0
+    assert "good enough" in (folder / "report.html").read_text(encoding="utf-8")
+    (result,) = folder.glob("calibration_rig_rig_*.yaml")
+    same = call("calibrate", "diff", result, result)
+    assert same.code == 0, same
+
+
+def test_a_result_that_is_not_good_enough_exits_with_3_and_says_what_to_do(file: Path) -> None:
+    done = call("calibrate", "rig", RIG, file, "--wanted-mm", "0.01")
+    assert done.code == 3
+    assert "not good enough" in done.out
+    assert "next" in done.out
+
+
+def changed(file: Path, tmp_path: Path, how: str) -> Path:
+    lines = file.read_text(encoding="utf-8").splitlines()
+    names = lines[0].split(",")
+    if how == "few":
+        lines = lines[:6]
+    elif how == "nan":
+        values = lines[3].split(",")
+        values[names.index("x_mm")] = "nan"
+        lines[3] = ",".join(values)
+    elif how == "text":
+        lines[5] = "lost," + lines[5].split(",", 1)[1]
+    elif how == "short":
+        lines[4] = lines[4].rsplit(",", 1)[0]
+    elif how == "column":
+        lines = [line.split(",", 1)[1] for line in lines]
+    elif how == "time":
+        lines = [f"{'time_s' if k == 0 else -k},{line}" for k, line in enumerate(lines)]
+    elif how == "quaternion":
+        values = lines[2].split(",")
+        values[names.index("qw")] = "0.5"
+        lines[2] = ",".join(values)
+    elif how == "more":
+        lines = [f"{line},{'actual_9_counts' if k == 0 else 0}" for k, line in enumerate(lines)]
+    elif how == "twice":
+        lines[0] = lines[0].replace("actual_2_counts", "actual_1_counts")
+    elif how == "empty":
+        lines = lines[:1]
+    elif how == "deviation":
+        stds = "std_x_mm,std_y_mm,std_z_mm,std_rx_deg,std_ry_deg,std_rz_deg"
+        lines = [f"{line},{stds if k == 0 else '0,1,1,1,1,1'}" for k, line in enumerate(lines)]
+    path = tmp_path / f"{how}.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("how", "what"),
+    [
+        ("few", "only 5 places"),
+        ("nan", "line 4, x_mm: 'nan' is not a finite number"),
+        ("text", "line 6, actual_1_counts: 'lost' is not a finite number"),
+        ("short", "line 5 has 22 values for 23 columns"),
+        ("column", "the column 'actual_1_counts' is missing"),
+        ("time", "line 3: time_s does not rise"),
+        ("quaternion", "line 3: the quaternion's length is"),
+        ("more", "the rig has 8 cables, the file more"),
+        ("twice", "the column 'actual_1_counts' stands twice"),
+        ("empty", "the file holds no measurement"),
+        ("deviation", "a standard deviation is not positive"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_refused_with_its_place(
+    file: Path, tmp_path: Path, how: str, what: str
+) -> None:
+    folder = tmp_path / "out"
+    done = call("calibrate", "rig", RIG, changed(file, tmp_path, how), "-o", folder, "--json")
+    assert done.code == 2, done
+    assert what in json.loads(done.out)["what"]
+    assert not list(folder.glob("*")) if folder.exists() else True
+
+
+def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
+    done = call("calibrate", "rig", RIG, finished_run, "--json")
+    assert done.code == 2
+    assert "this run was made with other" in json.loads(done.out)["what"]
+
+
+def test_a_folder_that_is_no_run_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "missing.csv"):
+        assert call("calibrate", "rig", RIG, path).code == 2
+
+
+def test_lengths_alone_in_a_file_need_no_poses(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "lengths.csv"
+    data = places(rig, 30, tilt=0.1, seed=6).measured
+    write_places(path, data, poses=False)
+    done = call("calibrate", "rig", RIG, path, "--known", "outlets", "--json")
+    assert done.code in (0, 3), done
+    told = json.loads(done.out)
+    assert not told["with_poses"]
+    assert told["held_out_mm"] < told["before_mm"]
+    assert np.array(told["outlets_mm"]) == pytest.approx(rig.outlets * 1e3)
