@@ -19,7 +19,7 @@ from cdpr.rig_file import RigDocument
 
 AXES = ("x_mm", "y_mm", "z_mm", "turn_x_deg", "turn_y_deg", "turn_z_deg")
 """Of a pose: its position, and turns about the outer frame's axes from the stated rotation."""
-_SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
+SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
 
 
 class ExtrinsicsResult(ResultDocument):
@@ -40,7 +40,7 @@ class ExtrinsicsResult(ResultDocument):
         """How far the other camera stands off, and how it is turned about the world's axes."""
         mine, theirs = self.world_from_camera.pose(), other.world_from_camera.pose()
         turn = rotation_vector_from_matrix(theirs.rotation @ mine.rotation.T)
-        numbers = np.concatenate([theirs.position - mine.position, turn]) * _SCALES
+        numbers = np.concatenate([theirs.position - mine.position, turn]) * SCALES
         return dict(zip(AXES, numbers.tolist(), strict=True))
 
     def apart_mm(self, other: Self) -> float:
@@ -95,8 +95,8 @@ def extrinsics_result(
 
 def pose_intervals(result: ExtrinsicCalibration) -> dict[str, Interval]:
     """The pose's numbers; turns are about the world's axes, from the stated rotation."""
-    values = np.concatenate([result.world_from_camera.position, np.zeros(3)]) * _SCALES
-    widths = result.half_widths * _SCALES
+    values = np.concatenate([result.world_from_camera.position, np.zeros(3)]) * SCALES
+    widths = result.half_widths * SCALES
     return {
         name: Interval(float(value), float(width))
         for name, value, width in zip(AXES, values, widths, strict=True)

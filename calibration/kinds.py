@@ -9,12 +9,14 @@ from calibration.camera_result import CameraResult
 from calibration.extrinsics_result import ExtrinsicsResult
 from calibration.result_file import ResultDocument, in_order
 from calibration.rig_result import RigResult
+from calibration.tags_result import TagsResult
 from cdpr.documents import load_yaml, read_yaml
 from cdpr.errors import BadInput
 from cdpr.rig import Rig, rig_from_document
 
 KINDS: dict[str, type[ResultDocument]] = {
     "camera": CameraResult,
+    "tags": TagsResult,
     "extrinsics": ExtrinsicsResult,
     "rig": RigResult,
 }

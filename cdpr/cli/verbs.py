@@ -12,6 +12,7 @@ from cdpr.cli.calibrate_diff import diff
 from cdpr.cli.calibrate_extrinsics import extrinsics
 from cdpr.cli.calibrate_print import print_
 from cdpr.cli.calibrate_rig import rig
+from cdpr.cli.calibrate_tags import tags
 from cdpr.cli.check import check
 from cdpr.cli.demo import demo
 from cdpr.cli.doctor import doctor
@@ -54,9 +55,8 @@ def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
         app.command()(_interruptible(verb))
-    _add_group(
-        app, "calibrate", "Calibrate and compare.", calibrate.camera, extrinsics, rig, print_, diff
-    )
+    calibrations = (calibrate.camera, extrinsics, tags, rig, print_, diff)
+    _add_group(app, "calibrate", "Calibrate and compare.", *calibrations)
     _add_group(app, "bench", "Measure the planner.", bench.paper)
 
 

@@ -1,0 +1,253 @@
+"""The tags' places on the platform from pictures taken from anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from calibration.kinds import calibrated, load_result
+from calibration.result_file import write_result
+from calibration.tag_graph import connected_tags
+from calibration.tag_layout import TagLayout, measure_layout, require_tags
+from calibration.tag_sights import TagSights
+from calibration.tag_views import TagViews, moved_tags
+from calibration.tags_result import tags_result
+from calibration.tags_verdict import judge_layout
+from cdpr.errors import BadInput
+from cdpr.poses import Pose
+from cdpr.rig import Rig, Tag, load_rig
+from tests.calibration.exact_sights import sights_at
+from tracking.bundle import moved
+from tracking.marks import tag_corners
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+def as_glued(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[Tag, ...]:
+    """Tags where people glued them: off by so much, and turned by the like."""
+    steps = rng.standard_normal((len(rig.platform_tags), 6)) * np.repeat([shift, 10 * shift], 3)
+    return moved_tags(rig.platform_tags, steps.ravel())
+
+
+def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
+    """Poses ``camera_from_platform`` of a platform that is turned every way before the camera.
+
+    As asked for, no picture looks straight at one face.
+    """
+    poses = {}
+    for k in range(count):
+        turn = Rotation.random(random_state=rng).as_matrix()
+        while np.abs(turn[2]).max() > 0.85:
+            turn = Rotation.random(random_state=rng).as_matrix()
+        place = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.5, 0.7)])
+        poses[f"{k:02}.png"] = Pose(place, turn)
+    return poses
+
+
+def session(rig: Rig, tags, count: int, seed: int, noise: float = 0.02) -> TagSights:
+    rng = np.random.default_rng(seed)
+    return sights_at(rig.cameras[0], tags, around(rig, count, rng), noise, rng)
+
+
+def gaps(found: TagLayout, truth) -> tuple[float, float]:
+    """RMS error of corners [mm] and of turns [deg], the truth put where it fits the drawing."""
+    true = {tag.id: tag for tag in truth}
+    here = np.concatenate([tag_corners(true[tag.id]) for tag in found.tags])
+    there = np.concatenate([tag_corners(tag) for tag in found.drawn])
+    middle, target = here.mean(axis=0), there.mean(axis=0)
+    u, _, vt = np.linalg.svd((there - target).T @ (here - middle))
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    shift = Pose(target - turn @ middle, turn)
+    placed = [replace(true[tag.id], pose=shift.compose(true[tag.id].pose)) for tag in found.tags]
+    corners = np.concatenate(
+        [tag_corners(a) - tag_corners(b) for a, b in zip(found.tags, placed, strict=True)]
+    )
+    angles = [a.pose.angle_to(b.pose) for a, b in zip(found.tags, placed, strict=True)]
+    off = np.sqrt(np.mean(np.sum(corners**2, axis=1)))
+    return float(off * 1e3), float(np.degrees(np.sqrt(np.mean(np.square(angles)))))
+
+
+def test_twenty_pictures_give_the_layout_to_hundredths_of_a_millimetre(rig: Rig) -> None:
+    tags = as_glued(rig, np.random.default_rng(1))
+    found = measure_layout(rig, rig.cameras[0], session(rig, tags, 24, seed=2))
+    off, turned = gaps(found, tags)
+    assert off < 0.04
+    assert turned < 0.02
+    assert found.reprojection < 0.05
+    assert found.unseen == {}
+    verdict = judge_layout(found, 0.2e-3)
+    assert verdict.good, verdict.reasons
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig) -> None:
+    inside, errors, stated = [], [], []
+    for seed in range(8):
+        tags = as_glued(rig, np.random.default_rng(seed))
+        sights = session(rig, tags, 16, seed=100 + seed, noise=0.05)
+        found = measure_layout(rig, rig.cameras[0], sights, fixed=301)
+        true = {tag.id: tag for tag in tags}
+        home = next(tag for tag in found.drawn if tag.id == 301)
+        shift = home.pose.compose(true[301].pose.inverse())
+        off = np.array(
+            [tag.pose.position - shift.compose(true[tag.id].pose).position for tag in found.tags]
+        )
+        widths = found.half_widths.reshape(-1, 6)[:, :3]
+        inside.append(np.abs(off[1:]) <= widths[1:])
+        errors.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+        stated.append(found.error)
+        assert widths[0] == pytest.approx(0.0, abs=1e-6)  # the fixed tag is as drawn
+    assert np.mean(inside) >= 0.9
+    assert np.median(stated) < 8.0 * np.median(errors)
+
+
+def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
+    sights = session(rig, rig.platform_tags, 4, seed=3)
+    tags = tuple(rig.platform_tags)
+    views = TagViews.of(rig.cameras[0], sights, tags)
+    rng = np.random.default_rng(3)
+    poses = [
+        p for name, p in around(rig, 4, np.random.default_rng(3)).items() if name in sights.squares
+    ]
+    poses = [moved(p, 1e-3 * rng.standard_normal(6)) for p in poses]
+    exact = views.dense_slopes(poses, tags)
+    count = 6 * len(poses)
+    numeric = np.zeros_like(exact)
+    for column in range(exact.shape[1]):
+        ends = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(exact.shape[1])
+            step[column] = sign * 1e-6
+            cameras = [moved(p, s) for p, s in zip(poses, step[:count].reshape(-1, 6), strict=True)]
+            ends.append(views.errors(cameras, moved_tags(tags, step[count:])).ravel())
+        numeric[:, column] = (ends[0] - ends[1]) / 2e-6
+    scale = np.abs(exact).max()
+    np.testing.assert_allclose(exact / scale, numeric / scale, atol=1e-6)
+
+
+def test_what_pictures_cannot_tell_is_said(rig: Rig) -> None:
+    """A tag that is never seen with others stays as drawn; a picture of one tag tells nothing."""
+    sights = session(rig, rig.platform_tags, 24, seed=4)
+    squares = {
+        name: {k: s for k, s in seen.items() if k != 306} for name, seen in sights.squares.items()
+    }
+    squares["alone.png"] = {301: next(s[301] for s in squares.values() if 301 in s)}
+    found = measure_layout(rig, rig.cameras[0], TagSights(squares, {}))
+    assert found.unseen == {306: "was not seen together with the others"}
+    assert "one tag only" in found.unused["alone.png"]
+    verdict = judge_layout(found, 1e-3)
+    assert "take pictures that show tag 306 together with others" in verdict.next_steps
+
+
+def test_sizes_that_are_not_as_told_are_noticed(rig: Rig) -> None:
+    """All places are right, but the tags were printed at 97 %."""
+    small = tuple(replace(tag, size=0.97 * tag.size) for tag in rig.platform_tags)
+    found = measure_layout(rig, rig.cameras[0], session(rig, small, 24, seed=5))
+    verdict = judge_layout(found, 1.0)
+    assert not verdict.good
+    assert any("larger than drawn" in reason for reason in verdict.reasons)
+    assert any("size_mm" in step for step in verdict.next_steps)
+
+
+def test_a_tag_that_was_glued_elsewhere_is_named(rig: Rig) -> None:
+    step = np.zeros(36)
+    step[6:9] = [0.0, 0.012, 0.008]
+    tags = moved_tags(rig.platform_tags, step)
+    found = measure_layout(rig, rig.cameras[0], session(rig, tags, 24, seed=6))
+    verdict = judge_layout(found, 1e-3)
+    assert any(reason.startswith("tag 302 is") for reason in verdict.reasons), verdict
+
+
+def test_a_picture_of_another_tag_is_left_out_by_name(rig: Rig) -> None:
+    sights = session(rig, rig.platform_tags, 16, seed=8)
+    numbers = [number for seen in sights.squares.values() for number in seen]
+    number = max(set(numbers), key=numbers.count)
+    name, seen = next((n, s) for n, s in sights.squares.items() if number in s and len(s) == 3)
+    square = seen[number]
+    off = replace(
+        square,
+        corners=square.corners + 12.0,
+        target=square.whitening @ (square.corners + 12.0).ravel(),
+    )
+    wrong = {**sights.squares, name: {**seen, number: off}}
+    found = measure_layout(rig, rig.cameras[0], TagSights(wrong, {}))
+    assert list(found.unused) == [name]
+    assert "px off, far more than the others" in found.unused[name]
+    assert gaps(found, rig.platform_tags)[0] < 0.08
+
+
+def test_too_few_pictures_and_tags_are_refused(rig: Rig) -> None:
+    with pytest.raises(BadInput, match="pictures show two tags of the platform or more; 4 are"):
+        measure_layout(rig, rig.cameras[0], session(rig, rig.platform_tags, 3, seed=7))
+    with pytest.raises(BadInput, match="no tag 999 on the platform"):
+        require_tags(rig, 999)
+    with pytest.raises(BadInput, match="no two tags"):
+        require_tags(replace(rig, platform_tags=rig.platform_tags[:1]), None)
+
+
+def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> None:
+    tags = as_glued(rig, np.random.default_rng(1))
+    found = measure_layout(rig, rig.cameras[0], session(rig, tags, 16, seed=2))
+    verdict = judge_layout(found, 2e-4)
+    result = tags_result(found, verdict, rig.document, date(2026, 3, 4))
+    path = write_result(tmp_path, result)
+    assert path.name == "calibration_tags_gachon_8_6_2026-03-04.yaml"
+    read = load_result(path)
+    assert read == result
+    better = calibrated(rig, [read])
+    for tag, own in zip(better.platform_tags, found.tags, strict=True):
+        assert tag.pose.distance_to(own.pose) < 1e-8
+        assert tag.size == pytest.approx(own.size)
+    other = rig.document.tags.platform[0].model_copy(update={"size_mm": 95.0})
+    resized = rig.document.tags.model_copy(
+        update={"platform": [other, *rig.document.tags.platform[1:]]}
+    )
+    changed = replace(rig, document=rig.document.model_copy(update={"tags": resized}))
+    with pytest.raises(BadInput, match="rests on other sizes or numbers of tags"):
+        calibrated(changed, [read])
+
+
+def test_results_are_compared_tag_by_tag(rig: Rig) -> None:
+    found = measure_layout(rig, rig.cameras[0], session(rig, rig.platform_tags, 16, seed=2))
+    step = np.zeros(36)
+    step[:6] = [1e-3, 0, 0, 0, 0, 2e-3]
+    other = replace(found, tags=moved_tags(found.tags, step))
+    verdict = judge_layout(found, 2e-4)
+    one, two = (
+        tags_result(layout, verdict, rig.document, date(2026, 3, 4)) for layout in (found, other)
+    )
+    changes = one.changes_to(two)
+    assert changes["tag_301_x_mm"] == pytest.approx(1.0, abs=1e-5)
+    assert changes["tag_301_turn_z_deg"] == pytest.approx(np.degrees(2e-3), abs=1e-5)
+    assert changes["tag_302_x_mm"] == pytest.approx(0.0, abs=1e-9)
+    assert one.apart_mm(two) == pytest.approx(np.hypot(1.0, 0.048 * 2.0) / np.sqrt(6), rel=0.05)
+
+
+@given(
+    pictures=st.lists(st.sets(st.integers(0, 7), min_size=1, max_size=3), max_size=8),
+    fixed=st.one_of(st.none(), st.integers(0, 7)),
+)
+def test_tags_are_tied_as_by_walking_from_picture_to_picture(pictures, fixed) -> None:
+    found = connected_tags(pictures, fixed)
+
+    def walked(start: int) -> set[int]:
+        reached = {start}
+        for _ in range(8):
+            reached |= {n for p in pictures if p & reached for n in p}
+        return reached
+
+    seen = {n for p in pictures for n in p}
+    groups = [walked(n) for n in seen if fixed is None or fixed in walked(n)]
+    assert len(found) == max((len(group) for group in groups), default=0)
+    assert not found or set(found) in groups

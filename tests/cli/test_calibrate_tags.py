@@ -1,0 +1,126 @@
+"""`cdpr calibrate tags` on rendered pictures of a platform whose tags were glued by hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from calibration.tag_views import moved_tags
+from cdpr.poses import Pose
+from cdpr.rig import Rig, load_rig, rig_from_document
+from cdpr.rig_file import TagDocument
+from cdpr.scene import load_scene
+from simulation.camera import SyntheticCamera
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import call, nothing_written, one_message
+from tracking.marks import tag_corners
+
+ALONG_MM = np.array([[0.4, -1.1], [0.0, 0.9], [1.2, 0.3], [-0.8, 0.0], [0.6, 0.7], [-0.3, 1.0]])
+OUTWARD_MM = 1.2  # or the platform's faces would hide tags that are not parallel to them
+TILTS_DEG = np.roll(ALONG_MM, 1, axis=0) / 2.0
+
+
+def as_glued() -> Rig:
+    """The rig with its tags where they truly are."""
+    rig = load_rig(RIG)
+    steps = []
+    for tag, along, tilt in zip(rig.platform_tags, ALONG_MM, TILTS_DEG, strict=True):
+        shift = tag.pose.rotation @ [*along, OUTWARD_MM] / 1e3
+        steps += [shift, tag.pose.rotation @ np.radians([*tilt, 1.0])]
+    tags = moved_tags(rig.platform_tags, np.concatenate(steps))
+    documents = [
+        TagDocument(
+            id=tag.id,
+            size_mm=tag.size * 1e3,
+            position_mm=(tag.pose.position * 1e3).tolist(),
+            rotation_wxyz=tag.pose.quaternion.tolist(),
+        )
+        for tag in tags
+    ]
+    assert rig.document.tags is not None
+    changed = rig.document.tags.model_copy(update={"platform": documents})
+    return rig_from_document(rig.document.model_copy(update={"tags": changed}))
+
+
+def before_the_camera(count: int) -> list[Pose]:
+    """Poses ``camera_from_platform``: turned every way, no face straight at the camera."""
+    rng, poses = np.random.default_rng(8), []
+    while len(poses) < count:
+        turn = Rotation.random(random_state=rng).as_matrix()
+        if np.abs(turn[2]).max() < 0.8:
+            poses.append(Pose(np.array([*rng.uniform(-0.05, 0.05, 2), 0.6]), turn))
+    return poses
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("platform")
+    rig = as_glued()
+    scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())
+    camera = SyntheticCamera(rig, scene, rig.cameras[0], seed=6)
+    for k, pose in enumerate(before_the_camera(18)):
+        image = camera.render(rig.cameras[0].world_from_camera.compose(pose), k)
+        cv2.imwrite(str(folder / f"{k}.png"), image)
+    cv2.imwrite(str(folder / "wall.png"), np.full((720, 1280), 128, np.uint8))
+    (folder / "broken.png").write_bytes(b"not a picture")
+    return folder
+
+
+def test_the_tags_are_found_where_they_were_glued_and_the_result_used(folder, tmp_path) -> None:
+    out = tmp_path / "out"
+    options = ("--fixed-tag", "301", "-o", out, "--json")
+    answer = call("calibrate", "tags", RIG, folder, *options)
+    found = json.loads(answer.out)
+    assert answer.code == 0, found["verdict"]
+    assert set(found["unused"]) >= {"wall.png", "broken.png"}
+    assert found["rms_px"] < 0.1
+    (saved,) = out.glob("calibration_tags_gachon_8_6_*.yaml")
+    assert yaml.safe_load(saved.read_text()) == found
+    page = (out / "report.html").read_text()
+    assert "Tags against the drawing" in page
+    truth, drawn = as_glued().platform_tags, load_rig(RIG).platform_tags
+    shift = drawn[0].pose.compose(truth[0].pose.inverse())
+    tags = [TagDocument.model_validate(tag) for tag in found["platform"]]
+    gaps = [
+        tag_corners(replace(true, pose=tag.pose())) - shift.apply(tag_corners(true))
+        for tag, true in zip(tags, truth, strict=True)
+    ]
+    assert np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1))) < 0.15e-3
+    again = call("calibrate", "tags", RIG, folder, "--calibration", saved, "--json")
+    moved = json.loads(again.out)
+    for tag, other in zip(found["platform"], moved["platform"], strict=True):
+        assert tag["position_mm"] == pytest.approx(other["position_mm"], abs=0.05)
+
+
+def test_people_read_what_changed_against_the_drawing(folder) -> None:
+    answer = call("calibrate", "tags", RIG, folder, "--wanted-mm", "0.01")
+    assert answer.code == 3
+    assert answer.out.splitlines()[1].split()[:4] == ["verdict", "not", "good", "enough:"]
+    assert "moved" in answer.out
+    assert "broken.png is no picture that can be read" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--fixed-tag", "7"), "no tag 7 on the platform"),
+        (("--camera", "side"), "no camera 'side'"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: str) -> None:
+    with nothing_written(tmp_path):
+        answer = call("calibrate", "tags", RIG, folder, "-o", tmp_path / "out", *options)
+    one_message(answer, 2, named)
+
+
+def test_pictures_of_no_platform_are_told(folder, tmp_path) -> None:
+    (tmp_path / "a.png").write_bytes((folder / "wall.png").read_bytes())
+    answer = call("calibrate", "tags", RIG, tmp_path)
+    one_message(answer, 2, "none of the tag36h11 tags 301", "a.png shows none of the tags whole")
