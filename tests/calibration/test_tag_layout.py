@@ -182,7 +182,8 @@ def test_a_picture_of_another_tag_is_left_out_by_name(rig: Rig) -> None:
     )
     wrong = {**sights.squares, name: {**seen, number: off}}
     found = measure_layout(rig, rig.cameras[0], TagSights(wrong, {}))
-    assert list(found.unused) == [name]
+    others = [why for other, why in found.unused.items() if other != name]
+    assert all("one tag only" in why for why in others)
     assert "px off, far more than the others" in found.unused[name]
     assert gaps(found, rig.platform_tags)[0] < 0.08
 
