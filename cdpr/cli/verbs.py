@@ -10,6 +10,7 @@ import typer
 from cdpr.cli import bench, calibrate
 from cdpr.cli.calibrate_diff import diff
 from cdpr.cli.calibrate_extrinsics import extrinsics
+from cdpr.cli.calibrate_poses import poses
 from cdpr.cli.calibrate_print import print_
 from cdpr.cli.calibrate_rig import rig
 from cdpr.cli.calibrate_tags import tags
@@ -55,7 +56,7 @@ def add_verbs(app: typer.Typer) -> None:
     """Adds every verb to the command line."""
     for verb in VERBS:
         app.command()(_interruptible(verb))
-    calibrations = (calibrate.camera, extrinsics, tags, rig, print_, diff)
+    calibrations = (calibrate.camera, extrinsics, tags, poses, rig, print_, diff)
     _add_group(app, "calibrate", "Calibrate and compare.", *calibrations)
     _add_group(app, "bench", "Measure the planner.", bench.paper)
 

@@ -130,3 +130,16 @@ def test_lengths_alone_in_a_file_need_no_poses(rig: Rig, tmp_path: Path) -> None
     assert not told["with_poses"]
     assert told["held_out_mm"] < told["before_mm"]
     assert np.array(told["outlets_mm"]) == pytest.approx(rig.outlets * 1e3)
+
+
+@pytest.mark.slow  # compiled planner
+def test_poses_for_measuring_are_planned_and_their_plan_holds(tmp_path: Path) -> None:
+    plan = tmp_path / "measure.json"
+    arguments = ("--count", "10", "--candidates", "25", "--tilt-deg", "5", "--json")
+    done = call("calibrate", "poses", RIG, ROOT / "configs/turn.yaml", "-o", plan, *arguments)
+    assert done.code == 0, done
+    told = json.loads(done.out)
+    assert len(told["stops"]) == 10
+    assert 2.0 < max(told["turned_deg"]) <= 5.0 + 1e-9
+    assert call("check", plan).code == 0
+    assert call("calibrate", "poses", RIG, ROOT / "configs/turn.yaml", "-o", plan).code == 2
