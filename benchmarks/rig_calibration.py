@@ -1,0 +1,166 @@
+"""A rig that is not built as its file says, calibrated by its own measurements: the whole round.
+
+    python benchmarks/rig_calibration.py [--count 60] [-o FOLDER]
+
+With the program itself, on configs/gachon_8_6_rehearsal.yaml: plans where to measure, runs it with
+the synthetic camera, calibrates, and runs environment 3 before and after. Then, with the truth that
+only the simulation knows: how far off places are that were never measured, and what is told of the
+rig when the platform is never turned. Measured faster than the rig file says (80 mm/s, 4 pictures
+a second), which changes nothing at rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from calibration.kinds import calibrated, load_result
+from calibration.rig_calibration import calibrate_rig
+from calibration.rig_parameters import DEFAULT_DEVIATIONS
+from calibration.rig_verdict import judge_rig
+from cdpr.kinematics import poses_near
+from cdpr.rig import Rig, load_rig
+from cdpr.winches import WinchMap
+from tests.calibration.rig_places import Truth, places
+
+ROOT = Path(__file__).parents[1]
+RIG = ROOT / "configs/gachon_8_6_rehearsal.yaml"
+ENVIRONMENT = ROOT / "configs/environment_3.yaml"
+FREE = """schema_version: 1
+name: measuring
+clearance: {obstacle_mm: 10, self_mm: 3}
+start: {position_mm: [0, 0, 445]}
+goal: {position_mm: [0, 0, 445]}
+"""
+
+
+def cdpr(*arguments: object, allowed: tuple[int, ...] = (0,)) -> dict[str, Any]:
+    """What the program answers with --json."""
+    command = [sys.executable, "-c", "from cdpr.cli import main; main()", *map(str, arguments)]
+    done = subprocess.run(
+        [*command, "--json"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False
+    )
+    if done.returncode not in allowed:
+        raise SystemExit(f"cdpr {' '.join(map(str, arguments))}: {done.stdout}")
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+def fast_rig(folder: Path) -> Path:
+    """The same rig, moving faster and looked at less often."""
+    text = RIG.read_text(encoding="utf-8")
+    text = text.replace("speed_mm_s: 20\n", "speed_mm_s: 80\n", 1)
+    text = text.replace("acceleration_mm_s2: 100\n", "acceleration_mm_s2: 300\n", 1)
+    text = text.replace("jerk_mm_s3: 1000\n", "jerk_mm_s3: 3000\n", 1)
+    path = folder / "fast.yaml"
+    path.write_text(text.replace("rate_hz: 10", "rate_hz: 4"), encoding="utf-8")
+    return path
+
+
+def told_wrong(rig: Rig, truth: Truth) -> float:
+    """How far off forward kinematics of a rig puts the platform, RMS, [mm]."""
+    winches, data = WinchMap(rig), truth.measured
+    lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
+    found, _ = poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)
+    squares = np.sum((found - truth.positions) ** 2, axis=1)
+    return float(np.sqrt(np.mean(squares))) * 1e3
+
+
+def run_of_environment_3(folder: Path, name: str, *calibration: object) -> dict[str, Any]:
+    """The summary of a run, whether its checks pass or not."""
+    plan = folder / f"{name}.json"
+    cdpr("plan", RIG, ENVIRONMENT, "-o", plan, "--rounds", 300, *calibration)
+    run = ("run", plan, "--rig", RIG, "-o", folder / name, "--fast", *calibration)
+    return cdpr(*run, allowed=(0, 1))
+
+
+def show(name: str, value: str) -> None:
+    """A line."""
+    print(f"{name:58s} {value}", flush=True)
+
+
+def whole_round(folder: Path, count: int) -> None:
+    """Before, measuring, calibrating, after."""
+    free, fast = folder / "free.yaml", fast_rig(folder)
+    free.write_text(FREE, encoding="utf-8")
+    before = run_of_environment_3(folder, "before")
+    show("environment 3 before, by tag", in_words(before))
+    plan = folder / "measure.json"
+    planned = cdpr("calibrate", "poses", RIG, free, "-o", plan, "--count", count)
+    turned = max(planned["turned_deg"])
+    show("poses for measuring", f"{count}, turned by up to {turned:.1f} deg")
+    cdpr("run", plan, "--rig", fast, "-o", folder / "measuring", "--fast", allowed=(0, 1))
+    out = folder / "calibration"
+    told = cdpr("calibrate", "rig", RIG, folder / "measuring", "-o", out, allowed=(0, 3))
+    show("verdict", told["verdict"])
+    show(
+        "held out, by tag (RMS)",
+        f"{told['held_out_mm']:.3f} mm, by the rig file {told['before_mm']:.3f} mm",
+    )
+    for line in told["not_identified"]:
+        show("not identified", line)
+    (file,) = out.glob("*.yaml")
+    rig = load_rig(RIG)
+    corrected = calibrated(rig, [load_result(file)])
+    for name, tilt in (("level", 0.0), ("turned by up to 8 deg", math.radians(8.0))):
+        truth = places(rig, 100, tilt=tilt, seed=77, noise=0.0)
+        errors = (told_wrong(rig, truth), told_wrong(corrected, truth))
+        show(
+            f"100 places never measured, {name}, against the truth",
+            f"{errors[0]:.3f} mm before, {errors[1]:.3f} mm after (RMS)",
+        )
+    after = run_of_environment_3(folder, "after", "--calibration", file)
+    show("environment 3 after, by tag", in_words(after))
+
+
+def in_words(summary: dict[str, Any]) -> str:
+    """How well a run was followed, as the camera saw it."""
+    error = summary["tag_error_mm"]
+    return f"{error['rms']:.3f} mm RMS, at most {error['max']:.3f} mm; {summary['verdict']}"
+
+
+def never_turned(count: int) -> None:
+    """What level places tell, with poses and by lengths alone."""
+    rig = load_rig(RIG)
+    level = places(rig, count, tilt=0.0, seed=5).measured
+    for name, data in (("poses, never turned", level), ("lengths alone", level.without_poses())):
+        result = calibrate_rig(rig, data, DEFAULT_DEVIATIONS, 1e-4)
+        quality = judge_rig(result, 1e-3, math.radians(5.0))
+        unknown = result.observability.unknown
+        moved = unknown.T @ (result.fit.values / result.parameters.deviations)
+        show(name, str(quality.verdict))
+        for line in result.not_identified:
+            show("  not identified", line)
+        show(
+            f"  {unknown.shape[1]} directions left as drawn, moved by",
+            f"{np.abs(moved).max(initial=0.0):.1e} deviations",
+        )
+
+
+def main() -> None:
+    """Prints a line a figure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("-o", "--output", type=Path, help="keep the files in this new folder")
+    options = parser.parse_args()
+    if options.output is not None:
+        options.output.mkdir(parents=True)
+        whole_round(options.output, options.count)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            whole_round(Path(folder), options.count)
+    never_turned(options.count)
+
+
+if __name__ == "__main__":
+    main()
