@@ -21,6 +21,9 @@ from tracking.projection import ideal_of
 
 #: Edge errors beyond this many deviations count linearly (Huber).
 HUBER = 3.0
+#: The edges' stated deviations weigh as much as so many residuals when the covariance is scaled by
+#: how well all edges fit: few edges fit well by chance.
+BELIEF = 20.0
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
 
@@ -115,7 +118,7 @@ def solve_bundle(
         The best pose, or None when no start led to one in front of the camera.
     """
     squares = _Squares.of(camera, views)
-    starts = [pose for view in views for pose in _square_poses(camera, view)]
+    starts = [pose for view in views for pose in square_poses(camera, view)]
     starts += [prior] if prior is not None else []
     starts = [pose for pose in starts if _in_front(squares, pose)]
     ranked = sorted(starts, key=lambda pose: _huber(squares.errors(pose)))
@@ -141,7 +144,7 @@ def polish_bundle(camera: Camera, views: Sequence[TagView], start: Pose) -> Bund
     return _result(squares, views, pose, _huber(squares.errors(pose)), float("inf"))
 
 
-def _square_poses(camera: Camera, view: TagView) -> list[Pose]:
+def square_poses(camera: Camera, view: TagView) -> list[Pose]:
     """Both poses ``camera_from_body`` that a single square allows."""
     half = view.tag.size / 2.0
     square = np.column_stack([CORNER_SIGNS * half, np.zeros(4)])
@@ -243,8 +246,7 @@ def _result(
     jacobian = squares.jacobian(pose).reshape(-1, 6)
     normal = jacobian.T @ (jacobian * _weights(errors)[:, None])
     freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
-    # Squares that fit worse than their edges' scatter says widen the covariance; never less.
-    scale = max(1.0, cost / freedom) if freedom > 0 else 1.0
+    scale = (BELIEF + cost) / (BELIEF + max(freedom, 0))
     try:
         covariance = scale * np.linalg.inv(normal)
     except np.linalg.LinAlgError:  # too few edges to fix all six

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,12 +13,15 @@ from cdpr.rig import Camera, Rig, Tag
 from tracking.bits import carries_tag
 from tracking.bundle import BundlePose, TagView, polish_bundle, solve_bundle
 from tracking.camera_check import CameraCheck, refuse_moved_camera
+from tracking.consensus import Consensus, agreeing
 from tracking.detector import Detection
 from tracking.detectors import make_detector
 from tracking.edges import refine
 from tracking.marks import modules_across, tag_corners
 from tracking.measurement import NoPose, Observation, PoseMeasurement
+from tracking.outliers import without_outliers
 from tracking.picture import Image, Region
+from tracking.prediction import predicted
 from tracking.projection import pixels_from_ideal, pixels_of
 
 
@@ -33,6 +36,7 @@ class TrackerSettings:
         jump: Largest way from the last pose beside what speed allows, [m].
         jump_angle: Largest turn from the last pose, [rad].
         speed: Fastest the platform is expected to go, [m/s].
+        turn: Largest turn from the home pose; no cable robot turns by a right angle, [rad].
         single_tag_margin: By how much, in variances, a single tag's pose must fit better than its
             mirror pose.
         camera_moved_px: Frame tags farther off than this mean that the camera was moved.
@@ -45,6 +49,7 @@ class TrackerSettings:
     jump: float = 0.03
     jump_angle: float = 0.25
     speed: float = 0.2
+    turn: float = float(np.radians(80.0))
     single_tag_margin: float = 30.0
     camera_moved_px: float = 1.0
     camera_check_period: int = 10
@@ -79,8 +84,12 @@ class Tracker:
         self._modules = modules_across(rig.tag_family)
         self._platform = {tag.id: tag for tag in rig.platform_tags}
         self._frame = {tag.id: tag for tag in rig.frame_tags}
+        # Cables pull: no platform leaves the box around the outlets by more than its own size.
+        size = float(np.linalg.norm(rig.half_size))
+        self._lower, self._upper = rig.outlets.min(axis=0) - size, rig.outlets.max(axis=0) + size
         self._camera_from_world = camera.world_from_camera.inverse()
         self._last: PoseMeasurement | None = None
+        self._before: PoseMeasurement | None = None
         self._pictures = 0
 
     @property
@@ -112,6 +121,7 @@ class Tracker:
             result = self._search(image, time)
         elif self._pictures % self.settings.camera_check_period == 0:
             self._check_camera(image, self._frame_detections(image))
+        self._before = self._last
         self._last = result if isinstance(result, PoseMeasurement) else None
         return result
 
@@ -127,13 +137,21 @@ class Tracker:
             )
 
     def _follow(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
-        """The pose near the last one, or None when it must be searched for."""
-        region = self._platform_region(last.pose)
-        detections = self._detector.detect(image, region) if region is not None else []
-        found = self._measure(image, time, detections, last.pose, "tracked")
-        if isinstance(found, NoPose) or not self._reachable(found, last):
+        """The pose where it is expected, or None when it must be searched for.
+
+        First the edges of all tags that should be seen are looked for where they should be, which
+        needs no detector and finds tags that are hidden in part; then tags around the platform.
+        """
+        expected = predicted(last, self._before, time)
+        found = self._measure(image, time, [], expected, "tracked")
+        if self._goes_on(found, last):
+            return found
+        region = self._platform_region(expected)
+        if region is None:
             return None
-        return found
+        detections = self._detector.detect_all(image, region)
+        found = self._measure(image, time, detections, expected, "tracked")
+        return found if self._goes_on(found, last) else None
 
     def _search(self, image: Image, time: float) -> Observation:
         """The pose by a search of the whole picture, once more thoroughly when it finds none."""
@@ -141,11 +159,14 @@ class Tracker:
         return self._searched(image, time, thorough=True) if isinstance(found, NoPose) else found
 
     def _searched(self, image: Image, time: float, thorough: bool) -> Observation:
-        detections = self._detector.detect(image, thorough=thorough)
+        detections = self._detector.detect_all(image, thorough=thorough)
         self._check_camera(image, detections)
         return self._measure(image, time, detections, None, "found")
 
-    def _reachable(self, found: PoseMeasurement, last: PoseMeasurement) -> bool:
+    def _goes_on(self, found: Observation, last: PoseMeasurement) -> bool:
+        """Whether a pose was found that the platform can have reached."""
+        if isinstance(found, NoPose):
+            return False
         limit = self.settings.jump + self.settings.speed * abs(found.time - last.time)
         if found.pose.distance_to(last.pose) > limit:
             return False
@@ -177,14 +198,29 @@ class Tracker:
                 continue
             region = self._region(pixels_of(self.camera, corners), slack=0.5)
             if region is not None:
-                found += [d for d in self._detector.detect(image, region) if d.id == tag.id]
+                found += [d for d in self._detector.detect_all(image, region) if d.id == tag.id]
         return found
 
     def _check_camera(self, image: Image, detections: Sequence[Detection]) -> None:
-        views = self._views(image, detections, self._frame)
+        views = self._views(image, self._nearest_to_frame_tags(detections), self._frame)
         limit = self.settings.camera_moved_px
         check = refuse_moved_camera(self.camera, views, limit)
         self.camera_check = check or self.camera_check
+
+    def _nearest_to_frame_tags(self, detections: Sequence[Detection]) -> list[Detection]:
+        """Of each frame tag the detection nearest to its place: others are of another print."""
+        nearest: dict[int, tuple[float, Detection]] = {}
+        for found in detections:
+            if found.id not in self._frame:
+                continue
+            points = self._camera_from_world.apply(tag_corners(self._frame[found.id]))
+            if np.any(points[:, 2] < 0.02):
+                continue
+            gap = pixels_of(self.camera, points).mean(axis=0) - found.corners.mean(axis=0)
+            distance = float(np.linalg.norm(gap))
+            if found.id not in nearest or distance < nearest[found.id][0]:
+                nearest[found.id] = (distance, found)
+        return [found for _, found in nearest.values()]
 
     def _views(
         self, image: Image, detections: Sequence[Detection], tags: dict[int, Tag]
@@ -205,13 +241,17 @@ class Tracker:
         status: str,
     ) -> Observation:
         seen = tuple(d.id for d in detections)
-        views = self._views(image, detections, self._platform)
+        agreed = self._agreed(self._views(image, detections, self._platform))
+        if agreed.ambiguous:
+            twice = ", ".join(map(str, agreed.ambiguous))
+            return NoPose(time, f"tags {twice} are seen in places that do not agree", seen)
+        views = agreed.views
         prior = None if expected is None else self._camera_from_world.compose(expected)
         first = solve_bundle(self.camera, views, prior) if views else None
         start = prior if first is None else first.camera_from_body
         if start is None:
             return NoPose(time, self._why_nothing(seen), seen)
-        views += self._looked_for(image, start, {v.tag.id for v in views})
+        views = views + self._looked_for(image, start, {v.tag.id for v in views})
         fitted = self._fitted(views, start)
         if fitted is None:
             return NoPose(time, "no tag of the platform fits a pose", seen)
@@ -220,6 +260,17 @@ class Tracker:
         if reason:
             return NoPose(time, reason, seen)
         return self._measurement(time, views, bundle, status)
+
+    def _agreed(self, views: Sequence[TagView]) -> Consensus:
+        """The views that agree on a pose of the platform within its frame."""
+        world_from_camera = self.camera.world_from_camera
+
+        def possible(camera_from_platform: Pose) -> bool:
+            pose = world_from_camera.compose(camera_from_platform)
+            inside = np.all((pose.position >= self._lower) & (pose.position <= self._upper))
+            return bool(inside) and pose.angle_to(self.rig.home) < self.settings.turn
+
+        return agreeing(self.camera, views, possible)
 
     def _why_nothing(self, seen: tuple[int, ...]) -> str:
         wanted = ", ".join(map(str, self._platform))
@@ -258,7 +309,7 @@ class Tracker:
             bundle = solve(self.camera, views, start) if views else None
             if bundle is None:
                 return None
-            kept = _without_outliers(views, bundle)
+            kept = without_outliers(views, bundle)
             if kept is None:
                 return views, bundle
             views, start = kept, bundle.camera_from_body
@@ -296,27 +347,3 @@ class Tracker:
             bundle.reprojection,
             status,
         )
-
-
-def _without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] | None:
-    """Views without edges that lie far off beside the others, or None when all belong."""
-    errors = bundle.edge_errors
-    measured = np.array([view.seen.edges for view in views])
-    usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # of two normal errors
-    off = measured & (errors > 4.5 * usual)
-    if not off.any():
-        return None
-    kept = []
-    for view, wrong in zip(views, off, strict=True):
-        edges = view.seen.edges & ~wrong
-        if edges.sum() < 2:
-            continue
-        keep = np.repeat(edges, 2)
-        seen = replace(
-            view.seen,
-            edges=edges,
-            whitening=read_only(view.seen.whitening * keep[:, None]),
-            target=read_only(view.seen.target * keep),
-        )
-        kept.append(TagView(view.tag, seen))
-    return kept

@@ -1,0 +1,156 @@
+"""Tracking against decoys, covers and blur, and what the stated covariance is worth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from cdpr.rig import Camera, Rig, Tag
+from cdpr.scene import Scene
+from simulation.camera import Optics, SyntheticCamera
+from tests.tracking.test_tracker import error_of
+from tracking.bundle import TagView
+from tracking.consensus import agreeing
+from tracking.measurement import NoPose, PoseMeasurement
+from tracking.prediction import predicted
+from tracking.tracker import Tracker
+
+HERE = Pose.level([0.1, 0.1, 0.4])
+FLAT = np.eye(3)
+
+
+@pytest.fixture(scope="module")
+def empty(scene: Scene) -> Scene:
+    return replace(scene, obstacles=())
+
+
+def with_prints(rig: Rig, *prints: tuple[int, list[float]], size: float = 0.12) -> Rig:
+    """The rig with further tags lying on the floor, which its file does not know."""
+    more = tuple(Tag(number, size, Pose(np.array(place), FLAT)) for number, place in prints)
+    return replace(rig, frame_tags=(*rig.frame_tags, *more))
+
+
+@pytest.mark.parametrize("number", [301, 302, 305])
+def test_another_print_of_a_tag_does_not_move_the_pose(
+    rig: Rig, camera: Camera, empty: Scene, number: int
+) -> None:
+    """302 looks away from the camera, so only the decoy of it is seen."""
+    real = with_prints(rig, (number, [-0.30, 0.42, 0.0]), size=0.16)
+    image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
+    tracker = Tracker(rig, camera)
+    found = tracker.observe(image, 0.0)
+    assert isinstance(found, PoseMeasurement)
+    assert found.pose.distance_to(HERE) < 1e-3
+    alone = Tracker(rig, camera).observe(
+        SyntheticCamera(rig, empty, camera, seed=4).render(HERE, 0), 0.0
+    )
+    assert isinstance(alone, PoseMeasurement)
+    assert found.tags == alone.tags
+    again = tracker.observe(image, 0.1)
+    assert isinstance(again, PoseMeasurement)
+    assert again.pose.distance_to(HERE) < 1e-3
+
+
+def test_a_decoy_alone_that_lies_as_no_platform_can_gives_no_pose(
+    rig: Rig, camera: Camera, empty: Scene
+) -> None:
+    real = with_prints(rig, (303, [-0.95, 0.0, 0.0]), size=0.2)
+    image = SyntheticCamera(real, empty, camera, seed=4).render(Pose.level([0.0, 0.0, -3.0]), 0)
+    found = Tracker(rig, camera).observe(image, 0.0)
+    assert isinstance(found, NoPose)
+
+
+def test_two_prints_of_one_tag_are_told_apart_by_nothing(
+    rig: Rig, camera: Camera, empty: Scene
+) -> None:
+    """A platform with a single tag, and the same print within the frame."""
+    one = replace(rig, platform_tags=rig.platform_tags[4:5])
+    real = with_prints(one, (305, [0.25, -0.1, 0.15]), size=0.096)
+    image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
+    found = Tracker(one, camera).observe(image, 0.0)
+    assert isinstance(found, NoPose)
+    assert "do not agree" in found.reason
+
+
+def test_another_print_of_a_frame_tag_does_not_move_the_camera(
+    rig: Rig, camera: Camera, empty: Scene
+) -> None:
+    real = with_prints(rig, (402, [0.25, -0.25, 0.0]), size=0.2)
+    image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
+    tracker = Tracker(rig, camera)
+    assert isinstance(tracker.observe(image, 0.0), PoseMeasurement)
+    assert tracker.camera_check is not None
+    assert tracker.camera_check.error < 0.2
+
+
+def test_no_squares_agree_on_nothing(camera: Camera) -> None:
+    nothing: list[TagView] = []
+    assert agreeing(camera, nothing, lambda _: True).views == []
+
+
+def test_tags_covered_in_part_are_followed(rig: Rig, camera: Camera, empty: Scene) -> None:
+    """A bar over each tag hides them from the detector; their free edges go on to be used."""
+    eye, tracker = SyntheticCamera(rig, empty, camera, seed=5), Tracker(rig, camera)
+    first = tracker.observe(eye.render(HERE, 0), 0.0)
+    assert isinstance(first, PoseMeasurement)
+    truth = Pose.level([0.103, 0.1, 0.401])
+    image = eye.render(truth, 1)
+    middle = np.round(np.array([image.shape[1], image.shape[0]]) / 2).astype(int)
+    whole = tracker.observe(image, 0.1)
+    assert isinstance(whole, PoseMeasurement)
+    covered = image.copy()
+    cv2.line(covered, (0, int(middle[1]) - 40), (1279, int(middle[1]) - 200), 90, 14)
+    found = tracker.observe(covered, 0.2)
+    assert isinstance(found, PoseMeasurement)
+    assert found.status == "tracked"
+    assert found.pose.distance_to(truth) < 2e-3
+
+
+def test_motion_is_carried_on() -> None:
+    def at(time: float) -> PoseMeasurement:
+        turn = matrix_from_rotation_vector(np.array([0.0, 0.3 * time, 0.0]))
+        pose = Pose(np.array([0.1 * time, 0.0, 0.4]), turn)
+        return PoseMeasurement(time, pose, np.eye(6), (301,), 0.1, "tracked")
+
+    ahead = predicted(at(0.2), at(0.1), 0.4)
+    assert ahead.distance_to(at(0.4).pose) < 1e-12
+    assert ahead.angle_to(at(0.4).pose) < 1e-6
+    long_ago = at(0.2)
+    assert predicted(long_ago, at(0.1), 9.0) is long_ago.pose
+    assert predicted(long_ago, None, 0.3) is long_ago.pose
+
+
+def test_a_fast_platform_is_followed_by_its_speed(rig: Rig, camera: Camera, empty: Scene) -> None:
+    """0.15 m/s at 10 pictures a second are 9 px from picture to picture, more than a module."""
+    eye, tracker = SyntheticCamera(rig, empty, camera, seed=6), Tracker(rig, camera)
+    for frame in range(8):
+        truth = Pose.level([-0.06 + 0.015 * frame, 0.1, 0.4])
+        found = tracker.observe(eye.render(truth, frame), frame * 0.1)
+        assert isinstance(found, PoseMeasurement)
+        assert found.status == ("tracked" if frame else "found")
+        assert found.pose.distance_to(truth) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_stated_covariance_is_that_of_the_errors(
+    rig: Rig, camera: Camera, empty: Scene
+) -> None:
+    """Mean NEES over seeds and places; 6 where the covariance is exact."""
+    rng, values = np.random.default_rng(12), []
+    optics = Optics(noise=1.5, blur=0.6)
+    for seed in range(4):
+        eye = SyntheticCamera(rig, empty, camera, seed=seed, optics=optics)
+        for frame in range(15):
+            place = rng.uniform([-0.15, -0.15, 0.3], [0.15, 0.15, 0.55])
+            truth = Pose(place, matrix_from_rotation_vector(rng.normal(size=3) * 0.1))
+            found = Tracker(rig, camera).observe(eye.render(truth, frame), 0.0)
+            assert isinstance(found, PoseMeasurement)
+            error = error_of(found, truth)
+            values.append(error @ np.linalg.solve(found.covariance, error))
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(values)) / len(values)
+    assert low < np.mean(values) < high

@@ -1,0 +1,28 @@
+"""Where the platform will be: it goes on as it went."""
+
+from __future__ import annotations
+
+from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from tracking.measurement import PoseMeasurement
+
+#: Older motion says nothing about the present one, [s].
+MEMORY = 0.5
+
+
+def predicted(last: PoseMeasurement, before: PoseMeasurement | None, time: float) -> Pose:
+    """The pose at a time if the platform goes on with the speed between two measurements.
+
+    Args:
+        last: The newest measurement.
+        before: The one before it, if there is one.
+        time: Of the prediction, [s].
+    """
+    if before is None:
+        return last.pose
+    between, ahead = last.time - before.time, time - last.time
+    if not (0.0 < between <= MEMORY and 0.0 < ahead <= MEMORY):
+        return last.pose
+    share = ahead / between
+    turn = rotation_vector_from_matrix(last.pose.rotation @ before.pose.rotation.T)
+    position = last.pose.position + share * (last.pose.position - before.pose.position)
+    return Pose(position, matrix_from_rotation_vector(share * turn) @ last.pose.rotation)
