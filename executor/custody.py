@@ -63,6 +63,25 @@ class Custody:
             raise self._refusal("the drives were referenced for another rig file", why)
         return reference
 
+    def why_unreferenced(self, stands: Sequence[int] | None = None) -> str:
+        """Why the drives do not count from their reference; nothing where they do.
+
+        Args:
+            stands: Where they stand, [counts]; where it is left out, only the file is looked at.
+        """
+        try:
+            reference = self.reference()
+        except Refused as error:
+            return f"{error.what}: {error.why}"
+        if reference is None or stands is None:
+            return ""
+        moved = moved_since(self._rig, reference, stands)
+        worst = max(range(len(moved)), key=moved.__getitem__)
+        if moved[worst] <= self._rig.motion.start_tolerance:
+            return ""
+        name = list(self._rig.drive_names.values())[worst]
+        return f"{name} stands {moved[worst] * 1000:.1f} mm of cable away from where it was left"
+
     def kept_reference(self) -> ReferenceDocument | None:
         """What is on file for this bus, whatever it says; None where nothing is."""
         return self.file.read() if self._is_kept else None

@@ -42,6 +42,8 @@ class CycleTable:
         travelled: Length along the path, shape (n,), [m].
         lateness: Of the cycle behind its deadline, shape (n,), [s]; 0 in simulated time.
         missing: Drives that did not answer, shape (n,).
+        rejected: Frames thrown away until then, as they could not be true, shape (n,).
+        error_frames: Error frames of the bus until then, shape (n,).
         planned: Commanded position of the platform, world frame, shape (n, 3), [m].
         planned_rotation: Commanded ``world_from_platform``, quaternions (w, x, y, z), shape (n, 4).
         encoder: Position from the drives' actual positions, world frame, shape (n, 3), [m].
@@ -62,6 +64,8 @@ class CycleTable:
     travelled: Array
     lateness: Array
     missing: Integers
+    rejected: Integers
+    error_frames: Integers
     planned: Array
     planned_rotation: Array
     encoder: Array
@@ -114,6 +118,8 @@ class CycleTable:
             numbers("path_mm", self.travelled, _MM),
             numbers("lateness_ms", self.lateness, _MS, 4),
             integers("missing", self.missing),
+            integers("rejected_frames", self.rejected),
+            integers("error_frames", self.error_frames),
             *_pose("planned", self.planned, self.planned_rotation),
             *_pose("encoder", self.encoder, self.encoder_rotation),
             numbers("following_error_mm", self.following_error, _MM),
@@ -151,6 +157,8 @@ class CycleTable:
             travelled=table.floats("path_mm", _MM),
             lateness=table.floats("lateness_ms", _MS),
             missing=table.ints("missing"),
+            rejected=table.ints("rejected_frames"),
+            error_frames=table.ints("error_frames"),
             planned=table.matrix([f"planned_{axis}_mm" for axis in "xyz"], _MM),
             planned_rotation=table.matrix([f"planned_q{axis}" for axis in "wxyz"]),
             encoder=table.matrix([f"encoder_{axis}_mm" for axis in "xyz"], _MM),

@@ -45,15 +45,17 @@ class Exchange:
         actual: Positions as last received, [counts].
     """
 
-    def __init__(self, course: Course, group: DriveGroup, clock: Clock) -> None:
-        """Nothing is sent yet."""
+    def __init__(
+        self, course: Course, group: DriveGroup, clock: Clock, *, slack_counts: bool = True
+    ) -> None:
+        """Nothing is sent yet; what slack cables mean is as for `watch_limits`."""
         rig = course.rig
         self._rig, self._group, self._clock = rig, group, clock
         self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
         self._limits = gate_limits(rig, course.setpoints, course.cycle)
         names = tuple(rig.drive_names.values())
         self._numbers = {node: k for k, node in enumerate(rig.drive_names, start=1)}
-        self._watch = Watch.fresh(watch_limits(rig), names)
+        self._watch = Watch.fresh(watch_limits(rig, slack_counts=slack_counts), names)
         self._stuck = StuckWatch.fresh(least_steps(rig), names)
         self.armed = False
         self.latched = False

@@ -37,6 +37,8 @@ class Loop:
 
     way = "along the path"
     """How the drives move and stop, in messages."""
+    slack_counts = True
+    """A cable that hangs slack is a fault."""
 
     def __init__(
         self,
@@ -61,7 +63,7 @@ class Loop:
         self.machine = Machine()
         self._course, self._group, self._clock = course, group, clock
         self._wishes, self._on_cycle, self._on_event = wishes, on_cycle, on_event
-        self._exchange = Exchange(course, group, clock)
+        self._exchange = Exchange(course, group, clock, slack_counts=self.slack_counts)
         self._feed = Feed(len(course), course.cycle, course.rig.motion)
         self._cycle = 0
         self._taken_over = False
@@ -208,6 +210,8 @@ class Loop:
             torques=tuple(int(t) for t in done.status.torques),
             words=tuple(int(w) for w in done.status.status_words),
             missing=int(np.count_nonzero(done.status.missing)),
+            rejected=done.status.rejected,
+            error_frames=done.status.error_frames,
             following_error=done.following_error,
             lateness=done.lateness,
         )

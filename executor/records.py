@@ -22,6 +22,8 @@ class CycleRecord:
         torques: What they answered, [‰ of rated torque].
         words: Their status words.
         missing: How many did not answer.
+        rejected: Frames thrown away since the drives were set up, as they could not be true.
+        error_frames: Error frames of the bus since then.
         following_error: Largest over the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
     """
@@ -36,6 +38,8 @@ class CycleRecord:
     torques: tuple[int, ...]
     words: tuple[int, ...]
     missing: int
+    rejected: int
+    error_frames: int
     following_error: float
     lateness: float
 

@@ -62,6 +62,8 @@ class RunLog:
             travelled=between(planned.travelled, index),
             lateness=np.array([r.lateness for r in records]) * planned.cycle,
             missing=np.array([r.missing for r in records], dtype=np.int64),
+            rejected=np.array([r.rejected for r in records], dtype=np.int64),
+            error_frames=np.array([r.error_frames for r in records], dtype=np.int64),
             planned=between(planned.positions, index),
             planned_rotation=quaternions_of(planned.rotations[rows]),
             encoder=encoder,

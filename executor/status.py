@@ -3,7 +3,8 @@
 Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, ``cause``,
 ``elapsed_s``, ``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``feed_percent`` (of
 the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
-``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``drives`` [{``node``, ``state``,
+``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``rejected_frames``,
+``error_frames``, ``drives`` [{``node``, ``state``,
 ``position_counts``, ``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``,
 ``text``}], the newest last. A number that is not known is null; before the first cycle ``state``
 is ``preparing`` and ``drives`` is empty; at the end ``cause`` says why it did not end well. Winches
@@ -66,6 +67,8 @@ class CyclesSoFar:
             "cause": cause or None,
             "simulated_time": self._simulated_time,
             "lost_replies": self._lost,
+            "rejected_frames": self.last.rejected if self.last else 0,
+            "error_frames": self.last.error_frames if self.last else 0,
         }
         record = self.last
         if record is None:

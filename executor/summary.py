@@ -3,7 +3,8 @@
 Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, ``sentence``,
 ``reasons`` (the sentences that decided), ``checks`` [{``name``, ``passed``, ``text``}], ``rig``,
 ``scene``, ``plan_hash``, ``rig_hash``, ``interface``, ``simulated``, ``fast``, ``started`` (ISO
-8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``path_length_mm``,
+8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``rejected_frames``,
+``error_frames``, ``path_length_mm``,
 ``travelled_mm``, ``stops`` [{``name``, ``kind``, ``reached_s``, ``left_s``}],
 ``following_error_mm`` {``max``, ``rms``, ``limit``}, ``encoder_error_mm``
 {``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``, ``frames_without_pose``} or null
@@ -99,6 +100,8 @@ def summarize(
         "cycles": len(cycles),
         "cycle_ms": context.rig.document.bus.cycle_ms,
         "lost_replies": int(cycles.missing.sum()),
+        "rejected_frames": int(cycles.rejected.max(initial=0)),
+        "error_frames": int(cycles.error_frames.max(initial=0)),
         "path_length_mm": context.plan.document.quality.length_mm,
         "travelled_mm": _last(cycles.travelled * 1e3),
         "stops": [

@@ -19,12 +19,9 @@ from executor.loop import Loop
 from executor.machine import Event, State
 from executor.records import CycleRecord, LoopEvent
 from executor.safety.gate import Purpose
-from executor.safety.watch import Finding
 from executor.winch_laws import WinchLaw
 from executor.wishes import Wishes
 
-#: What the watch says of cables that hang slack.
-SLACK_CODES = frozenset({"slack", "cable_loose"})
 _ENDLESS = 10**9
 
 
@@ -32,6 +29,7 @@ class WinchLoop(Loop):
     """One motion by a law on one drive group; the gate allows what lies in the law's reach."""
 
     way = "together"
+    slack_counts = False
 
     def __init__(
         self,
@@ -69,7 +67,3 @@ class WinchLoop(Loop):
                 self._judge(findings, "")
             if self.machine.state is state:
                 self._status = self._send(Purpose.MOVE, targets)
-
-    def _judge(self, findings: tuple[Finding, ...], lost: str) -> None:
-        """As in a run, but for cables that hang slack."""
-        super()._judge(tuple(f for f in findings if f.code not in SLACK_CODES), lost)

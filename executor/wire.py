@@ -26,7 +26,7 @@ class RecordWire:
     def __init__(self, cables: int) -> None:
         """For so many cables."""
         self._cables = cables
-        self._layout = struct.Struct(f"<Qd B dd H dd {4 * cables}i 7d")
+        self._layout = struct.Struct(f"<Qd B dd HQQ dd {4 * cables}i 7d")
         self.size = self._layout.size
 
     def pack(self, record: CycleRecord, pose: Pose | None) -> bytes:
@@ -39,6 +39,8 @@ class RecordWire:
             record.index,
             record.rate,
             record.missing,
+            record.rejected,
+            record.error_frames,
             record.following_error,
             record.lateness,
             *record.targets,
@@ -51,10 +53,11 @@ class RecordWire:
     def unpack(self, content: bytes) -> tuple[CycleRecord, Pose | None]:
         """The inverse of `pack`."""
         values = self._layout.unpack(content)
-        cycle, at, state, index, rate, missing, error, lateness = values[:8]
+        cycle, at, state, index, rate, missing, rejected, error_frames = values[:8]
+        error, lateness = values[8:10]
         m = self._cables
-        targets, actual, torques, words = (values[8 + k * m : 8 + (k + 1) * m] for k in range(4))
-        place = values[8 + 4 * m :]
+        targets, actual, torques, words = (values[10 + k * m : 10 + (k + 1) * m] for k in range(4))
+        place = values[10 + 4 * m :]
         record = CycleRecord(
             cycle=cycle,
             at=at,
@@ -66,6 +69,8 @@ class RecordWire:
             torques=torques,
             words=words,
             missing=missing,
+            rejected=rejected,
+            error_frames=error_frames,
             following_error=error,
             lateness=lateness,
         )

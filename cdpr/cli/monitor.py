@@ -141,6 +141,7 @@ def _head(status: dict[str, Any]) -> str:
         _lateness(status),
         f"following error {_number(status['following_error_mm'], '.3f')} mm",
         f"{status['lost_replies']} lost replies",
+        f"{status['rejected_frames']} rejected, {status['error_frames']} error frames",
     ]
     return "  ".join(parts)
 

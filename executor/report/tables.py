@@ -138,6 +138,8 @@ def _bus(run: RunData) -> list[tuple[str, str]]:
         ("Cycle", f"{summary['cycle_ms']:g} ms"),
         ("Cycles", str(summary["cycles"])),
         ("Replies lost", str(summary["lost_replies"])),
+        ("Frames rejected", str(summary["rejected_frames"])),
+        ("Error frames", str(summary["error_frames"])),
         ("Lateness", lateness),
         ("Duration", f"{summary['duration_s']:.2f} s"),
         ("Final state", summary["final_state"]),

@@ -28,14 +28,20 @@ def tension_limits(rig: Rig) -> tuple[float, float]:
     return SLACK_SHARE * rig.min_tension, OVERLOAD_SHARE * rig.max_tension
 
 
-def watch_limits(rig: Rig) -> WatchLimits:
-    """When the watch speaks up."""
+def watch_limits(rig: Rig, *, slack_counts: bool = True) -> WatchLimits:
+    """When the watch speaks up.
+
+    Args:
+        rig: The robot.
+        slack_counts: A cable that hangs slack is wrong; otherwise only one whose tension is no
+            number.
+    """
     low, high = tension_limits(rig)
     return WatchLimits(
         following_error=rig.motion.following_error,
-        min_tension=low,
+        min_tension=low if slack_counts else -math.inf,
         max_tension=high,
-        no_tension=LOOSE_SHARE * rig.min_tension,
+        no_tension=LOOSE_SHARE * rig.min_tension if slack_counts else -math.inf,
     )
 
 

@@ -40,6 +40,8 @@ def status(**changes: Any) -> dict[str, Any]:
         "worst_lateness_ms": 0.2,
         "following_error_mm": None,
         "lost_replies": 3,
+        "rejected_frames": 2,
+        "error_frames": 1,
         "drives": [
             {
                 "node": 12,
@@ -98,6 +100,7 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     assert now["elapsed_s"] == pytest.approx(0.02)
     assert now["events"] == [{"time_s": 0.01, "code": "moving", "text": "winding in"}]
     assert now["lateness_ms"] == pytest.approx(0.5)
+    assert (now["rejected_frames"], now["error_frames"]) == (10, 14)
     text = shown(now).lower()
     for part in (
         "moving",
@@ -106,6 +109,7 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
         "-4711",
         "-3",
         "1 lost",
+        "10 rejected, 14 error frames",
         "100 %",
         "runs/[first]",
     ):
@@ -125,6 +129,8 @@ def _record(cycle: int) -> CycleRecord:
         torques=(500,) * 8,
         words=(0x0637,) * 8,
         missing=cycle % 2,
+        rejected=5 * cycle,
+        error_frames=7 * cycle,
         following_error=0.001,
         lateness=0.05,
     )

@@ -216,6 +216,8 @@ def _cycles(rig: Rig, scene: Scene, every: int) -> CycleTable:
         travelled=travelled,
         lateness=np.zeros(n),
         missing=np.zeros(n, dtype=np.int64),
+        rejected=np.zeros(n, dtype=np.int64),
+        error_frames=np.zeros(n, dtype=np.int64),
         planned=planned,
         planned_rotation=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
         encoder=encoder,

@@ -118,6 +118,8 @@ def test_a_record_comes_back_as_it_was(state, counts, numbers, error, turned):
         torques=tuple(counts[4:6]),
         words=tuple(counts[6:]),
         missing=2,
+        rejected=5,
+        error_frames=7,
         following_error=error,
         lateness=numbers[3],
     )

@@ -7,6 +7,7 @@ import pytest
 
 from cdpr.rig import load_rig
 from executor.safety.limits import gate_limits, least_steps, tension_limits, watch_limits
+from executor.safety.watch import Observation, Watch
 from tests.cli.plans import HALL, RIG
 
 PER_MM = 131072 / 206.06
@@ -23,6 +24,24 @@ def test_the_watch_judges_by_the_rig_file():
     assert limits.following_error == rig.motion.following_error == pytest.approx(0.002)
     assert (limits.min_tension, limits.max_tension) == tension_limits(rig)
     assert limits.no_tension == pytest.approx(0.5)
+
+
+def test_where_cables_may_hang_slack_the_watch_says_nothing_of_it():
+    rig = load_rig(RIG)
+    limits = watch_limits(rig, slack_counts=False)
+    assert limits.max_tension == tension_limits(rig)[1]
+    watch = Watch.fresh(limits, ["a", "b"])
+
+    def found(tension: float) -> set[str]:
+        now = watch
+        for _ in range(10):
+            seen = Observation(True, [0.0] * 2, [tension, 20.0], [False] * 2, [], 0.0)
+            now, findings = now.look(seen)
+        return {finding.code for finding in findings}
+
+    assert found(0.0) == found(-1.0) == set()
+    assert found(103.0) == {"over_tension"}
+    assert "cable_loose" in found(float("nan"))
 
 
 def test_a_step_that_counts_is_a_hundredth_of_the_following_error():
