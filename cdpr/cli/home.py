@@ -194,8 +194,12 @@ def _known_pose(
 def _go_by_the_rig_file(custody: Custody, yes: bool, as_json: bool) -> None:
     """Drops the reference, so that the rig file's counts are the drives' again."""
     from cdpr.cli.carry_out import ask_operator
-    from cdpr.cli.output import out, show_json
+    from cdpr.cli.output import err, out, show_json
+    from cdpr.cli.reference_facts import reference_text, reference_told
 
+    if not yes or not as_json:
+        text = f"the reference that is given up: {reference_text(reference_told(custody))}"
+        (err if as_json else out).print(text, soft_wrap=True, markup=False)
     if not yes:
         ask_operator("Do all drives count what the rig file says?", "the reference is as it was")
     custody.go_by_the_rig_file()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -36,6 +36,7 @@ def reset(
     from cdpr.cli.carry_out import ask_operator
     from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.output import err, out, show_json
+    from cdpr.cli.reference_facts import reference_text
     from drivers.bus import BusSettings
     from executor.latch import Latch
 
@@ -51,12 +52,16 @@ def reset(
     if not yes:
         ask_operator("Is the cause gone and the platform safe?", "nothing was reset")
     with latch.held_for_reset(the_rig.name, latched):
-        states = _drives_reset(the_rig)
+        told = _drives_reset(the_rig)
     if as_json:
         cause_before = latched.cause if latched else None
-        show_json({"released": latched is not None, "cause": cause_before, "drives": states})
+        show_json({"released": latched is not None, "cause": cause_before, **told})
         return
-    out.print(f"drives: {', '.join(sorted(set(states)))}", soft_wrap=True)
+    out.print(f"drives: {', '.join(sorted(set(told['drives'])))}", soft_wrap=True)
+    if told["restarted"]:
+        names = ", ".join(the_rig.drive_names[node] for node in told["restarted"])
+        out.print(f"switched on since they were last set up: {names}", soft_wrap=True)
+    out.print(f"reference: {reference_text(told['reference'])}", soft_wrap=True, markup=False)
     freed = "released" if latched else "nothing was latched"
     out.print(f"{freed}; the next run starts only from where the platform stands now")
 
@@ -74,8 +79,12 @@ def _require_bus(rig: Rig) -> None:
         )
 
 
-def _drives_reset(rig: Rig) -> list[str]:
-    """Sets the drives up, resets those in fault; their states afterwards.
+def _drives_reset(rig: Rig) -> dict[str, Any]:
+    """Sets the drives up, resets those in fault.
+
+    Returns:
+        ``drives``, the state of each afterwards; ``restarted``, nodes that were found without their
+        set-up; ``reference``, see `reference_told`.
 
     Where all held all the while, as after a program that was killed, their reference still counts
     from where they stand.
@@ -84,6 +93,7 @@ def _drives_reset(rig: Rig) -> list[str]:
         CdprError: A drive does not answer, may not be reset now, or stays in fault.
     """
     from cdpr.cli.drives import open_drives
+    from cdpr.cli.reference_facts import reference_told
     from cdpr.errors import Fault, HardwareMissing
     from cdpr.scene import load_from_document
     from cdpr.scene_file import LoadDocument
@@ -124,9 +134,14 @@ def _drives_reset(rig: Rig) -> list[str]:
                 why="it lost power or the bus since it was set up",
                 next_step="check power and wiring, then reset again; the latch stays engaged",
             )
+        custody, stands = Custody(rig), status.positions.tolist()
         if held and not group.restarted:
-            Custody(rig).found_held(status.positions.tolist())
-        return list(drive_states(rig, status.status_words.tolist()))
+            custody.found_held(stands)
+        return {
+            "drives": list(drive_states(rig, status.status_words.tolist())),
+            "restarted": list(group.restarted),
+            "reference": reference_told(custody, stands),
+        }
 
 
 def _counted(silent: list[int], status: CycleStatus) -> list[int]:

@@ -126,7 +126,9 @@ def test_a_lost_reference_can_be_dropped_for_what_absolute_encoders_count(tmp_pa
     Custody(rig).file.write(as_in_the_file(rig).model_copy(update={"lost": "emergency stop"}))
     with pytest.raises(Refused, match="no more referenced"):
         Custody(rig).require_ready()
-    assert call("home", RIG, "--as-rig-file", *bus, answers="n\n").code == 130
+    asked = call("home", RIG, "--as-rig-file", *bus, answers="n\n")
+    assert asked.code == 130
+    assert "does not count: the drives are no more referenced: emergency stop" in asked.out
     assert Custody(rig).file.path.is_file()
     assert call("home", RIG, "--as-rig-file", *bus, "--yes").code == 0
     Custody(rig).require_ready()

@@ -63,7 +63,11 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         Path(told["file"]).write_text(json.dumps(elsewhere))
         killed = call(*run, "-o", tmp_path / "killed")
         assert (killed.code, "away from where it was left" in killed.err) == (3, True)
-        assert call("reset", rig, *bus[:5]).code == 0
+        reset = call("reset", rig, *bus[:5], "--json")
+        assert reset.code == 0
+        after = json.loads(reset.out)
+        assert (after["restarted"], after["reference"]["counts"]) == ([], True)
+        assert after["reference"]["made"] == kept["made"]
         assert json.loads(Path(told["file"]).read_text()) == kept
         rehearsal.drives[5].power_on()
         third = call(*run, "-o", tmp_path / "third")
@@ -72,7 +76,10 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         again = call(*run, "-o", tmp_path / "again")
         assert again.code == 3
         assert "no more referenced" in again.err
-        assert call("reset", rig, *bus[:5]).code == 0
+        reset = call("reset", rig, *bus[:5])
+        assert reset.code == 0
+        assert "reference: does not count" in reset.out
+        assert "cable 6 (drive 6): switched on" in reset.out.replace("\n", " ")
         jogged = call("jog", rig, "--by-mm", "0", "0", "1", "--no-scene", *bus)
         assert jogged.code == 3
         assert "cable 6 (drive 6): switched on" in jogged.err.replace("\n", " ").replace("  ", "")
