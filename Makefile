@@ -54,8 +54,8 @@ hil: install  ## Run the tests that need a CAN bus of the kernel, here or in a v
 	@"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_3.yaml -o "$(VENV)/hil-plan.json" --force --json >/dev/null
 	CDPR_HIL_PLAN="$$PWD/$(VENV)/hil-plan.json" "$(BIN)/python" tools/hil/run.py
 
-hil-subset: install  # those of them that take a few minutes
-	"$(BIN)/python" tools/hil/run.py --limit-s 600 -m "hil and not slow"
+hil-subset: install  ## Run those of them that take a few minutes, as .ci/run does
+	"$(BIN)/python" tools/hil/run.py --limit-s 1200 -m "hil and not slow"
 
 lint: install  ## Check style, types, import contracts, and that the docs build without a warning
 	"$(BIN)/python" -m ruff check

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,20 @@ def assert_nothing_was_lost(frames: list[Frame], cycles: int) -> None:
         assert counts[TPDO1_BASE + node] == counts[SYNC_ID]
 
 
+def assert_commanded_together(frames: list[Frame]) -> None:
+    """From one SYNC to the next every drive gets one set-point, and all the same control word."""
+    words: dict[int, bytes] = {}
+    for frame in frames:
+        node = frame.can_id - RPDO1_BASE
+        if node in NODES:
+            assert node not in words
+            words[node] = frame.data[:2]
+        elif frame.can_id == SYNC_ID:
+            assert sorted(words) == list(NODES)
+            assert len(set(words.values())) == 1, words
+            words = {}
+
+
 def assert_decodes(frames: list[Frame], folder: Path) -> None:
     """Names and values by the EDS file are those of the run's own record."""
     targets: dict[int, list[int]] = {node: [] for node in NODES}
@@ -50,22 +65,37 @@ def assert_decodes(frames: list[Frame], folder: Path) -> None:
         assert state_of(last[node]["Statusword"]) is DriveState.QUICK_STOP_ACTIVE
 
 
-def whole_run(drives_at: Callable[[Path], Any], plan: Path, trace: Path, tell: Tell) -> None:
+def whole_run(
+    drives_at: Callable[[Path], Any], plan: Path, trace: Path, tell: Tell, stopped: bool = False
+) -> None:
+    """From `cdpr run` to its record; one that the operator stops is stopped on the path."""
     with drives_at(plan) as rig:
         running = rig.run()
+        if stopped:
+            rig.wait_for_motion(running)
+            rig.wait_for_cycles(50, running)
+            running.send(signal.SIGINT)
         code = running.ended()
-        assert code == 0, running.said.read_text()
+        assert code == (130 if stopped else 0), running.said.read_text()
         summary = rig.summary()
         assert rig.states() == {DriveState.QUICK_STOP_ACTIVE}
     tell(f"{summary['cycles']} cycles, lateness in ms: {summary['lateness_ms']}")
-    assert summary["verdict"] == "PASSED"
+    assert summary["verdict"] == ("STOPPED" if stopped else "PASSED")
     assert summary["simulated"] is False
     assert summary["lost_replies"] == 0
     frames = read_trace(trace)
     assert_nothing_was_lost(frames, summary["cycles"])
+    assert_commanded_together(frames)
     assert_decodes(frames, rig.folder / "run")
 
 
+def test_ctrl_c_stops_all_drives_together_along_the_path(
+    drives_at: Callable[[Path], Any], short_plan: Path, trace: Path, figures: Tell
+) -> None:
+    whole_run(drives_at, short_plan, trace, figures, stopped=True)
+
+
+@pytest.mark.slow
 def test_a_short_path(
     drives_at: Callable[[Path], Any], short_plan: Path, trace: Path, figures: Tell
 ) -> None:

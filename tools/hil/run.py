@@ -1,8 +1,10 @@
 """Runs the tests marked `hil` on a virtual CAN bus: of this machine, else of a virtual one.
 
     python tools/hil/run.py [--artefacts DIR] [--limit-s S] [pytest's arguments]
+    python tools/hil/run.py --missing
 
-The exit status is pytest's; 125 when there is no bus to run them on.
+The exit status is pytest's; 125 when there is no bus to run them on. With --missing it only names
+the Debian packages that must be installed before, in one line; needs no environment of its own.
 """
 
 from __future__ import annotations
@@ -16,14 +18,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-from kernel import VmFailed
-from vm import run_in_vm
+from kernel import BUSYBOX, VmFailed
+from vm import QEMU, run_in_vm
 
 ROOT = Path(__file__).resolve().parents[2]
 CHANNEL = "vcan0"
 NO_BUS = 125
 TESTS = ("-m", "pytest", "-p", "no:cacheprovider", "tests/hil")
 NEEDED = {"ip": "iproute2", "candump": "can-utils"}
+NEEDED_BY_VM = {QEMU: "qemu-system-x86", str(BUSYBOX): "busybox-static"}
+COMPILED = ("cdpr", "drivers", "executor", "planner", "simulation", "tests", "tracking")
 
 
 def main() -> int:
@@ -31,7 +35,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="run the hardware-in-the-loop tests on vcan")
     parser.add_argument("--artefacts", type=Path, default=_cache() / "last")
     parser.add_argument("--limit-s", type=float, default=1800.0)
+    parser.add_argument("--missing", action="store_true")
     options, rest = parser.parse_known_args()
+    if options.missing:
+        print(*_missing())
+        return 0
     artefacts = options.artefacts.resolve()
     if artefacts.is_relative_to(ROOT):
         parser.error(f"--artefacts {artefacts} is inside the repository; name another folder")
@@ -47,6 +55,7 @@ def main() -> int:
             print(f"hil: on this machine's {CHANNEL}; traces in {artefacts}", flush=True)
             return _on_host(tests, artefacts)
         print(f"hil: no AF_CAN here, so in a virtual machine; traces in {artefacts}", flush=True)
+        _compile()
         return run_in_vm(_job(tests), artefacts, _cache(), options.limit_s)
     except VmFailed as error:
         print(f"hil: {error}", file=sys.stderr)
@@ -59,10 +68,16 @@ def _cache() -> Path:
 
 
 def _require_tools() -> None:
-    path = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
-    missing = [package for tool, package in NEEDED.items() if not shutil.which(tool, path=path)]
+    missing = _missing()
     if missing:
         raise VmFailed(f"tools are missing; next: sudo apt-get install {' '.join(missing)}")
+
+
+def _missing() -> list[str]:
+    """Packages whose tools are not here."""
+    path = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
+    needed = NEEDED if _host_has_can() else NEEDED | NEEDED_BY_VM
+    return [package for tool, package in needed.items() if not shutil.which(tool, path=path)]
 
 
 def _host_has_can() -> bool:
@@ -91,6 +106,12 @@ def _bring_up() -> str:
 
 def _environment(artefacts: Path) -> dict[str, str]:
     return {"CDPR_HIL_CHANNEL": CHANNEL, "CDPR_HIL_ARTEFACTS": str(artefacts)}
+
+
+def _compile() -> None:
+    """To bytecode, here: it takes twenty times as long where instructions are counted."""
+    command = [sys.executable, "-m", "compileall", "-q", *COMPILED]
+    subprocess.run(command, cwd=ROOT, check=False)  # a folder that is read-only costs time alone
 
 
 def _job(tests: list[str]) -> str:

@@ -31,7 +31,7 @@ from executor.status import RunStatus
 from executor.wishes import OwnBoard
 from simulation.drive import SimulatedDrive
 from simulation.fault_bus import FaultBus, lose
-from tests.scenarios.faults.masters import Masters, gone
+from tests.scenarios.faults.masters import StartsMasters, gone
 from tests.scenarios.faults.samples import Limits, Stopped, WatchedRehearsal, stopped, violations
 from tests.scenarios.stage import Stage
 
@@ -202,7 +202,7 @@ class LiveBench(Bench):
         prepared: PreparedRun,
         folder: RunFolder,
         settings: BusSettings,
-        masters: Masters,
+        masters: StartsMasters,
         line: FaultBus,
         rehearsal: WatchedRehearsal,
     ) -> None:
@@ -279,7 +279,7 @@ def _ahead_of_others() -> Iterator[None]:
 
 @contextmanager
 def live(
-    prepared: PreparedRun, path: Path, script: Script, settings: BusSettings, masters: Masters
+    prepared: PreparedRun, path: Path, script: Script, settings: BusSettings, masters: StartsMasters
 ) -> Iterator[LiveBench]:
     """A bench in real time; the script is asked at every SYNC."""
     document = prepared.rig.document.bus.model_copy(

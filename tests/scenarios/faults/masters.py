@@ -9,14 +9,18 @@ runs it; `outcome.json` in the folder tells how it ended, if it came to its end.
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Protocol
 
 from drivers.bus import BusSettings
+from executor.prepare import PreparedRun
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = (
@@ -34,8 +38,36 @@ def gone(process: int) -> bool:
     return state == "Z"
 
 
-class Masters:
+class StartsMasters(Protocol):
     """Starts executors for one plan."""
+
+    def start(self, settings: BusSettings, folder: Path) -> int:
+        """A run with the drives on a bus; the number of its process."""
+        ...
+
+
+class ForkedMasters:
+    """From this very process: where instructions are counted, to import all anew takes a minute."""
+
+    def __init__(self, prepared: PreparedRun) -> None:
+        context = multiprocessing.get_context("fork")
+        self._link, far_end = context.Pipe()
+        self._process = context.Process(target=_serve_forked, args=(prepared, far_end))
+        self._process.start()
+
+    def start(self, settings: BusSettings, folder: Path) -> int:
+        """A run with the drives on a bus; the number of its process."""
+        self._link.send((settings, folder))
+        return int(self._link.recv())
+
+    def close(self) -> None:
+        self._link.send(None)
+        self._process.join()
+        self._process.close()
+
+
+class Masters:
+    """Starts executors for one plan, from a process that was started for it."""
 
     def __init__(self, plan: Path, rig: Path) -> None:
         self._process = subprocess.Popen(
@@ -69,14 +101,27 @@ def serve() -> None:
     plan, rig = map(Path, sys.argv[1:])
     prepared = prepare(verify(load_plan(plan)), load_rig(rig))
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-    from tests.scenarios.faults import one_master
-
     for line in sys.stdin:
         interface, channel, folder = json.loads(line)
-        child = os.fork()
-        if child == 0:
-            with suppress(KeyboardInterrupt):
-                one_master.run(prepared, BusSettings(interface, channel), Path(folder))
-            os._exit(0)
+        child = _forked(prepared, BusSettings(interface, channel), Path(folder))
         sys.stdout.write(f"{child}\n")
         sys.stdout.flush()
+
+
+def _serve_forked(prepared: PreparedRun, link: Connection) -> None:
+    os.setsid()
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    while (asked := link.recv()) is not None:
+        link.send(_forked(prepared, *asked))
+
+
+def _forked(prepared: PreparedRun, settings: BusSettings, folder: Path) -> int:
+    """A run in a process of its own; its number."""
+    from tests.scenarios.faults import one_master
+
+    child = os.fork()
+    if child == 0:
+        with suppress(KeyboardInterrupt):
+            one_master.run(prepared, settings, folder)
+        os._exit(0)
+    return child

@@ -81,9 +81,12 @@ class WatchedRehearsal(Rehearsal):
     def _advance(self, elapsed: float) -> None:
         super()._advance(elapsed)
         self.passed += elapsed
-        self._keep()
+        self._keep(self.now)
 
     def _on_sync(self, data: Frame) -> None:
+        # Drives act when the SYNC comes; to compute what the platform does takes time of this
+        # computer alone.
+        came = self.now
         self.on_cycle()
         heard = {i: self.drives[i] for i in self.deaf}
         was = {i: drive.silent for i, drive in heard.items()}
@@ -93,12 +96,12 @@ class WatchedRehearsal(Rehearsal):
         for i, drive in heard.items():
             drive.silent = was[i]
         self.deaf = set()
-        self._keep()
+        self._keep(came)
 
-    def _keep(self) -> None:
+    def _keep(self, at: float) -> None:
         drives = self.drives
         sample = Sample(
-            self.now,
+            at,
             self.cycles,
             tuple(drive.state for drive in drives),
             tuple(drive._target for drive in drives),
