@@ -15,6 +15,7 @@ from cdpr.documents import content_hash, key_path, load_yaml
 from cdpr.errors import BadInput
 from cdpr.payload import Payload
 from cdpr.poses import Array, Pose, read_only
+from cdpr.rig import Rig
 from cdpr.rotation_limits import RotationLimits
 from cdpr.scene_file import (
     BoxDocument,
@@ -177,6 +178,14 @@ def scene_from_document(document: SceneDocument) -> Scene:
         load=load_from_document(document.load),
         stops=tuple(Stop(s.name, s.kind, s.pose(), s.dwell_s) for s in document.stops),
         rotation_limits=_rotation_limits(document.rotation_limits),
+    )
+
+
+def nothing_in_the_way(rig: Rig) -> Scene:
+    """Nothing but the rig, at home."""
+    home = PoseDocument.of(rig.home)
+    return scene_from_document(
+        SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
     )
 
 

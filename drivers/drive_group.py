@@ -110,6 +110,24 @@ class CycleStatus:
     error_frames: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivesSeen:
+    """What drives tell who only looks; in the order of the winches, as in `CycleStatus`.
+
+    Attributes:
+        positions: Shape (m,), [counts].
+        torques: Positive where they pull the cable in, shape (m,), [per mille of rated torque].
+        status_words: Shape (m,); `drive_states` tells what they say.
+        restarted: Nodes that do not hold this program's set-up: switched on since, or never set up.
+            None of drives that keep their settings without power.
+    """
+
+    positions: Counts
+    torques: Counts
+    status_words: Counts
+    restarted: tuple[int, ...]
+
+
 class DriveGroup(Protocol):
     """All drives of a rig, enabled, moved and stopped together."""
 
@@ -222,6 +240,29 @@ def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
     from drivers.cia402.states import state_of
 
     return tuple(state_of(word).value for word in status_words)
+
+
+def look_at_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DrivesSeen:
+    """Asks drives that nobody moves how they stand; changes nothing, not even their set-up.
+
+    Args:
+        rig: The robot; its winches name the nodes.
+        bus: An open bus; it stays the caller's.
+        pump: As for `make_drive_group`.
+
+    Raises:
+        HardwareMissing: A drive does not answer.
+        Refused: It will not tell.
+        Fault: The bus failed.
+    """
+    document = rig.document.drives
+    if document.type == "odrive":
+        from drivers.odrive import look as odrive
+
+        return odrive.look(rig, document, bus, pump)
+    from drivers.cia402 import look as cia402
+
+    return cia402.look(rig, bus, pump)
 
 
 def make_drive_group(

@@ -88,7 +88,7 @@ class Latch:
             Refused: One is.
         """
         latched = self.read()
-        if latched is not None and self._held_by_another():
+        if latched is not None and self.held_by_another():
             raise self._refusal(latched)
 
     @contextmanager
@@ -177,7 +177,7 @@ class Latch:
             self._held()
             self._held = None
 
-    def _held_by_another(self) -> bool:
+    def held_by_another(self) -> bool:
         """Somebody moves or resets the drives at this moment."""
         if self._held is not None:
             return False
@@ -213,7 +213,7 @@ class Latch:
             raise self._not_kept(error.strerror or str(error)) from None
 
     def _refusal(self, latched: Latched | None) -> Refused:
-        if latched is not None and self._held_by_another():
+        if latched is not None and self.held_by_another():
             return Refused(
                 f"a run or a reset (process {latched.process}) is under way on this bus",
                 where=f"bus {self._bus}",

@@ -133,12 +133,12 @@ def look_at_rest(
     """
     import time
 
-    from cdpr.cli.jog import no_scene
+    from cdpr.scene import nothing_in_the_way
     from executor.observer import Trigger
     from tracking.tracker import Tracker
 
     camera = rig.cameras[0]
-    source, tracker = _source(rig, no_scene(rig), camera, name), Tracker(rig, camera)
+    source, tracker = _source(rig, nothing_in_the_way(rig), camera, name), Tracker(rig, camera)
     try:
         looks = []
         for frame in range(pictures):

@@ -191,7 +191,7 @@ def _slow(rig: Rig, speed_mm_s: float) -> Rig:
 def _scene(path: Path | None, without: bool, clearance_mm: float | None, rig: Rig) -> Scene:
     """What is around; nothing only when somebody says so."""
     from cdpr.errors import BadInput
-    from cdpr.scene import load_scene
+    from cdpr.scene import load_scene, nothing_in_the_way
 
     if (path is None) != without:
         raise BadInput(
@@ -199,18 +199,6 @@ def _scene(path: Path | None, without: bool, clearance_mm: float | None, rig: Ri
             where="--scene",
             next_step="pass --scene with the file, or --no-scene if there is nothing to hit",
         )
-    scene = no_scene(rig) if path is None else load_scene(path).changed(stops=())
+    scene = nothing_in_the_way(rig) if path is None else load_scene(path).changed(stops=())
     clearance = None if clearance_mm is None else clearance_mm / 1000.0
     return scene.changed(clearance=clearance)
-
-
-def no_scene(rig: Rig) -> Scene:
-    """Nothing but the rig, at home."""
-    from cdpr.document_types import PoseDocument
-    from cdpr.scene import scene_from_document
-    from cdpr.scene_file import SceneDocument
-
-    home = PoseDocument.of(rig.home)
-    return scene_from_document(
-        SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
-    )

@@ -20,6 +20,24 @@ def rig_on_bus(path: Path, interface: str | None, channel: str | None) -> Rig:
     return rig_from_document(document.model_copy(update={"bus": bus}))
 
 
+def require_other_process(rig: Rig) -> None:
+    """The bus reaches drives that outlive this process.
+
+    Raises:
+        BadInput: It is the interface ``virtual``.
+    """
+    from cdpr.errors import BadInput
+    from drivers.bus import IN_PROCESS
+
+    if rig.document.bus.interface == IN_PROCESS:
+        raise BadInput(
+            "nothing is kept on the interface 'virtual'",
+            where="bus",
+            why="its drives are simulated in the process of a run and end with it",
+            next_step="name the bus with --interface and --channel",
+        )
+
+
 def require_own_time(fast: bool, in_process: bool) -> None:
     """Only drives that are simulated in this process can go faster than time.
 

@@ -34,14 +34,14 @@ def reset(
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
     from cdpr.cli.carry_out import ask_operator
-    from cdpr.cli.named_bus import rig_on_bus
+    from cdpr.cli.named_bus import require_other_process, rig_on_bus
     from cdpr.cli.output import err, out, show_json
     from cdpr.cli.reference_facts import reference_text
     from drivers.bus import BusSettings
     from executor.latch import Latch
 
     the_rig = rig_on_bus(rig, interface, channel)
-    _require_bus(the_rig)
+    require_other_process(the_rig)
     latch = Latch(BusSettings.of(the_rig))
     latched = latch.read()
     latch.require_no_run()
@@ -66,19 +66,6 @@ def reset(
     out.print(f"{freed}; the next run starts only from where the platform stands now")
 
 
-def _require_bus(rig: Rig) -> None:
-    from cdpr.errors import BadInput
-    from drivers.bus import IN_PROCESS
-
-    if rig.document.bus.interface == IN_PROCESS:
-        raise BadInput(
-            "nothing is latched on the interface 'virtual'",
-            where="bus",
-            why="its drives are simulated in the process of a run and end with it",
-            next_step="name the bus with --interface and --channel",
-        )
-
-
 def _drives_reset(rig: Rig) -> dict[str, Any]:
     """Sets the drives up, resets those in fault.
 
@@ -95,15 +82,14 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
     from cdpr.cli.drives import open_drives
     from cdpr.cli.reference_facts import reference_told
     from cdpr.errors import Fault, HardwareMissing
-    from cdpr.scene import load_from_document
-    from cdpr.scene_file import LoadDocument
+    from cdpr.scene import nothing_in_the_way
     from drivers.drive_group import GroupCommand, GroupState, drive_states
     from executor.clock import RealClock
     from executor.custody import Custody
     from executor.safety.watch import MISSING_CYCLES
 
     clock = RealClock(rig.document.bus.cycle_ms / 1000.0)
-    with open_drives(rig, rig.home, load_from_document(LoadDocument()), to_reset=True) as drives:
+    with open_drives(rig, rig.home, nothing_in_the_way(rig).load, to_reset=True) as drives:
         group = drives.group
         status = group.read_positions()
         if status.state is GroupState.FAULT:

@@ -26,6 +26,7 @@ from cdpr.cli.report import report
 from cdpr.cli.reset import reset
 from cdpr.cli.run import run
 from cdpr.cli.sim import sim
+from cdpr.cli.status import status
 from cdpr.cli.stop import stop
 from cdpr.cli.track import track
 from cdpr.cli.workspace import workspace
@@ -41,6 +42,7 @@ VERBS = (
     resume,
     speed,
     monitor,
+    status,
     reset,
     home,
     jog,

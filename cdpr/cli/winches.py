@@ -97,8 +97,8 @@ def carry_out_by_law(
         CdprError: Nothing was enabled, for the reason told.
     """
     from cdpr.cli.drives import open_drives
-    from cdpr.cli.jog import no_scene
     from cdpr.errors import Fault, StoppedByOperator
+    from cdpr.scene import nothing_in_the_way
     from drivers.bus import IN_PROCESS
     from executor.command_server import serving
     from executor.machine import State
@@ -119,7 +119,7 @@ def carry_out_by_law(
 
     board = OwnBoard()
     status = WinchStatus(rig, board, simulated_time=motion.fast)
-    load = no_scene(rig).load
+    load = nothing_in_the_way(rig).load
     with (
         stop_requests(board),
         announced() as listeners,

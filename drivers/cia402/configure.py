@@ -71,7 +71,7 @@ def configure_drives(
     for node in nodes:
         _check_idle(network, node, to_reset)
     on_restarted(
-        tuple(n for n, s in zip(nodes, settings, strict=True) if not _still_set_up(network, n, s))
+        tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
     )
     entries = []
     absent: dict[Setting, list[int]] = {}
@@ -88,7 +88,7 @@ def configure_drives(
     return (*_absent(absent), *_unwatched_peers(nodes, entries))
 
 
-def _still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
+def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
     """Whether it holds what only a set-up gives it: a drive that starts again forgets it."""
     client = network.client(node)
     return all(

@@ -12,13 +12,14 @@ import pytest
 
 from cdpr.errors import BadInput, Fault, HardwareMissing, Refused
 from cdpr.rig import Rig, rig_from_document
-from drivers.drive_group import GroupCommand, GroupState, drive_states
+from drivers.drive_group import GroupCommand, GroupState, drive_states, look_at_drives
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
 from drivers.odrive.messages import AxisError, AxisState, can_id, node_and_command
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
 SET_AXIS_STATE, SET_INPUT_POS = 0x07, 0x0C
+HEARTBEAT, ENCODER_ESTIMATES, TORQUES = 0x01, 0x09, 0x1C
 WATCHDOG_S = 0.1
 
 
@@ -390,3 +391,13 @@ def test_counts_that_a_float_cannot_tell_apart_are_refused() -> None:
     with pytest.raises(BadInput, match="finer than an ODrive's set-point") as caught:
         check_resolution(with_counts(odrive_rig(), 2_000_000))
     assert "counts_per_rev" in caught.value.next_step
+
+
+def test_who_only_looks_sends_nothing(bench: OdriveBench) -> None:
+    seen = look_at_drives(bench.rig, bench.group._bus, bench.rehearsal.pump)
+    assert seen.positions.tolist() == [round(drive.motor.position) for drive in bench.drives]
+    assert not seen.torques.any(), "their brakes hold"
+    assert seen.restarted == ()
+    assert all("idle" in state for state in drive_states(bench.rig, seen.status_words.tolist()))
+    told = {node_and_command(message.arbitration_id)[1] for message in bench.frames()}
+    assert told == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}

@@ -12,12 +12,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cdpr.cli.jog import no_scene
 from cdpr.cli.jog_way import straight_way
 from cdpr.errors import Fault, Refused, StoppedByOperator
 from cdpr.plan import plan_from_document
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, load_rig
+from cdpr.scene import nothing_in_the_way
 from drivers.bus import BusSettings, open_bus
 from drivers.bus_faults import BusDown
 from drivers.cia402.states import DriveState
@@ -161,7 +161,9 @@ def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
         )
         place.group.close()
         home = place.rig.home.position
-        way = no_scene(rig).changed(goal=Pose.level(home + np.array([0.012, -0.006, 0.015])))
+        way = nothing_in_the_way(rig).changed(
+            goal=Pose.level(home + np.array([0.012, -0.006, 0.015]))
+        )
         document = straight_plan(rig, way, [tuple(home * 1e3), tuple(way.goal.position * 1e3)])
         prepared = prepare(verify(plan_from_document(document), rig), rig)
         bus = place.group._bus  # type: ignore[attr-defined]
@@ -185,7 +187,7 @@ def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
 
 def looks(rig: Rig, *poses: Pose) -> list[object]:
     camera, tracker = (
-        SyntheticCamera(rig, no_scene(rig), rig.cameras[0]),
+        SyntheticCamera(rig, nothing_in_the_way(rig), rig.cameras[0]),
         Tracker(rig, rig.cameras[0]),
     )
     poses = poses * 6 if len(poses) == 1 else poses
@@ -204,10 +206,10 @@ def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
         reference = reference_at(
             place.rig, seen.pose, stand.counts, stand.tensions, "tags", seen.uncertainty
         )
-        rig, load = referenced(place.rig, reference), no_scene(place.rig).load
+        rig, load = referenced(place.rig, reference), nothing_in_the_way(place.rig).load
         found = standing_pose(rig, stand.counts, load)
         assert found.distance_to(true) < 4.0 * seen.uncertainty
-        home = straight_way(rig, no_scene(rig), found, rig.home, False)
+        home = straight_way(rig, nothing_in_the_way(rig), found, rig.home, False)
         prepared = prepare(verify(plan_from_document(home), rig), rig)
         bus = place.group._bus  # type: ignore[attr-defined]
         place.group.close()
