@@ -41,6 +41,8 @@ class GroupState(Enum):
     """All drives were told to stop and hold under torque."""
     FAULT = auto()
     """As QUICK_STOP, because of a fault; latched until RESET_FAULT."""
+    RELEASED = auto()
+    """No drive has torque any more; brakes, where there are such, are closed."""
 
 
 class GroupCommand(Enum):
@@ -48,6 +50,9 @@ class GroupCommand(Enum):
 
     ENABLE = auto()
     QUICK_STOP = auto()
+    RELEASE = auto()
+    """Brakes close, then the torque goes, of all drives together: for a platform that stands on
+    something."""
     RESET_FAULT = auto()
 
 

@@ -22,6 +22,7 @@ from cdpr.cli.jog import jog
 from cdpr.cli.monitor import monitor
 from cdpr.cli.operate import hold, resume, speed
 from cdpr.cli.plan import plan
+from cdpr.cli.release import release
 from cdpr.cli.report import report
 from cdpr.cli.reset import reset
 from cdpr.cli.run import run
@@ -46,6 +47,7 @@ VERBS = (
     reset,
     home,
     jog,
+    release,
     track,
     sim,
     report,

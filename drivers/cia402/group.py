@@ -34,7 +34,7 @@ from drivers.reply_check import largest_steps
 from drivers.torque import winding_signs
 
 STEP_TIMEOUT = 1.0
-"""For enabling, [s]: a brake takes a few tenths to open."""
+"""For enabling and for releasing, [s]: a brake takes a few tenths to open or close."""
 
 RESET_CYCLES = 10
 """Cycles a drive has to leave the state FAULT after a reset."""
@@ -45,6 +45,8 @@ FIRST_READINGS = 2
 
 FIRST_READING_TIMEOUT = 0.1
 """A drive that was just started may let the first SYNC pass; [s] for each."""
+
+_WITHOUT_TORQUE = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)
 
 
 class Cia402Group:
@@ -215,6 +217,8 @@ class Cia402Group:
             self._stop()
         elif command is GroupCommand.ENABLE:
             self._begin_enabling()
+        elif command is GroupCommand.RELEASE:
+            self._begin_release()
         else:
             self._reset_fault()
 
@@ -250,7 +254,7 @@ class Cia402Group:
                 self._released[drive] = True
 
     def _look_for_faults(self) -> None:
-        powered = self._goal is Goal.ENABLE
+        powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
         found = self._watch.news()
         if not powered:  # an emergency of a drive that moves nothing becomes its state's reason
             found = [(node, text) for node, text in found if node in self._watch.restarted]
@@ -284,6 +288,11 @@ class Cia402Group:
                 self._state = GroupState.ENABLED
             elif self._cycles_to_goal > self._patience:
                 self._latch(self._late(DriveState.OPERATION_ENABLED))
+        elif self._goal is Goal.RELEASE:
+            if all(state in _WITHOUT_TORQUE for state in states):
+                self._goal, self._state = Goal.IDLE, GroupState.RELEASED
+            elif self._cycles_to_goal > self._patience:
+                self._latch(self._late(DriveState.READY_TO_SWITCH_ON))
 
     def _late(self, wanted: DriveState) -> list[tuple[int, str]]:
         names = self._rig.drive_names
@@ -329,6 +338,12 @@ class Cia402Group:
             return
         self._refuse_latched("enable the drives")
         self._goal, self._state, self._cycles_to_goal = Goal.ENABLE, GroupState.ENABLING, 0
+
+    def _begin_release(self) -> None:
+        self._refuse_latched("release the drives")
+        self._goal, self._cycles_to_goal = Goal.RELEASE, 0
+        if self._state in (GroupState.ENABLING, GroupState.ENABLED):
+            self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
 
     def _refuse_latched(self, wish: str) -> None:
         if self._state is not GroupState.FAULT:

@@ -19,6 +19,7 @@ class Goal(Enum):
     """No power; a drive found under torque is told to stop and hold."""
     ENABLE = auto()
     STOP = auto()
+    RELEASE = auto()
     RESET_FAULT = auto()
 
 
@@ -57,6 +58,8 @@ def next_words(
         return (ControlWord.QUICK_STOP,) * len(states)
     if goal is Goal.ENABLE:
         return _enable(states, released)
+    if goal is Goal.RELEASE:
+        return _release(states, released)
     if goal is Goal.RESET_FAULT:
         return tuple(
             ControlWord.RESET_FAULT if state is DriveState.FAULT else _idle(state)
@@ -84,3 +87,18 @@ def _enable(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[Con
         return (ControlWord.ENABLE_OPERATION,) * len(states)
     word = _NEXT_WORD[min(lowest, 1)]
     return tuple(ControlWord.QUICK_STOP if s in _MAY_HOLD else word for s in states)
+
+
+def _release(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[ControlWord, ...]:
+    """Operation disabled on all, which closes brakes; shut down once none is under torque.
+
+    The only way out of QUICK STOP ACTIVE without "disable voltage" leads through OPERATION
+    ENABLED, for all drives together and with targets on the actual positions.
+    """
+    if any(state in FAULTED for state in states):
+        return (ControlWord.QUICK_STOP,) * len(states)
+    if DriveState.QUICK_STOP_ACTIVE in states:
+        return _enable(states, released)
+    if DriveState.OPERATION_ENABLED in states:
+        return (ControlWord.SWITCH_ON,) * len(states)
+    return (ControlWord.SHUTDOWN,) * len(states)

@@ -96,6 +96,7 @@ class OdriveGroup:
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
         self._stop = _Stop.NONE
         self._waited = 0
+        self._releasing = False
         self._all_hold = False  # the stop under way found all drives enabled
         self._resetting = 0
         self._faults: list[tuple[int, str]] = []
@@ -233,8 +234,9 @@ class OdriveGroup:
             self._begin_enabling()
         elif command is GroupCommand.RESET_FAULT:
             self._reset_fault()
-        else:
+        else:  # every stop of ODrives ends with closed brakes and without torque
             self._begin_stop(GroupState.QUICK_STOP)
+            self._releasing = command is GroupCommand.RELEASE
 
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
@@ -298,6 +300,8 @@ class OdriveGroup:
                 self._state = GroupState.ENABLED
             elif self._waited > self._patience:
                 self._latch(self._not_enabled())
+        if self._releasing and self._state is GroupState.QUICK_STOP and self._all_disarmed():
+            self._state = GroupState.RELEASED
 
     def _all_disarmed(self) -> bool:
         return self._watch.states_known and not self._watch.any_enabled()

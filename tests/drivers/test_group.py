@@ -52,6 +52,12 @@ class TestFromSetUpToPowerOff:
             status = bench.cycle()
         assert status.holding
         assert group.state is GroupState.QUICK_STOP
+        stood = [drive.motor.position for drive in bench.drives]
+        group.command(GroupCommand.RELEASE)
+        bench.until(GroupState.RELEASED)
+        assert all(d.state is DriveState.READY_TO_SWITCH_ON for d in bench.drives)
+        assert not bench.status.holding
+        assert [drive.motor.position for drive in bench.drives] == pytest.approx(stood, abs=1)
 
     def test_stop_now_needs_no_further_cycle(self, served_bench: Bench) -> None:
         bench = served_bench
@@ -216,8 +222,9 @@ def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:
         bench.cycle()
     assert bench.group.state is GroupState.FAULT
     assert bench.drives[2].state is DriveState.FAULT  # no reset by itself
-    with pytest.raises(Refused, match="latched"):
-        bench.group.command(GroupCommand.ENABLE)
+    for command in (GroupCommand.ENABLE, GroupCommand.RELEASE):
+        with pytest.raises(Refused, match="latched"):
+            bench.group.command(command)
     with pytest.raises(Refused, match="while other drives hold"):
         bench.group.command(GroupCommand.RESET_FAULT)
     for drive in bench.drives:  # the operator's emergency stop takes the torque off

@@ -401,3 +401,12 @@ def test_who_only_looks_sends_nothing(bench: OdriveBench) -> None:
     assert all("idle" in state for state in drive_states(bench.rig, seen.status_words.tolist()))
     told = {node_and_command(message.arbitration_id)[1] for message in bench.frames()}
     assert told == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
+
+
+def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) -> None:
+    bench.enable()
+    bench.group.command(GroupCommand.RELEASE)
+    status = bench.cycles(40)
+    assert status.state is GroupState.RELEASED
+    assert status.holding
+    assert states(bench) == {AxisState.IDLE}

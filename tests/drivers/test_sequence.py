@@ -47,7 +47,7 @@ def test_words_never_free_a_cable_and_enable_all_or_none(
     assert len(words) == len(states)
     assert all(word & 0x02 for word in words)
     if ControlWord.ENABLE_OPERATION in words:
-        assert goal is Goal.ENABLE
+        assert goal in (Goal.ENABLE, Goal.RELEASE)
         assert set(words) == {ControlWord.ENABLE_OPERATION}
         assert set(states) <= READY
     for state, word in zip(states, words, strict=True):
@@ -73,7 +73,9 @@ def test_words_never_free_a_cable_and_enable_all_or_none(
         max_size=10,
     )
 )
-def test_any_mixture_without_fault_is_enabled_and_stopped(states: list[DriveState]) -> None:
+def test_any_mixture_without_fault_is_enabled_and_released(
+    states: list[DriveState],
+) -> None:
     def run(goal: Goal, states: list[DriveState]) -> list[DriveState]:
         released = [False] * len(states)
         for _ in range(8):
@@ -88,12 +90,14 @@ def test_any_mixture_without_fault_is_enabled_and_stopped(states: list[DriveStat
     enabled = run(Goal.ENABLE, states)
     assert set(enabled) == {DriveState.OPERATION_ENABLED}
     assert set(run(Goal.STOP, enabled)) == {DriveState.QUICK_STOP_ACTIVE}
+    assert set(run(Goal.RELEASE, states)) == {DriveState.READY_TO_SWITCH_ON}
 
 
 @pytest.mark.parametrize("bad", [DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE])
-def test_a_fault_of_one_stops_all(bad: DriveState) -> None:
+@pytest.mark.parametrize("goal", [Goal.ENABLE, Goal.RELEASE])
+def test_a_fault_of_one_stops_all(goal: Goal, bad: DriveState) -> None:
     states = [DriveState.OPERATION_ENABLED] * 7 + [bad]
-    assert set(next_words(Goal.ENABLE, states, [True] * 8)) == {ControlWord.QUICK_STOP}
+    assert set(next_words(goal, states, [True] * 8)) == {ControlWord.QUICK_STOP}
 
 
 def test_a_drive_that_stopped_by_itself_is_first_told_to_stop() -> None:

@@ -1,0 +1,97 @@
+"""`cdpr release`: brakes close and the torque goes, of all drives together."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from cdpr.cli.named_bus import rig_on_bus
+from cdpr.rig import Rig
+from drivers.bus import BusSettings
+from drivers.cia402.states import DriveState
+from executor.custody import Custody
+from executor.latch import Latch
+from executor.prepare import PreparedRun
+from executor.reference import as_in_the_file
+from simulation.drive import SimulatedDrive
+from tests.cli.plans import RIG
+from tests.cli.program import call
+from tests.scenarios.test_real_time import drives_on
+
+
+def watched(drives: tuple[SimulatedDrive, ...], words: list[int]) -> None:
+    """Keeps every control word that a drive takes."""
+    for drive in drives:
+        takes = drive._take_control_word
+
+        def take(word: int, takes: object = takes) -> None:
+            words.append(word)
+            takes(word)  # type: ignore[operator]
+
+        drive._take_control_word = take  # type: ignore[method-assign]
+
+
+def hold(drives: tuple[SimulatedDrive, ...]) -> None:
+    """As after a run."""
+    for drive in drives:
+        drive.state = DriveState.QUICK_STOP_ACTIVE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("braked", [True, False])
+def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
+    prepared: PreparedRun, tmp_path: Path, braked: bool
+) -> None:
+    channel = f"239.74.163.30:{20000 + (os.getpid() * 29 + braked) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    rig = tmp_path / "rig.yaml"
+    text = RIG.read_text()
+    rig.write_text(text.replace("encoder: absolute", "encoder: absolute, brake: true"))
+    file = rig if braked else RIG
+    with drives_on(channel, prepared) as rehearsal:
+        stood = [round(drive.motor.position) for drive in rehearsal.drives]
+        custody = Custody(_on(channel, file))
+        custody.file.write(
+            as_in_the_file(_on(channel, file)).model_copy(update={"stands_at": stood})
+        )
+        words: list[int] = []
+        hold(rehearsal.drives)
+        watched(rehearsal.drives, words)
+        assert call("release", file, *bus, answers="n\n").code == 130
+        assert call("reset", file, *bus, "--yes").code == 0
+        answer = call("release", file, *bus, "--yes", "--json")
+        assert answer.code == 0, answer
+        told = json.loads(answer.out)
+        assert told["drives"] == ["ready to switch on"] * 8
+        assert {drive.state for drive in rehearsal.drives} == {DriveState.READY_TO_SWITCH_ON}
+        assert [round(drive.motor.position) for drive in rehearsal.drives] == stood
+        assert all(word & 0x02 for word in words), "disable voltage frees cables at once"
+        assert told["reference"]["counts"] is braked
+        if not braked:
+            assert "released by the operator" in told["reference"]["why_not"]
+    Latch(BusSettings("udp_multicast", channel)).require_released()
+
+
+def _on(channel: str, file: Path) -> Rig:
+    return rig_on_bus(file, "udp_multicast", channel)
+
+
+@pytest.mark.slow
+def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    channel = f"239.74.163.31:{20000 + (os.getpid() * 29) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    with drives_on(channel, prepared) as rehearsal:
+        hold(rehearsal.drives)
+        stuck = rehearsal.drives[3]
+        stuck._command_shutdown = lambda: None  # type: ignore[method-assign]
+        answer = call("release", RIG, *bus, "--yes")
+    assert answer.code == 1
+    assert "cable 4 (drive 4) stays in" in answer.err
+    latched = Latch(BusSettings("udp_multicast", channel)).read()
+    assert latched is not None
+    assert "being released" in latched.cause
