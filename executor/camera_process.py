@@ -27,10 +27,14 @@ BLIND_PICTURES = 10
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """So many pictures were measured, so many of them gave a pose."""
+    """So many pictures were measured, so many of them gave a pose.
+
+    ``near`` says with which obstacle the measured clearance fell below the limit, if it did.
+    """
 
     measured: int
     seen: int
+    near: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +52,8 @@ class CameraProcess:
 
         Args:
             make_observer: Called in the process; picklable.
-            may_wait: In simulated time triggers queue up. In real time one is dropped while the
-                picture before is still being measured, so that none is older than it says.
+            may_wait: In simulated time a trigger waits until the picture before is measured. In
+                real time it is dropped instead, so that no picture is older than it says.
 
         Raises:
             CdprError: The camera cannot be used, for the reason told.
@@ -58,6 +62,8 @@ class CameraProcess:
         self.triggered = 0
         self._measured = 0
         self._seen = 0
+        self.near = ""
+        """Between what the measured clearance fell below the limit, with numbers; else nothing."""
         self._may_wait = may_wait
         self._closed = False
         context = multiprocessing.get_context("spawn")
@@ -92,10 +98,12 @@ class CameraProcess:
         Raises:
             CdprError: The process is gone, for the reason told.
         """
-        while self._link.poll():
+        # Simulated time waits for the picture before: a stop comes at the same place every time.
+        while self._link.poll() or (self._may_wait and self._measured < self.triggered):
             answer = self._receive()
             if isinstance(answer, _Progress):
                 self._measured, self._seen = answer.measured, answer.seen
+                self.near = self.near or answer.near
         if not self._may_wait and self._measured < self.triggered:
             self.dropped += 1
             return
@@ -158,7 +166,7 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
                 while (trigger := _next_trigger(link)) is not None:
                     looks.append(observer.look(trigger))
                     seen += looks[-1].pose is not None
-                    _say(link, _Progress(len(looks), seen))
+                    _say(link, _Progress(len(looks), seen, observer.too_near))
                 _say(link, looks)
         except CdprError as error:
             _say(link, _Failure(error))

@@ -239,7 +239,10 @@ class Loop:
         """Does what the operator wants, as far as the state allows it."""
         state = self.machine.state
         if wishes.stop and state in _STOPPABLE:
-            self._tell_cause("stop", f"stop requested; slowing down {self.way}")
+            if wishes.too_near:
+                self._tell_cause("clearance_low", f"{_TOO_NEAR}; slowing down {self.way}")
+            else:
+                self._tell_cause("stop", f"stop requested; slowing down {self.way}")
             self._feed.stop()
             self.machine.on(Event.STOP)
         elif wishes.hold and state is State.MOVING:
@@ -319,6 +322,7 @@ _ACTIVE = ON_PATH | {State.ENABLING, State.APPROACHING, State.SECURING}
 _WITHOUT_QUICK_STOP = ON_PATH | {State.SECURING}
 _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.HOLDING})
 
+_TOO_NEAR = "the camera measured less clearance than the scene asks for"
 _HELD = "at rest; the drives hold by themselves under torque"
 _BRAKED = "at rest; the brakes of the winches hold"
 _NEVER_ENABLED = "stopped before all drives were enabled; none of them follows set-points"

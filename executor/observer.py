@@ -20,6 +20,9 @@ from tracking.measured_clearance import MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 
+#: So many pictures in a row must show too little clearance before the run is stopped for it.
+NEAR_PICTURES = 2
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trigger:
@@ -108,6 +111,9 @@ class Observer:
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._tracker = Tracker(rig, camera)
         self._clearance = ClearanceModel(rig, scene)
+        self._limit, self._near_pictures = scene.obstacle_clearance, 0
+        self.too_near = ""
+        """Between what clearance was below the scene's limit in the last pictures, or nothing."""
 
     def __enter__(self) -> Observer:
         return self
@@ -130,6 +136,8 @@ class Observer:
         found = self._tracker.observe(image, time)
         if not isinstance(found, PoseMeasurement):
             return replace(unseen(trigger.frame, time, found.reason), picture=kept)
+        clearance = clearance_of(self._clearance, found)
+        self._watch(clearance)
         return Look(
             trigger.frame,
             time,
@@ -139,8 +147,24 @@ class Observer:
             found.tags,
             found.reprojection,
             kept,
-            clearance_of(self._clearance, found),
+            clearance,
         )
+
+    def _watch(self, clearance: MeasuredClearance | None) -> None:
+        """Notes clearance that is below the limit by more than its uncertainty, picture by picture.
+
+        One picture alone may be wrong for a reason that its covariance does not know.
+        """
+        if clearance is None or clearance.distance + clearance.uncertainty >= self._limit:
+            self._near_pictures, self.too_near = 0, ""
+            return
+        self._near_pictures += 1
+        if self._near_pictures >= NEAR_PICTURES:
+            nearest = min(clearance.nearest, key=lambda n: n.distance)
+            self.too_near = (
+                f"{nearest.first} to {nearest.second}: {clearance.distance * 1e3:.1f} ± "
+                f"{clearance.uncertainty * 1e3:.1f} mm; the scene asks for {self._limit * 1e3:g} mm"
+            )
 
 
 MakeObserver = Callable[[], Observer]

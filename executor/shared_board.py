@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import time
+from dataclasses import replace
 
 from executor.shared_memory import SharedMemory
 from executor.wishes import Wishes
@@ -12,7 +13,7 @@ from executor.wishes import Wishes
 #: The supervisor has hung if nothing is heard of it for so long, [s].
 SILENCE = 2.0
 
-_STOP, _HOLD, _PERCENT, _BEAT, _TROUBLE = 0, 1, 2, 8, 16
+_STOP, _HOLD, _PERCENT, _NEAR, _BEAT, _TROUBLE = 0, 1, 2, 3, 8, 16
 _LONGEST_TROUBLE = 400
 _SIZE = _TROUBLE + 2 + _LONGEST_TROUBLE
 _BEATS, _LENGTH = struct.Struct("<Q"), struct.Struct("<H")
@@ -27,8 +28,10 @@ class SharedBoard:
         self.memory.view[_PERCENT] = 100
         self._beats = 0
 
-    def ask_stop(self) -> None:
+    def ask_stop(self, too_near: bool = False) -> None:
         """See `WishBoard`."""
+        if too_near and not self.memory.view[_STOP]:
+            self.memory.view[_NEAR] = 1  # before the stop: whoever reads that knows why
         self.memory.view[_STOP] = 1
 
     def ask_hold(self, hold: bool) -> None:
@@ -78,7 +81,7 @@ class Supervised:
     def read(self) -> Wishes:
         """What is wished now, and whether anybody is there to wish."""
         wishes = _read(self._memory)
-        return Wishes(wishes.stop or self._stopped, wishes.hold, wishes.speed, self._lost())
+        return replace(wishes, stop=wishes.stop or self._stopped, lost=self._lost())
 
     def _lost(self) -> str:
         beats = _BEATS.unpack_from(self._memory.view, _BEAT)[0]
@@ -96,4 +99,5 @@ class Supervised:
 
 def _read(memory: SharedMemory) -> Wishes:
     view = memory.view
-    return Wishes(bool(view[_STOP]), bool(view[_HOLD]), view[_PERCENT] / 100.0)
+    stop, hold, near = (bool(view[place]) for place in (_STOP, _HOLD, _NEAR))
+    return Wishes(stop, hold, view[_PERCENT] / 100.0, too_near=near)

@@ -35,6 +35,7 @@ def carry_out(
     start: Pose | None = None,
     yes: bool = False,
     without_real_time: bool = False,
+    clearance_stop: bool = True,
     as_json: bool = False,
 ) -> int:
     """Shows the run, asks before a bus moves, runs, tells what happened; returns the exit code.
@@ -47,6 +48,7 @@ def carry_out(
         start: Where the simulated platform stands; None at the plan's start.
         yes: Do not ask.
         without_real_time: Move drives on a bus even if real-time scheduling is denied.
+        clearance_stop: Stop along the path when the camera sees too little clearance.
         as_json: The summary as JSON, and nothing else on standard output.
 
     Raises:
@@ -70,6 +72,7 @@ def carry_out(
         fast=fast,
         start=start,
         without_real_time=without_real_time,
+        clearance_stop=clearance_stop,
         quiet=as_json,
     )
     show_summary(summary, folder, as_json)

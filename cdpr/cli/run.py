@@ -43,6 +43,10 @@ def run(
         bool,
         typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
     ] = False,
+    no_clearance_stop: Annotated[
+        bool,
+        typer.Option("--no-clearance-stop", help="go on when the camera sees too little clearance"),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> None:
     """Run a plan: prove it, make its set-points, arm the drives, move, measure, report.
@@ -83,6 +87,7 @@ def run(
         start=start,
         yes=yes,
         without_real_time=without_real_time,
+        clearance_stop=not no_clearance_stop,
         as_json=as_json,
     )
     raise typer.Exit(code)

@@ -33,6 +33,7 @@ class _Job:
     fast: bool
     start: Pose | None
     without_real_time: bool
+    clearance_stop: bool
     quiet: bool
 
 
@@ -44,6 +45,7 @@ def run_prepared(
     fast: bool,
     start: Pose | None,
     without_real_time: bool,
+    clearance_stop: bool = True,
     quiet: bool,
 ) -> dict[str, Any]:
     """Arms, moves, measures and writes the run folder; returns the run's summary.
@@ -57,6 +59,7 @@ def run_prepared(
         fast: Simulated time.
         start: Where the simulated platform stands; None at the plan's start.
         without_real_time: Move drives on a bus even if real-time scheduling is denied.
+        clearance_stop: Stop along the path when the camera sees too little clearance.
         quiet: No progress.
     """
     from cdpr.cli.output import spinner
@@ -65,7 +68,7 @@ def run_prepared(
     from executor.run_folder import RunFolder
 
     folder = RunFolder.create(output)
-    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, quiet)
+    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, clearance_stop, quiet)
     moved = False
 
     def before_motion() -> None:
@@ -128,6 +131,9 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
             def picture(time: float, asked: float, true_pose: Pose | None) -> None:
                 assert camera is not None
                 camera.trigger(time, asked, true_pose)
+                if camera.near and job.clearance_stop and not board.read().stop:
+                    board.ask_stop(too_near=True)
+                    err.print(f"[red]too near[/] {camera.near}", soft_wrap=True)
                 if camera.sees_nothing and not told:
                     told.append("the camera saw no tags so far: is it where the rig file says?")
                     recorder.take_event(LoopEvent(0, asked, "camera_sees_nothing", told[0]))

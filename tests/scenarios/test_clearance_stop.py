@@ -1,0 +1,148 @@
+"""A platform nearer to an obstacle than its drives know: the camera sees it, the run stops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from cdpr.clearance import ClearanceModel
+from cdpr.kinematics import cable_lengths
+from cdpr.plan import load_plan, save_plan
+from cdpr.poses import Pose
+from cdpr.rig import load_rig
+from cdpr.scene import scene_from_document
+from cdpr.scene_file import SceneDocument
+from executor.machine import State
+from executor.observer import Observer, Trigger
+from executor.prepare import PreparedRun
+from executor.run_folder import RunFolder
+from simulation.camera import SyntheticCamera
+from tests.cli.plans import GOAL_MM, RIG, START_MM, straight_plan
+from tests.cli.program import call
+from tests.scenarios.stage import at, staged
+
+#: The platform truly stands so far towards the block, [m].
+OFF = np.array([-0.005, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ready rig, simulated with drives whose reference is off by `OFF` at home."""
+    rig, data = load_rig(RIG), yaml.safe_load(RIG.read_text())
+    home = rig.home
+    beyond = Pose(home.position - OFF, home.rotation)
+    wrong = cable_lengths(rig, beyond) - cable_lengths(rig, home)
+    counts = [w.counts_per_metre * x for w, x in zip(rig.winches, wrong, strict=True)]
+    data["simulation"] = {
+        "as_built": {
+            "outlets_mm": data["outlets_mm"],
+            "anchors_mm": data["anchors_mm"],
+            "drums_mm_per_rev": [w["drum_mm_per_rev"] for w in data["winches"]],
+            "home_counts": [float(c) for c in counts],
+        }
+    }
+    path = tmp_path_factory.mktemp("off") / "rig.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.fixture(scope="module")
+def narrow_plan(rig_file: Path) -> Path:
+    """Along a small block, 12 mm from it, where the scene asks for 10 mm."""
+    document = {
+        "schema_version": 1,
+        "name": "narrow",
+        "clearance": {"obstacle_mm": 10, "self_mm": 5},
+        "start": {"position_mm": list(START_MM)},
+        "goal": {"position_mm": list(GOAL_MM)},
+        "obstacles": [
+            {
+                "name": "block",
+                "box": {"size_mm": [40.0, 40.0, 40.0]},
+                "position_mm": [-97.0, 15.0, 480.0],
+            }
+        ],
+    }
+    scene = scene_from_document(SceneDocument.model_validate(document))
+    path = rig_file.parent / "plan.json"
+    save_plan(straight_plan(load_rig(rig_file), scene, [START_MM, GOAL_MM]), path)
+    return path
+
+
+def events_of(run: Path) -> Iterator[str]:
+    return (event["code"] for event in RunFolder.open(run).summary()["events"])
+
+
+def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
+    rig_file: Path, narrow_plan: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    answer = call("run", narrow_plan, "--rig", rig_file, "-o", run, "--fast")
+    assert answer.code == 1, answer
+    assert "too near" in answer.said
+    assert "the scene asks for 10 mm" in answer.said
+    summary: dict[str, Any] = RunFolder.open(run).summary()
+    assert summary["final_state"] == "stopped"
+    assert summary["verdict"] == "FAILED"
+    codes = list(events_of(run))
+    assert codes.count("clearance_low") == 1
+    assert codes.index("clearance_low") < codes.index("held")
+    assert "docs/faults/clearance_low.md" in answer.out + answer.said
+
+
+def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
+    rig_file: Path, narrow_plan: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    arguments = ("--rig", rig_file, "-o", run, "--fast", "--no-clearance-stop")
+    answer = call("run", narrow_plan, *arguments)
+    assert answer.code == 1, answer
+    summary = RunFolder.open(run).summary()
+    assert summary["final_state"] != "stopped"
+    assert "clearance_low" not in list(events_of(run))
+    assert "clearance_tag" in [c["name"] for c in summary["checks"] if not c["passed"]]
+
+
+def test_the_loop_tells_who_wanted_the_stop(prepared: PreparedRun, tmp_path: Path) -> None:
+    with staged(
+        prepared, tmp_path / "run", at(150, lambda s: s.board.ask_stop(too_near=True))
+    ) as stage:
+        outcome = stage.run()
+    assert outcome.state is State.STOPPED
+    assert "less clearance than the scene asks for" in outcome.cause
+    codes = [event.code for event in stage.events()]
+    assert "clearance_low" in codes
+    assert "stop" not in codes
+
+
+class Rendered:
+    """Pictures of the platform where a trigger says that it is."""
+
+    def __init__(self, camera: SyntheticCamera) -> None:
+        self._camera = camera
+
+    def picture(self, trigger: Trigger) -> tuple[np.ndarray, float]:
+        assert trigger.true_pose is not None
+        return self._camera.render(trigger.true_pose, trigger.frame), 0.0
+
+    def close(self) -> None:
+        pass
+
+
+def test_one_picture_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path) -> None:
+    rig, scene = load_rig(RIG), load_plan(narrow_plan).scene
+    eye = SyntheticCamera(rig, scene, rig.cameras[0])
+    near, far = Pose.level([-0.008, 0.02, 0.48]), Pose.level([0.05, 0.02, 0.48])
+    assert min(n.distance for n in ClearanceModel(rig, scene).obstacles(near)) < 0.005
+    folder = RunFolder.create(tmp_path / "run")
+    with Observer(rig, scene, rig.cameras[0], Rendered(eye), folder, 1000) as observer:
+        told = []
+        for frame, pose in enumerate([near, far, near, near, far]):
+            observer.look(Trigger(frame, frame * 0.1, 0.0, pose))
+            told.append(bool(observer.too_near))
+    assert told == [False, False, False, True, False]
