@@ -38,6 +38,7 @@ from cdpr.shapes import (
     Sphere,
     TriangleMesh,
     convex_hull,
+    encloses_convex,
     read_only_indices,
 )
 
@@ -230,6 +231,9 @@ def _shape(key: str, document: Document) -> Shape:
             return convex_hull(np.asarray(points) / 1000.0)
         case MeshDocument(points_mm=points, triangles=triangles):
             vertices = read_only(np.asarray(points) / 1000.0)
-            return TriangleMesh(vertices, read_only_indices(triangles))
+            numbers = read_only_indices(triangles)
+            if encloses_convex(vertices, numbers):
+                return convex_hull(vertices[np.unique(numbers)])
+            return TriangleMesh(vertices, numbers)
         case _:
             raise ValueError(f"unknown shape {key!r}")

@@ -11,6 +11,9 @@ from cdpr.poses import Array, Pose, read_only
 
 Indices = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
+_FLAT = 1e-9
+"""Of the size of a mesh: heights up to this are round-off."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
@@ -52,7 +55,10 @@ class ConvexHull:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleMesh:
-    """A surface of triangles: ``vertices`` shape (n, 3), [m]; ``triangles`` shape (t, 3)."""
+    """A surface of triangles: ``vertices`` shape (n, 3), [m]; ``triangles`` shape (t, 3).
+
+    What it encloses is free. A scene's mesh about a convex volume is read as a `ConvexHull`.
+    """
 
     vertices: Array
     triangles: Indices
@@ -77,6 +83,33 @@ def shape_points(shape: Shape) -> Array:
             return np.array([[0.0, 0.0, -length / 2], [0.0, 0.0, length / 2]])
         case ConvexHull(vertices=vertices) | TriangleMesh(vertices=vertices):
             return vertices
+
+
+def encloses_convex(vertices: Array, triangles: Indices) -> bool:
+    """Whether triangles enclose a convex volume.
+
+    Every side is then shared by two triangles, and every vertex lies behind every triangle.
+
+    Args:
+        vertices: Shape (n, 3), [m].
+        triangles: Numbers of their corners, shape (t, 3).
+    """
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    _, counts = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
+    if np.any(counts != 2):
+        return False
+    corners = vertices[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    used = vertices[np.unique(triangles)]
+    size = float(np.ptp(used, axis=0).max())
+    if np.any(lengths <= _FLAT * size**2):
+        return False
+    normals = normals / lengths[:, None]
+    heights = used @ normals.T - np.sum(corners[:, 0] * normals, axis=1)
+    one_side = np.all(heights <= _FLAT * size, axis=0) | np.all(heights >= -_FLAT * size, axis=0)
+    flat = np.all(np.abs(heights) <= _FLAT * size)
+    return bool(np.all(one_side) and not flat)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

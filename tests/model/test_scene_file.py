@@ -144,7 +144,7 @@ def test_a_wrong_number_in_a_section_is_told(
 
 def test_every_shape_arrives_in_metres_and_in_its_place() -> None:
     data = scene_data()
-    mesh = {"points_mm": TETRAHEDRON, "triangles": FACES}
+    mesh = {"points_mm": TETRAHEDRON, "triangles": FACES[1:]}  # open: a surface
     shapes: list[tuple[str, dict[str, Any]]] = [
         ("box", {"size_mm": [100, 200, 300]}),
         ("sphere", {"radius_mm": 50}),
@@ -172,6 +172,25 @@ def test_every_shape_arrives_in_metres_and_in_its_place() -> None:
         assert not body.triangles.flags.writeable
     pose = scene.obstacles[0].pose
     np.testing.assert_allclose(pose.apply([1.0, 0.0, 0.0]), [0.001, 1.002, 0.003], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("faces", "kind"),
+    [
+        (FACES, ConvexHull),
+        ([face[::-1] for face in FACES], ConvexHull),
+        (FACES[1:], TriangleMesh),
+        ([*FACES, [0, 1, 4]], TriangleMesh),
+    ],
+    ids=["closed", "closed, seen from inside", "open", "closed, and a fin"],
+)
+def test_a_mesh_about_a_convex_volume_is_solid(faces: list[list[int]], kind: type) -> None:
+    data = scene_data()
+    mesh = {"points_mm": [*TETRAHEDRON, [0, 0, 200]], "triangles": faces}
+    data["obstacles"] = [{"name": "mesh", "mesh": mesh, "position_mm": [0, 0, 0]}]
+    [obstacle] = scene_of(data).obstacles
+    assert isinstance(obstacle.shape, kind)
+    assert len(obstacle.shape.vertices) == (4 if kind is ConvexHull else 5)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 30))
