@@ -6,12 +6,12 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from cdpr.document_types import Document, Finding
 from cdpr.errors import BadInput, InvalidFile, Problem
@@ -21,6 +21,7 @@ from cdpr.yaml_tree import KeyPath, Places, YamlSyntaxError, YamlTree, parse_yam
 __all__ = [
     "check_version",
     "content_hash",
+    "document_hash",
     "key_path",
     "load_yaml",
     "problems_of",
@@ -165,6 +166,20 @@ def content_hash(document: Any) -> str:
     """SHA-256 of a JSON-like document, whatever the order of its keys or its layout."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
+
+
+def document_hash(document: BaseModel, without: Collection[str] = ()) -> str:
+    """SHA-256 of what a document says.
+
+    A key that stands at its default counts as left out. So a key that a later version of the
+    program adds changes no hash, and a default that it changes does.
+
+    Args:
+        document: Read or made.
+        without: Keys at its top that do not count.
+    """
+    said = document.model_dump(mode="json", exclude_defaults=True)
+    return content_hash({key: value for key, value in said.items() if key not in without})
 
 
 def write_atomic(path: Path, text: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 from pydantic import ValidationError
 
-from cdpr.documents import check_version, content_hash, problems_of, read_text, write_atomic
+from cdpr.documents import check_version, document_hash, problems_of, read_text, write_atomic
 from cdpr.errors import BadInput, InvalidFile
 from cdpr.plan_file import PlanDocument
 from cdpr.poses import Pose
@@ -57,8 +57,7 @@ def plan_from_document(document: PlanDocument) -> Plan:
 def sealed(fields: dict[str, Any]) -> PlanDocument:
     """A plan document with its hash, from all of its other fields."""
     unsealed = PlanDocument(hash="", **fields)
-    digest = _digest(unsealed.model_dump(mode="json"))
-    return unsealed.model_copy(update={"hash": digest})
+    return unsealed.model_copy(update={"hash": _digest(unsealed)})
 
 
 def save_plan(document: PlanDocument, path: Path) -> None:
@@ -85,8 +84,7 @@ def load_plan(path: Path) -> Plan:
         document = PlanDocument.model_validate(data)
     except ValidationError as error:
         raise InvalidFile(str(path), problems_of(error, PlanDocument, {}), ANEW) from None
-    _check_hash("hash", document.hash, _digest(data), path)
-    _check_whole(document, path)
+    _check_hash("hash", document.hash, _digest(document), path)
     plan = plan_from_document(document)
     _check_hash("rig_hash", document.rig_hash, plan.rig.plan_hash, path)
     _check_hash("scene_hash", document.scene_hash, plan.scene.hash, path)
@@ -144,19 +142,8 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return data
 
 
-def _digest(data: dict[str, Any]) -> str:
-    return content_hash({key: value for key, value in data.items() if key != "hash"})
-
-
-def _check_whole(document: PlanDocument, path: Path) -> None:
-    """Nothing was filled in: a copy of the plan in a run folder would not be the same file."""
-    if document.hash != _digest(document.model_dump(mode="json")):
-        raise BadInput(
-            "the plan lacks keys that this program writes",
-            where=str(path),
-            why="it was made by another version of the program",
-            next_step=ANEW,
-        )
+def _digest(document: PlanDocument) -> str:
+    return document_hash(document, {"hash"})
 
 
 def _check_hash(key: str, stated: str, actual: str, path: Path) -> None:
@@ -164,6 +151,6 @@ def _check_hash(key: str, stated: str, actual: str, path: Path) -> None:
         raise BadInput(
             f"the plan's {key} does not match its content",
             where=str(path),
-            why="the file was edited or damaged after it was written",
+            why="the file was edited or damaged, or written by a program with other defaults",
             next_step=f"{ANEW}; a plan cannot be edited by hand",
         )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cdpr.document_types import millimetres
-from cdpr.documents import content_hash, key_path, load_yaml
+from cdpr.documents import document_hash, key_path, load_yaml
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, read_only
 from cdpr.rig_file import (
@@ -175,13 +175,12 @@ class Rig:
     @cached_property
     def plan_hash(self) -> str:
         """Hash of the parts of the rig that a plan's proof rests on."""
-        document = self.document.model_dump(mode="json")
-        return content_hash({k: v for k, v in document.items() if k not in NOT_IN_PLAN_HASH})
+        return document_hash(self.document, NOT_IN_PLAN_HASH)
 
     @cached_property
     def hash(self) -> str:
         """Hash of the whole rig file's content."""
-        return content_hash(self.document.model_dump(mode="json"))
+        return document_hash(self.document)
 
     @cached_property
     def platform_corners(self) -> Array:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cdpr.document_types import Document, PoseDocument, millimetres
-from cdpr.documents import content_hash, key_path, load_yaml
+from cdpr.documents import document_hash, key_path, load_yaml
 from cdpr.errors import BadInput
 from cdpr.payload import Payload
 from cdpr.poses import Array, Pose, read_only
@@ -112,7 +112,7 @@ class Scene:
     @cached_property
     def hash(self) -> str:
         """Hash of the scene's content."""
-        return content_hash(self.document.model_dump(mode="json"))
+        return document_hash(self.document)
 
     def changed(
         self,

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from cdpr.document_types import Document, PoseDocument
-from cdpr.documents import content_hash, write_atomic
+from cdpr.documents import content_hash, document_hash, write_atomic
 from cdpr.errors import CdprError, Refused
 from cdpr.kinematics import cable_lengths
 from cdpr.poses import Array, Pose
@@ -83,7 +83,7 @@ def as_in_the_file(rig: Rig) -> ReferenceDocument:
 
 def counting_hash(rig: Rig) -> str:
     """Of everything that decides what drives count at a pose."""
-    winches = [winch.model_dump(mode="json") for winch in rig.document.winches]
+    winches = [document_hash(winch) for winch in rig.document.winches]
     return content_hash({"rig": rig.plan_hash, "winches": winches})
 
 

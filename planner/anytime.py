@@ -59,6 +59,11 @@ class AnytimeSettings:
         else:
             progress(min(spent, self.budget), self.budget, cost)
 
+    @property
+    def longer(self) -> str:
+        """What a user does for a longer search."""
+        return "raise --budget-ms" if self.rounds is None else "raise --rounds"
+
     def not_found(self, rounds: int, gap: float) -> str:
         """What is told after so many rounds without a path; ``gap`` between the trees, [m]."""
         of_budget = f" of the {self.budget * 1e3:g} ms budget" if self.rounds is None else ""
@@ -76,7 +81,7 @@ class AnytimeSettings:
             f"no path of at most {limit:.1f} mm was found",
             where=where,
             why=f"the path found has {length:.1f} mm, and the straight way {straight * 1e3:.1f} mm",
-            next_step="allow a longer path, or raise --budget-ms; `--cost length` tells how short"
-            " paths can be",
+            next_step=f"allow a longer path, or {self.longer}; `--cost length` without a limit"
+            " tells how short paths can be",
             values={**values, "longest_mm": limit, "found_mm": length},
         )

@@ -47,6 +47,7 @@ def paper(
 
       cdpr bench paper --seeds 100 -o bench-paper
     """
+    from cdpr.cli.compiling import told_when_compiling
     from cdpr.cli.demo import RIG, configs
     from cdpr.cli.output import out, progress_bar, show_json, spinner
     from cdpr.cli.workers import Count, make_folder, worker_pool
@@ -63,7 +64,7 @@ def paper(
     scenes = [load_scene(configs() / f"{name}.yaml") for name in ENVIRONMENTS]
     make_folder(output, force)
     work = batches(rig, scenes, seeds, checked=check)
-    with spinner("preparing (compiles the planner when run for the first time)", not as_json):
+    with told_when_compiling("paper", not as_json):
         run_batch(work[0])  # before several processes would compile the same
     total = sum(len(batch.seeds) for batch in work)
     with (
@@ -71,15 +72,20 @@ def paper(
         progress_bar("searching", total, not as_json) as advance,
     ):
         results = Results(run_all(work, pool, Count(advance).more))
+    told = about(rig, scenes, seeds, results)
     with spinner("drawing", not as_json):
-        _write(output, results, about(rig, scenes, seeds, results))
+        _write(output, results, told)
     if as_json:
         from json import loads
 
         show_json(loads((output / "findings.json").read_text(encoding="utf-8")))
-        return
-    out.print(_table([finding for finding in findings(results) if finding.box == OWN]))
-    out.print(f"larger boxes, every reading, figures: open {output / 'index.html'}")
+    else:
+        out.print(_table([finding for finding in findings(results) if finding.box == OWN]))
+        for name in ("searches without a path", "paths checked", "paths that failed their check"):
+            out.print(f"{name}: {told[name]}")
+        out.print(f"larger boxes, every reading, figures: open {output / 'index.html'}")
+    if told["paths that failed their check"]:
+        raise typer.Exit(1)
 
 
 def about(rig: Rig, scenes: Sequence[Scene], seeds: int, results: Results) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -62,15 +63,24 @@ def sentences_of(report: CheckReport) -> list[tuple[str, str]]:
             "self clearance",
             _distance(own, report.proved_self_clearance, report.required_self_clearance),
         ),
-        ("tension", f"{report.min_tension:.1f} to {report.max_tension:.1f} N"),
-        ("capacity margin", f"{report.capacity_margin:.1f} N"),
-        ("cable speed", f"at most {report.max_cable_speed * 1000:.1f} mm/s"),
+        ("tension", _tensions(report)),
+        (
+            "capacity margin",
+            f"{report.capacity_margin:.1f} N; proved {report.proved_capacity_margin:.1f} N",
+        ),
+        ("cable speed", f"up to {report.max_cable_speed * 1000:.1f} mm/s at these poses"),
     ]
     near = report.obstacle_clearance
     if near is not None:
         text = _distance(near, report.proved_obstacle_clearance, report.required_obstacle_clearance)
         facts.insert(1, ("clearance", text))
     return facts
+
+
+def _tensions(report: CheckReport) -> str:
+    if math.isnan(report.min_tension):
+        return "none within the limits hold the weight"
+    return f"{report.min_tension:.1f} to {report.max_tension:.1f} N at these poses"
 
 
 def _distance(closest: Closest, proved: float, required: float) -> str:

@@ -22,20 +22,14 @@ from cdpr.cli.plan_options import (
     RoundsOption,
     ViaOption,
     WeightOption,
-    optimal_settings,
-    paper_settings,
-    refuse,
 )
+from cdpr.cli.plan_settings import SettingsOptions, settings_of
 from cdpr.cli.readings import (
-    ConeDrawName,
     ConeDrawOption,
-    FailureRateName,
     FailureRateOption,
-    FocusName,
     FocusOption,
     GoalSightOption,
     SpacingOption,
-    SteerName,
     SteerOption,
 )
 
@@ -44,6 +38,7 @@ if TYPE_CHECKING:
     from cdpr.rig import Rig
     from cdpr.scene import Scene
     from cdpr.scene_stops import StopDocument
+    from planner.machine_code import Task
     from planner.way import Settings
 
 _LONG = 1000.0
@@ -54,7 +49,10 @@ def plan(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
     scene: Annotated[Path, typer.Argument(help="scene file (YAML)", metavar="SCENE")],
     output: Annotated[Path, typer.Option("-o", "--output", help="plan file to write (JSON)")],
-    seed: Annotated[int, typer.Option(min=0, help="random seed; the same seed, the same plan")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, help="of the random numbers; with --rounds the same plan again"),
+    ] = 0,
     calibration: CalibrationOption = None,
     clearance_mm: Annotated[
         float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
@@ -76,11 +74,11 @@ def plan(
     ] = None,
     via_mm: ViaOption = None,
     from_run: FromRunOption = None,
-    failure_rate: FailureRateOption = FailureRateName.streak,
-    focus: FocusOption = FocusName.last_failed,
-    cone_draw: ConeDrawOption = ConeDrawName.radius,
-    steer: SteerOption = SteerName.full_step,
-    spacing_mm: SpacingOption = 0.0,
+    failure_rate: FailureRateOption = None,
+    focus: FocusOption = None,
+    cone_draw: ConeDrawOption = None,
+    steer: SteerOption = None,
+    spacing_mm: SpacingOption = None,
     goal_sight: GoalSightOption = False,
     force: Annotated[bool, typer.Option("--force", help="replace an existing plan file")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
@@ -108,7 +106,6 @@ def plan(
     from cdpr.plan import save_plan
     from cdpr.rig import load_rig
     from cdpr.scene import load_scene
-    from planner.paper.readings import Readings
 
     the_rig = calibrated_rig(load_rig(rig), calibration)
     if from_run is not None and start_mm is not None:
@@ -121,39 +118,26 @@ def plan(
         require_room(the_scene, the_rig)
     the_scene = by_way_of(the_scene, via_mm or [])
     check_output(output, force)
-    readings = Readings(
-        failure_rate=failure_rate.value,
-        focus=focus.value,
-        cone_draw=cone_draw.value,
-        steer=steer.value,
-        spacing=spacing_mm / 1000.0,
-        goal_sight=goal_sight,
+    settings = settings_of(
+        SettingsOptions(
+            planner=planner,
+            seed=seed,
+            cost=cost,
+            weight=weight or (),
+            budget_ms=budget_ms,
+            rounds=rounds or (),
+            longest_mm=longest_mm,
+            free_rotation=free_rotation,
+            mode=mode,
+            max_iterations=max_iterations,
+            failure_rate=failure_rate,
+            focus=focus,
+            cone_draw=cone_draw,
+            steer=steer,
+            spacing_mm=spacing_mm,
+            goal_sight=goal_sight,
+        )
     )
-    settings: Settings
-    if planner is PlannerName.optimal:
-        refuse(
-            planner,
-            {
-                "--mode": mode is not None,
-                "--max-iterations": max_iterations is not None,
-                "readings of the paper": readings != Readings(),
-            },
-        )
-        settings = optimal_settings(
-            free_rotation, seed, cost, weight or [], budget_ms, rounds or [], longest_mm
-        )
-    else:
-        refuse(
-            planner,
-            {
-                "--weight": bool(weight),
-                "--free-rotation": free_rotation,
-                "--longest-mm": longest_mm is not None,
-                "--budget-ms": budget_ms is not None,
-                "--rounds": bool(rounds),
-            },
-        )
-        settings = paper_settings(planner, seed, cost, mode, max_iterations, readings)
     of_legs = rounds if rounds is not None and len(rounds) > 1 else []
     document = planned(the_rig, the_scene, settings, not as_json, of_legs, done)
     save_plan(document, output)
@@ -175,32 +159,34 @@ def planned(
     """A plan, made with a bar where the search is long, and a word where it must be compiled."""
     from functools import partial
 
-    from cdpr.cli.output import err, progress_bar, spinner
+    from cdpr.cli.compiling import told_when_compiling
+    from cdpr.cli.output import progress_bar, spinner
     from planner.plan import make_plan
     from planner.settings import PlannerSettings
 
     make = partial(make_plan, rig, scene, settings, rounds=rounds, done=visited)
-    if isinstance(settings, PlannerSettings):
-        with progress_bar("planning", settings.max_iterations, shown) as advance:
-            return make(progress=lambda done, _most, _distance: advance(done))
-    from planner import optimal, turning
-    from planner.optimal.compilation import is_compiled, note_compiled
+    with told_when_compiling(_task(settings), shown) as compiled:
+        if not compiled:
+            return make()
+        if isinstance(settings, PlannerSettings):
+            with progress_bar("planning", settings.max_iterations, shown) as advance:
+                return make(progress=lambda done, _most, _distance: advance(done))
+        unit, scale = ("ms", 1e3) if settings.rounds is None else ("rounds", 1.0)
+        total = scale * (settings.rounds or settings.budget)
+        if total < _LONG:
+            with spinner("planning", shown):
+                return make()
+        with progress_bar(f"planning, {unit}", total, shown) as advance:
+            return make(progress=lambda done, _most, _cost: advance(scale * done))
+
+
+def _task(settings: Settings) -> Task:
+    from planner.settings import PlannerSettings
     from planner.turning.settings import TurningSettings
 
-    kernels = Path((turning if isinstance(settings, TurningSettings) else optimal).__path__[0])
-    compiled = is_compiled(kernels)
-    if not compiled:
-        err.print("compiling the planner for this machine, once; about a minute …")
-    unit, scale = ("ms", 1e3) if settings.rounds is None else ("rounds", 1.0)
-    total = scale * (settings.rounds or settings.budget)
-    if compiled and total >= _LONG:
-        with progress_bar(f"planning, {unit}", total, shown) as advance:
-            document = make(progress=lambda done, _most, _cost: advance(scale * done))
-    else:
-        with spinner("planning" if compiled else "compiling", shown):
-            document = make()
-    note_compiled(kernels)
-    return document
+    if isinstance(settings, PlannerSettings):
+        return "paper"
+    return "turning" if isinstance(settings, TurningSettings) else "optimal"
 
 
 def _changed(
@@ -272,7 +258,7 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
         (
             "length",
             f"{quality.length_mm:.1f} mm ({len(document.waypoints)} waypoints;"
-            f" {quality.raw_length_mm:.1f} mm before post-processing)",
+            f" {quality.raw_length_mm:.1f} mm {_before(document)})",
         ),
     ]
     facts += rotation_facts(document)
@@ -287,6 +273,13 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
         ("search", _search_sentence(document)),
     ]
     return facts
+
+
+def _before(document: PlanDocument) -> str:
+    from cdpr.plan_file import PlannerDocument
+
+    is_paper = isinstance(document.planner, PlannerDocument)
+    return "before post-processing" if is_paper else "when first found"
 
 
 def _search_sentence(document: PlanDocument) -> str:

@@ -42,19 +42,19 @@ class SteerName(StrEnum):
 
 
 FailureRateOption = Annotated[
-    FailureRateName, typer.Option(help="e_r, k: failures in a row", rich_help_panel=_PANEL)
+    FailureRateName | None, typer.Option(help="e_r, k: failures in a row", rich_help_panel=_PANEL)
 ]
-FocusOption = Annotated[FocusName, typer.Option(help="the node x_c", rich_help_panel=_PANEL)]
+FocusOption = Annotated[FocusName | None, typer.Option(help="the node x_c", rich_help_panel=_PANEL)]
 ConeDrawOption = Annotated[
-    ConeDrawName,
+    ConeDrawName | None,
     typer.Option(help="r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL),
 ]
 SteerOption = Annotated[
-    SteerName,
+    SteerName | None,
     typer.Option(help="steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL),
 ]
 SpacingOption = Annotated[
-    float,
+    float | None,
     typer.Option(min=0.0, help="reject nodes nearer than this to another", rich_help_panel=_PANEL),
 ]
 GoalSightOption = Annotated[

@@ -75,6 +75,7 @@ def workspace(
       cdpr workspace configs/gachon_8_6.yaml --scene configs/environment_1.yaml
       --slice z=445 --slice x=0 --step-mm 5 -o maps
     """
+    from cdpr.cli.compiling import told_when_compiling
     from cdpr.cli.output import progress_bar, show_facts, show_json, spinner
     from cdpr.cli.workers import Count, make_folder, worker_pool
     from cdpr.cli.workspace_files import write_maps
@@ -90,7 +91,7 @@ def workspace(
     question = Question.about(the_rig, the_scene, _rotation(rotation_wxyz), length)
     grids = _grids(the_rig, slices or [], volume, step_mm, lower_mm, upper_mm)
     make_folder(output, force)
-    with spinner("preparing (compiles exact distances when run for the first time)", not as_json):
+    with told_when_compiling("maps", not as_json):
         extremes = Extremes.over_workspace(question)
         _warm_up(question)
     total = sum(grid.count for grid in grids)

@@ -58,7 +58,7 @@ COMPARISONS = (
     Comparison("adaptive has the goal sight", SIGHT, TO_SAMPLE),
     Comparison("both have the goal sight", SIGHT, SIGHT),
 )
-NEAREST_TO_THE_CLAIM = COMPARISONS[2]
+NEAREST_TO_THE_CLAIM, BOTH_REJECT = COMPARISONS[2], COMPARISONS[3]
 
 
 def batches(
