@@ -19,13 +19,12 @@ _DEVIATIONS = ("std_x_mm", "std_y_mm", "std_z_mm", "std_rx_deg", "std_ry_deg", "
 _TO_SI = np.array([1e-3, 1e-3, 1e-3, *([float(np.radians(1.0))] * 3)])
 
 
-def read_rig_data(path: Path, cables: int, pose_deviations: Array) -> RigMeasurements:
-    """The places of a file.
+def read_rig_data(path: Path, cables: int) -> RigMeasurements:
+    """The places of a file; poses without a stated deviation are exact.
 
     Args:
         path: The file.
         cables: How many the rig has.
-        pose_deviations: Of measured poses where the file does not tell, shape (6,), [m, rad].
 
     Raises:
         BadInput: It cannot be read, or a column is missing, too many, or not of finite numbers; the
@@ -42,7 +41,7 @@ def read_rig_data(path: Path, cables: int, pose_deviations: Array) -> RigMeasure
     if "tension_1_n" in table.names:
         tensions = table.of([f"tension_{i}_n" for i in range(1, cables + 1)])
     positions, rotations = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
-    deviations = np.tile(pose_deviations, (n, 1))
+    deviations = np.zeros((n, 6))
     if _POSITION[0] in table.names:
         positions = table.of(_POSITION) / 1e3
         rotations = _rotations(table)

@@ -65,6 +65,15 @@ class RigMeasurements:
             **{key: read_only(getattr(self, key)[chosen]) for key in _ARRAYS},
         )
 
+    def with_doubt(self, deviations: Array) -> RigMeasurements:
+        """The same, poses less certain: errors that all pictures of a place have in common.
+
+        Args:
+            deviations: Of camera and tags, shape (6,), [m, rad].
+        """
+        more = self.covariances + np.diag(np.square(deviations))
+        return replace(self, covariances=read_only(more))
+
     def without_poses(self) -> RigMeasurements:
         """The same drive positions, as if nobody had looked at the platform."""
         positions, rotations = (np.full_like(a, np.nan) for a in (self.positions, self.rotations))

@@ -24,8 +24,6 @@ STEP_OF_TURN = float(np.radians(1.0))
 """A turn is tried in such steps from the orientation of home: cables must not meet on the way."""
 CLEARANCE_RESERVE = 1e-3
 """More clearance than the scene asks for, so that a way in and out is left, [m]."""
-TENSION_RESERVE = 0.05
-"""Share of the tension range kept to both limits: a rig that is not calibrated pulls otherwise."""
 TURNING_SHARE = 0.3
 """So many of the candidates are turned about the vertical, the others tilted."""
 
@@ -39,6 +37,8 @@ class Wish:
         tilt: Largest tilt, [rad].
         turn: Largest turn about the vertical, [rad].
         candidates: How many places they are chosen from.
+        reserve: Kept between tensions and the rig's limits, [N]: one that is not calibrated pulls
+            otherwise than it is told.
         length_deviation: Of a cable's length as a drive tells it, [m].
         pose_deviations: Of measured poses, shape (6,), [m, rad].
     """
@@ -47,6 +47,7 @@ class Wish:
     tilt: float
     turn: float
     candidates: int
+    reserve: float
     length_deviation: float
     pose_deviations: tuple[float, ...]
 
@@ -71,7 +72,8 @@ def chosen_poses(
         raise NoSolution(
             f"only {len(found)} of {2 * wish.candidates} poses tried can be held and are free",
             where=f"rig {rig.name}, scene {scene.name}",
-            next_step="ask for fewer poses, less clearance in the scene, or more --candidates",
+            next_step="ask for fewer poses, less --reserve-n, less clearance in the scene, or more"
+            " --candidates",
         )
     best = _most_telling(_rows(rig, found, wish, parameters), wish.count)
     reach = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
@@ -94,7 +96,7 @@ def _candidates(rig: Rig, scene: Scene, wish: Wish, random: np.random.Generator)
         for share in np.linspace(0.0, 1.0, steps + 1):
             rotation = matrix_from_rotation_vector(share * whole) @ rig.home.rotation
             pose = Pose(position, rotation)
-            if not _is_free(rig, scene, model, pose):
+            if not _is_free(rig, scene, model, pose, wish.reserve):
                 break
             if share == 0.0:
                 found.append(pose)
@@ -104,8 +106,7 @@ def _candidates(rig: Rig, scene: Scene, wish: Wish, random: np.random.Generator)
     return found
 
 
-def _is_free(rig: Rig, scene: Scene, model: ClearanceModel, pose: Pose) -> bool:
-    room = TENSION_RESERVE * (rig.max_tension - rig.min_tension)
+def _is_free(rig: Rig, scene: Scene, model: ClearanceModel, pose: Pose, room: float) -> bool:
     try:
         tensions = working_tensions(rig, pose, scene.load).tensions
         if tensions.min() < rig.min_tension + room or tensions.max() > rig.max_tension - room:

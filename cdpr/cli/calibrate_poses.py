@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.scene import Scene
 
+RESERVE_SHARE = 0.075
+"""Of the tension range, kept from its ends: more leaves only the middle of the workspace."""
 ROUNDS = 3
 """Of shortening each way: measuring is not about speed."""
 
@@ -32,6 +34,10 @@ def poses(
     candidates: Annotated[
         int, typer.Option(min=10, max=5000, help="places that they are chosen from")
     ] = 300,
+    reserve_n: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="kept from the tension limits (default: 7.5 % of their range)"),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="of the candidates and of the ways")] = 0,
     calibration: CalibrationOption = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing plan file")] = False,
@@ -62,7 +68,9 @@ def poses(
     check_output(output, force)
     the_rig, the_scene = calibrated_rig(load_rig(rig), calibration), load_scene(scene)
     of_poses = (0.3e-3,) * 3 + (radians(0.05),) * 3
-    wish = Wish(count, radians(tilt_deg), radians(turn_deg), candidates, 0.1e-3, of_poses)
+    span = the_rig.max_tension - the_rig.min_tension
+    room = RESERVE_SHARE * span if reserve_n is None else reserve_n
+    wish = Wish(count, radians(tilt_deg), radians(turn_deg), candidates, room, 0.1e-3, of_poses)
     parameters = Parameters.of(the_rig, DEFAULT_DEVIATIONS)
     with spinner("choosing poses", not as_json):
         chosen = chosen_poses(the_rig, the_scene, wish, parameters, seed)

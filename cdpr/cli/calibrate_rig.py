@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from calibration.rig_calibration import RigCalibration
     from calibration.rig_measurements import RigMeasurements
     from calibration.rig_verdict import RigQuality
-    from cdpr.poses import Array
     from cdpr.rig import Rig
 
 
@@ -59,9 +58,9 @@ def rig(
         float, typer.Option(min=1e-6, help="how far off lengths by drive positions may be")
     ] = 0.1,
     pose_mm: Annotated[
-        float, typer.Option(min=1e-6, help="poses, where a CSV file does not tell")
-    ] = 0.3,
-    pose_deg: Annotated[float, typer.Option(min=1e-6, help="their turns, likewise")] = 0.05,
+        float, typer.Option(min=1e-6, help="how far off poses may be beside what their file tells")
+    ] = 0.1,
+    pose_deg: Annotated[float, typer.Option(min=1e-6, help="their turns, likewise")] = 0.02,
     tilt_deg: Annotated[
         float, typer.Option(min=0.0, max=90.0, help="how far the platform will be turned")
     ] = 5.0,
@@ -107,7 +106,8 @@ def rig(
     }
     wanted = {k: v for k, v in deviations.items() if k not in {g.value for g in known or []}}
     of_poses = np.array([pose_mm / 1e3] * 3 + [radians(pose_deg)] * 3)
-    the_rig, measured = _measured(load_rig(rig), data, of_poses)
+    the_rig, measured = _measured(load_rig(rig), data)
+    measured = measured.with_doubt(of_poses)
     if without_poses:
         measured = measured.without_poses()
     if output is not None:
@@ -120,7 +120,7 @@ def rig(
     finish(document, page, _facts(result, quality), output, as_json)
 
 
-def _measured(rig: Rig, data: list[Path], of_poses: Array) -> tuple[Rig, RigMeasurements]:
+def _measured(rig: Rig, data: list[Path]) -> tuple[Rig, RigMeasurements]:
     """The rig as the drives counted, and all places.
 
     Raises:
@@ -133,8 +133,7 @@ def _measured(rig: Rig, data: list[Path], of_poses: Array) -> tuple[Rig, RigMeas
     runs = [(str(path), _rig_of(path)) for path in data if path.is_dir()]
     counted = require_one_drawing(rig, runs)
     parts = [
-        _places_of(path) if path.is_dir() else read_rig_data(path, rig.cable_count, of_poses)
-        for path in data
+        _places_of(path) if path.is_dir() else read_rig_data(path, rig.cable_count) for path in data
     ]
     return counted, joined(parts)
 

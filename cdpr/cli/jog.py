@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
+
 if TYPE_CHECKING:
     from cdpr.rig import Rig
     from cdpr.scene import Scene
@@ -54,6 +56,7 @@ def jog(
         str | None, typer.Option(help="python-can interface instead of the rig file's")
     ] = None,
     channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    calibration: CalibrationOption = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
     ] = False,
@@ -76,6 +79,7 @@ def jog(
 
       cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
     """
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.jog_way import moved, require_short, straight_way, where_it_stands
     from cdpr.cli.named_bus import require_own_time, rig_on_bus
@@ -86,7 +90,8 @@ def jog(
     from executor.custody import Custody
     from executor.run_folder import RunFolder
 
-    the_rig = _slow(rig_on_bus(rig, interface, channel), speed_mm_s)
+    told = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
+    the_rig = _slow(told, speed_mm_s)
     in_process = the_rig.document.bus.interface == IN_PROCESS
     require_own_time(fast, in_process)
     if cable is not None or mm is not None:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
+
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
@@ -39,6 +41,7 @@ def sim(
     plan: Annotated[
         Path | None, typer.Option(help="put the platform at the start of this plan, with its load")
     ] = None,
+    calibration: CalibrationOption = None,
 ) -> None:
     """Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.
 
@@ -51,6 +54,7 @@ def sim(
       --channel 239.74.163.2 --no-camera -o runs/udp --yes
       --without-real-time
     """
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.output import err, out
     from cdpr.errors import BadInput
@@ -61,7 +65,7 @@ def sim(
     from simulation.power_loss import PowerLoss
     from simulation.simulate import make_rehearsal
 
-    the_rig = rig_on_bus(rig, interface, channel)
+    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     if the_rig.document.bus.interface == IN_PROCESS:
         raise BadInput(
             "the interface 'virtual' reaches no other process",

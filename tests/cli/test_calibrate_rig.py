@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.kinds import calibrated, load_result
+from cdpr.kinematics import poses_near
 from cdpr.rig import Rig, load_rig
+from cdpr.winches import WinchMap
 from tests.calibration.rig_places import places, write_places
 from tests.cli.program import call
 
 ROOT = Path(__file__).resolve().parents[2]
 RIG = ROOT / "configs/gachon_8_6_rehearsal.yaml"
+SESSION = ROOT / "examples/rig_session"
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +43,43 @@ def test_a_result_and_its_report_are_written_and_applied(file: Path, tmp_path: P
     (result,) = folder.glob("calibration_rig_rig_*.yaml")
     same = call("calibrate", "diff", result, result)
     assert same.code == 0, same
+
+
+@pytest.mark.slow  # a jog, planned and run
+def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
+    rig: Rig, tmp_path: Path
+) -> None:
+    """Poses by the tracker, from pictures; the truth is the simulation's. Then a jog with it."""
+    folder = tmp_path / "calibration"
+    done = call("calibrate", "rig", RIG, SESSION / "places.csv", "-o", folder, "--json")
+    assert done.code == 0, done
+    (result,) = folder.glob("*.yaml")
+    corrected = calibrated(rig, [load_result(result)])
+    truth = places(rig, 20, tilt=0.05, seed=8, noise=0.0)
+    winches, data = WinchMap(corrected), truth.measured
+    lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
+    told, _ = poses_near(corrected, lengths, truth.positions, truth.rotations, steps=10)
+    assert np.linalg.norm(told - truth.positions, axis=1).max() < 0.2e-3
+    way = ("--by-mm", "0", "0", "2", "--no-scene", "--fast", "-o", tmp_path / "jog")
+    jogged = call("jog", RIG, *way, "--calibration", result, "--json")
+    assert jogged.code == 0, jogged
+    ran = json.loads((tmp_path / "jog" / "rig.json").read_text(encoding="utf-8"))
+    assert ran["outlets_mm"] == json.loads(done.out)["outlets_mm"]
+
+
+def test_pictures_of_the_recorded_session_show_the_poses_in_its_table(tmp_path: Path) -> None:
+    """To the noise of a JPEG file; a table and pictures of different rigs would be far apart."""
+    log = tmp_path / "poses.csv"
+    assert call("track", RIG, SESSION / "pictures", "-o", log).code == 0
+    tables = [
+        np.genfromtxt(path, delimiter=",", names=True, usecols=columns, max_rows=6)
+        for path, columns in (
+            (log, ("x_mm", "y_mm", "z_mm")),
+            (SESSION / "places.csv", ("x_mm", "y_mm", "z_mm")),
+        )
+    ]
+    for axis in ("x_mm", "y_mm", "z_mm"):
+        assert tables[0][axis] == pytest.approx(tables[1][axis], abs=0.5)
 
 
 def test_a_result_that_is_not_good_enough_exits_with_3_and_says_what_to_do(file: Path) -> None:
@@ -135,7 +176,17 @@ def test_lengths_alone_in_a_file_need_no_poses(rig: Rig, tmp_path: Path) -> None
 @pytest.mark.slow  # compiled planner
 def test_poses_for_measuring_are_planned_and_their_plan_holds(tmp_path: Path) -> None:
     plan = tmp_path / "measure.json"
-    arguments = ("--count", "10", "--candidates", "25", "--tilt-deg", "5", "--json")
+    arguments = (
+        "--count",
+        "10",
+        "--candidates",
+        "25",
+        "--tilt-deg",
+        "5",
+        "--reserve-n",
+        "3",
+        "--json",
+    )
     done = call("calibrate", "poses", RIG, ROOT / "configs/turn.yaml", "-o", plan, *arguments)
     assert done.code == 0, done
     told = json.loads(done.out)
