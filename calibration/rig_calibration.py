@@ -121,21 +121,27 @@ class RigCalibration:
         Returns:
             Along the worst direction, shape (k,), [m].
         """
-        counts = _counts_at(self.rig, positions, rotations)
-        tensions = np.full_like(counts, np.nan)
-        there = RigMeasurements(
-            names=("",) * len(positions),
-            counts=counts,
-            tensions=tensions,
-            positions=positions,
-            rotations=rotations,
-            covariances=np.zeros((len(positions), 6, 6)),
-        )
+        there = _sent_to(self.rig, positions, rotations)
         line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
         moved = -np.linalg.pinv(line.by_pose) @ line.by_values
         covariances = np.einsum("kip,pq,kjq->kij", moved[:, :3], self.covariance, moved[:, :3])
         worst: Array = _SIGMAS * np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
         return worst
+
+    def reached(self, positions: Array, rotations: Array) -> Array:
+        """Where the platform truly goes when the rig file's numbers are to bring it to poses.
+
+        Args:
+            positions: World frame, shape (k, 3), [m].
+            rotations: ``world_from_platform``, shape (k, 3, 3).
+
+        Returns:
+            Shape (k, 3), [m].
+        """
+        there = _sent_to(self.rig, positions, rotations)
+        lengths = RigModel(self.parameters, there).counted.by(self.geometry)
+        rig = rig_with(self.rig, self.geometry)
+        return poses_near(rig, lengths, positions, rotations, steps=10)[0]
 
 
 def calibrate_rig(
@@ -237,8 +243,16 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
     return np.asarray(np.linalg.norm(positions - measured.positions, axis=1))
 
 
-def _counts_at(rig: Rig, positions: Array, rotations: Array) -> Array:
-    """Drive positions at poses, by the drawing and under the tensions of home, (k, m)."""
+def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:
+    """Places with the drive positions of poses, by the drawing and under the tensions of home."""
     anchors = positions[:, None, :] + np.einsum("kij,mj->kmi", rotations, rig.anchors)
     winches, tensions = WinchMap(rig), working_tensions(rig, rig.home).tensions
-    return winches.counts(winches.unstrained(cables_to(rig, anchors).lengths, tensions))
+    counts = winches.counts(winches.unstrained(cables_to(rig, anchors).lengths, tensions))
+    return RigMeasurements(
+        names=("",) * len(positions),
+        counts=counts,
+        tensions=np.full_like(counts, np.nan),
+        positions=positions,
+        rotations=rotations,
+        covariances=np.zeros((len(positions), 6, 6)),
+    )

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from calibration.result_file import ResultDocument, common_keys
 from calibration.rig_calibration import RigCalibration
-from calibration.rig_verdict import RigQuality
+from calibration.rig_verdict import RigQuality, judged_places
 from cdpr.document_types import NonNegative, Number, Positive, Vector
 from cdpr.errors import BadInput
 from cdpr.poses import Array
@@ -45,21 +45,28 @@ class RigResult(ResultDocument):
     level_mm: NonNegative = Field(description="of the platform turned as at home, 95 %")
     turned_mm: NonNegative = Field(description="turned by tilt_deg, 95 %")
     tilt_deg: NonNegative
+    reached_mm: list[Vector] = Field(
+        description="where the platform goes when the rig file as it is would bring it to the"
+        " centre of the workspace and near its corners"
+    )
     cable_residuals_mm: list[NonNegative] = Field(description="RMS, one a cable")
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart outlets and anchors are, RMS over all of them, [mm].
+        """How far apart both say that the platform goes, RMS over the workspace, [mm].
+
+        Outlets and anchors may differ by more where they cannot be told from each other.
 
         Raises:
-            BadInput: The results are of rigs with different numbers of cables.
+            BadInput: The results rest on different rig files.
         """
-        if len(self.outlets_mm) != len(other.outlets_mm):
+        if self.rests_on != other.rests_on:
             raise BadInput(
-                f"one rig has {len(self.outlets_mm)} cables, the other {len(other.outlets_mm)}",
-                next_step="compare results of one rig",
+                "the results rest on different rig files",
+                where=f"rig {self.name}, {self.date} and {other.date}",
+                next_step="compare results that were made with one rig file",
             )
-        mine, others = (np.array([*r.outlets_mm, *r.anchors_mm]) for r in (self, other))
-        return float(np.sqrt(np.mean(np.sum((others - mine) ** 2, axis=1))))
+        apart = np.array(other.reached_mm) - np.array(self.reached_mm)
+        return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with these numbers.
@@ -141,6 +148,7 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
         level_mm=quality.level * 1e3,
         turned_mm=quality.turned * 1e3,
         tilt_deg=float(np.degrees(quality.tilt)),
+        reached_mm=_rows(result.reached(*judged_places(rig, 0.0))),
         cable_residuals_mm=[
             float(x) * 1e3 for x in np.sqrt(np.mean(result.fit.residuals**2, axis=0))
         ],

@@ -12,6 +12,7 @@ from calibration.interval import CONFIDENCE
 from calibration.rig_calibration import RigCalibration
 from calibration.verdict import Lack, Verdict
 from cdpr.poses import Array, matrix_from_rotation_vector
+from cdpr.rig import Rig
 
 _INSET = 0.15
 """The workspace is judged at its centre and this share inside its corners."""
@@ -46,8 +47,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         wanted: What is good enough, 95 %, [m].
         tilt: By how much the platform will be turned from its orientation at home, [rad].
     """
-    level = float(result.position_error(*_places(result, 0.0)).max())
-    turned = float(result.position_error(*_places(result, tilt)).max()) if tilt else level
+    level = float(result.position_error(*judged_places(result.rig, 0.0)).max())
+    turned = float(result.position_error(*judged_places(result.rig, tilt)).max()) if tilt else level
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
@@ -89,9 +90,16 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     return RigQuality(verdict, before, after, level, turned, tilt)
 
 
-def _places(result: RigCalibration, tilt: float) -> tuple[Array, Array]:
-    """Centre and corners of the workspace, turned about x and y both ways."""
-    rig = result.rig
+def judged_places(rig: Rig, tilt: float) -> tuple[Array, Array]:
+    """Centre and corners of the workspace, turned about x and y both ways.
+
+    Args:
+        rig: The drawing.
+        tilt: How far, [rad]; 0 for the orientation of home alone.
+
+    Returns:
+        Positions, shape (k, 3), [m], and rotations, shape (k, 3, 3).
+    """
     centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
     half = (0.5 - _INSET) * (rig.workspace_upper - rig.workspace_lower)
     corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half

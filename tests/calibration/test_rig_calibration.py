@@ -22,7 +22,7 @@ from calibration.rig_observability import Observability, sentences
 from calibration.rig_page import rig_page
 from calibration.rig_parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.rig_result import RigResult, require_one_drawing, rig_result
-from calibration.rig_verdict import judge_rig
+from calibration.rig_verdict import judge_rig, judged_places
 from cdpr.errors import BadInput
 from cdpr.kinematics import poses_near
 from cdpr.poses import Array, matrix_from_rotation_vector, rotation_vector_from_matrix
@@ -264,10 +264,27 @@ def test_a_result_file_is_applied_to_its_own_rig_only(
     assert corrected.document.simulation == rig.document.simulation
     with pytest.raises(BadInput, match="rests on other outlets"):
         calibrated(load_rig(ROOT / "configs/gachon_8_6.yaml"), [result])
-    assert result.apart_mm(result) == 0.0
     page = rig_page(found, quality, "rig", "2026-03-14")
     assert "good enough" in page
     assert "cable 8" in page
+
+
+def test_two_results_are_compared_by_where_the_platform_goes(
+    rig: Rig, found: RigCalibration, found_level: RigCalibration
+) -> None:
+    """Never turned, outlets are known worse than where the platform is: that is no disagreement."""
+    one, other = (
+        rig_result(r, judge_rig(r, 1e-3, 0.0), "rig", TODAY) for r in (found, found_level)
+    )
+    apart = one.apart_mm(other)
+    outlets = np.linalg.norm(np.array(one.outlets_mm) - np.array(other.outlets_mm), axis=1)
+    assert 0.0 < apart < 0.3
+    assert rms(outlets) > 3.0 * apart
+    assert one.apart_mm(one) == 0.0
+    sent = judged_places(rig, 0.0)[0]
+    assert np.linalg.norm(found.reached(*judged_places(rig, 0.0)) - sent, axis=1).max() > 1e-3
+    with pytest.raises(BadInput, match="rest on different rig files"):
+        one.apart_mm(one.model_copy(update={"rests_on": "another"}))
 
 
 def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(
