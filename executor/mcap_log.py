@@ -54,18 +54,31 @@ def write_mcap(
         *_events(context, start),
         *_pictures(folder, poses, start),
     ]
-    messages.sort(key=lambda message: message[1])
+    write_messages(folder.mcap, messages, start)
+    return folder.mcap
+
+
+def write_messages(path: Path, messages: Sequence[Message], start: int) -> None:
+    """Writes messages in the order of their times, or no file.
+
+    Args:
+        path: The file.
+        messages: Of the channels in `executor.mcap_schemas.CHANNELS`.
+        start: What their times count from, [ns since 1970].
+
+    Raises:
+        Fault: The disk is full or gone; no part of the file is left.
+    """
     try:
-        _write(folder.mcap, messages, start)
+        _write(path, sorted(messages, key=lambda message: message[1]), start)
     except OSError as error:
-        folder.mcap.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
         raise Fault(
             "the log cannot be written",
-            where=str(folder.mcap),
+            where=str(path),
             why=error.strerror or str(error),
-            next_step="free some space; the CSV files of the run hold the same numbers",
+            next_step="free some space; the CSV files hold the same numbers",
         ) from None
-    return folder.mcap
 
 
 def _write(path: Path, messages: Sequence[Message], start: int) -> None:

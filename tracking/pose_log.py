@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cdpr.documents import write_atomic
+from tracking.measured_clearance import MeasuredClearance
 from tracking.measurement import NoPose, Observation
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -38,12 +39,23 @@ POSE_COLUMNS = (
 )
 
 
+#: Further columns where obstacles are known.
+CLEARANCE_COLUMNS = ("clearance_mm", "clearance_uncertainty_mm", "body", "obstacle")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedPicture:
-    """One picture's name and what was measured in it."""
+    """One picture's name and what was measured in it.
+
+    Attributes:
+        name: Of the picture.
+        observation: The pose, or why there is none.
+        clearance: At the pose, where obstacles are known.
+    """
 
     name: str
     observation: Observation
+    clearance: MeasuredClearance | None = None
 
 
 def pose_row(frame: int, logged: LoggedPicture) -> tuple[str, ...]:
@@ -67,15 +79,35 @@ def pose_row(frame: int, logged: LoggedPicture) -> tuple[str, ...]:
     )
 
 
-def write_pose_log(path: Path, pictures: Sequence[LoggedPicture]) -> None:
+def write_pose_log(
+    path: Path, pictures: Sequence[LoggedPicture], with_clearance: bool = False
+) -> None:
     """Writes ``poses.csv`` whole or not at all.
+
+    Args:
+        path: The file.
+        pictures: Its rows.
+        with_clearance: Whether it has the `CLEARANCE_COLUMNS`.
 
     Raises:
         BadInput: The folder cannot be written to.
     """
-    rows = [pose_row(frame, logged) for frame, logged in enumerate(pictures)]
-    lines = [",".join(_quoted(value) for value in row) for row in (POSE_COLUMNS, *rows)]
+    head = POSE_COLUMNS + (CLEARANCE_COLUMNS if with_clearance else ())
+    rows = [
+        pose_row(frame, logged) + (_clearance_values(logged.clearance) if with_clearance else ())
+        for frame, logged in enumerate(pictures)
+    ]
+    lines = [",".join(_quoted(value) for value in row) for row in (head, *rows)]
     write_atomic(path, "\n".join(lines) + "\n")
+
+
+def _clearance_values(clearance: MeasuredClearance | None) -> tuple[str, ...]:
+    """The values of the `CLEARANCE_COLUMNS`; empty where there is no pose."""
+    if clearance is None:
+        return ("",) * len(CLEARANCE_COLUMNS)
+    nearest = min(clearance.nearest, key=lambda n: n.distance)
+    distance, spread = clearance.distance * 1e3, clearance.uncertainty * 1e3
+    return (f"{distance:.6f}", f"{spread:.6f}", nearest.first, nearest.second)
 
 
 def _quoted(text: str) -> str:

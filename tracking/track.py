@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from time import monotonic
 from typing import Protocol
 
+from cdpr.clearance import ClearanceModel
 from cdpr.errors import BadInput
+from tracking.measured_clearance import MeasuredClearance, clearance_of
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.other_tags import what_else_is_seen
 from tracking.picture import Image
@@ -42,10 +45,11 @@ class NoPlatformSeen(BadInput):
 
 @dataclass(slots=True)
 class TrackCount:
-    """What came of a source so far."""
+    """What came of a source so far, and how long each picture took to measure, [s]."""
 
     pictures: int = 0
     poses: int = 0
+    seconds: list[float] = field(default_factory=list)
 
 
 def track(
@@ -53,6 +57,8 @@ def track(
     tracker: Tracker,
     count: TrackCount | None = None,
     give_up_after: int | None = None,
+    model: ClearanceModel | None = None,
+    on_picture: Callable[[Picture, LoggedPicture], None] | None = None,
 ) -> Iterator[LoggedPicture]:
     """Measures picture after picture.
 
@@ -61,6 +67,8 @@ def track(
         tracker: Keeps the last pose between pictures.
         count: Kept up to date while pictures are measured.
         give_up_after: Ends a source without an end after so many pictures without any pose.
+        model: Where obstacles are; the clearance is measured too.
+        on_picture: Told every picture with what was measured in it.
 
     Raises:
         NoPlatformSeen: At the end, when no picture gave a pose.
@@ -71,14 +79,21 @@ def track(
     reasons: Counter[str] = Counter()
     last: Picture | None = None
     for picture in source:
+        start = monotonic()
         observation = tracker.observe(picture.image, picture.time)
+        count.seconds.append(monotonic() - start)
         count.pictures += 1
+        clearance: MeasuredClearance | None = None
         if isinstance(observation, PoseMeasurement):
             count.poses += 1
+            clearance = clearance_of(model, observation) if model is not None else None
         else:
             reasons[_reason(observation)] += 1
             last = picture
-        yield LoggedPicture(picture.name, observation)
+        logged = LoggedPicture(picture.name, observation, clearance)
+        if on_picture is not None:
+            on_picture(picture, logged)
+        yield logged
         if count.poses == 0 and count.pictures == give_up_after:
             break
     if count.poses == 0:

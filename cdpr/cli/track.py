@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,11 +12,10 @@ import typer
 from cdpr.cli.calibrations import CalibrationOption
 
 if TYPE_CHECKING:
-    from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
     from cdpr.scene import Scene
     from tracking.pose_log import LoggedPicture
-    from tracking.track import Picture
+    from tracking.track import Picture, TrackCount
 
 #: A live camera that shows no tag for so many pictures is given up.
 PATIENCE = 50
@@ -46,7 +46,17 @@ def track(
     pictures: Annotated[
         int | None, typer.Option(min=1, help="stop after so many; Ctrl-C also stops")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an existing pose log")] = False,
+    mcap: Annotated[
+        Path | None, typer.Option(help="also write the poses as MCAP", metavar="MCAP")
+    ] = None,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            help="also draw what is measured into the pictures: a folder, or a video (.mp4, .avi)",
+            metavar="DIR|VIDEO",
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace what exists already")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
     """Measure the platform's pose from its tags, picture by picture.
@@ -59,40 +69,55 @@ def track(
 
       cdpr track configs/gachon_8_6.yaml synthetic --plan plan.json -o poses.csv
     """
+    import time
     from itertools import islice
 
+    from cdpr.clearance import ClearanceModel
     from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.cameras import named_camera
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
+    from cdpr.cli.track_sources import picture_source
     from cdpr.rig import load_rig
     from executor.running import stop_requests
+    from executor.track_mcap import write_track_mcap
     from executor.wishes import OwnBoard
     from tracking.pose_log import write_pose_log
+    from tracking.track import TrackCount
     from tracking.track import track as tracked
     from tracking.tracker import Tracker
 
     check_output(output, force)
+    if mcap is not None:
+        check_output(mcap, force)
     the_rig = calibrated_rig(load_rig(rig), calibration)
     the_camera = named_camera(the_rig, camera)
     the_scene = _scene(scene, plan)
-    frames, total = _source(the_rig, the_scene, the_camera, source, plan)
+    frames, total = picture_source(the_rig, the_scene, the_camera, source, plan)
+    model = ClearanceModel(the_rig, the_scene) if the_scene and the_scene.obstacles else None
     logged: list[LoggedPicture] = []
-    board = OwnBoard()
+    count, board, began = TrackCount(), OwnBoard(), time.time_ns()
     with (
+        _overlay(overlay, the_rig, the_camera, force) as draw,
         stop_requests(board),
         progress_bar("tracking", pictures or total, not as_json) as show,
     ):
-        patience = PATIENCE if total is None else None
         for found in tracked(
-            islice(frames, pictures), Tracker(the_rig, the_camera), give_up_after=patience
+            islice(frames, pictures),
+            Tracker(the_rig, the_camera),
+            count,
+            give_up_after=PATIENCE if total is None else None,
+            model=model,
+            on_picture=draw,
         ):
             logged.append(found)
             show(len(logged))
             if board.read().stop:
                 break
-    write_pose_log(output, logged)
-    facts = _facts(the_rig, the_scene, logged, output)
+    write_pose_log(output, logged, with_clearance=model is not None)
+    if mcap is not None:
+        write_track_mcap(mcap, logged, began)
+    facts = _facts(logged, output, count)
     if as_json:
         show_json(facts)
     else:
@@ -108,78 +133,30 @@ def _scene(scene: Path | None, plan: Path | None) -> Scene | None:
     return load_plan(plan).scene if plan is not None else None
 
 
-def _source(
-    rig: Rig, scene: Scene | None, camera: Camera, source: str, plan: Path | None
-) -> tuple[Iterable[Picture], int | None]:
-    """The pictures, and how many there are where that is known."""
-    from cdpr.cli.cameras import SYNTHETIC
-    from cdpr.cli.output import err
-    from cdpr.cli.picture_sources import require_camera_source
-    from cdpr.errors import BadInput
-    from drivers.cameras import LiveCamera, VideoFile
-    from drivers.picture_folder import ImageFolder
+@contextmanager
+def _overlay(
+    place: Path | None, rig: Rig, camera: Camera, force: bool
+) -> Iterator[Callable[[Picture, LoggedPicture], None] | None]:
+    """What draws each picture's measurement into it; None without a place for it."""
+    if place is None:
+        yield None
+        return
+    from drivers.picture_output import PictureOutput
+    from tracking.overlay import drawn_over
 
-    if source == SYNTHETIC:
-        if plan is None or scene is None:
-            raise BadInput(
-                "the synthetic camera needs a path to look at",
-                where="track",
-                next_step="pass --plan plan.json",
-            )
-        rendered = _rendered_times(rig, camera, plan)
-        return _rendered(rig, scene, camera, rendered), len(rendered)
-    if plan is not None:
-        raise BadInput(
-            "--plan is for the synthetic camera",
-            where="track",
-            next_step="name the obstacles with --scene, or the source 'synthetic'",
-        )
-    path = Path(source)
-    if path.is_dir():
-        folder = ImageFolder(
-            path, camera, on_unreadable=lambda name: err.print(f"skipped, no picture: {name}")
-        )
-        return folder, len(folder)
-    if path.is_file():
-        video = VideoFile(path, camera)
-        return video, len(video)
-    require_camera_source(source)
-    return LiveCamera(source, camera), None
+    with PictureOutput(place, camera.rate, force) as out:
+
+        def draw(picture: Picture, logged: LoggedPicture) -> None:
+            found = logged.observation
+            out.write(drawn_over(picture.image, rig, camera, found, logged.clearance), picture.name)
+
+        yield draw
 
 
-def _rendered_times(rig: Rig, camera: Camera, plan: Path) -> list[tuple[float, Pose]]:
-    """Times and poses at which the synthetic camera looks: those of a run of the plan."""
-    from cdpr.cli.carry_out import prepared_run
-    from cdpr.cli.plan_for_rig import require_same_rig
-    from cdpr.plan import load_plan
-
-    the_plan = load_plan(plan)
-    require_same_rig(the_plan, rig, plan)
-    table = prepared_run(the_plan, rig, quiet=True).checked.table
-    poses = table.poses()
-    every = max(1, round(1.0 / (camera.rate * table.cycle)))
-    return [(row * table.cycle, poses[row]) for row in range(0, len(table), every)]
-
-
-def _rendered(
-    rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
-) -> Iterable[Picture]:
-    from drivers.cameras import Frame
-    from simulation.simulate import make_synthetic_camera
-
-    synthetic = make_synthetic_camera(rig, scene, camera)
-    for number, (time, pose) in enumerate(looks):
-        yield Frame(time, synthetic.render(pose, number), f"rendered {number}")
-
-
-def _facts(
-    rig: Rig, scene: Scene | None, logged: list[LoggedPicture], output: Path
-) -> dict[str, Any]:
+def _facts(logged: list[LoggedPicture], output: Path, count: TrackCount) -> dict[str, Any]:
     """What was measured, in numbers."""
     import numpy as np
 
-    from cdpr.clearance import ClearanceModel
-    from tracking.measured_clearance import clearance_of
     from tracking.measurement import PoseMeasurement
 
     poses = [p.observation for p in logged if isinstance(p.observation, PoseMeasurement)]
@@ -190,11 +167,11 @@ def _facts(
         "poses": len(poses),
         "position_deviation_mm": round(float(np.median(deviations)) * 1000, 4),
         "reprojection_px": round(float(np.median([p.reprojection for p in poses])), 4),
+        "measuring_ms": round(float(np.median(count.seconds)) * 1000, 2),
     }
-    if scene is not None and scene.obstacles:
-        model = ClearanceModel(rig, scene)
-        found = [c for p in poses if (c := clearance_of(model, p)) is not None]
-        nearest = min(found, key=lambda c: c.distance)
+    clearances = [p.clearance for p in logged if p.clearance is not None]
+    if clearances:
+        nearest = min(clearances, key=lambda c: c.distance)
         facts["smallest_clearance_mm"] = round(nearest.distance * 1000, 3)
         facts["clearance_uncertainty_mm"] = round(nearest.uncertainty * 1000, 3)
     return facts

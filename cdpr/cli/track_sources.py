@@ -1,0 +1,77 @@
+"""Where the pictures of `cdpr track` come from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cdpr.poses import Pose
+    from cdpr.rig import Camera, Rig
+    from cdpr.scene import Scene
+    from tracking.track import Picture
+
+
+def picture_source(
+    rig: Rig, scene: Scene | None, camera: Camera, source: str, plan: Path | None
+) -> tuple[Iterable[Picture], int | None]:
+    """The pictures, and how many there are where that is known."""
+    from cdpr.cli.cameras import SYNTHETIC
+    from cdpr.cli.output import err
+    from cdpr.cli.picture_sources import require_camera_source
+    from cdpr.errors import BadInput
+    from drivers.cameras import LiveCamera, VideoFile
+    from drivers.picture_folder import ImageFolder
+
+    if source == SYNTHETIC:
+        if plan is None or scene is None:
+            raise BadInput(
+                "the synthetic camera needs a path to look at",
+                where="track",
+                next_step="pass --plan plan.json",
+            )
+        rendered = _rendered_times(rig, camera, plan)
+        return _rendered(rig, scene, camera, rendered), len(rendered)
+    if plan is not None:
+        raise BadInput(
+            "--plan is for the synthetic camera",
+            where="track",
+            next_step="name the obstacles with --scene, or the source 'synthetic'",
+        )
+    path = Path(source)
+    if path.is_dir():
+        folder = ImageFolder(
+            path, camera, on_unreadable=lambda name: err.print(f"skipped, no picture: {name}")
+        )
+        return folder, len(folder)
+    if path.is_file():
+        video = VideoFile(path, camera)
+        return video, len(video)
+    require_camera_source(source)
+    return LiveCamera(source, camera), None
+
+
+def _rendered_times(rig: Rig, camera: Camera, plan: Path) -> list[tuple[float, Pose]]:
+    """Times and poses at which the synthetic camera looks: those of a run of the plan."""
+    from cdpr.cli.carry_out import prepared_run
+    from cdpr.cli.plan_for_rig import require_same_rig
+    from cdpr.plan import load_plan
+
+    the_plan = load_plan(plan)
+    require_same_rig(the_plan, rig, plan)
+    table = prepared_run(the_plan, rig, quiet=True).checked.table
+    poses = table.poses()
+    every = max(1, round(1.0 / (camera.rate * table.cycle)))
+    return [(row * table.cycle, poses[row]) for row in range(0, len(table), every)]
+
+
+def _rendered(
+    rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
+) -> Iterable[Picture]:
+    from drivers.cameras import Frame
+    from simulation.simulate import make_synthetic_camera
+
+    synthetic = make_synthetic_camera(rig, scene, camera)
+    for number, (time, pose) in enumerate(looks):
+        yield Frame(time, synthetic.render(pose, number), f"rendered {number}")

@@ -1,0 +1,94 @@
+"""`cdpr track`: pose log, clearance, MCAP, and pictures with what was measured in them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from cdpr.rig import load_rig
+from tests.cli.plans import RIG, write_short_plan
+from tests.cli.program import call, nothing_written, one_message
+from tracking.measurement import NoPose
+from tracking.overlay import USED, drawn_over
+from tracking.pose_log import CLEARANCE_COLUMNS, POSE_COLUMNS
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_short_plan(tmp_path_factory.mktemp("plan") / "plan.json")
+
+
+def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> None:
+    log, mcap, drawn = tmp_path / "poses.csv", tmp_path / "poses.mcap", tmp_path / "drawn"
+    arguments = ("synthetic", "--plan", plan, "-o", log, "--mcap", mcap, "--overlay", drawn)
+    answer = call("track", RIG, *arguments, "--pictures", "3", "--json")
+    assert answer.code == 0, answer
+    facts = json.loads(answer.out)
+    assert facts["poses"] == 3
+    assert facts["measuring_ms"] > 0.0
+    with log.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert tuple(rows[0]) == POSE_COLUMNS + CLEARANCE_COLUMNS
+    nearest = min(float(row["clearance_mm"]) for row in rows)
+    assert nearest == pytest.approx(facts["smallest_clearance_mm"], abs=1e-3)
+    assert all(float(row["clearance_uncertainty_mm"]) > 0.5 for row in rows)
+    assert {row["obstacle"] for row in rows} == {"block"}
+    with mcap.open("rb") as stream:
+        messages = [
+            (channel.topic, json.loads(message.data))
+            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages()
+        ]
+    counted = Counter(topic for topic, _ in messages)
+    assert counted == {"/tag_pose": 3, "/tag_status": 3, "/clearance": 3}
+    distances = [content["distance_mm"] for topic, content in messages if topic == "/clearance"]
+    assert distances == pytest.approx([float(row["clearance_mm"]) for row in rows], abs=1e-5)
+    names = sorted(path.name for path in drawn.iterdir())
+    assert names == ["rendered_0.png", "rendered_1.png", "rendered_2.png"]
+    picture = cv2.imread(str(drawn / names[0]))
+    assert picture is not None
+    greenish = np.all(np.abs(picture.astype(int) - USED) < 60, axis=-1)
+    assert greenish.sum() > 100, "outlines of the tags"
+
+
+def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -> None:
+    video = tmp_path / "drawn.avi"
+    arguments = ("synthetic", "--plan", plan, "-o", tmp_path / "poses.csv", "--overlay", video)
+    assert call("track", RIG, *arguments, "--pictures", "2").code == 0
+    capture = cv2.VideoCapture(str(video))
+    frames = 0
+    while capture.read()[0]:
+        frames += 1
+    capture.release()
+    assert frames == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("drawn.gif", "neither a folder nor a video"), ("there.avi", "it exists already")],
+)
+def test_a_place_that_cannot_be_drawn_to_is_refused(
+    plan: Path, tmp_path: Path, name: str, words: str
+) -> None:
+    (tmp_path / "there.avi").write_text("kept")
+    log, place = tmp_path / "poses.csv", tmp_path / name
+    with nothing_written(tmp_path):
+        answer = call("track", RIG, "synthetic", "--plan", plan, "-o", log, "--overlay", place)
+    one_message(answer, 2, words, name)
+
+
+def test_a_picture_without_a_pose_says_why() -> None:
+    rig = load_rig(RIG)
+    camera = rig.cameras[0]
+    grey = np.full((camera.height, camera.width), 90, dtype=np.uint8)
+    drawn = drawn_over(grey, rig, camera, NoPose(0.5, "no tag is to be seen"))
+    assert drawn.shape == (camera.height, camera.width, 3)
+    changed = np.any(drawn != 90, axis=-1)
+    assert changed[:60].any()
+    assert not changed[200:].any()
