@@ -18,9 +18,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from calibration.boards import Chessboard
 from calibration.camera import calibrate_camera
 from calibration.camera_verdict import judge_camera
+from calibration.chessboard import Chessboard
 from calibration.uncertainty import NAMES
 from tests.calibration.board_pictures import (
     DISTORTION,

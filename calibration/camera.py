@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from calibration.boards import Board, Seen, mirrored
+from calibration.board import Board, Seen, mirrored
 from calibration.interval import Interval
 from calibration.uncertainty import NAMES, Uncertainty, uncertainty_of
 from cdpr.errors import BadInput
@@ -109,6 +109,7 @@ def calibrate_camera(
             example = image if example is None else example
         else:
             views[name] = seen
+            left_out |= {f"{name}, {k}": "is seen more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, example)
     return calibrate_from_views(views, size, left_out)
@@ -193,6 +194,8 @@ def _too_few(
     why = f"{board} was looked for"
     if example is not None and mirrored(board, example):
         why += "; flipped over it is there, so the pictures are mirrored, or the board's print is"
+    elif example is not None and (instead := board.instead(example)):
+        why += f"; a picture shows {instead}"
     told = [f"{name} {reason}" for name, reason in unused.items()]
     if told:
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""

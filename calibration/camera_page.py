@@ -42,6 +42,7 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
             *interval_rows(result.intervals),
             ("corners off, RMS", f"{result.error:.3f} px"),
             (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
+            ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
             ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
             ("data", result.data_hash[:16]),
         ]

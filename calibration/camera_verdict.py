@@ -29,6 +29,8 @@ class CameraQuality:
         tilts: Angle of each picture's board against the picture's plane, about its x and y axes,
             shape (pictures, 2), [deg].
         distance: For which the errors are stated, [m].
+        nearest: Least distance of a board, [m]; it grows with the squares' size that was told.
+        farthest: Greatest distance of a board, [m].
         halves: How far apart two halves of the pictures would see a point there, RMS over the
             picture, [m].
     """
@@ -37,6 +39,8 @@ class CameraQuality:
     coverage: Array
     tilts: Array
     distance: float
+    nearest: float
+    farthest: float
     halves: float
 
     @property
@@ -55,9 +59,8 @@ def judge_camera(
         wanted: What is good enough, [m].
         distance: At which the camera will measure, [m]; that of the boards when left out.
     """
-    if distance is None:
-        away = [np.linalg.norm(pose.position) for pose in result.boards.values()]
-        distance = float(np.median(away))
+    away = [float(np.linalg.norm(pose.position)) for pose in result.boards.values()]
+    distance = float(np.median(away)) if distance is None else distance
     coverage, tilts = _coverage(result), _tilts(result)
     slopes = _slopes(result)
     scale = distance / float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
@@ -72,7 +75,7 @@ def judge_camera(
         *_about_errors(result, error, halves, wanted, distance),
     ]
     verdict = Verdict.of(error, wanted, f"at {distance:.2g} m", lacks)
-    return CameraQuality(verdict, coverage, tilts, distance, halves)
+    return CameraQuality(verdict, coverage, tilts, distance, min(away), max(away), halves)
 
 
 def _coverage(result: CameraCalibration) -> Array:

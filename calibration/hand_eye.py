@@ -27,6 +27,8 @@ from tracking.tracker import TrackerSettings
 
 LEAST_POSES = 8
 """Fewer poses do not show how well the rig keeps what it tells."""
+_LEAST_SPAN = 0.1
+"""Along the axis of the largest, [m]."""
 DRAWING = (1e-3, np.radians(0.5))
 """Deviation of the tags' frame from the drawing, [m] and [rad]."""
 _FIRST = (1e-3, np.radians(0.2))
@@ -220,5 +222,10 @@ def _lacks(looks: Sequence[_Look]) -> list[Lack]:
     lacks = []
     if len(looks) < LEAST_POSES:
         what = f"{len(looks)} poses were seen, {LEAST_POSES} are needed"
+        lacks.append(Lack(what, "take pictures at more poses, far apart"))
+    places = np.array([look.world_from_platform.position for look in looks])
+    span = float(np.ptp(places, axis=0).max())
+    if span < _LEAST_SPAN:
+        what = f"all poses lie within {span * 1e3:.0f} mm, {_LEAST_SPAN * 1e3:.0f} mm are needed"
         lacks.append(Lack(what, "take pictures at more poses, far apart"))
     return lacks

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board, Charuco, Chessboard, TagGrid
+from calibration.board import Board
+from calibration.charuco import Charuco
+from calibration.chessboard import Chessboard
+from calibration.tag_grid import TagGrid
 from cdpr.errors import BadInput
 from cdpr.poses import Array
 from tracking.marks import modules_across, official_modules

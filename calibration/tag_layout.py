@@ -47,6 +47,7 @@ class TagLayout:
         errors: RMS corner error of each picture, by name, [px].
         seen: In how many pictures each tag was, by number.
         unseen: Why each of the other tags is as drawn, by number.
+        sides: Largest angle between directions from which pictures were taken, [rad].
         scale: Size of the layout by that of the drawing.
         unused: Why pictures are not used, by name.
         data_hash: Of what was seen.
@@ -60,6 +61,7 @@ class TagLayout:
     errors: Mapping[str, float]
     seen: Mapping[int, int]
     unseen: Mapping[int, str]
+    sides: float
     scale: float
     unused: Mapping[str, str]
     data_hash: str
@@ -243,10 +245,18 @@ def _result(
             for number in drawn
             if number not in {tag.id for tag in tags}
         },
+        sides=_sides(cameras),
         scale=scale,
         unused=sights.unused,
         data_hash=sights.data_hash(),
     )
+
+
+def _sides(cameras: Sequence[Pose]) -> float:
+    """Largest angle between directions from the platform to ``camera_from_platform``, [rad]."""
+    places = np.array([pose.inverse().position for pose in cameras])
+    directions = places / np.linalg.norm(places, axis=1, keepdims=True)
+    return float(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)).max())
 
 
 def corner_slopes(tags: Sequence[Tag]) -> Array:

@@ -9,6 +9,7 @@ from calibration.verdict import Lack, Verdict
 
 GOOD_PICTURES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
 """Pictures in all, pictures of each tag, pixels."""
+GOOD_SIDES_DEG = 40.0
 GOOD_SCALE = 0.02
 """Share by which a layout may be larger or smaller than drawn."""
 FAR_MM, FAR_DEG = 10.0, 8.0
@@ -35,6 +36,12 @@ def _about_pictures(result: TagLayout) -> list[Lack]:
     if len(result.errors) < GOOD_PICTURES:
         what = f"{len(result.errors)} pictures show two tags or more, {GOOD_PICTURES} are needed"
         lacks.append(Lack(what, "take 20 pictures from all sides, two or three tags in each"))
+    if np.degrees(result.sides) < GOOD_SIDES_DEG:
+        what = (
+            f"all pictures are taken from within {np.degrees(result.sides):.0f}°,"
+            f" {GOOD_SIDES_DEG:.0f}° are needed"
+        )
+        lacks.append(Lack(what, "take pictures from all sides, not alike"))
     if result.reprojection > GOOD_ERROR:
         what = f"corners are {result.reprojection:.2f} px off"
         step = "check sizes and numbers of the tags, that they lie flat, and the camera's numbers"

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from scipy.stats import t as student
 
-from calibration.boards import Seen
+from calibration.board import Seen
 from calibration.interval import CONFIDENCE
 from cdpr.errors import BadInput
 from cdpr.poses import Array, read_only

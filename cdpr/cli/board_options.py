@@ -11,7 +11,7 @@ import typer
 from cdpr.errors import BadInput
 
 if TYPE_CHECKING:
-    from calibration.boards import Board
+    from calibration.board import Board
 
 
 class BoardName(StrEnum):
@@ -71,7 +71,9 @@ def board_of(
     Raises:
         BadInput: A size is missing or one too many is given, or there can be no such board.
     """
-    from calibration.boards import Charuco, Chessboard, TagGrid
+    from calibration.charuco import Charuco
+    from calibration.chessboard import Chessboard
+    from calibration.tag_grid import TagGrid
 
     needed = _NEEDED[kind]
     given = [name for name, size in sizes_mm.items() if size is not None]

@@ -97,6 +97,10 @@ def _facts(result: CameraCalibration, quality: CameraQuality) -> list[tuple[str,
     """What was found beside the numbers, for people."""
     return [
         ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
+        (
+            "boards were",
+            f"{quality.nearest:.3g} to {quality.farthest:.3g} m away; if not, the sizes are wrong",
+        ),
         ("covered", f"{quality.covered:.0%} of the picture"),
         (
             "precision",

@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards import Charuco, Chessboard, TagGrid, mirrored
+from calibration.board import mirrored
 from calibration.camera import calibrate_camera
+from calibration.charuco import Charuco
+from calibration.chessboard import Chessboard
+from calibration.tag_grid import TagGrid
 from cdpr.errors import BadInput
 from cdpr.poses import Pose
 from tests.calibration.board_pictures import (
@@ -94,6 +97,40 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
     with pytest.raises(BadInput) as caught:
         calibrate_camera([("a", flipped), ("b", flipped)], board)
     assert "mirrored" in caught.value.why
+
+
+@pytest.mark.parametrize(
+    ("board", "wrong", "told"),
+    [
+        (CHARUCO, Charuco(7, 5, 0.040, 0.030, "6X6_50"), "; 4X4 0, 1"),
+        (TAGS, TagGrid(5, 4, 0.040, 0.012, "tag25h9"), "shows tag36h11 20, 21"),
+        (TAGS, TagGrid(5, 4, 0.040, 0.012, "tag36h11", first=300), "shows tag36h11 20, 21"),
+    ],
+)
+def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
+    image = next(image for image, _ in pictures(board) if board.find(image) is not None)
+    with pytest.raises(BadInput) as caught:
+        calibrate_camera([("a", image), ("b", image)], wrong)
+    assert "is to be seen in 0 of 2 pictures" in caught.value.what
+    assert told in caught.value.why
+
+
+@pytest.mark.parametrize(("board", "number"), [(CHARUCO, 8), (TAGS, 27)])
+def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> None:
+    image = next(
+        image for image, _ in pictures(board) if (s := board.find(image)) and len(s.points) > 20
+    )
+    family = cv2.aruco.DICT_4X4_50 if board is CHARUCO else cv2.aruco.DICT_APRILTAG_36H11
+    decoy = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(family), number, 60)
+    doubled = image.copy()
+    doubled[:80, :80] = 255
+    doubled[10:70, 10:70] = decoy
+    seen, plain = board.find(doubled), board.find(image)
+    assert seen is not None
+    assert seen.twice == (number,)
+    assert plain.twice == ()
+    assert len(seen.points) < len(plain.points)
+    assert {tuple(p) for p in seen.points} <= {tuple(p) for p in plain.points}
 
 
 @pytest.mark.parametrize(

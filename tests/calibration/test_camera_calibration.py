@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.boards import Chessboard, Seen
+from calibration.board import Seen
 from calibration.camera import CameraCalibration, calibrate_camera, calibrate_from_views
 from calibration.camera_result import camera_result
 from calibration.camera_verdict import judge_camera
+from calibration.chessboard import Chessboard
 from calibration.kinds import load_result
 from calibration.result_file import write_result
 from cdpr.errors import BadInput

@@ -85,7 +85,7 @@ def crooked(tags: tuple[Tag, ...], survey: float, rng: np.random.Generator) -> t
 @pytest.mark.parametrize("survey", [0.5e-3, 2e-3])
 def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) -> None:
     truth, camera, inside, errors, stated = elsewhere(rig), rig.cameras[0], [], [], []
-    for seed in range(40):
+    for seed in range(25):
         rng = np.random.default_rng(seed)
         tags = crooked(rig.frame_tags, survey, rng)
         poses = {str(k): truth.inverse() for k in range(3)}
@@ -226,6 +226,9 @@ def test_mirrored_pictures_and_other_tags_are_told(rig: Rig, pictures) -> None:
         sights_of([(name, image)], rig, camera, [411, 412])
     assert "shows tag36h11" in caught.value.why
     assert "401" in caught.value.why
+    with pytest.raises(BadInput, match="none of the tag25h9 tags 401") as caught:
+        sights_of([(name, image)], replace(rig, tag_family="tag25h9"), camera, numbers(rig))
+    assert "shows tag36h11 301" in caught.value.why
 
 
 def test_a_number_that_is_seen_twice_is_left_out_by_name(rig: Rig, pictures) -> None:

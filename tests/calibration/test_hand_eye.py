@@ -11,6 +11,7 @@ import pytest
 from calibration.extrinsics import judge_extrinsics
 from calibration.hand_eye import locate_by_motion
 from calibration.pose_file import read_poses
+from calibration.tag_sights import TagSights
 from cdpr.errors import BadInput, InvalidFile
 from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from cdpr.rig import Camera, Rig, load_rig
@@ -90,6 +91,15 @@ def test_a_pose_that_was_written_wrongly_counts_little(rig: Rig) -> None:
     told["3.png"] = Pose(told["3.png"].position + np.array([0.05, 0, 0]), told["3.png"].rotation)
     found = locate_by_motion(rig, unaware(rig.cameras[0]), sights, told)
     assert found.world_from_camera.distance_to(rig.cameras[0].world_from_camera) < 2e-3
+
+
+def test_poses_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
+    sights, told = session(rig, 10, 0.1, 1e-4, seed=7)
+    first = next(iter(sights.squares))
+    alike = TagSights(dict.fromkeys(told, sights.squares[first]), {})
+    found = locate_by_motion(rig, rig.cameras[0], alike, dict.fromkeys(told, told[first]))
+    verdict = judge_extrinsics(found, 1.0)
+    assert any("all poses lie within 0 mm" in reason for reason in verdict.reasons)
 
 
 def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> None:

@@ -11,10 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards import Board, Charuco, Chessboard, TagGrid
+from calibration.board import Board
+from calibration.charuco import Charuco
+from calibration.chessboard import Chessboard
 from calibration.pdf import pdf_of
 from calibration.prints import board_print, tag_print
 from calibration.sheets import MARGIN_MM, PAPERS, sheet_of, sheets_of
+from calibration.tag_grid import TagGrid
 from cdpr.errors import BadInput
 from tests.calibration.pages import drawn, pages_in
 from tracking.detector import TagDetector

@@ -188,6 +188,17 @@ def test_a_picture_of_another_tag_is_left_out_by_name(rig: Rig) -> None:
     assert gaps(found, rig.platform_tags)[0] < 0.08
 
 
+def test_pictures_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
+    rng = np.random.default_rng(9)
+    base = next(iter(around(rig, 1, rng).values()))
+    poses = {f"{k}.png": moved(base, 0.01 * rng.standard_normal(6)) for k in range(20)}
+    camera = rig.cameras[0]
+    sights = sights_at(camera, rig.platform_tags, poses, 0.02, rng)
+    verdict = judge_layout(measure_layout(rig, camera, sights), 1.0)
+    assert any("all pictures are taken from within" in reason for reason in verdict.reasons)
+    assert "take pictures from all sides, not alike" in verdict.next_steps
+
+
 def test_too_few_pictures_and_tags_are_refused(rig: Rig) -> None:
     with pytest.raises(BadInput, match="pictures show two tags of the platform or more; 4 are"):
         measure_layout(rig, rig.cameras[0], session(rig, rig.platform_tags, 3, seed=7))

@@ -1,0 +1,90 @@
+"""Photographs that we did not render, in the formats, sizes and turns that people have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.camera import CameraCalibration, calibrate_camera
+from calibration.camera_verdict import judge_camera
+from calibration.charuco import Charuco
+from calibration.chessboard import Chessboard
+from drivers.picture_folder import OneCamerasPictures, read_picture
+from tests.calibration.exif import turned_by_exif
+from tracking.detector import TagDetector
+
+FOLDER = Path(__file__).parent / "photographs"
+BOARD = Chessboard(9, 6, 0.025)
+
+
+def chessboards() -> list[Path]:
+    return sorted(FOLDER.glob("left*.jpg"))
+
+
+@pytest.fixture(scope="module")
+def found() -> CameraCalibration:
+    return calibrate_camera([(p.name, read_picture(p)) for p in chessboards()], BOARD)
+
+
+def test_a_real_camera_is_calibrated_from_thirteen_photographs(found: CameraCalibration) -> None:
+    """Against OpenCV's own fit to its own corners, which must lie within our intervals."""
+    corners = []
+    for path in chessboards():
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        good, seen = cv2.findChessboardCorners(image, (9, 6))
+        assert good
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
+        corners.append(cv2.cornerSubPix(image, seen, (5, 5), (-1, -1), stop))
+    points = [BOARD.points().astype(np.float32)] * len(corners)
+    _, matrix, lens, _, _ = cv2.calibrateCamera(points, corners, (640, 480), None, None)
+    peer = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(lens)]
+    assert len(found.views) == 13
+    assert found.error < 0.3
+    for (name, interval), value in zip(found.intervals.items(), peer, strict=True):
+        assert abs(interval.value - value) < 2.0 * interval.half_width, name
+    assert found.matrix[0, 0] == pytest.approx(533.0, abs=3.0)
+
+
+def test_thirteen_photographs_with_a_small_error_are_not_said_to_be_good(found) -> None:
+    verdict = judge_camera(found, 1e-3).verdict
+    assert not verdict.good
+    assert "take more pictures: 40 are good" in verdict.next_steps
+
+
+def test_turned_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
+    """JPEG turned by EXIF, and PNG in colour."""
+    grey = read_picture(chessboards()[0])
+    (tmp_path / "a.jpg").write_bytes(turned_by_exif(grey))
+    cv2.imwrite(str(tmp_path / "b.png"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    expected = BOARD.find(grey).corners
+    for name, image in OneCamerasPictures(tmp_path):
+        assert image.shape == (480, 640), name
+        assert np.abs(BOARD.find(image).corners - expected).max() < 0.3, name
+
+
+def test_corners_are_found_in_twelve_megapixels() -> None:
+    grey = read_picture(chessboards()[1])
+    large = cv2.resize(grey, (4032, 3024), interpolation=cv2.INTER_CUBIC)
+    gaps = (BOARD.find(large).corners + 0.5) / 6.3 - 0.5 - BOARD.find(grey).corners
+    assert np.sqrt(np.mean(gaps**2)) < 0.15
+    assert np.abs(gaps).max() < 0.5
+
+
+def test_a_charuco_board_in_a_colour_photograph_is_flat() -> None:
+    image = read_picture(FOLDER / "charuco.jpg")
+    seen = Charuco(5, 7, 0.04, 0.02, "6X6_250").find(image)
+    assert seen is not None
+    assert len(seen.points) == 24
+    flat = seen.points[:, :2].astype(np.float32)
+    turn, _ = cv2.findHomography(flat, seen.corners.astype(np.float32))
+    there = cv2.perspectiveTransform(flat.reshape(-1, 1, 2), turn).reshape(-1, 2)
+    assert np.sqrt(np.mean(np.sum((there - seen.corners) ** 2, axis=1))) < 0.4
+
+
+def test_markers_in_a_colour_photograph_are_found() -> None:
+    image = read_picture(FOLDER / "markers.jpg")
+    assert [d.id for d in TagDetector("6X6_250").detect(image)] == [23, 40, 62, 98, 124, 203]
+    assert TagDetector("tag36h11").detect(image) == []
