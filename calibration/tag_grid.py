@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from calibration.board import LEAST_POINTS, Seen, require_board
-from cdpr.poses import Array, Pose
-from cdpr.rig import Camera
+from calibration.plain_camera import plain_camera
+from cdpr.poses import Array
 from cdpr.tag_families import FAMILIES
 from tracking.detector import TagDetector
 from tracking.edges import refine
@@ -70,7 +70,8 @@ class TagGrid:
         counts = Counter(d.id for d in detected)
         detected = [d for d in detected if counts[d.id] == 1]
         rough = np.array([d.corners for d in detected]).reshape(-1, 4, 2)
-        lens = _plain_camera(image)  # an edge is short: its bend by the lens does not count
+        # An edge is short: its bend by the lens does not count.
+        lens = plain_camera((image.shape[1], image.shape[0]))
         squares = refine(image, lens, rough, modules_across(self.family))
         whole = [(d.id, s) for d, s in zip(detected, squares, strict=True) if s and s.whole]
         if 4 * len(whole) < LEAST_POINTS:
@@ -93,9 +94,3 @@ class TagGrid:
     @cached_property
     def _detector(self) -> TagDetector:
         return TagDetector(self.family)
-
-
-def _plain_camera(image: Image) -> Camera:
-    height, width = image.shape
-    matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
-    return Camera("plain", width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 1.0)

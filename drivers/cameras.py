@@ -187,6 +187,16 @@ def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
         )
 
 
+def video_size(path: Path) -> tuple[int, int]:
+    """Width and height of a video's pictures, [px]; nought of a file that is none."""
+    capture = _opened(str(path))
+    try:
+        width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+        return int(capture.get(width)), int(capture.get(height))
+    finally:
+        capture.release()
+
+
 def _opened(source: int | str) -> cv2.VideoCapture:
     """Opens quietly: what OpenCV and FFmpeg print about it, our own message says better."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 def camera(
     folder: Annotated[
-        Path, typer.Argument(help="folder with pictures of the board", metavar="DIR")
+        Path, typer.Argument(help="folder of pictures of the board, or for --live", metavar="DIR")
     ],
     columns: ColumnsOption,
     rows: RowsOption,
@@ -44,6 +44,17 @@ def camera(
     gap_mm: GapOption = None,
     family: FamilyOption = "tag36h11",
     first: FirstOption = 0,
+    live: Annotated[
+        str | None,
+        typer.Option(help="take the pictures with this camera (or of a video) into DIR first"),
+    ] = None,
+    pictures: Annotated[
+        int | None, typer.Option(min=4, help="with --live: how many at least (default: 40)")
+    ] = None,
+    size_px: Annotated[
+        tuple[int, int] | None,
+        typer.Option(help="with --live: width and height (default: 1280 720)"),
+    ] = None,
     name: Annotated[str, typer.Option(help="of the camera in the rig file")] = "camera",
     wanted_mm: WantedOption = 1.0,
     distance_m: Annotated[
@@ -64,6 +75,8 @@ def camera(
 
       cdpr calibrate camera pictures/ --board charuco --columns 7 --rows 5 --square-mm 30
       --marker-mm 22 --dictionary 4X4_50
+
+      cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
     """
     from datetime import UTC, datetime
 
@@ -72,21 +85,32 @@ def camera(
     from calibration.camera_result import camera_result
     from calibration.camera_verdict import judge_camera
     from calibration.result_file import require_file_name
+    from cdpr.cli.calibrate_live import take_pictures
     from cdpr.cli.calibration_output import finish
     from cdpr.cli.output import progress_bar
     from cdpr.cli.picture_sources import Pictures, told
     from cdpr.cli.workers import make_folder
+    from cdpr.errors import BadInput
     from drivers.picture_folder import OneCamerasPictures
 
     require_file_name(name, "--name")
     sizes = {"square": square_mm, "marker": marker_mm, "tag": tag_mm, "gap": gap_mm}
     the_board = board_of(board, columns, rows, sizes, dictionary, legacy, family, first)
-    images = OneCamerasPictures(folder)
-    pictures = Pictures(images, len(images.names), images.unused)
+    if live is None and (pictures is not None or size_px is not None):
+        raise BadInput(
+            "--pictures and --size-px are for taking pictures",
+            where="calibrate camera",
+            next_step="pass --live CAMERA too, or leave them out: a folder's pictures are all used",
+        )
     if output is not None:
         make_folder(output, force)
-    with progress_bar("looking for the board", pictures.count, not as_json) as advance:
-        result = calibrate_camera(told(pictures, advance), the_board, pictures.unused)
+    if live is not None:
+        make_folder(folder, force)
+        take_pictures(live, folder, the_board, pictures or 40, size_px or (1280, 720))
+    images = OneCamerasPictures(folder)
+    source = Pictures(images, len(images.names), images.unused)
+    with progress_bar("looking for the board", source.count, not as_json) as advance:
+        result = calibrate_camera(told(source, advance), the_board, source.unused)
     quality = judge_camera(result, wanted_mm / 1000.0, distance_m)
     document = camera_result(result, quality, name, datetime.now(UTC).date())
     page = camera_page(result, quality, name, document.date)

@@ -1,0 +1,123 @@
+"""Which pictures a live camera takes, and what the person with the board is told."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.board import Seen
+from calibration.capture import CaptureGuide
+from calibration.chessboard import Chessboard
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+
+SIZE = (1280, 720)
+POINTS = Chessboard(9, 6, 0.025).points()
+MATRIX = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 360.0], [0.0, 0.0, 1.0]])
+BLANK = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+
+
+class Shown:
+    """A board that is where a test holds it."""
+
+    def __init__(self) -> None:
+        self.pose: Pose | None = None
+
+    def find(self, image: np.ndarray) -> Seen | None:
+        if self.pose is None:
+            return None
+        zero = np.zeros(3)
+        points = self.pose.apply(POINTS)
+        corners = cv2.projectPoints(points, zero, zero, MATRIX, np.zeros(5))[0].reshape(-1, 2)
+        return Seen(POINTS, corners)
+
+    def instead(self, image: np.ndarray) -> str:
+        return ""
+
+
+def held(x: float, y: float, turn: Array | list[float] = (0.0, 0.0, 0.0), z: float = 0.6) -> Pose:
+    """A board whose middle is at a place before the camera, [m], turned about its middle."""
+    rotation = matrix_from_rotation_vector(turn)
+    return Pose(np.array([x, y, z]) - rotation @ POINTS.mean(axis=0), rotation)
+
+
+@pytest.fixture
+def shown() -> Shown:
+    return Shown()
+
+
+def show(guide: CaptureGuide, board: Shown, pose: Pose | None, times: int = 2):
+    board.pose = pose
+    advice = [guide.look(BLANK) for _ in range(times)]
+    return advice[-1]
+
+
+def test_a_picture_is_taken_when_the_board_stands_still_and_shows_something_new(shown) -> None:
+    guide = CaptureGuide(shown, wanted=10)
+    assert guide.look(BLANK).text == "0 of 10 pictures: show the board"
+    shown.pose = held(0.0, 0.0)
+    moving = guide.look(BLANK)
+    assert not moving.taken
+    assert "hold it still" in moving.text
+    assert guide.look(BLANK).taken
+    assert not guide.look(BLANK).taken  # the same again
+    shown.pose = held(0.15, 0.0)
+    assert not guide.look(BLANK).taken  # still moving
+    assert guide.look(BLANK).taken
+    assert len(guide.views) == 2
+
+
+def test_the_part_of_the_picture_that_is_missing_is_named(shown) -> None:
+    guide = CaptureGuide(shown, wanted=4)
+    advice = show(guide, shown, held(0.0, 0.0))
+    assert "bring the board to the top left of the picture" in advice.text
+    advice = show(guide, shown, held(-0.21, -0.11))
+    assert "top left" not in advice.text
+
+
+@pytest.mark.parametrize(
+    ("turn", "edge"),
+    [
+        ([-0.5, 0.0, 0.0], "upper"),
+        ([0.5, 0.0, 0.0], "lower"),
+        ([0.0, 0.5, 0.0], "left"),
+        ([0.0, -0.5, 0.0], "right"),
+    ],
+)
+def test_tilts_are_named_by_the_edge_that_is_away(shown, turn, edge: str) -> None:
+    pose = held(0.0, 0.0, turn)
+    corners = POINTS.reshape(6, 9, 3)
+    edges = {
+        "upper": corners[0], "lower": corners[-1], "left": corners[:, 0], "right": corners[:, -1]
+    }  # fmt: skip
+    far = max(edges, key=lambda name: pose.apply(edges[name])[:, 2].mean())
+    guide = CaptureGuide(shown, wanted=4)
+    for x in (-0.21, 0.0, 0.21):
+        for y in (-0.11, 0.0, 0.11):
+            show(guide, shown, held(x, y))
+    asked = set()
+    for other in edges:
+        turns = {
+            "lower": [0.5, 0, 0],
+            "upper": [-0.5, 0, 0],
+            "left": [0, 0.5, 0],
+            "right": [0, -0.5, 0],
+        }
+        if other != far:
+            show(guide, shown, held(0.0, 0.0, turns[other]))
+    asked = guide.missing()
+    assert far == edge
+    assert asked == f"tilt the board by 20° to 40°, its {edge} edge away from the camera"
+
+
+def test_enough_is_said_when_all_parts_and_tilts_were_seen(shown) -> None:
+    guide = CaptureGuide(shown, wanted=12)
+    for x in (-0.21, 0.0, 0.21):
+        for y in (-0.11, 0.0, 0.11):
+            show(guide, shown, held(x, y))
+    for turn in ([0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0]):
+        assert not show(guide, shown, held(0.0, 0.0, turn)).done
+    last = show(guide, shown, held(0.0, 0.0, [0, -0.5, 0]))
+    assert last.done
+    assert last.text.endswith("enough")
+    assert not show(CaptureGuide(shown, wanted=99), shown, None).done

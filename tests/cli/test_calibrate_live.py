@@ -1,0 +1,76 @@
+"""`cdpr calibrate camera --live`, with a video in place of a camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from tests.calibration.board_pictures import SIZE, picture_of
+from tests.cli.program import call, nothing_written, one_message
+from tests.cli.test_calibrate_camera import BOARD, MIDDLE, chessboard_print
+
+TURNS = ([0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0], [0.3, 0.3, 0.2])
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A board that is held at nine places, two pictures each, and tilted every way."""
+    places = [(x, y) for x in (-0.11, 0.0, 0.11) for y in (-0.08, 0.0, 0.08)]
+    held = [(*place, [0.0, 0.0, 0.0]) for place in places] + [(0.0, 0.0, turn) for turn in TURNS]
+    path = tmp_path_factory.mktemp("live") / "board.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, SIZE)
+    for x, y, turn in held:
+        rotation = matrix_from_rotation_vector(turn)
+        pose = Pose(np.array([x, y, 0.5]) - rotation @ MIDDLE, rotation)
+        image = picture_of(chessboard_print(), 0.0005, np.full(2, 0.05), pose)
+        for _ in range(2):
+            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+def test_pictures_are_taken_with_advice_and_then_used(video: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "taken"
+    options = ("--live", video, "--pictures", "12", *BOARD, "--wanted-mm", "20", "--json")
+    answer = call("calibrate", "camera", folder, *options)
+    assert answer.code in (0, 3), answer
+    found = json.loads(answer.out)
+    taken = sorted(path.name for path in folder.iterdir())
+    assert 10 <= len(taken) <= 14
+    assert taken[0] == "live_001.png"
+    assert found["pictures_used"] == len(taken)
+    assert "bring the board to the top right of the picture" in answer.err
+    assert "edge away from the camera" in answer.err
+    assert "enough" in answer.err
+
+
+def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None:
+    other = ("--board", "charuco", "--columns", "5", "--rows", "4", "--square-mm", "25")
+    other += ("--marker-mm", "20")
+    answer = call("calibrate", "camera", tmp_path / "taken", "--live", video, *other)
+    one_message(answer, 2, "no picture was taken", "a ChArUco board of 5 x 4 squares")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "named"),
+    [
+        (("--live", "nowhere.avi"), 2, "neither a folder of pictures"),
+        (("--live", "97"), 4, "the camera cannot be opened"),
+        (("--pictures", "12"), 2, "are for taking pictures"),
+    ],
+)
+def test_cameras_that_are_none_are_told(tmp_path: Path, options, code: int, named: str) -> None:
+    answer = call("calibrate", "camera", tmp_path / "taken", *options, *BOARD)
+    one_message(answer, code, named)
+
+
+def test_pictures_of_before_are_not_mixed_with_new_ones(video: Path, tmp_path: Path) -> None:
+    (tmp_path / "old.png").write_bytes(b"old")
+    with nothing_written(tmp_path):
+        answer = call("calibrate", "camera", tmp_path, "--live", video, *BOARD)
+    one_message(answer, 2, "the folder is not empty")
