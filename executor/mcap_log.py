@@ -15,6 +15,7 @@ from cdpr.errors import Fault
 from cdpr.poses import Array
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
+from executor.fused_table import FusedTable
 from executor.mcap_scene import robot_messages, scene_messages
 from executor.mcap_schemas import CHANNELS
 from executor.mcap_values import WORLD, Message, nanoseconds, pose_value, stamp_of
@@ -31,6 +32,7 @@ def write_mcap(
     cycles: CycleTable,
     poses: PoseTable,
     clearance: ClearanceTable,
+    fused: FusedTable,
 ) -> Path:
     """Writes ``run.mcap``; times in it are the start of the run plus run time.
 
@@ -40,6 +42,7 @@ def write_mcap(
         cycles: Every cycle is logged.
         poses: Every picture's pose, or why there is none.
         clearance: Every row.
+        fused: Every row.
 
     Raises:
         Fault: The disk is full or gone; no part of the file is left.
@@ -51,6 +54,7 @@ def write_mcap(
         *_cycles(cycles, start),
         *_tags(poses, start),
         *_clearance(clearance),
+        *_poses_of("/fused_pose", fused.time, fused.position, fused.rotation, start),
         *_events(context, start),
         *_pictures(folder, poses, start),
     ]

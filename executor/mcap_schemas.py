@@ -108,6 +108,7 @@ CHANNELS: dict[str, tuple[str, Schema]] = {
     "/planned_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
     "/encoder_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
     "/tag_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
+    "/fused_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
     "/tag_status": ("cdpr.TagStatus", TAG_STATUS),
     "/drives": ("cdpr.Drives", DRIVES),
     "/clearance": ("cdpr.Clearance", CLEARANCE),

@@ -12,6 +12,7 @@ from cdpr.poses import Array, Pose
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
 from executor.execution import Outcome
+from executor.fused_table import fused_table
 from executor.mcap_log import write_mcap
 from executor.measured import ClearanceRow, clearance_table, encoder_rows
 from executor.observer import Look
@@ -47,6 +48,8 @@ def conclude(
     folder.write_cycles(cycles)
     folder.write_poses(poses)
     folder.write_clearance(clearance)
+    together = fused_table(cycles, poses)
+    folder.write_fused(together)
     context = RunContext(
         plan=prepared.plan.plan,
         rig=prepared.rig,
@@ -62,7 +65,7 @@ def conclude(
     )
     summary = summarize(context, cycles, poses, clearance)
     folder.write_summary(summary)
-    write_mcap(folder, context, cycles, poses, clearance)
+    write_mcap(folder, context, cycles, poses, clearance, together)
     build_report(folder)
     return summary
 

@@ -21,10 +21,12 @@ from cdpr.rig import Rig, rig_from_document
 from cdpr.rig_file import RigDocument
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
+from executor.fused_table import FusedTable
 from executor.pose_table import PoseTable
 
 PLAN, RIG, SUMMARY, EVENTS = "plan.json", "rig.json", "summary.json", "events.jsonl"
 CYCLES, POSES, CLEARANCE = "cycles.csv", "poses.csv", "clearance.csv"
+FUSED = "fused.csv"
 MCAP, REPORT, PICTURES = "run.mcap", "report.html", "pictures"
 NEEDED = (PLAN, RIG, CYCLES, POSES, CLEARANCE, SUMMARY, EVENTS)
 JPEG_QUALITY = 88
@@ -205,6 +207,10 @@ class RunFolder:
     def clearance(self) -> ClearanceTable:
         """Reads ``clearance.csv``."""
         return ClearanceTable.read_csv(self.path / CLEARANCE)
+
+    def write_fused(self, table: FusedTable) -> None:
+        """Writes ``fused.csv``."""
+        table.write_csv(self.path / FUSED)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Writes ``summary.json`` (see `executor.summary`)."""

@@ -21,6 +21,7 @@ from cdpr.scene import Scene, load_scene
 from cdpr.statics.working import working_tensions
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
+from executor.fused_table import fused_table
 from executor.mcap_log import write_mcap
 from executor.pose_table import PoseTable
 from executor.run_folder import RunEvent, RunFolder
@@ -75,7 +76,9 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
     for event in run.context.events:
         folder.append_event(event)
     folder.write_summary(run.summary)
-    write_mcap(folder, run.context, run.cycles, poses, run.clearance)
+    write_mcap(
+        folder, run.context, run.cycles, poses, run.clearance, fused_table(run.cycles, poses)
+    )
     return folder
 
 

@@ -13,6 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 from cdpr.errors import Fault
+from executor.fused_table import fused_table
 from executor.mcap_log import write_mcap
 from executor.mcap_schemas import CHANNELS
 from executor.run_folder import RunFolder
@@ -50,6 +51,7 @@ def test_no_row_is_lost(run: fake_run.FakeRun, folder: RunFolder, messages: Mess
         "/encoder_pose": cycles,
         "/drives": cycles,
         "/tag_pose": seen,
+        "/fused_pose": len(fused_table(run.cycles, poses)),
         "/tag_status": len(poses),
         "/clearance": len(run.clearance),
         "/events": len(run.context.events),
@@ -145,5 +147,12 @@ def test_a_full_disk_leaves_no_broken_log(
 
     monkeypatch.setattr("mcap.writer.Writer.add_message", full)
     with pytest.raises(Fault, match="log cannot be written"):
-        write_mcap(folder, run.context, run.cycles, run.poses, run.clearance)
+        write_mcap(
+            folder,
+            run.context,
+            run.cycles,
+            run.poses,
+            run.clearance,
+            fused_table(run.cycles, run.poses),
+        )
     assert not folder.mcap.exists()

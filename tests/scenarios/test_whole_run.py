@@ -69,6 +69,7 @@ def test_every_file_of_the_run_folder_is_there_and_no_other(folder: RunFolder) -
         "pictures",
         "plan.json",
         "poses.csv",
+        "fused.csv",
         "report.html",
         "rig.json",
         "run.mcap",
@@ -170,12 +171,27 @@ def test_measured_clearance_is_not_below_the_plan_by_more_than_its_uncertainty(
 
 
 def test_tables_have_a_value_in_every_column_of_every_row(folder: RunFolder) -> None:
-    for name in ("cycles.csv", "poses.csv", "clearance.csv"):
+    for name in ("cycles.csv", "poses.csv", "clearance.csv", "fused.csv"):
         with (folder.path / name).open(newline="") as file:
             header, *rows = list(csv.reader(file))
         assert rows
         assert all(len(row) == len(header) for row in rows)
         assert len(set(header)) == len(header)
+
+
+def fused_rows(folder: RunFolder) -> Any:
+    return np.genfromtxt(folder.path / "fused.csv", delimiter=",", names=True)
+
+
+def test_drives_and_camera_together_tell_a_pose_every_cycle(folder: RunFolder) -> None:
+    rows, cycles, poses = fused_rows(folder), folder.cycles(), folder.poses()
+    first = poses.time[poses.ok][0]
+    assert first <= rows["time_s"][0] <= first + 0.011
+    assert rows["time_s"][-1] == pytest.approx(cycles.time[-1])
+    place = np.column_stack([rows[f"{axis}_mm"] for axis in "xyz"])
+    planned = cycles.planned[-len(rows) :] * 1e3
+    assert np.linalg.norm(place - planned, axis=1).max() < 1.0
+    assert rows["age_s"].max() < 0.5
 
 
 def test_the_mcap_file_holds_as_much_as_the_tables(folder: RunFolder) -> None:
@@ -190,6 +206,7 @@ def test_the_mcap_file_holds_as_much_as_the_tables(folder: RunFolder) -> None:
                 json.loads(message.data)
     assert counts["/drives"] == len(folder.cycles())
     assert counts["/tag_pose"] == int(folder.poses().ok.sum())
+    assert counts["/fused_pose"] == len(fused_rows(folder))
     assert counts["/clearance"] == len(folder.clearance())
     assert counts["/events"] == len(folder.events())
     assert counts["/pictures"] == sum(1 for name in folder.poses().picture if name)
