@@ -239,7 +239,7 @@ def _drives(channel: str, plan: Path, folder: Path) -> Iterator[Rig]:
     bus = ("--interface", "socketcan", "--channel", channel)
     drives = Program(folder / "drives.txt", ("sim", RIG, *bus, "--plan", plan))
     started: list[Program] = []
-    try:
+    with stopped_programs([drives]), stopped_programs(started):
         with open_bus(BusSettings("socketcan", channel)) as ear:
             greeting = ear.recv(LISTENS_FOR_S)  # the boot-up message of the first drive
             assert greeting is not None, drives.said.read_text()
@@ -247,8 +247,15 @@ def _drives(channel: str, plan: Path, folder: Path) -> Iterator[Rig]:
         assert drives.is_running, drives.said.read_text()
         drives.send(signal.SIGINT)
         assert drives.ended() == 0, drives.said.read_text()
+
+
+@contextmanager
+def stopped_programs(started: list[Program]) -> Iterator[None]:
+    """Whatever is in the list ends with the block."""
+    try:
+        yield
     finally:
-        for program in (*started, drives):
+        for program in started:
             program.close()
 
 

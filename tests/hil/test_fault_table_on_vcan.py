@@ -20,7 +20,6 @@ from tests.scenarios.faults.masters import ForkedMasters
 
 BLUR_S = 0.010  # executor and drives share one slow processor
 SOON = (
-    "F5 one set-point lost",
     "F5 three set-points lost",
     "F6 20 % of SYNC lost",
     "F7 a drive falls silent",
