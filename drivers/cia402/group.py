@@ -10,7 +10,6 @@ import numpy as np
 from cdpr.errors import HardwareMissing, Refused
 from cdpr.rig import Rig
 from drivers.bus import hears_itself
-from drivers.bus_faults import BusFault
 from drivers.bus_load import TESTED_HZ, check_bus_load, heartbeat_cycles
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.cyclic import CyclicFrames
@@ -19,8 +18,8 @@ from drivers.cia402.sequence import Goal, next_words
 from drivers.cia402.states import FAULTED, TORQUE_ON, ControlWord, DriveState
 from drivers.cia402.watch import DriveWatch
 from drivers.cyclic_bus import CyclicBus
+from drivers.cyclic_group import CyclicGroup
 from drivers.drive_group import (
-    WHOLE_BUS,
     Capabilities,
     Counts,
     CycleStatus,
@@ -49,23 +48,21 @@ FIRST_READING_TIMEOUT = 0.1
 _WITHOUT_TORQUE = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)
 
 
-class Cia402Group:
+class Cia402Group(CyclicGroup):
     """CiA 402 drives in cyclic synchronous position mode; see `drivers.drive_group.DriveGroup`."""
 
     def __init__(
         self, rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None
     ) -> None:
         """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
+        super().__init__(rig, bus, pump)
         check_bus_load(rig)
-        self._rig, self._bus, self._pump = rig, bus, pump
-        self._nodes = tuple(winch.node_id for winch in rig.winches)
         self._signs = winding_signs(rig)
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
         self._max_tension = max_tension
         self._max_steps = largest_steps(rig, cycle)
-        self._state = GroupState.OFFLINE
         self._restarted: tuple[int, ...] = ()
         self._reset_memory()
 
@@ -80,7 +77,7 @@ class Cia402Group:
         self._released = [False] * count
         self._targets = [0] * count
         self._demands = [0] * count
-        self._faults: list[tuple[int, str]] = []
+        self._faults = []
         self._cycle = 0
         self._cycles_to_goal = 0
         self._known = False
@@ -98,9 +95,8 @@ class Cia402Group:
         )
 
     @property
-    def state(self) -> GroupState:
-        """Where the group stands."""
-        return self._state
+    def _heard(self) -> DriveWatch:
+        return self._watch
 
     @property
     def restarted(self) -> tuple[int, ...]:
@@ -121,12 +117,7 @@ class Cia402Group:
         self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
     ) -> tuple[str, ...]:
         """Sets every drive up and reads every setting back; see `DriveGroup.configure`."""
-        if self._state in (GroupState.ENABLING, GroupState.ENABLED):
-            raise Refused(
-                "the drives are enabled; they cannot be set up now",
-                where="configuring the drives",
-                next_step="stop them first",
-            )
+        self._refuse_enabled()
         self._state = GroupState.OFFLINE
         self._reset_memory()
 
@@ -173,11 +164,7 @@ class Cia402Group:
     def send_cycle(self, targets: Sequence[int]) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
-        try:
-            self._cyclic.discard_stale(self._watch)
-        except BusFault as fault:
-            self._latch_bus(fault)
-            raise
+        self._discard_stale()
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._released)
         self._demands = self._targets if self._known else list(self._watch.positions)
@@ -192,23 +179,6 @@ class Cia402Group:
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
             self._cyclic.send((self._frames.heartbeat,))
-
-    def receive(self, timeout_s: float) -> CycleStatus:
-        """Takes the replies of this cycle; see `DriveGroup.receive`."""
-        self._online()
-        if self._pump is not None:
-            self._pump()
-            timeout_s = 0.0
-        try:
-            self._cyclic.take_replies(self._watch, timeout_s)
-            self._cyclic.end_cycle()
-        except BusFault as fault:
-            self._latch_bus(fault)
-            raise
-        self._watch.end_cycle()
-        self._look_for_faults()
-        self._advance()
-        return self._status()
 
     def command(self, command: GroupCommand) -> None:
         """Sets where the group goes; see `DriveGroup.command`."""
@@ -226,18 +196,6 @@ class Cia402Group:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
         self._stop()  # first: whatever the bus does now, no later cycle enables the drives again
         self._send((ControlWord.QUICK_STOP,) * len(self._nodes))
-
-    def close(self) -> None:
-        """Lets go of the bus without sending anything."""
-        self._state = GroupState.OFFLINE
-
-    def _online(self) -> None:
-        if self._state is GroupState.OFFLINE:
-            raise Refused(
-                "the drives are not set up",
-                where="drive group",
-                next_step="call configure() first",
-            )
 
     def _send(self, words: tuple[ControlWord, ...]) -> None:
         """One cycle's frames; what was asked for is remembered even if the bus fails."""
@@ -264,10 +222,6 @@ class Cia402Group:
         found += self._watch.state_faults(powered=powered)
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
-
-    def _latch_bus(self, fault: BusFault) -> None:
-        """A bus that fails stops the group for good, whatever the caller does with the error."""
-        self._latch([(WHOLE_BUS, fault.what)])
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:
@@ -344,16 +298,6 @@ class Cia402Group:
         self._goal, self._cycles_to_goal = Goal.RELEASE, 0
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
-
-    def _refuse_latched(self, wish: str) -> None:
-        if self._state is not GroupState.FAULT:
-            return
-        raise Refused(
-            f"cannot {wish}: a fault is latched",
-            where="drive group",
-            why="; ".join(text for _, text in self._faults),
-            next_step="find the cause, then reset the fault",
-        )
 
     def _reset_fault(self) -> None:
         """Clears the latch; a drive in fault is reset only when no other holds the platform."""

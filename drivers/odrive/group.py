@@ -20,11 +20,10 @@ from cdpr.drives_file import OdriveDocument
 from cdpr.errors import HardwareMissing, Refused
 from cdpr.rig import Rig
 from drivers.bus import hears_itself
-from drivers.bus_faults import BusFault
 from drivers.bus_load import TESTED_HZ, check_bus_load
 from drivers.cyclic_bus import CyclicBus
+from drivers.cyclic_group import CyclicGroup
 from drivers.drive_group import (
-    WHOLE_BUS,
     Capabilities,
     Counts,
     CycleStatus,
@@ -64,7 +63,7 @@ class _Stop(Enum):
     OVER = auto()
 
 
-class OdriveGroup:
+class OdriveGroup(CyclicGroup):
     """ODrives in position control; see `drivers.drive_group.DriveGroup`."""
 
     def __init__(
@@ -74,10 +73,10 @@ class OdriveGroup:
         document = rig.document.drives
         if not isinstance(document, OdriveDocument):
             raise TypeError("the rig has no ODrives")
+        super().__init__(rig, bus, pump)
         check_bus_load(rig)
-        self._rig, self._document, self._bus, self._pump = rig, document, bus, pump
+        self._document = document
         self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
-        self._nodes = tuple(winch.node_id for winch in rig.winches)
         self._frames = OdriveFrames(rig, self._layouts)
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
@@ -85,7 +84,6 @@ class OdriveGroup:
         self._max_tension = rig.max_tension if max_tension is None else max_tension
         self._max_steps = largest_steps(rig, cycle)
         self._per_mille = winding_signs(rig) * 1000.0 / [w.rated_torque for w in rig.winches]
-        self._state = GroupState.OFFLINE
         self._reset_memory()
 
     def _reset_memory(self) -> None:
@@ -99,7 +97,7 @@ class OdriveGroup:
         self._releasing = False
         self._all_hold = False  # the stop under way found all drives enabled
         self._resetting = 0
-        self._faults: list[tuple[int, str]] = []
+        self._faults = []
 
     @property
     def capabilities(self) -> Capabilities:
@@ -114,9 +112,8 @@ class OdriveGroup:
         )
 
     @property
-    def state(self) -> GroupState:
-        """Where the group stands."""
-        return self._state
+    def _heard(self) -> OdriveWatch:
+        return self._watch
 
     @property
     def restarted(self) -> tuple[int, ...]:
@@ -137,12 +134,7 @@ class OdriveGroup:
         self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
     ) -> tuple[str, ...]:
         """Sets every drive up; see `DriveGroup.configure`."""
-        if self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping:
-            raise Refused(
-                "the drives are enabled; they cannot be set up now",
-                where="configuring the drives",
-                next_step="stop them first",
-            )
+        self._refuse_enabled()
         self._state = GroupState.OFFLINE
         self._reset_memory()
         if on_restarted is not None:
@@ -187,11 +179,7 @@ class OdriveGroup:
     def send_cycle(self, targets: Sequence[int]) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
-        try:
-            self._cyclic.discard_stale(self._watch)
-        except BusFault as fault:
-            self._latch_bus(fault)
-            raise
+        self._discard_stale()
         self._watch.begin_cycle()
         before = self._last()
         if self._state is GroupState.ENABLED:
@@ -210,23 +198,6 @@ class OdriveGroup:
         if self._state is GroupState.ENABLING and self._waited == 1:
             self._cyclic.send(self._frames.axis_states(AxisState.CLOSED_LOOP_CONTROL))
 
-    def receive(self, timeout_s: float) -> CycleStatus:
-        """Takes what the drives tell in this cycle; see `DriveGroup.receive`."""
-        self._online()
-        if self._pump is not None:
-            self._pump()
-            timeout_s = 0.0
-        try:
-            self._cyclic.take_replies(self._watch, timeout_s)
-            self._cyclic.end_cycle()
-        except BusFault as fault:
-            self._latch_bus(fault)
-            raise
-        self._watch.end_cycle()
-        self._look_for_faults()
-        self._advance()
-        return self._status()
-
     def command(self, command: GroupCommand) -> None:
         """Sets where the group goes; see `DriveGroup.command`."""
         self._online()
@@ -234,7 +205,10 @@ class OdriveGroup:
             self._begin_enabling()
         elif command is GroupCommand.RESET_FAULT:
             self._reset_fault()
-        else:  # every stop of ODrives ends with closed brakes and without torque
+        else:
+            if command is GroupCommand.RELEASE:
+                self._refuse_latched("release the drives")
+            # Every stop of ODrives ends with closed brakes and without torque.
             self._begin_stop(GroupState.QUICK_STOP)
             self._releasing = command is GroupCommand.RELEASE
 
@@ -243,18 +217,6 @@ class OdriveGroup:
         self._begin_stop(GroupState.QUICK_STOP)
         if self._stop is _Stop.HOLDING:
             self._cyclic.send(self._frames.set_points(self._last(), self._last()))
-
-    def close(self) -> None:
-        """Lets go of the bus without sending anything."""
-        self._state = GroupState.OFFLINE
-
-    def _online(self) -> None:
-        if self._state is GroupState.OFFLINE:
-            raise Refused(
-                "the drives are not set up",
-                where="drive group",
-                next_step="call configure() first",
-            )
 
     def _last(self) -> list[int]:
         return self._recent[-1] if self._recent else list(self._watch.positions)
@@ -267,10 +229,6 @@ class OdriveGroup:
         enabled = self._state is GroupState.ENABLED or (holding and self._all_hold)
         powered = enabled or holding or self._state is GroupState.ENABLING
         self._latch(self._watch.faults(powered=powered, enabled=enabled))
-
-    def _latch_bus(self, fault: BusFault) -> None:
-        """A bus that fails stops the group for good, whatever the caller does with the error."""
-        self._latch([(WHOLE_BUS, fault.what)])
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         self._faults += [fault for fault in found if fault not in self._faults]
@@ -346,13 +304,7 @@ class OdriveGroup:
     def _begin_enabling(self) -> None:
         if self._state is GroupState.ENABLED:
             return
-        if self._state is GroupState.FAULT:
-            raise Refused(
-                "cannot enable the drives: a fault is latched",
-                where="drive group",
-                why="; ".join(text for _, text in self._faults),
-                next_step="find the cause, then reset the fault",
-            )
+        self._refuse_latched("enable the drives")
         if self.stopping:
             raise Refused("cannot enable the drives: they are being stopped", where="drive group")
         self._cyclic.forget_waiting()  # the drives went on telling while nobody listened
