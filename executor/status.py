@@ -15,6 +15,7 @@ that move without a path (`cdpr home`, `cdpr jog --cable`) have no ``path_mm`` a
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
@@ -130,58 +131,77 @@ def wished(board: WishBoard) -> dict[str, Any]:
     return {"wished": {"stop": wishes.stop, "hold": wishes.hold, "speed_percent": speed}}
 
 
-class RunStatus:
+class MotionStatus(ABC):
     """Takes in what happens; tells it to whoever asks, from any thread."""
+
+    def __init__(self, rig: Rig, board: WishBoard, *, simulated_time: bool) -> None:
+        """A motion that is being prepared."""
+        self._rig, self._board = rig, board
+        self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
+        self.folder: Path | None = None
+        """Where it is on record, if anywhere."""
+
+    def take_end(self, state: State, cause: str) -> None:
+        """The motion is over."""
+        self._cycles.take_end(state, cause)
+
+    def as_dict(self) -> dict[str, Any]:
+        """See the head of this file."""
+        return {
+            **whose(self._rig, self.folder),
+            **self._cycles.as_dict(),
+            **self._place(),
+            **wished(self._board),
+            "events": self._told(),
+        }
+
+    @abstractmethod
+    def _place(self) -> dict[str, Any]:
+        """How far the motion is."""
+
+    @abstractmethod
+    def _told(self) -> list[dict[str, Any]]:
+        """The newest events."""
+
+
+class RunStatus(MotionStatus):
+    """Of a run along a path."""
 
     def __init__(
         self, prepared: PreparedRun, folder: Path, board: WishBoard, *, simulated_time: bool
     ) -> None:
         """A run that is being prepared."""
-        self._prepared, self._folder, self._board = prepared, folder, board
-        self._cycles = CyclesSoFar(prepared.rig, simulated_time=simulated_time)
+        super().__init__(prepared.rig, board, simulated_time=simulated_time)
+        self._prepared, self.folder = prepared, folder
         self._events: deque[RunEvent] = deque(maxlen=EVENTS_TOLD)
 
     def take_cycle(self, record: CycleRecord) -> None:
         """A cycle is over."""
         self._cycles.take(record)
 
-    def take_end(self, state: State, cause: str) -> None:
-        """The motion is over."""
-        self._cycles.take_end(state, cause)
-
     def take_event(self, event: RunEvent) -> None:
         """Something happened."""
         self._events.append(event)
 
-    def as_dict(self) -> dict[str, Any]:
-        """See the head of this file."""
-        return {
-            **whose(self._prepared.rig, self._folder),
-            **self._cycles.as_dict(),
-            **self._place(self._cycles.last),
-            **wished(self._board),
-            "events": [asdict(event) for event in list(self._events)],
-        }
-
-    def _place(self, record: CycleRecord | None) -> dict[str, Any]:
-        table = self._prepared.checked.table
+    def _place(self) -> dict[str, Any]:
+        table, record = self._prepared.checked.table, self._cycles.last
         whole = {"rows": len(table), "path_length_mm": round(self._prepared.length * 1e3, 3)}
         if record is None:
             return {"row": None, "path_mm": None, **whole}
         path = float(np.interp(record.index, np.arange(len(table)), table.travelled))
         return {"row": round(record.index, 2), "path_mm": round(path * 1e3, 3), **whole}
 
+    def _told(self) -> list[dict[str, Any]]:
+        return [asdict(event) for event in list(self._events)]
 
-class WinchStatus:
-    """As `RunStatus`, of winches that move without a path."""
+
+class WinchStatus(MotionStatus):
+    """Of winches that move without a path."""
 
     def __init__(self, rig: Rig, board: WishBoard, *, simulated_time: bool) -> None:
         """A motion that is being prepared."""
-        self._rig, self._board = rig, board
-        self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
+        super().__init__(rig, board, simulated_time=simulated_time)
         self._progress = 0.0
-        self.folder: Path | None = None
-        """Where it is on record, if anywhere."""
         self._events: deque[LoopEvent] = deque(maxlen=EVENTS_TOLD)
 
     def take_cycle(self, record: CycleRecord, progress: float) -> None:
@@ -189,27 +209,17 @@ class WinchStatus:
         self._cycles.take(record)
         self._progress = progress
 
-    def take_end(self, state: State, cause: str) -> None:
-        """The motion is over."""
-        self._cycles.take_end(state, cause)
-
     def take_event(self, event: LoopEvent) -> None:
         """Something happened."""
         self._events.append(event)
 
-    def as_dict(self) -> dict[str, Any]:
-        """See the head of this file."""
+    def _place(self) -> dict[str, Any]:
+        row = None if self._cycles.last is None else round(100.0 * self._progress, 1)
+        return {"row": row, "rows": 100, "path_mm": None, "path_length_mm": None}
+
+    def _told(self) -> list[dict[str, Any]]:
         began = self._cycles.began
-        return {
-            **whose(self._rig, self.folder),
-            **self._cycles.as_dict(),
-            "row": None if self._cycles.last is None else round(100.0 * self._progress, 1),
-            "rows": 100,
-            "path_mm": None,
-            "path_length_mm": None,
-            **wished(self._board),
-            "events": [
-                {"time_s": round(event.at - began, 3), "code": event.code, "text": event.text}
-                for event in list(self._events)
-            ],
-        }
+        return [
+            {"time_s": round(event.at - began, 3), "code": event.code, "text": event.text}
+            for event in list(self._events)
+        ]
