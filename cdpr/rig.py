@@ -168,6 +168,11 @@ class Rig:
         tensions: Array = np.asarray(torques, dtype=np.float64) / 1000.0 * self._rated_tensions
         return tensions
 
+    def torques_by(self, tensions: ArrayLike) -> Array:
+        """The inverse of `tensions_by`: torques, shape (..., m), [per mille of rated torque]."""
+        torques: Array = np.asarray(tensions, dtype=np.float64) * 1000.0 / self._rated_tensions
+        return torques
+
     @cached_property
     def _rated_tensions(self) -> Array:
         return np.array([winch.torque_constant for winch in self.winches])

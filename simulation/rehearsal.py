@@ -46,8 +46,8 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
 
     def _torque_per_newton(self) -> Array:
         """In per mille of rated torque."""
-        rated = np.array([winch.torque_constant for winch in self._rig.winches])
-        per_mille: Array = winding_signs(self._rig) * 1000.0 / rated
+        one_newton = np.ones(self._rig.cable_count)
+        per_mille: Array = winding_signs(self._rig) * self._rig.torques_by(one_newton)
         return per_mille
 
     def _make_drive(self, number: int, position: float, top_speed: float) -> SimulatedDrive:
