@@ -6,7 +6,7 @@ import signal
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from cdpr.errors import CdprError, Fault, Refused
+from cdpr.errors import CdprError, Fault
 from cdpr.poses import Pose
 from executor.arming import require_still_referenced
 from executor.clock import RealClock
@@ -22,7 +22,7 @@ from executor.real_time_job import (
     Job,
     ReadyDrives,
 )
-from executor.realtime import real_time
+from executor.realtime import real_time, require_real_time
 from executor.records import CycleRecord, LoopEvent
 from executor.ring import Ring
 from executor.shared_board import Supervised
@@ -75,8 +75,7 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
         events.put(pack_event(event, events.largest_content))
 
     with real_time() as denied:
-        if denied and job.need_real_time:
-            raise _no_real_time(denied)
+        require_real_time(denied, needed=job.need_real_time)
         loop = Loop(
             course,
             drives.group,
@@ -92,16 +91,6 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             return
         state = loop.run()
     _say(link, Ended(state, loop.cause, loop.holding))
-
-
-def _no_real_time(denied: str) -> Refused:
-    return Refused(
-        f"no real-time scheduling: {denied}",
-        where="arming",
-        why="without it other programs make cycles late, and late cycles stop the path",
-        next_step="allow it as named above, or pass --without-real-time if you accept that;"
-        " nothing was enabled",
-    )
 
 
 def _may_go(link: Connection) -> bool:

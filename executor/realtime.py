@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from cdpr.errors import Refused
+
 #: Above ordinary programs, below the kernel's own threads.
 PRIORITY = 50
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
@@ -65,3 +67,23 @@ def _lock_memory() -> bool:
         return False
     libc = ctypes.CDLL(None, use_errno=True)
     return int(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE)) == 0
+
+
+def require_real_time(denied: str, *, needed: bool) -> None:
+    """Nothing on a bus is moved without real-time scheduling, unless the operator accepts that.
+
+    Args:
+        denied: What the system did not grant; nothing when it granted all.
+        needed: The drives are on a bus, and the operator did not accept it.
+
+    Raises:
+        Refused: It is needed and was denied.
+    """
+    if denied and needed:
+        raise Refused(
+            f"no real-time scheduling: {denied}",
+            where="arming",
+            why="without it other programs make cycles late, and late cycles stop the motion",
+            next_step="allow it as named above, or pass --without-real-time if you accept that;"
+            " nothing was enabled",
+        )

@@ -161,11 +161,10 @@ def _moved(
 
     from cdpr.cli.output import err, progress_bar
     from cdpr.cli.run_folders import free_folder
-    from cdpr.errors import Refused
     from drivers.bus import IN_PROCESS
     from executor.clock import RealClock, SimulatedClock
     from executor.custody import Custody
-    from executor.realtime import real_time
+    from executor.realtime import real_time, require_real_time
     from executor.winch_motion import move_winches
     from executor.winch_record import recording
 
@@ -177,13 +176,7 @@ def _moved(
         progress_bar("moving, %", 100.0, not motion.quiet) as advance,
     ):
         status.folder = None if kept is None else kept.folder
-        if denied and not (simulated or motion.without_real_time):
-            raise Refused(
-                f"no real-time scheduling: {denied}",
-                where="arming",
-                next_step="allow it as named above, or pass --without-real-time if you accept"
-                " that; nothing was enabled",
-            )
+        require_real_time(denied, needed=not (simulated or motion.without_real_time))
         if denied:
             err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
 
