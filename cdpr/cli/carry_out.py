@@ -6,6 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rich.console import Console
+
     from cdpr.plan import Plan
     from cdpr.poses import Pose
     from cdpr.rig import Rig
@@ -55,16 +59,20 @@ def carry_out(
         Refused: The bus is latched, or the drives cannot be armed; nothing moved.
         StoppedByOperator: The answer was no.
     """
+    from functools import partial
+
     from cdpr.cli.run_motion import run_prepared
     from cdpr.cli.run_summary import show_prepared, show_summary
     from drivers.bus import IN_PROCESS
 
     in_process = prepared.rig.document.bus.interface == IN_PROCESS
-    asks = not (in_process or yes)
-    if asks or not as_json:
-        show_prepared(prepared, in_process, as_json)
-    if asks:
-        ask_operator("Move the platform now?", "nothing was moved")
+    show_and_ask(
+        partial(show_prepared, prepared, in_process),
+        "Move the platform now?",
+        "nothing was moved",
+        asks=not (in_process or yes),
+        as_json=as_json,
+    )
     summary = run_prepared(
         prepared,
         folder,
@@ -77,6 +85,30 @@ def carry_out(
     )
     show_summary(summary, folder, as_json)
     return _exit_code(summary)
+
+
+def show_and_ask(
+    show: Callable[[Console], None], question: str, otherwise: str, *, asks: bool, as_json: bool
+) -> None:
+    """Shows what is about to happen to whoever is going to be asked, or reads; then asks.
+
+    Args:
+        show: Shows it, on standard error where a program reads the other.
+        question: As for `ask_operator`.
+        otherwise: As for `ask_operator`.
+        asks: There is something to ask; False with ``--yes``.
+        as_json: Standard output is for a program.
+
+    Raises:
+        StoppedByOperator: The answer was no.
+        BadInput: There is nobody to ask.
+    """
+    from cdpr.cli.output import err, out
+
+    if asks or not as_json:
+        show(err if as_json else out)
+    if asks:
+        ask_operator(question, otherwise)
 
 
 def ask_operator(question: str, otherwise: str) -> None:

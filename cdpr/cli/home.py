@@ -9,6 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cdpr.cli.calibrations import CalibrationOption
+from cdpr.cli.motion_options import (
+    ChannelOption,
+    FastOption,
+    InterfaceOption,
+    WithoutRealTimeOption,
+    YesOption,
+)
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
@@ -57,21 +64,14 @@ def home(
         float, typer.Option(min=0.01, max=FASTEST_MM_S, help="no winch is faster")
     ] = 2.0,
     pictures: Annotated[int, typer.Option(min=5, max=1000, help="to measure the pose in")] = 20,
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the rig file's")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
     simulated_slack_mm: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="how slack simulated cables hang at most")
     ] = 5.0,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")] = False,
-    without_real_time: Annotated[
-        bool,
-        typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
-    ] = False,
+    fast: FastOption = False,
+    yes: YesOption = False,
+    without_real_time: WithoutRealTimeOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the reference as JSON")] = False,
 ) -> None:
     """Wind slack cables in until all are taut, then reference the drives at a pose that is known.
@@ -86,8 +86,10 @@ def home(
 
       cdpr home configs/gachon_8_6.yaml --camera synthetic --fast
     """
+    from functools import partial
+
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.home_facts import show_reference, show_wish
     from cdpr.cli.named_bus import require_own_time, rig_on_bus
     from cdpr.cli.output import show_json
@@ -111,11 +113,13 @@ def home(
     custody.require_free()
     if camera is not None:
         _require_picture(the_rig, camera)
-    asks = not (in_process or yes)
-    if asks or not as_json:
-        show_wish(the_rig, target, limit, reach, speed, camera, as_json)
-    if asks:
-        ask_operator("Wind the cables in now?", "nothing was moved")
+    show_and_ask(
+        partial(show_wish, the_rig, target, limit, reach, speed, camera),
+        "Wind the cables in now?",
+        "nothing was moved",
+        asks=not (in_process or yes),
+        as_json=as_json,
+    )
     made: list[ReferenceDocument] = []
 
     def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
@@ -193,15 +197,18 @@ def _known_pose(
 
 def _go_by_the_rig_file(custody: Custody, yes: bool, as_json: bool) -> None:
     """Drops the reference, so that the rig file's counts are the drives' again."""
-    from cdpr.cli.carry_out import ask_operator
-    from cdpr.cli.output import err, out, show_json
+    from cdpr.cli.carry_out import show_and_ask
+    from cdpr.cli.output import out, show_json
     from cdpr.cli.reference_facts import reference_text, reference_told
 
-    if not yes or not as_json:
-        text = f"the reference that is given up: {reference_text(reference_told(custody))}"
-        (err if as_json else out).print(text, soft_wrap=True, markup=False)
-    if not yes:
-        ask_operator("Do all drives count what the rig file says?", "the reference is as it was")
+    text = f"the reference that is given up: {reference_text(reference_told(custody))}"
+    show_and_ask(
+        lambda on: on.print(text, soft_wrap=True, markup=False),
+        "Do all drives count what the rig file says?",
+        "the reference is as it was",
+        asks=not yes,
+        as_json=as_json,
+    )
     custody.go_by_the_rig_file()
     if as_json:
         show_json({"file": None})

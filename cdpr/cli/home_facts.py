@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from cdpr.rig import Rig
     from executor.reference import ReferenceDocument
 
@@ -16,13 +18,10 @@ def show_wish(
     reach: float,
     speed: float,
     camera: str | None,
-    as_json: bool,
+    on: Console,
 ) -> None:
-    """What is going to happen; tensions in N, lengths in m.
-
-    On standard error where a program reads the other.
-    """
-    from cdpr.cli.output import err, out, show_facts
+    """What is going to happen; tensions in N, lengths in m."""
+    from cdpr.cli.output import show_facts
     from executor.winch_laws import wind_in_speed
 
     fastest = wind_in_speed(rig, target, limit, speed).max() * 1000.0
@@ -36,7 +35,7 @@ def show_wish(
             ("pose", "stated, held by a jig" if camera is None else f"measured, camera {camera}"),
             ("bus", f"{bus.interface} {bus.channel}".strip()),
         ],
-        err if as_json else out,
+        on,
     )
 
 

@@ -9,6 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cdpr.cli.calibrations import CalibrationOption
+from cdpr.cli.motion_options import (
+    ChannelOption,
+    FastOption,
+    InterfaceOption,
+    WithoutRealTimeOption,
+    YesOption,
+)
 
 if TYPE_CHECKING:
     from cdpr.rig import Rig
@@ -52,19 +59,12 @@ def jog(
         Path | None,
         typer.Option("-o", "--output", help="run folder to make (default: runs/jog, runs/jog-2 …)"),
     ] = None,
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the rig file's")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
     calibration: CalibrationOption = None,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")] = False,
-    without_real_time: Annotated[
-        bool,
-        typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
-    ] = False,
+    fast: FastOption = False,
+    yes: YesOption = False,
+    without_real_time: WithoutRealTimeOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> None:
     """Move the platform straight by a few millimetres, slowly, from where it stands.
@@ -106,8 +106,7 @@ def jog(
             },
             "one cable alone is moved without a path, and nothing in its way is looked at",
         )
-        _one_cable(the_rig, cable, mm, limit_n, speed_mm_s, fast, yes, without_real_time,
-                   as_json)  # fmt: skip
+        _one_cable(the_rig, cable, mm, limit_n, fast, yes, without_real_time, as_json)
         return
     _require_unused({"--limit-n": limit_n}, "only with --cable; a path has the rig's own limits")
     if (by_mm is None) != to_home:
@@ -144,7 +143,6 @@ def _one_cable(
     cable: int | None,
     mm: float | None,
     limit_n: float | None,
-    speed_mm_s: float,
     fast: bool,
     yes: bool,
     without_real_time: bool,
@@ -160,8 +158,8 @@ def _one_cable(
             next_step="pass both, or --by-mm X Y Z to move the platform",
         )
     jog_cable(
-        rig, cable, mm, limit_n=limit_n, speed_mm_s=speed_mm_s, fast=fast, yes=yes,
-        without_real_time=without_real_time, as_json=as_json,
+        rig, cable, mm, limit_n=limit_n, fast=fast, yes=yes, without_real_time=without_real_time,
+        as_json=as_json,
     )  # fmt: skip
 
 

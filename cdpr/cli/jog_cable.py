@@ -19,13 +19,12 @@ def jog_cable(
     mm: float,
     *,
     limit_n: float | None,
-    speed_mm_s: float,
     fast: bool,
     yes: bool,
     without_real_time: bool,
     as_json: bool,
 ) -> None:
-    """Moves one winch and tells what its cable did.
+    """Moves one winch, no faster than the rig, and tells what its cable did.
 
     On a taut platform one cable alone moves by hardly more than its stretch before a tension is
     too large, or another cable slack: both stop it.
@@ -36,11 +35,12 @@ def jog_cable(
         Fault: A tension left its bounds; all drives stopped together.
     """
     import math
+    from functools import partial
 
-    from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.jog_way import LONGEST_MM
-    from cdpr.cli.output import err, out, show_facts, show_json
-    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of, speed_of
+    from cdpr.cli.output import out, show_facts, show_json
+    from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of
     from cdpr.errors import BadInput, Refused
     from drivers.bus import IN_PROCESS
     from executor.custody import Custody
@@ -61,27 +61,24 @@ def jog_cable(
             why="one cable alone is moved in short steps, somebody looking",
             next_step="go there in several steps",
         )
-    limit, speed = limit_of(rig, limit_n), speed_of(rig, speed_mm_s)
+    limit, speed = limit_of(rig, limit_n), rig.motion.speed
     in_process = rig.document.bus.interface == IN_PROCESS
     Custody(rig).require_free()
     winch = rig.winches[cable - 1]
-    asks = not (in_process or yes)
-    if asks or not as_json:
-        show_facts(
-            "ready to move one cable",
-            [
-                ("rig", rig.name),
-                ("cable", rig.drive_names[winch.node_id]),
-                (
-                    "way",
-                    f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed * 1000:g} mm/s",
-                ),
-                ("tension", f"at most {limit:g} N in any cable; none that is taut may go slack"),
-            ],
-            err if as_json else out,
-        )
-    if asks:
-        ask_operator("Move this cable now?", "nothing was moved")
+    way = f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed * 1000:g} mm/s"
+    facts = [
+        ("rig", rig.name),
+        ("cable", rig.drive_names[winch.node_id]),
+        ("way", way),
+        ("tension", f"at most {limit:g} N in any cable; none that is taut may go slack"),
+    ]
+    show_and_ask(
+        partial(show_facts, "ready to move one cable", facts),
+        "Move this cable now?",
+        "nothing was moved",
+        asks=not (in_process or yes),
+        as_json=as_json,
+    )
     begun: list[Sequence[int]] = []
 
     def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:

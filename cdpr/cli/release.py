@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.motion_options import ChannelOption, InterfaceOption
+
 if TYPE_CHECKING:
     from cdpr.rig import Rig
     from drivers.drive_group import CycleStatus
@@ -20,10 +22,8 @@ _RELEASED = "released by the operator"
 
 def release(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the rig file's")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
@@ -36,9 +36,11 @@ def release(
 
       cdpr release configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
-    from cdpr.cli.carry_out import ask_operator
+    from functools import partial
+
+    from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.named_bus import require_other_process, rig_on_bus
-    from cdpr.cli.output import err, out, show_facts, show_json
+    from cdpr.cli.output import out, show_facts, show_json
     from cdpr.cli.reference_facts import reference_text, reference_told
     from drivers.bus import BusSettings
     from drivers.drive_group import drive_states
@@ -49,17 +51,19 @@ def release(
     custody = Custody(the_rig)
     custody.require_free()
     braked = _braked(the_rig)
-    if not (yes and as_json):
-        facts = [
-            ("rig", the_rig.name),
-            ("bus", str(BusSettings.of(the_rig))),
-            ("afterwards", "the brakes hold the drums" if braked else "nothing holds the cables"),
-            ("reference", "as it is" if braked else "given up: `cdpr home` before the next motion"),
-        ]
-        show_facts("ready to take the torque off", facts, err if as_json else out)
-    if not yes:
-        question = "Does the platform stand on something, so that no cable carries it?"
-        ask_operator(question, "the drives hold as before")
+    facts = [
+        ("rig", the_rig.name),
+        ("bus", str(BusSettings.of(the_rig))),
+        ("afterwards", "the brakes hold the drums" if braked else "nothing holds the cables"),
+        ("reference", "as it is" if braked else "given up: `cdpr home` before the next motion"),
+    ]
+    show_and_ask(
+        partial(show_facts, "ready to take the torque off", facts),
+        "Does the platform stand on something, so that no cable carries it?",
+        "the drives hold as before",
+        asks=not yes,
+        as_json=as_json,
+    )
     status = _released(the_rig, custody)
     stands = status.positions.tolist()
     told: dict[str, Any] = {

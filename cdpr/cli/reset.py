@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.motion_options import ChannelOption, InterfaceOption
+
 if TYPE_CHECKING:
     from cdpr.rig import Rig
     from drivers.drive_group import CycleStatus
@@ -17,10 +19,8 @@ SETTLING_CYCLES = 30
 
 def reset(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the rig file's")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
@@ -33,24 +33,27 @@ def reset(
 
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
-    from cdpr.cli.carry_out import ask_operator
+    from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.named_bus import require_other_process, rig_on_bus
-    from cdpr.cli.output import err, out, show_json
+    from cdpr.cli.output import out, show_json
     from cdpr.cli.reference_facts import reference_text
     from drivers.bus import BusSettings
     from executor.latch import Latch
 
     the_rig = rig_on_bus(rig, interface, channel)
     require_other_process(the_rig)
-    latch = Latch(BusSettings.of(the_rig))
+    bus = BusSettings.of(the_rig)
+    latch = Latch(bus)
     latched = latch.read()
     latch.require_no_run()
-    if not (yes and as_json):
-        cause = f"latched since {latched.since}: {latched.cause}" if latched else "no fault latched"
-        shown = err if as_json else out
-        shown.print(f"bus {BusSettings.of(the_rig)}: {cause}", soft_wrap=True, markup=False)
-    if not yes:
-        ask_operator("Is the cause gone and the platform safe?", "nothing was reset")
+    cause = f"latched since {latched.since}: {latched.cause}" if latched else "no fault latched"
+    show_and_ask(
+        lambda on: on.print(f"bus {bus}: {cause}", soft_wrap=True, markup=False),
+        "Is the cause gone and the platform safe?",
+        "nothing was reset",
+        asks=not yes,
+        as_json=as_json,
+    )
     with latch.held_for_reset(the_rig.name, latched):
         told = _drives_reset(the_rig)
     if as_json:

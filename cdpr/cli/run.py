@@ -8,6 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cdpr.cli.calibrations import CalibrationOption
+from cdpr.cli.motion_options import (
+    ChannelOption,
+    FastOption,
+    InterfaceOption,
+    WithoutRealTimeOption,
+    YesOption,
+)
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
@@ -19,9 +26,7 @@ def run(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUNDIR")
     ],
-    fast: Annotated[
-        bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
-    ] = False,
+    fast: FastOption = False,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -30,19 +35,14 @@ def run(
     ] = None,
     calibration: CalibrationOption = None,
     no_camera: Annotated[bool, typer.Option("--no-camera", help="run without a camera")] = False,
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the rig file's")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
     simulated_start_mm: Annotated[
         tuple[float, float, float] | None,
         typer.Option(help="where the simulated platform stands: x y z (default: at the start)"),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")] = False,
-    without_real_time: Annotated[
-        bool,
-        typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
-    ] = False,
+    yes: YesOption = False,
+    without_real_time: WithoutRealTimeOption = False,
     no_clearance_stop: Annotated[
         bool,
         typer.Option("--no-clearance-stop", help="go on when the camera sees too little clearance"),

@@ -7,18 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
-from cdpr.cli.output import err, out, show_facts, show_json
+from cdpr.cli.output import out, show_facts, show_json
 from cdpr.cli.stop_facts import stop_facts
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from cdpr.rig import Rig
     from executor.prepare import PreparedRun
 
 COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
 
 
-def show_prepared(prepared: PreparedRun, simulated: bool, as_json: bool) -> None:
-    """What is going to happen; on standard error where a program reads the other."""
+def show_prepared(prepared: PreparedRun, simulated: bool, on: Console) -> None:
+    """What is going to happen."""
     rig, bus = prepared.rig, prepared.rig.document.bus
     start, goal = prepared.scene.start.position * 1000, prepared.scene.goal.position * 1000
     table = prepared.checked.table
@@ -38,7 +40,7 @@ def show_prepared(prepared: PreparedRun, simulated: bool, as_json: bool) -> None
             *_reference(rig),
             ("bus", f"{bus.interface} {bus.channel}{', simulated drives' if simulated else ''}"),
         ],
-        err if as_json else out,
+        on,
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cdpr.cli.calibrations import CalibrationOption
+from cdpr.cli.motion_options import ChannelOption, InterfaceOption
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
@@ -17,10 +18,8 @@ if TYPE_CHECKING:
 
 def sim(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the rig file's")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
     start_mm: Annotated[
         tuple[float, float, float] | None,
         typer.Option("--at-mm", help="where the platform stands: x y z (default: home)"),

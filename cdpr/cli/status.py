@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.motion_options import ChannelOption, InterfaceOption
+
 if TYPE_CHECKING:
     from cdpr.rig import Rig
 
 
 def status(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the rig file's")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="its channel")] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
     """Tell how a rig stands: faults, reference, drives, tensions, pose. Moves and writes nothing.
