@@ -17,7 +17,7 @@ unexport PYTHONPATH PYTHONHOME
 help:  ## Show this help
 	@echo "cdpr: plan, prove, run and measure paths of cable-driven parallel robots"
 	@echo
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
 	@echo
 	@echo "The Python to build on: make PYTHON=python3.12 ... (3.11 or newer; now: $(PYTHON))"
 
