@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.motion_options import ChannelOption, InterfaceOption
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def release(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    calibration: CalibrationOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
@@ -38,6 +40,7 @@ def release(
     """
     from functools import partial
 
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.named_bus import require_other_process, rig_on_bus
     from cdpr.cli.output import out, show_facts, show_json
@@ -46,7 +49,7 @@ def release(
     from drivers.drive_group import drive_states
     from executor.custody import Custody
 
-    the_rig = rig_on_bus(rig, interface, channel)
+    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     require_other_process(the_rig)
     custody = Custody(the_rig)
     custody.require_free()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.motion_options import ChannelOption, InterfaceOption
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ def reset(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    calibration: CalibrationOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
@@ -33,6 +35,7 @@ def reset(
 
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.named_bus import require_other_process, rig_on_bus
     from cdpr.cli.output import out, show_json
@@ -40,7 +43,7 @@ def reset(
     from drivers.bus import BusSettings
     from executor.latch import Latch
 
-    the_rig = rig_on_bus(rig, interface, channel)
+    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     require_other_process(the_rig)
     bus = BusSettings.of(the_rig)
     latch = Latch(bus)

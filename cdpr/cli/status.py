@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.motion_options import ChannelOption, InterfaceOption
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ def status(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    calibration: CalibrationOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
     """Tell how a rig stands: faults, reference, drives, tensions, pose. Moves and writes nothing.
@@ -27,6 +29,7 @@ def status(
 
       cdpr status configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
+    from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.named_bus import require_other_process, rig_on_bus
     from cdpr.cli.output import show_json
     from cdpr.cli.reference_facts import reference_told
@@ -35,7 +38,7 @@ def status(
     from executor.custody import Custody
     from executor.latch import Latch
 
-    the_rig = rig_on_bus(rig, interface, channel)
+    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     require_other_process(the_rig)
     settings = BusSettings.of(the_rig)
     latch, custody = Latch(settings), Custody(the_rig)
