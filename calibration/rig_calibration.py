@@ -9,10 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from calibration.interval import Interval
-from calibration.rig_fit import RigFit, RigFitter, poses_from_lengths
+from calibration.rig_fit import RigFit
+from calibration.rig_held_out import HeldOut, held_out
 from calibration.rig_measurements import RigMeasurements
 from calibration.rig_model import RigModel
-from calibration.rig_observability import Observability, sentences
+from calibration.rig_observability import Observability, identified, sentences
 from calibration.rig_parameters import Parameters, RigGeometry, rig_with
 from cdpr.cables import cables_to
 from cdpr.errors import BadInput
@@ -24,24 +25,8 @@ from cdpr.winches import WinchMap
 
 FEWEST_PLACES = 10
 """Fewer say too little to be fitted at all."""
-FOLDS = 5
 _SIGMAS = 1.959964
 """Half the width of a 95 % interval in standard deviations."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
-    """Places that a fit has not seen, each left out once.
-
-    Attributes:
-        before: How far off they are by the drawing, shape (n,), [m].
-        after: By the fits that did not see them, shape (n,), [m].
-        poses: Distances of positions; else of cables from any pose, for lengths alone.
-    """
-
-    before: Array
-    after: Array
-    poses: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,24 +162,15 @@ def calibrate_rig(
             why="every group of numbers is taken as known",
             next_step="leave out --known for one of them",
         )
-    fit, observability = _identified(parameters, measured, length_deviation)
+    fit, observability = identified(parameters, measured, length_deviation)
     return RigCalibration(
         parameters,
         measured,
         fit,
         observability,
         _covariance(parameters, measured, fit, observability, length_deviation),
-        _held_out(parameters, measured, length_deviation),
+        held_out(parameters, measured, length_deviation),
     )
-
-
-def _identified(
-    parameters: Parameters, measured: RigMeasurements, length_deviation: float
-) -> tuple[RigFit, Observability]:
-    """The fit in the directions that the data tell, and which those are."""
-    fitter = RigFitter(parameters, measured, length_deviation)
-    observability = Observability.of(fitter.fit().information)
-    return fitter.fit(observability.known), observability
 
 
 def _covariance(
@@ -214,33 +190,6 @@ def _covariance(
     spread = parameters.deviations
     covariance: Array = inner * np.outer(spread, spread)
     return covariance
-
-
-def _held_out(
-    parameters: Parameters, measured: RigMeasurements, length_deviation: float
-) -> HeldOut:
-    n = len(measured)
-    posed = bool(measured.posed.all())
-    before, after = np.empty(n), np.empty(n)
-    zero = np.zeros(len(parameters))
-    for fold in range(FOLDS):
-        out = np.arange(n) % FOLDS == fold
-        rest, left_out = measured.part(~out), measured.part(out)
-        fit, _ = _identified(parameters, rest, length_deviation)
-        for errors, values in ((before, zero), (after, fit.values)):
-            errors[out] = _errors(parameters, values, left_out, posed)
-    return HeldOut(before, after, posed)
-
-
-def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
-    """How far off places are that a fit has not seen, shape (n,), [m]."""
-    model, geometry = RigModel(parameters, measured), parameters.geometry(values)
-    lengths, rig = model.counted.by(geometry), rig_with(parameters.rig, geometry)
-    if not posed:
-        found = poses_from_lengths(rig, lengths)
-        return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in found])
-    positions, _ = poses_near(rig, lengths, measured.positions, measured.rotations, steps=8)
-    return np.asarray(np.linalg.norm(positions - measured.positions, axis=1))
 
 
 def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.rig_fit import RigFit, RigFitter
+from calibration.rig_measurements import RigMeasurements
 from calibration.rig_parameters import AXES, Parameters
 from cdpr.poses import Array, skew
 
@@ -145,3 +147,21 @@ def _by_parts(direction: Array, parameters: Parameters) -> str:
     largest = np.argsort(-np.abs(direction))[:LARGEST_PARTS]
     parts = ", ".join(f"{parameters.names[i]} {direction[i]:+.2f}" for i in largest)
     return f"one of them mostly {parts} (in deviations of the drawing)"
+
+
+def identified(
+    parameters: Parameters, measured: RigMeasurements, length_deviation: float
+) -> tuple[RigFit, Observability]:
+    """The fit in the directions that the data tell, and which those are.
+
+    Args:
+        parameters: The unknowns.
+        measured: Places at rest.
+        length_deviation: Of a cable's length as a drive tells it, [m].
+
+    Raises:
+        Fault: The measurements cannot be fitted.
+    """
+    fitter = RigFitter(parameters, measured, length_deviation)
+    observability = Observability.of(fitter.fit().information)
+    return fitter.fit(observability.known), observability

@@ -27,6 +27,7 @@ from cdpr.errors import BadInput
 from cdpr.kinematics import poses_near
 from cdpr.poses import Array, matrix_from_rotation_vector, rotation_vector_from_matrix
 from cdpr.rig import Rig, load_rig, rig_from_document
+from cdpr.rig_file import RigDocument
 from cdpr.winches import WinchMap
 from simulation.as_built import rig_as_built
 from tests.calibration.rig_places import Truth, places
@@ -240,6 +241,32 @@ def test_pulleys_are_looked_for_only_where_the_rig_has_them(rig: Rig) -> None:
     hall = load_rig(ROOT / "configs/hall_10_6.yaml")
     assert "pulley_radius" in Parameters.of(hall, DEFAULT_DEVIATIONS).names
     assert "pulley_radius" not in Parameters.of(rig, DEFAULT_DEVIATIONS).names
+
+
+def test_a_rig_over_pulleys_is_told_better_than_by_its_file() -> None:
+    """Another rig: ten cables over pulleys of another radius than drawn."""
+    drawn = load_rig(ROOT / "configs/hall_10_6.yaml")
+    document, random = drawn.document.model_dump(mode="json"), np.random.default_rng(3)
+    m = drawn.cable_count
+    shifted = np.array(document["outlets_mm"]) + 2.0 * random.standard_normal((m, 3))
+    document["cables"]["stiffness_n"] = 40000
+    document["simulation"] = {
+        "as_built": {
+            "outlets_mm": shifted.tolist(),
+            "anchors_mm": document["anchors_mm"],
+            "drums_mm_per_rev": [w["drum_mm_per_rev"] * 1.003 for w in document["winches"]],
+            "home_counts": [0.0] * m,
+            "pulley_radius_mm": document["pulleys"]["radius_mm"] + 0.8,
+        }
+    }
+    hall = rig_from_document(RigDocument.model_validate(document))
+    data = places(hall, 40, tilt=0.12, seed=1).measured
+    result = calibrate_rig(hall, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    corrected = calibrated(hall, [rig_result(result, judge_rig(result, 1e-3, 0.0), "hall", TODAY)])
+    others = places(hall, 20, tilt=0.12, seed=2, noise=0.0)
+    assert rms(errors_of(corrected, others)) < 0.3 * rms(errors_of(hall, others))
+    radius = result.intervals["pulley_radius_mm"]
+    assert abs(radius.value - 40.8) < radius.half_width
 
 
 def test_unknown_directions_without_a_name_are_told_by_their_largest_parts(rig: Rig) -> None:
