@@ -241,6 +241,8 @@ def test_a_run_that_ends_says_once_more_how_it_stands(
 ) -> None:
     """To those who watch it; who looks a few times a second may have missed the end."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # root looks at all users' runs there
+    monkeypatch.setattr(tempfile, "tempdir", None)
     now = {"state": "moving"}
     status: Any = SimpleNamespace(as_dict=lambda: now)
     with ExitStack() as watching:
