@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +12,7 @@ import typer
 from cdpr.cli.calibrations import CalibrationOption
 
 if TYPE_CHECKING:
+    from cdpr.clearance import ClearanceModel
     from cdpr.rig import Camera, Rig
     from cdpr.scene import Scene
     from tracking.pose_log import LoggedPicture
@@ -24,10 +25,11 @@ PATIENCE = 50
 def track(
     rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
     source: Annotated[
-        str,
+        list[str],
         typer.Argument(
-            help="folder of pictures, video file, camera index, or 'synthetic' with --plan",
-            metavar="SOURCE",
+            help="folder of pictures, video file, camera index, or 'synthetic' with --plan;"
+            " for each of several cameras NAME=SOURCE",
+            metavar="SOURCE...",
         ),
     ],
     output: Annotated[
@@ -68,16 +70,17 @@ def track(
       cdpr track rig.yaml 0 -o poses.csv --scene scene.yaml --pictures 100
 
       cdpr track configs/gachon_8_6.yaml synthetic --plan plan.json -o poses.csv
+
+      cdpr track rig.yaml front=0 side=1 -o poses.csv
     """
     import time
     from itertools import islice
 
     from cdpr.clearance import ClearanceModel
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.cameras import named_camera
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
-    from cdpr.cli.track_sources import picture_source
+    from cdpr.cli.track_sources import eyes_of, picture_source
     from cdpr.rig import load_rig
     from executor.running import stop_requests
     from executor.track_mcap import write_track_mcap
@@ -91,29 +94,44 @@ def track(
     if mcap is not None:
         check_output(mcap, force)
     the_rig = calibrated_rig(load_rig(rig), calibration)
-    the_camera = named_camera(the_rig, camera)
+    eyes = eyes_of(the_rig, source, camera)
+    several = len(eyes) > 1
+    logs = {eye.name: _own_file(output, eye.name) for eye in eyes} if several else {}
+    for path in logs.values():
+        check_output(path, force)
     the_scene = _scene(scene, plan)
-    frames, total = picture_source(the_rig, the_scene, the_camera, source, plan)
+    opened = [picture_source(the_rig, the_scene, eye, name, plan) for eye, name in eyes.items()]
+    totals = [total for _, total in opened if total is not None]
+    total = min(totals) if len(totals) == len(opened) else None
     model = ClearanceModel(the_rig, the_scene) if the_scene and the_scene.obstacles else None
     logged: list[LoggedPicture] = []
+    each: dict[str, list[LoggedPicture]] = {eye.name: [] for eye in eyes}
     count, board, began = TrackCount(), OwnBoard(), time.time_ns()
     with (
-        _overlay(overlay, the_rig, the_camera, force) as draw,
+        ExitStack() as drawing,
         stop_requests(board),
         progress_bar("tracking", pictures or total, not as_json) as show,
     ):
-        for found in tracked(
-            islice(frames, pictures),
-            Tracker(the_rig, the_camera),
-            count,
-            give_up_after=PATIENCE if total is None else None,
-            model=model,
-            on_picture=draw,
-        ):
+        streams: dict[str, Iterator[LoggedPicture]] = {}
+        for eye, (frames, length) in zip(eyes, opened, strict=True):
+            place = overlay / eye.name if overlay is not None and several else overlay
+            streams[eye.name] = tracked(
+                islice(frames, pictures),
+                Tracker(the_rig, eye),
+                count,
+                give_up_after=PATIENCE if length is None and not several else None,
+                model=model,
+                on_picture=drawing.enter_context(_overlay(place, the_rig, eye, force)),
+            )
+        for found, alone in _all_of(streams, 0.5 / next(iter(eyes)).rate, model):
             logged.append(found)
+            for name, one in alone.items():
+                each[name].append(one)
             show(len(logged))
             if board.read().stop:
                 break
+    for name, path in logs.items():
+        write_pose_log(path, each[name], with_clearance=model is not None)
     write_pose_log(output, logged, with_clearance=model is not None)
     if mcap is not None:
         write_track_mcap(mcap, logged, began)
@@ -122,6 +140,25 @@ def track(
         show_json(facts)
     else:
         show_facts(f"poses in {output}", [(k.replace("_", " "), str(v)) for k, v in facts.items()])
+
+
+def _own_file(output: Path, name: str) -> Path:
+    """Where one of several cameras is logged alone: ``poses-front.csv`` beside ``poses.csv``."""
+    return output.with_name(f"{output.stem}-{name}{output.suffix}")
+
+
+def _all_of(
+    streams: dict[str, Iterator[LoggedPicture]], within: float, model: ClearanceModel | None
+) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
+    """What is measured together and by each camera alone."""
+    from tracking.track_together import track_together
+
+    if len(streams) > 1:
+        yield from track_together(streams, within, model)
+        return
+    for name, stream in streams.items():
+        for found in stream:
+            yield found, {name: found}
 
 
 def _scene(scene: Path | None, plan: Path | None) -> Scene | None:

@@ -13,6 +13,47 @@ if TYPE_CHECKING:
     from tracking.track import Picture
 
 
+def eyes_of(rig: Rig, sources: list[str], wanted: str | None) -> dict[Camera, str]:
+    """Which camera's pictures come from where.
+
+    Args:
+        rig: Its cameras.
+        sources: One source, or for each of several cameras ``NAME=SOURCE``.
+        wanted: The camera of a single source; None for the rig's first.
+
+    Raises:
+        BadInput: A camera is not the rig's, is named twice, or not at all.
+    """
+    from cdpr.cli.cameras import named_camera
+    from cdpr.errors import BadInput
+
+    named = [source.partition("=") for source in sources]
+    names = [camera.name for camera in rig.cameras]
+    if len(sources) == 1 and named[0][0] not in names:
+        return {named_camera(rig, wanted): sources[0]}
+    if wanted is not None:
+        raise BadInput(
+            "--camera is for a single source without a name",
+            where="track",
+            next_step="leave it out, or name the camera in the source: NAME=SOURCE",
+        )
+    eyes: dict[Camera, str] = {}
+    for name, sign, place in named:
+        if not sign or not place:
+            raise BadInput(
+                f"the source {name!r} does not say which camera it is of",
+                where="track",
+                next_step=f"write NAME={name}, NAME one of: {', '.join(names)}",
+            )
+        camera = named_camera(rig, name)
+        if camera in eyes:
+            raise BadInput(
+                f"camera {name!r} has two sources", where="track", next_step="name each camera once"
+            )
+        eyes[camera] = place
+    return eyes
+
+
 def picture_source(
     rig: Rig, scene: Scene | None, camera: Camera, source: str, plan: Path | None
 ) -> tuple[Iterable[Picture], int | None]:

@@ -1,0 +1,85 @@
+"""`cdpr track` with several cameras: one pose, and each camera's alone."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from cdpr.plan import load_plan, save_plan
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from cdpr.rig import load_rig
+from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
+from tests.cli.program import call, nothing_written, one_message
+
+
+@pytest.fixture(scope="module")
+def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ready rig with a second camera, a quarter turn round the frame."""
+    data = yaml.safe_load(RIG.read_text())
+    (front,) = load_rig(RIG).cameras
+    quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
+    place = front.world_from_camera
+    side = Pose(quarter @ place.position, quarter @ place.rotation)
+    where = {
+        "position_mm": (side.position * 1e3).tolist(),
+        "rotation_wxyz": side.quaternion.tolist(),
+    }
+    data["cameras"].append({**data["cameras"][0], "name": "side", "world_from_camera": where})
+    path = tmp_path_factory.mktemp("rig") / "rig.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.fixture(scope="module")
+def plan(rig_file: Path) -> Path:
+    path = rig_file.parent / "plan.json"
+    scene = free_scene(START_MM, GOAL_MM)
+    save_plan(straight_plan(load_rig(rig_file), scene, [START_MM, GOAL_MM]), path)
+    assert load_plan(path).scene.obstacles
+    return path
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_two_cameras_are_logged_together_and_alone(
+    rig_file: Path, plan: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "poses.csv"
+    sources = ("front=synthetic", "side=synthetic", "--plan", plan, "--pictures", "3")
+    answer = call("track", rig_file, *sources, "-o", log, "--overlay", tmp_path / "drawn", "--json")
+    assert answer.code == 0, answer
+    assert json.loads(answer.out)["poses"] == 3
+    both = rows_of(log)
+    front, side = (rows_of(tmp_path / f"poses-{name}.csv") for name in ("front", "side"))
+    for fused, *alone in zip(both, front, side, strict=True):
+        for axis in "xyz":
+            smallest = min(float(one[f"std_{axis}_mm"]) for one in alone)
+            assert float(fused[f"std_{axis}_mm"]) < smallest
+        numbers = {n for one in alone for n in one["tags"].split()}
+        assert set(fused["tags"].split()) == numbers
+    assert len(list((tmp_path / "drawn" / "side").iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    ("sources", "parts"),
+    [
+        (["front=synthetic", "back=synthetic"], ["no camera 'back'", "front, side"]),
+        (["front=synthetic", "synthetic"], ["'synthetic' does not say which camera"]),
+        (["front=synthetic", "front=synthetic"], ["'front' has two sources"]),
+        (["front=synthetic", "side=synthetic", "--camera", "side"], ["--camera is for a single"]),
+    ],
+)
+def test_sources_that_do_not_say_whose_they_are_are_refused(
+    rig_file: Path, plan: Path, tmp_path: Path, sources: list[str], parts: list[str]
+) -> None:
+    with nothing_written(tmp_path):
+        answer = call("track", rig_file, *sources, "--plan", plan, "-o", tmp_path / "poses.csv")
+    one_message(answer, 2, *parts)

@@ -1,0 +1,97 @@
+"""Several cameras: better than each alone, one that is wrong does not count."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from cdpr.rig import Camera, Rig
+from cdpr.scene import Scene
+from simulation.camera import Optics, SyntheticCamera
+from tests.tracking.test_tracker import error_of
+from tracking.cameras_together import together
+from tracking.measurement import NoPose, PoseMeasurement
+from tracking.tracker import Tracker
+
+HERE = Pose.level([0.05, 0.05, 0.4])
+
+
+def other_side(camera: Camera) -> Camera:
+    """The same camera, standing a quarter turn round the frame."""
+    quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
+    place = camera.world_from_camera
+    there = Pose(quarter @ place.position, quarter @ place.rotation)
+    return replace(camera, name="side", world_from_camera=there)
+
+
+def measured(place: list[float], sigma: list[float]) -> PoseMeasurement:
+    covariance = np.diag(np.square([*sigma, 1e-3, 1e-3, 1e-3]))
+    return PoseMeasurement(0.0, Pose.level(place), covariance, (301,), 0.1, "tracked")
+
+
+def test_each_camera_counts_where_it_measures_well() -> None:
+    a = measured([1e-3, 0.0, 0.4], [1e-3, 1e-5, 1e-3])
+    b = measured([0.0, 1e-3, 0.4], [1e-5, 1e-3, 1e-3])
+    found = together({"a": a, "b": b})
+    assert isinstance(found, PoseMeasurement)
+    assert np.abs(found.pose.position - [0.0, 0.0, 0.4]).max() < 1e-6
+    assert np.sqrt(np.diag(found.covariance)[:2]).max() < 1.01e-5
+    assert np.diag(found.covariance)[2] == pytest.approx(0.5e-6)
+
+
+def test_two_cameras_give_a_better_pose_than_each_alone(
+    rig: Rig, camera: Camera, scene: Scene
+) -> None:
+    empty, optics = replace(scene, obstacles=()), Optics(blur=0.6)
+    eyes = {"front": camera, "side": other_side(camera)}
+    pictures = {n: SyntheticCamera(rig, empty, c, seed=3, optics=optics) for n, c in eyes.items()}
+    rng = np.random.default_rng(8)
+    squares: dict[str, list[float]] = {"front": [], "side": [], "both": []}
+    values = []
+    for frame in range(12):
+        truth = Pose(
+            rng.uniform([-0.1, -0.1, 0.35], [0.1, 0.1, 0.5]),
+            matrix_from_rotation_vector(rng.normal(size=3) * 0.1),
+        )
+        seen = {
+            name: Tracker(rig, eyes[name]).observe(pictures[name].render(truth, frame), 0.0)
+            for name in eyes
+        }
+        for name, one in {**seen, "both": together(seen)}.items():
+            assert isinstance(one, PoseMeasurement), one
+            error = error_of(one, truth)
+            squares[name].append(float(error[:3] @ error[:3]))
+            if name == "both":
+                values.append(error @ np.linalg.solve(one.covariance, error))
+    rms = {name: np.sqrt(np.mean(values)) for name, values in squares.items()}
+    assert rms["both"] < 0.8 * min(rms["front"], rms["side"])
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(values)) / len(values)
+    assert 0.5 * low < np.mean(values) < high
+
+
+def test_of_two_that_disagree_there_is_no_pose() -> None:
+    a, b = measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([0.01, 0.0, 0.4], [1e-4] * 3)
+    found = together({"front": a, "side": b})
+    assert isinstance(found, NoPose)
+    assert found.reason == "cameras front and side disagree by 10.0 mm"
+
+
+def test_of_three_the_one_that_disagrees_is_left_out() -> None:
+    good = [measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([1e-4, 0.0, 0.4], [1e-4] * 3)]
+    wrong = measured([0.03, 0.0, 0.4], [1e-4] * 3)
+    found = together({"a": good[0], "wrong": wrong, "b": good[1]})
+    assert isinstance(found, PoseMeasurement)
+    assert found.pose.distance_to(Pose.level([5e-5, 0.0, 0.4])) < 1e-9
+
+
+def test_one_that_sees_nothing_leaves_it_to_the_others() -> None:
+    good = measured([0.0, 0.0, 0.4], [1e-4] * 3)
+    assert together({"a": NoPose(0.0, "dark"), "b": good}) is good
+    none = together({"a": NoPose(0.0, "dark", (7,)), "b": NoPose(0.0, "covered")})
+    assert isinstance(none, NoPose)
+    assert none.reason == "a: dark; b: covered"
+    assert none.seen == (7,)

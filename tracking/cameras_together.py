@@ -1,0 +1,90 @@
+"""One pose from what several cameras measured at the same time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from cdpr.poses import (
+    Array,
+    Pose,
+    matrix_from_rotation_vector,
+    read_only,
+    rotation_vector_from_matrix,
+)
+from tracking.measurement import NoPose, Observation, PoseMeasurement
+
+#: What a camera's place may be off by, beside the covariance of what it measures, [m] and [rad].
+PLACE = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
+#: Cameras disagree when their poses differ by more (squared, in covariances) than one pair of true
+#: ones in ten thousand does.
+GATE = 27.9
+
+
+def together(seen: Mapping[str, Observation]) -> Observation:
+    """The mean of all poses, each by the weight of its information.
+
+    Of three cameras and more one that disagrees with the others is left out; of two that disagree
+    nobody knows which is wrong.
+
+    Args:
+        seen: What each camera measured, by its name, at about the same time.
+    """
+    poses = {name: one for name, one in seen.items() if isinstance(one, PoseMeasurement)}
+    if not poses:
+        return _nothing(seen)
+    while len(poses) > 1:
+        apart = {name: _apart(name, poses) for name in poses}
+        worst = max(apart, key=lambda name: apart[name])
+        if apart[worst] <= GATE:
+            break
+        if len(poses) == 2:
+            a, b = poses.values()
+            gap = a.pose.distance_to(b.pose) * 1e3
+            names = " and ".join(poses)
+            return NoPose(a.time, f"cameras {names} disagree by {gap:.1f} mm", ())
+        del poses[worst]
+    return _mean(list(poses.values()))
+
+
+def _nothing(seen: Mapping[str, Observation]) -> NoPose:
+    missed = {name: one for name, one in seen.items() if isinstance(one, NoPose)}
+    reasons = "; ".join(f"{name}: {one.reason}" for name, one in missed.items())
+    tags = sorted({number for one in missed.values() for number in one.seen})
+    return NoPose(next(iter(missed.values())).time, reasons, tuple(tags))
+
+
+def _apart(name: str, poses: Mapping[str, PoseMeasurement]) -> float:
+    """How far a pose lies from the others, squared, in covariances: the median of them."""
+    mine, distances = poses[name], []
+    for other in (one for key, one in poses.items() if key != name):
+        gap = _between(mine.pose, other.pose)
+        spread = mine.covariance + other.covariance + 2.0 * np.diag(PLACE**2)
+        distances.append(float(gap @ np.linalg.solve(spread, gap)))
+    return float(np.median(distances)) if len(distances) > 1 else distances[0]
+
+
+def _between(from_: Pose, to: Pose) -> Array:
+    turn = rotation_vector_from_matrix(to.rotation @ from_.rotation.T)
+    return np.concatenate([to.position - from_.position, turn])
+
+
+def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
+    first = poses[0]
+    if len(poses) == 1:
+        return first
+    weights = [np.linalg.inv(one.covariance) for one in poses]
+    covariance = np.linalg.inv(np.sum(weights, axis=0))
+    steps = [w @ _between(first.pose, one.pose) for w, one in zip(weights, poses, strict=True)]
+    step = covariance @ np.sum(steps, axis=0)
+    turned = matrix_from_rotation_vector(step[3:]) @ first.pose.rotation
+    return replace(
+        first,
+        time=float(np.mean([one.time for one in poses])),
+        pose=Pose(first.pose.position + step[:3], turned),
+        covariance=read_only((covariance + covariance.T) / 2.0),
+        tags=tuple(sorted({number for one in poses for number in one.tags})),
+        reprojection=float(np.sqrt(np.mean([one.reprojection**2 for one in poses]))),
+    )
