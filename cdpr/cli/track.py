@@ -48,6 +48,10 @@ def track(
     pictures: Annotated[
         int | None, typer.Option(min=1, help="stop after so many; Ctrl-C also stops")
     ] = None,
+    detector: Annotated[
+        str | None,
+        typer.Option(help="opencv or apriltag, instead of the rig file's tags: detector"),
+    ] = None,
     mcap: Annotated[
         Path | None, typer.Option(help="also write the poses as MCAP", metavar="MCAP")
     ] = None,
@@ -74,6 +78,7 @@ def track(
       cdpr track rig.yaml front=0 side=1 -o poses.csv
     """
     import time
+    from dataclasses import replace
     from itertools import islice
 
     from cdpr.clearance import ClearanceModel
@@ -94,6 +99,8 @@ def track(
     if mcap is not None:
         check_output(mcap, force)
     the_rig = calibrated_rig(load_rig(rig), calibration)
+    if detector is not None:
+        the_rig = replace(the_rig, tag_detector=detector)
     eyes = eyes_of(the_rig, source, camera)
     several = len(eyes) > 1
     logs = {eye.name: _own_file(output, eye.name) for eye in eyes} if several else {}
@@ -135,7 +142,7 @@ def track(
     write_pose_log(output, logged, with_clearance=model is not None)
     if mcap is not None:
         write_track_mcap(mcap, logged, began)
-    facts = _facts(logged, output, count)
+    facts = _facts(logged, output, count, (time.time_ns() - began) * 1e-9)
     if as_json:
         show_json(facts)
     else:
@@ -190,8 +197,17 @@ def _overlay(
         yield draw
 
 
-def _facts(logged: list[LoggedPicture], output: Path, count: TrackCount) -> dict[str, Any]:
-    """What was measured, in numbers."""
+def _facts(
+    logged: list[LoggedPicture], output: Path, count: TrackCount, took: float
+) -> dict[str, Any]:
+    """What was measured, in numbers.
+
+    Args:
+        logged: What was measured.
+        output: Where it is written.
+        count: How many pictures were measured, and in which times.
+        took: How long all of it took, [s].
+    """
     import numpy as np
 
     from tracking.measurement import PoseMeasurement
@@ -204,6 +220,7 @@ def _facts(logged: list[LoggedPicture], output: Path, count: TrackCount) -> dict
         "poses": len(poses),
         "position_deviation_mm": round(float(np.median(deviations)) * 1000, 4),
         "reprojection_px": round(float(np.median([p.reprojection for p in poses])), 4),
+        "pictures_per_second": round(len(logged) / took, 1),
         "measuring_ms": round(float(np.median(count.seconds)) * 1000, 2),
     }
     clearances = [p.clearance for p in logged if p.clearance is not None]

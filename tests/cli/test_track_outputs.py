@@ -33,6 +33,7 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
     facts = json.loads(answer.out)
     assert facts["poses"] == 3
     assert facts["measuring_ms"] > 0.0
+    assert facts["pictures_per_second"] > 0.0
     with log.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert tuple(rows[0]) == POSE_COLUMNS + CLEARANCE_COLUMNS
@@ -81,6 +82,13 @@ def test_a_place_that_cannot_be_drawn_to_is_refused(
     with nothing_written(tmp_path):
         answer = call("track", RIG, "synthetic", "--plan", plan, "-o", log, "--overlay", place)
     one_message(answer, 2, words, name)
+
+
+def test_a_detector_nobody_knows_is_refused(plan: Path, tmp_path: Path) -> None:
+    arguments = ("synthetic", "--plan", plan, "-o", tmp_path / "poses.csv", "--detector", "eyes")
+    with nothing_written(tmp_path):
+        answer = call("track", RIG, *arguments)
+    one_message(answer, 2, "unknown tag detector 'eyes'", "opencv, apriltag")
 
 
 def test_a_picture_without_a_pose_says_why() -> None:
