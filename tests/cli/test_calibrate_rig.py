@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from calibration.kinds import calibrated, load_result
+from calibration.rig_parameters import DEFAULT_DEVIATIONS
+from cdpr.cli import calibrate_rig
 from cdpr.kinematics import poses_near
 from cdpr.rig import Rig, load_rig
 from cdpr.winches import WinchMap
@@ -154,6 +157,23 @@ def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
     done = call("calibrate", "rig", RIG, finished_run, "--json")
     assert done.code == 2
     assert "this run was made with other" in json.loads(done.out)["what"]
+
+
+def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
+    """The command line loads nothing heavy, so its defaults stand there once more."""
+    options = inspect.signature(calibrate_rig.rig).parameters
+    for group, deviation in DEFAULT_DEVIATIONS.items():
+        name, unit = (f"{group}_percent", 1e2) if group == "drum_scale" else (f"{group}_mm", 1e3)
+        assert options[name].default == pytest.approx(deviation * unit), group
+
+
+def test_a_run_with_too_few_rests_is_told_so(finished_run: Path) -> None:
+    """Without a camera; it stands still at its start and its goal, if at all."""
+    done = call("calibrate", "rig", ROOT / "configs/gachon_8_6.yaml", finished_run, "--json")
+    assert done.code == 2
+    answer = json.loads(done.out)
+    assert "places at rest, 10 are needed" in answer["what"]
+    assert "cdpr calibrate poses" in answer["next_step"]
 
 
 def test_a_folder_that_is_no_run_and_a_missing_file_are_refused(tmp_path: Path) -> None:
