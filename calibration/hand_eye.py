@@ -23,7 +23,7 @@ from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, read_only
 from cdpr.rig import Camera, Rig
 from tracking.bundle import TagView, moved, solve_bundle
-from tracking.tracker import TrackerSettings
+from tracking.settings import TrackerSettings
 
 LEAST_POSES = 8
 """Fewer poses do not show how well the rig keeps what it tells."""

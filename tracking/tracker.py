@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from cdpr.errors import BadInput
-from cdpr.poses import Array, Pose, read_only
+from cdpr.poses import Pose, read_only
 from cdpr.rig import Camera, Rig, Tag
 from tracking.bits import carries_tag
 from tracking.bundle import BundlePose, TagView, polish_bundle, solve_bundle
@@ -17,42 +16,14 @@ from tracking.consensus import Consensus, agreeing
 from tracking.detector import Detection
 from tracking.detectors import make_detector
 from tracking.edges import refine
+from tracking.frame_tags import near_places, nearest_to, region_around
 from tracking.marks import modules_across, tag_corners
 from tracking.measurement import NoPose, Observation, PoseMeasurement
 from tracking.outliers import without_outliers
-from tracking.picture import Image, Region
+from tracking.picture import Image
 from tracking.prediction import predicted
 from tracking.projection import pixels_from_ideal, pixels_of
-
-
-@dataclass(frozen=True, slots=True)
-class TrackerSettings:
-    """When a pose is believed.
-
-    Attributes:
-        reprojection_px: Largest RMS error of the corners.
-        view_angle: Tags seen more aslant than this are left out, [rad].
-        position_deviation: Largest standard deviation of the position along any direction, [m].
-        jump: Largest way from the last pose beside what speed allows, [m].
-        jump_angle: Largest turn from the last pose, [rad].
-        speed: Fastest the platform is expected to go, [m/s].
-        turn: Largest turn from the home pose; no cable robot turns by a right angle, [rad].
-        single_tag_margin: By how much, in variances, a single tag's pose must fit better than its
-            mirror pose.
-        camera_moved_px: Frame tags farther off than this mean that the camera was moved.
-        camera_check_period: Pictures between checks of the camera.
-    """
-
-    reprojection_px: float = 0.5
-    view_angle: float = float(np.radians(76.0))
-    position_deviation: float = 0.003
-    jump: float = 0.03
-    jump_angle: float = 0.25
-    speed: float = 0.2
-    turn: float = float(np.radians(80.0))
-    single_tag_margin: float = 30.0
-    camera_moved_px: float = 1.0
-    camera_check_period: int = 10
+from tracking.settings import TrackerSettings
 
 
 class Tracker:
@@ -120,7 +91,7 @@ class Tracker:
         if result is None:
             result = self._search(image, time)
         elif self._pictures % self.settings.camera_check_period == 0:
-            self._check_camera(image, self._frame_detections(image))
+            self._check_camera(image, near_places(self.camera, self._frame, self._detector, image))
         self._before = self._last
         self._last = result if isinstance(result, PoseMeasurement) else None
         return result
@@ -146,7 +117,7 @@ class Tracker:
         found = self._measure(image, time, [], expected, "tracked")
         if self._goes_on(found, last):
             return found
-        region = self._platform_region(expected)
+        region = region_around(self.camera, expected.apply(self.rig.platform_corners), slack=0.2)
         if region is None:
             return None
         detections = self._detector.detect_all(image, region)
@@ -172,55 +143,11 @@ class Tracker:
             return False
         return found.pose.angle_to(last.pose) <= self.settings.jump_angle
 
-    def _platform_region(self, pose: Pose) -> Region | None:
-        """The pixels around the platform at a pose, or None out of view."""
-        corners = self._camera_from_world.apply(pose.apply(self.rig.platform_corners))
-        if np.any(corners[:, 2] < 0.02):
-            return None
-        return self._region(pixels_of(self.camera, corners), slack=0.2)
-
-    def _region(self, pixels: Array, slack: float) -> Region | None:
-        low, high = pixels.min(axis=0), pixels.max(axis=0)
-        border = slack * (high - low).max() + 8.0
-        size = np.array([self.camera.width, self.camera.height])
-        left, top = np.clip(np.floor(low - border), 0, size).astype(int).tolist()
-        right, bottom = np.clip(np.ceil(high + border), 0, size).astype(int).tolist()
-        if right - left < 16 or bottom - top < 16:
-            return None
-        return Region(left, top, right, bottom)
-
-    def _frame_detections(self, image: Image) -> list[Detection]:
-        """Frame tags near where they should be."""
-        found = []
-        for tag in self._frame.values():
-            corners = self._camera_from_world.apply(tag_corners(tag))
-            if np.any(corners[:, 2] < 0.02):
-                continue
-            region = self._region(pixels_of(self.camera, corners), slack=0.5)
-            if region is not None:
-                found += [d for d in self._detector.detect_all(image, region) if d.id == tag.id]
-        return found
-
     def _check_camera(self, image: Image, detections: Sequence[Detection]) -> None:
-        views = self._views(image, self._nearest_to_frame_tags(detections), self._frame)
+        views = self._views(image, nearest_to(self.camera, self._frame, detections), self._frame)
         limit = self.settings.camera_moved_px
         check = refuse_moved_camera(self.camera, views, limit)
         self.camera_check = check or self.camera_check
-
-    def _nearest_to_frame_tags(self, detections: Sequence[Detection]) -> list[Detection]:
-        """Of each frame tag the detection nearest to its place: others are of another print."""
-        nearest: dict[int, tuple[float, Detection]] = {}
-        for found in detections:
-            if found.id not in self._frame:
-                continue
-            points = self._camera_from_world.apply(tag_corners(self._frame[found.id]))
-            if np.any(points[:, 2] < 0.02):
-                continue
-            gap = pixels_of(self.camera, points).mean(axis=0) - found.corners.mean(axis=0)
-            distance = float(np.linalg.norm(gap))
-            if found.id not in nearest or distance < nearest[found.id][0]:
-                nearest[found.id] = (distance, found)
-        return [found for _, found in nearest.values()]
 
     def _views(
         self, image: Image, detections: Sequence[Detection], tags: dict[int, Tag]

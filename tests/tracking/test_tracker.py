@@ -22,7 +22,8 @@ from cdpr.scene import Scene
 from simulation.camera import Optics, SyntheticCamera
 from tracking.camera_check import CameraMoved
 from tracking.measurement import NoPose, PoseMeasurement
-from tracking.tracker import Tracker, TrackerSettings
+from tracking.settings import TrackerSettings
+from tracking.tracker import Tracker
 
 
 def along(points: list[list[float]], count: int) -> Iterator[Pose]:
