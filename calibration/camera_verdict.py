@@ -15,6 +15,9 @@ CELLS = (8, 6)
 """Columns and rows of the map of what is covered."""
 GOOD_VIEWS, GOOD_COVERAGE, GOOD_TILT, GOOD_ERROR = 12, 0.6, 20.0, 1.0
 """Pictures, share of the map, degrees to either side of both axes together, pixels."""
+FULL_COVERAGE = 0.9
+"""Share of the map beyond which nothing is gained by more of it."""
+EDGES = "bring the board near the edges and corners of the picture"
 MORE = "take more pictures: 40 are good"
 _SIDES = (("left", 0, 0), ("right", 0, -1), ("top", 1, 0), ("bottom", 1, -1))
 
@@ -72,7 +75,7 @@ def judge_camera(
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     lacks = [
         *_about_pictures(result, coverage, tilts),
-        *_about_errors(result, error, halves, wanted, distance),
+        *_about_errors(result, coverage, error, halves, wanted, distance),
     ]
     verdict = Verdict.of(error, wanted, f"at {distance:.2g} m", lacks)
     return CameraQuality(verdict, coverage, tilts, distance, min(away), max(away), halves)
@@ -121,7 +124,7 @@ def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) ->
         what = (
             f"the board covered {share:.0%} of the picture{place}, {GOOD_COVERAGE:.0%} are needed"
         )
-        lacks.append(Lack(what, "bring the board near the edges and corners of the picture"))
+        lacks.append(Lack(what, EDGES))
     for axis, name in enumerate(("forward and backward", "left and right")):
         span = float(np.ptp(tilts[:, axis]))
         if span < 2.0 * GOOD_TILT:
@@ -132,7 +135,12 @@ def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) ->
 
 
 def _about_errors(
-    result: CameraCalibration, error: float, halves: float, wanted: float, distance: float
+    result: CameraCalibration,
+    coverage: Array,
+    error: float,
+    halves: float,
+    wanted: float,
+    distance: float,
 ) -> list[Lack]:
     """What the numbers lack, and what to do."""
     lacks = []
@@ -146,6 +154,9 @@ def _about_errors(
             f" {wanted * 1e3:.2g} mm are wanted"
         )
         lacks.append(Lack(what, MORE))
+        share = float(np.mean(coverage > 0))
+        if GOOD_COVERAGE <= share < FULL_COVERAGE:
+            lacks.append(Lack(f"the board covered {share:.0%} of the picture", EDGES))
     if not halves <= 2.0 * wanted:
         what = f"two halves of the pictures see them {halves * 1e3:.2g} mm apart"
         lacks.append(Lack(what, MORE))

@@ -28,8 +28,7 @@ def extrinsics_page(
     tags = [(f"tag {k}", f"{error:.3f} px") for k, error in result.tag_errors.items()]
     return page_of(
         f"Place of camera {document.name}",
-        f"{document.date}, by {result.by}, {result.pictures} pictures used,"
-        f" {len(result.unused)} remarks on others",
+        f"{document.date}, by {result.by}, {result.pictures} pictures used",
         verdict,
         [
             Section(

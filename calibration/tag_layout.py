@@ -15,14 +15,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calibration.extrinsics import widths_of
+from calibration.layout_frame import corner_slopes, held_still, to_drawing
 from calibration.tag_graph import connected_tags
 from calibration.tag_sights import TagSights
 from calibration.tag_views import TagViews, moved_tags
 from cdpr.errors import BadInput
-from cdpr.poses import Array, Pose, read_only, skew
+from cdpr.poses import Array, Pose, read_only
 from cdpr.rig import Camera, Rig, Tag
 from tracking.bundle import TagView, moved, solve_bundle
-from tracking.marks import tag_corners
 
 LEAST_PICTURES = 4
 """Of two tags or more; twenty are good."""
@@ -219,11 +219,11 @@ def _result(
 ) -> TagLayout:
     drawn = {tag.id: tag for tag in rig.platform_tags}
     at_drawing = tuple(drawn[tag.id] for tag in tags)
-    shift, scale = _to_drawing(tags, at_drawing, fixed)
+    shift, scale = to_drawing(tags, at_drawing, fixed)
     tags = tuple(replace(tag, pose=shift.compose(tag.pose)) for tag in tags)
     cameras = [pose.compose(shift.inverse()) for pose in cameras]
     informations, scores, misfit = views.about_tags(cameras, tags, HUBER)
-    gauge = _gauge(tags, fixed)
+    gauge = held_still(tags, fixed)
     whole = np.sum(informations, axis=0)
     pinned = gauge.T @ gauge * (1e3 * np.trace(whole) / np.trace(gauge.T @ gauge))
     covariance = max(1.0, misfit) * np.linalg.inv(whole + pinned)
@@ -257,48 +257,6 @@ def _sides(cameras: Sequence[Pose]) -> float:
     places = np.array([pose.inverse().position for pose in cameras])
     directions = places / np.linalg.norm(places, axis=1, keepdims=True)
     return float(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)).max())
-
-
-def corner_slopes(tags: Sequence[Tag]) -> Array:
-    """How corners shift when tags shift and turn, shape (4 t, 3, 6 t)."""
-    slopes = np.zeros((4 * len(tags), 3, 6 * len(tags)))
-    for k, tag in enumerate(tags):
-        for corner, arm in enumerate(tag_corners(tag) - tag.pose.position):
-            slopes[4 * k + corner, :, 6 * k : 6 * k + 6] = np.hstack([np.eye(3), -skew(arm)])
-    return slopes
-
-
-def _to_drawing(tags: Sequence[Tag], drawn: Sequence[Tag], fixed: int | None) -> tuple[Pose, float]:
-    """The motion that puts tags where they were drawn, and their size by that of the drawing.
-
-    Source: Umeyama 1991.
-    """
-    here = np.concatenate([tag_corners(tag) for tag in tags])
-    there = np.concatenate([tag_corners(tag) for tag in drawn])
-    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
-    left, _, right = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left * sign @ right
-    places = [np.array([tag.pose.position for tag in which]) for which in (tags, drawn)]
-    sizes = [float(np.linalg.norm(place - place.mean(axis=0))) for place in places]
-    scale = sizes[0] / sizes[1]
-    if fixed is not None:
-        (one,) = (tag for tag in tags if tag.id == fixed)
-        (other,) = (tag for tag in drawn if tag.id == fixed)
-        return other.pose.compose(one.pose.inverse()), scale
-    return Pose(there.mean(axis=0) - rotation @ here.mean(axis=0), rotation), scale
-
-
-def _gauge(tags: Sequence[Tag], fixed: int | None) -> Array:
-    """What must not change with the layout, shape (6, 6 t): it would move the platform's frame."""
-    if fixed is not None:
-        which = [tag.id for tag in tags].index(fixed)
-        return np.eye(6 * len(tags))[6 * which : 6 * which + 6]
-    corners = np.concatenate([tag_corners(tag) for tag in tags])
-    slopes = corner_slopes(tags)
-    arms = [skew(corner) for corner in corners - corners.mean(axis=0)]
-    turns = np.sum([arm @ slope for arm, slope in zip(arms, slopes, strict=True)], axis=0)
-    return np.concatenate([slopes.sum(axis=0), turns / 0.05])
 
 
 def _too_few(sights: TagSights, fixed: int | None) -> BadInput:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.extrinsics_result import AXES
 from calibration.page import Section, page_of, table_of
 from calibration.tag_layout import TagLayout
 from calibration.tags_result import TagsResult
@@ -28,7 +29,11 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: Verdict) -> str:
                 ),
                 gauge,
             ),
-            Section("Places, with 95 % intervals", table_of(_places(document))),
+            Section(
+                "Places, with 95 % intervals",
+                table_of(_places(document), ("tag", *AXES)),
+                "Turns are about the platform's axes, from the stated rotation.",
+            ),
             Section(
                 "Quality",
                 table_of(
@@ -68,8 +73,7 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
 
 def _places(document: TagsResult) -> list[tuple[str, ...]]:
     stated = document.stated
-    names = [name.removeprefix(f"tag_{document.platform[0].id}_") for name in list(stated)[:6]]
     return [
-        (f"tag {tag.id}", *(f"{n} {stated[f'tag_{tag.id}_{n}']}" for n in names))
+        (f"tag {tag.id}", *(str(stated[f"tag_{tag.id}_{axis}"]) for axis in AXES))
         for tag in document.platform
     ]

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
+USE = "use it: pass the result's file with --calibration, or copy its numbers into the rig file"
+"""What to do with a result that is good enough."""
+
 
 @dataclass(frozen=True, slots=True)
 class Lack:
@@ -29,7 +32,7 @@ class Verdict:
         wanted: What is good enough, [m].
         where: The place or the conditions of that, such as ``at 0.6 m``.
         reasons: Why it is not good enough; empty if it is.
-        next_steps: What to do about each.
+        next_steps: What to do about each, or with a good result.
     """
 
     error: float
@@ -42,7 +45,7 @@ class Verdict:
     def of(cls, error: float, wanted: float, where: str, lacks: Sequence[Lack]) -> Self:
         """The verdict of what was found to be lacking; each next step once."""
         reasons = tuple(lack.reason for lack in lacks)
-        steps = tuple(dict.fromkeys(lack.next_step for lack in lacks))
+        steps = tuple(dict.fromkeys(lack.next_step for lack in lacks)) or (USE,)
         return cls(error, wanted, where, reasons, steps)
 
     @property
