@@ -24,7 +24,7 @@ from tracking.projection import ideal_from_pixels, pixels_from_ideal
 FLOOR = 0.0035
 #: Error of an edge whose step is as wide as a module, [px]; it falls with the fifth power of that
 #: ratio (measured on rendered pictures of 24 to 90 px, tilted to 75°, blurred to 2 px).
-CROWDED = 0.25
+CROWDED = 0.16
 #: Blur reaches around a corner this many widths of a step far.
 CORNER_REACH = 1.2
 
