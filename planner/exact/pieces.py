@@ -1,9 +1,7 @@
 """Obstacles as the pieces that the compiled checks know, chosen by shape alone.
 
-A box, ball, capsule, cylinder or hull is one piece. A mesh that encloses a convex volume is the
-hull of its vertices; any other mesh is a guard, its hull, which is looked into, triangle by
-triangle, only where the guard is too near. (As everywhere in this program a mesh is its surface;
-for the convex ones the volume inside is forbidden too.)
+A box, ball, capsule, cylinder or hull is one piece. A mesh is a guard, its hull, which is looked
+into, triangle by triangle, only where the guard is too near.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ from cdpr.shapes import (
     Capsule,
     ConvexHull,
     Cylinder,
-    Indices,
     Obstacle,
     Shape,
     Sphere,
@@ -32,8 +29,6 @@ BOX: Final = 0
 ROUND: Final = 1
 HULL: Final = 2
 MESH: Final = 3
-
-_FLAT = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,8 +102,8 @@ def _sizes(shape: Shape, points: Array) -> tuple[int, Array, float, float]:
             return HULL, none, 0.0, radius
         case ConvexHull():
             return HULL, none, 0.0, 0.0
-        case TriangleMesh(triangles=triangles):
-            return (HULL if _encloses_convex(points, triangles) else MESH), none, 0.0, 0.0
+        case TriangleMesh():
+            return MESH, none, 0.0, 0.0
 
 
 def _features(shape: Shape, points: Array, pose: Pose) -> tuple[Array, Array]:
@@ -131,23 +126,3 @@ def _features(shape: Shape, points: Array, pose: Pose) -> tuple[Array, Array]:
             return np.stack([pose.rotation[:, 2], -pose.rotation[:, 2]]), np.zeros((0, 2, 3))
         case _:
             return np.zeros((0, 3)), np.zeros((0, 2, 3))
-
-
-def _encloses_convex(points: Array, triangles: Indices) -> bool:
-    """Whether every side is shared by two triangles and every vertex behind every triangle."""
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    _, counts = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
-    if np.any(counts != 2):
-        return False
-    corners = points[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    used = points[np.unique(triangles)]
-    size = float(np.ptp(used, axis=0).max())
-    if np.any(lengths <= _FLAT * size**2):
-        return False
-    normals = normals / lengths[:, None]
-    heights = used @ normals.T - np.sum(corners[:, 0] * normals, axis=1)
-    one_side = np.all(heights <= _FLAT * size, axis=0) | np.all(heights >= -_FLAT * size, axis=0)
-    flat = np.all(np.abs(heights) <= _FLAT * size)
-    return bool(np.all(one_side) and not flat)

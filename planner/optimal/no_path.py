@@ -58,8 +58,8 @@ def no_path(
         settings.not_found(int(search.totals[0]), gap),
         where=where,
         why=f"it is not proved that there is none; {_in_the_way(rig, scene, problem, search)}",
-        next_step="raise --budget-ms, ask for less clearance, try another seed, or move the goal"
-        " or an obstacle",
+        next_step=f"{settings.longer}, ask for less clearance, try another seed, or move the"
+        " goal or an obstacle",
         values=values,
     )
 

@@ -39,12 +39,14 @@ def paper_route(
         NoSolution: The search ended at its limit.
     """
     start, goal = np.array(scene.start.position), np.array(scene.goal.position)
-    attempts = [(CLEARANCE_RESERVE, settings)]
+    attempts = [(CLEARANCE_RESERVE, 1.0)]
     if settings.mode == "rewire":
-        fewer = max(1, int(ATTEMPT_WITH_ROOM * settings.max_iterations))
         room = CLEARANCE_RESERVE + rig.motion.blend_tolerance
-        attempts.insert(0, (room, replace(settings, max_iterations=fewer)))
-    for reserve, attempt in attempts:
+        attempts.insert(0, (room, ATTEMPT_WITH_ROOM))
+    iterations = checks = 0
+    for reserve, share in attempts:
+        most = max(1, int(share * settings.max_iterations) - iterations)
+        attempt = replace(settings, max_iterations=most)
         planner = PaperPlanner(rig, scene, attempt, reserve, kinematic)
         if reserve > CLEARANCE_RESERVE and not (
             planner.edge(start, start) and planner.edge(goal, goal)
@@ -52,16 +54,18 @@ def paper_route(
             continue
         random = np.random.default_rng(settings.seed)
         result = planner.search(start, goal, random, progress)
+        iterations += result.iterations
         if result.path is not None:
             return Route(
                 path=_post_processed(result.path, planner, kinematic),
                 raw=result.path,
                 nodes=result.points,
                 parents=result.parents,
-                iterations=result.iterations,
-                edge_checks=planner.checks,
+                iterations=iterations,
+                edge_checks=checks + planner.checks,
             )
-    raise _no_solution(scene, settings, result)
+        checks += planner.checks
+    raise _no_solution(scene, settings, result, iterations)
 
 
 def _post_processed(raw: Array, planner: PaperPlanner, kinematic: KinematicCost) -> Array:
@@ -77,7 +81,9 @@ def _post_processed(raw: Array, planner: PaperPlanner, kinematic: KinematicCost)
     return planner.shortcut(path, _FOR_FEWER_CORNERS)
 
 
-def _no_solution(scene: Scene, settings: PlannerSettings, result: SearchResult) -> NoSolution:
+def _no_solution(
+    scene: Scene, settings: PlannerSettings, result: SearchResult, iterations: int
+) -> NoSolution:
     refused = sorted(result.refused.items(), key=lambda item: -item[1])
     why = ", ".join(f"{count} for {reason}" for reason, count in refused) or "none"
     pairs = sorted(result.in_the_way.items(), key=lambda item: -item[1])[:3]
@@ -86,7 +92,7 @@ def _no_solution(scene: Scene, settings: PlannerSettings, result: SearchResult) 
         why += f"; most often in the way: {listed}"
     best = result.best_distance * 1000.0
     return NoSolution(
-        f"no path after {result.iterations} iterations; the tree came within {best:.1f} mm of the"
+        f"no path after {iterations} iterations; the tree came within {best:.1f} mm of the"
         f" goal with {len(result.points)} nodes",
         where=f"scene {scene.name}",
         why=f"edges refused: {why}",
@@ -94,7 +100,7 @@ def _no_solution(scene: Scene, settings: PlannerSettings, result: SearchResult) 
         " goal or an obstacle",
         values={
             "best_distance_mm": best,
-            "iterations": float(result.iterations),
+            "iterations": float(iterations),
             "nodes": float(len(result.points)),
             "seed": float(settings.seed),
         },

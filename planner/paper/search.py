@@ -38,8 +38,6 @@ from planner.route import Progress
 from planner.settings import IMPROVING_ITERATIONS, PlannerSettings
 from planner.space import TranslationSpace
 
-"""Called with iterations done, iterations at most, and the tree's distance to the goal [m]."""
-
 _CHUNK = 500
 """Iterations between two reports of progress."""
 

@@ -176,7 +176,7 @@ def _no_path(scene: Scene, search: Search, settings: TurningSettings) -> NoSolut
         settings.not_found(search.rounds, gap),
         where=f"scene {scene.name}",
         why=f"it is not proved that there is none; moves were refused for: {listed}",
-        next_step="raise --budget-ms, ask for less clearance, allow more in rotation_limits, try"
+        next_step=f"{settings.longer}, ask for less clearance, allow more in rotation_limits, try"
         " another seed, or move the goal or an obstacle",
         values=values,
     )

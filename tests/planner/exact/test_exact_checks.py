@@ -12,7 +12,7 @@ import pytest
 from cdpr.poses import Pose, matrix_from_rotation_vector
 from cdpr.rig import load_rig
 from cdpr.scene import load_scene
-from planner.exact import compilation, compiled
+from planner.exact import compiled
 from planner.exact.checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
 
 ROOT = Path(__file__).parents[3]
@@ -83,25 +83,12 @@ def test_the_cache_is_the_given_folder_and_none_where_nothing_can_be_written(
     assert find(kernels) is None
 
 
-def test_kernels_without_a_cache_still_run_and_are_never_said_to_be_compiled(
+def test_kernels_without_a_cache_still_run(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(compiled, "cache_folder", lambda sources: None)
-    monkeypatch.setattr(compilation, "cache_folder", lambda sources: None)
 
     def twice(value: float) -> float:
         return 2.0 * value
 
     assert compiled.kernel(twice)(1.5) == 3.0
-    assert not compilation.is_compiled()
-
-
-def test_compiling_all_leaves_its_mark_and_tells_each_step(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(compilation, "cache_folder", lambda sources: tmp_path)
-    assert not compilation.is_compiled()
-    steps: list[str] = []
-    compilation.compile_all(GACHON, SCENE, steps.append)
-    assert compilation.is_compiled()
-    assert len(steps) == 4

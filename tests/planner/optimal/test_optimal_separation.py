@@ -107,7 +107,7 @@ def test_a_search_that_ends_too_early_says_that_nothing_is_proved(
     assert "no path after 9 rounds" in said
     assert "it is not proved that there is none" in said
     assert "workspace" in said
-    assert "--budget-ms" in said
+    assert "raise --rounds" in said
     assert "proved" not in nothing.value.values
 
 

@@ -1,11 +1,11 @@
-"""Arrays kept in the user's cache, whatever has become of it, and the stamp of compiled kernels."""
+"""Arrays kept in the user's cache, whatever has become of it."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from planner.optimal import compilation, stored
+from planner.optimal import stored
 
 KEY = ["rig", {"mass": 0.4}]
 
@@ -25,7 +25,6 @@ def made():
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "cache_folder", lambda _: tmp_path)
-    monkeypatch.setattr(compilation, "cache_folder", lambda _: tmp_path)
     return tmp_path
 
 
@@ -72,21 +71,6 @@ def test_a_cache_that_cannot_be_written_is_done_without(folder, made, monkeypatc
 
 def test_without_a_folder_every_run_computes(made, monkeypatch) -> None:
     monkeypatch.setattr(stored, "cache_folder", lambda _: None)
-    monkeypatch.setattr(compilation, "cache_folder", lambda _: None)
     take(made)
     take(made)
     assert made.times == 2
-    compilation.note_compiled()
-    assert not compilation.is_compiled()
-
-
-def test_the_stamp_of_compiled_kernels_is_kept(folder) -> None:
-    assert not compilation.is_compiled()
-    compilation.note_compiled()
-    assert compilation.is_compiled()
-
-
-def test_a_stamp_that_cannot_be_written_is_done_without(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(compilation, "cache_folder", lambda _: tmp_path / "gone")
-    compilation.note_compiled()
-    assert not compilation.is_compiled()

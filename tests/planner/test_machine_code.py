@@ -1,0 +1,64 @@
+"""When a task is said to be compiled: done before, with the very files that lie here."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from planner import machine_code
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache, and two kernels of our own."""
+    monkeypatch.setattr(machine_code, "cache_folder", lambda _: tmp_path)
+    kernels = tmp_path / "kernels"
+    kernels.mkdir()
+    (kernels / "edge.py").write_text("a kernel")
+    (kernels / "hull.py").write_text("another")
+    monkeypatch.setattr(machine_code, "_KERNELS", (kernels,))
+    return tmp_path
+
+
+def test_a_task_is_compiled_once_it_was_done_and_the_others_are_not(cache: Path) -> None:
+    assert not machine_code.is_compiled("optimal")
+    machine_code.note_compiled("optimal")
+    assert machine_code.is_compiled("optimal")
+    assert not machine_code.is_compiled("turning")
+
+
+@pytest.mark.parametrize("change", ["touched", "edited", "added", "elsewhere"])
+def test_code_that_numba_would_not_find_again_is_not_said_to_be_there(
+    cache: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine_code.note_compiled("optimal")
+    kernels = cache / "kernels"
+    match change:
+        case "touched":
+            os.utime(kernels / "edge.py", ns=(0, 0))
+        case "edited":
+            stat = (kernels / "edge.py").stat()
+            (kernels / "edge.py").write_text("a kernel, longer")
+            os.utime(kernels / "edge.py", ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        case "added":
+            (kernels / "ball.py").write_text("a third")
+        case "elsewhere":
+            kernels.rename(cache / "moved")
+            monkeypatch.setattr(machine_code, "_KERNELS", (cache / "moved",))
+    assert not machine_code.is_compiled("optimal")
+
+
+def test_without_a_folder_nothing_is_said_to_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine_code, "cache_folder", lambda _: None)
+    machine_code.note_compiled("maps")
+    assert not machine_code.is_compiled("maps")
+
+
+def test_a_stamp_that_cannot_be_written_is_done_without(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine_code, "cache_folder", lambda _: cache / "gone")
+    machine_code.note_compiled("maps")
+    assert not machine_code.is_compiled("maps")
