@@ -15,6 +15,7 @@ from calibration.result_file import ResultDocument, common_keys
 from calibration.tag_layout import TagLayout
 from calibration.verdict import Verdict
 from cdpr.document_types import NonNegative, PoseDocument, Positive
+from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, rotation_vector_from_matrix
 from cdpr.rig import Tag
 from cdpr.rig_file import RigDocument, TagDocument
@@ -44,13 +45,21 @@ class TagsResult(ResultDocument):
         return changes
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart corners of tags that both have are, RMS, [mm]."""
+        """How far apart corners of tags that both have are, RMS, [mm].
+
+        Raises:
+            BadInput: They have no tag in common.
+        """
         corners = {tag.id: tag_corners(_plain(tag)) for tag in other.platform}
         gaps = [
             tag_corners(_plain(tag)) - corners[tag.id] for tag in self.platform if tag.id in corners
         ]
         if not gaps:
-            return float("inf")
+            raise BadInput(
+                "the results have no tag in common",
+                where=f"calibration {self.kind} {self.name}, {self.date}",
+                next_step="compare results for one platform",
+            )
         return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1)))) * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:

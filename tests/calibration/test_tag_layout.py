@@ -243,6 +243,9 @@ def test_results_are_compared_tag_by_tag(rig: Rig) -> None:
     assert changes["tag_301_x_mm"] == pytest.approx(1.0, abs=1e-5)
     assert changes["tag_301_turn_z_deg"] == pytest.approx(np.degrees(2e-3), abs=1e-5)
     assert changes["tag_302_x_mm"] == pytest.approx(0.0, abs=1e-9)
+    strange = [tag.model_copy(update={"id": tag.id + 100}) for tag in two.platform]
+    with pytest.raises(BadInput, match="no tag in common"):
+        one.apart_mm(two.model_copy(update={"platform": strange}))
     assert one.apart_mm(two) == pytest.approx(np.hypot(1.0, 0.048 * 2.0) / np.sqrt(6), rel=0.05)
 
 
