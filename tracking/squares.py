@@ -34,11 +34,11 @@ class Pass:
     windows: tuple[int, int, int]
 
 
-#: Faint ones; small ones; blurred and noisy ones.
+#: Small ones; faint and noisy ones; blurred ones.
 PASSES = (
     Pass(1, 0.0, 2.0, (3, 23, 10)),
-    Pass(2, 0.0, 2.0, (7, 47, 20)),
-    Pass(2, 1.2, 2.0, (21, 81, 30)),
+    Pass(2, 0.8, 2.0, (7, 47, 20)),
+    Pass(2, 1.2, 3.0, (21, 81, 30)),
 )
 
 
