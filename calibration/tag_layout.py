@@ -128,14 +128,13 @@ def measure_layout(
     sights = sights.without(single)
     starts, sights = _starts(camera, drawn, sights)
     located = connected_tags([tuple(squares) for squares in sights.squares.values()], fixed)
+    among = fixed if fixed is not None else next(iter(located), None)
     sights = sights.without(
         {
-            name: f"shows only tags that no picture shows with tag {located[0]}"
+            name: f"shows only tags that no picture shows with tag {among}"
             for name, squares in sights.squares.items()
             if not set(squares) <= set(located)
         }
-        if located
-        else {}
     )
     if len(sights.squares) < LEAST_PICTURES:
         raise _too_few(sights, fixed)

@@ -208,6 +208,13 @@ def test_too_few_pictures_and_tags_are_refused(rig: Rig) -> None:
         require_tags(replace(rig, platform_tags=rig.platform_tags[:1]), None)
 
 
+def test_a_fixed_tag_that_no_picture_shows_is_refused_by_name(rig: Rig) -> None:
+    unseen, *seen = rig.platform_tags
+    with pytest.raises(BadInput, match=f"^0 pictures show .* tied to tag {unseen.id}") as told:
+        measure_layout(rig, rig.cameras[0], session(rig, seen, 6, seed=3), unseen.id)
+    assert f"no picture shows with tag {unseen.id}" in told.value.why
+
+
 def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> None:
     tags = as_glued(rig, np.random.default_rng(1))
     found = measure_layout(rig, rig.cameras[0], session(rig, tags, 16, seed=2))
