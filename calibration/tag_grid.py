@@ -11,7 +11,7 @@ import numpy as np
 from calibration.board import LEAST_POINTS, Seen, require_board
 from calibration.plain_camera import plain_camera
 from cdpr.poses import Array
-from cdpr.tag_families import FAMILIES
+from cdpr.tag_families import FAMILIES, tags_in
 from tracking.detector import TagDetector
 from tracking.edges import refine
 from tracking.marks import CORNER_SIGNS, modules_across
@@ -43,7 +43,8 @@ class TagGrid:
         """Refuses boards that cannot be.
 
         Raises:
-            BadInput: Too few tags, sizes that are none, or an unknown family.
+            BadInput: Too few tags, sizes that are none, an unknown family, or numbers that it
+                does not have.
         """
         require_board(self.columns * self.rows >= 4, "a tag grid needs 4 tags")
         require_board(min(self.columns, self.rows) >= 1, "a tag grid needs a row and a column")
@@ -53,6 +54,13 @@ class TagGrid:
             self.family in FAMILIES,
             f"unknown tag family {self.family!r}",
             f"use one of {', '.join(FAMILIES)}",
+        )
+        last = self.first + self.columns * self.rows - 1
+        require_board(
+            0 <= self.first and last < tags_in(self.family),
+            f"{self.family} has the tags 0 to {tags_in(self.family) - 1}, the grid needs"
+            f" {self.first} to {last}",
+            "choose a smaller first number, fewer tags or a larger family",
         )
 
     def __str__(self) -> str:

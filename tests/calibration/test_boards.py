@@ -144,6 +144,8 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> 
         (lambda: TagGrid(3, 1, 0.03, 0.01, "tag36h11"), "needs 4 tags"),
         (lambda: TagGrid(3, 2, 0.03, 0.0, "tag36h11"), "gap"),
         (lambda: TagGrid(3, 2, 0.03, 0.01, "tag99h1"), "unknown tag family"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586, .* 580 to 591"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586, .* -1 to 10"),
     ],
 )
 def test_boards_that_cannot_be_are_refused(make, named: str) -> None:
