@@ -21,7 +21,8 @@ class ClearanceTable:
         time: Since the start of the run, shape (n,), [s].
         source: Where each pose came from, n texts: ``tag`` or ``encoder``.
         distance: Smallest distance, shape (n,), [m].
-        uncertainty: Of that distance, as its source states it, shape (n,), [m].
+        uncertainty: How much less than that the smallest true one may be, shape (n,), [m].
+        at_most: The smallest true one is no more than this, shape (n,), [m].
         body: Which part of the robot is nearest, n texts.
         obstacle: Which obstacle it is nearest to, n texts.
         planned_distance: Smallest distance of the planned pose at that time, shape (n,), [m].
@@ -34,6 +35,7 @@ class ClearanceTable:
     source: tuple[str, ...]
     distance: Array
     uncertainty: Array
+    at_most: Array
     body: tuple[str, ...]
     obstacle: tuple[str, ...]
     planned_distance: Array
@@ -67,6 +69,7 @@ class ClearanceTable:
             source=tuple(self.source[i] for i in chosen),
             distance=self.distance[rows],
             uncertainty=self.uncertainty[rows],
+            at_most=self.at_most[rows],
             body=tuple(self.body[i] for i in chosen),
             obstacle=tuple(self.obstacle[i] for i in chosen),
             planned_distance=self.planned_distance[rows],
@@ -86,6 +89,7 @@ class ClearanceTable:
             texts("source", self.source),
             numbers("distance_mm", self.distance, _MM),
             numbers("uncertainty_mm", self.uncertainty, _MM),
+            numbers("at_most_mm", self.at_most, _MM),
             texts("body", self.body),
             texts("obstacle", self.obstacle),
             numbers("planned_distance_mm", self.planned_distance, _MM),
@@ -104,18 +108,19 @@ class ClearanceTable:
         """
         table = TableFile(path)
         # By place, not by name: one obstacle may be called "x" and another "planned_x".
-        own = range(7, len(table.names), 2)
+        own = range(8, len(table.names), 2)
         return cls(
             time=table.floats("time_s"),
             source=table.texts("source"),
             distance=table.floats("distance_mm", _MM),
             uncertainty=table.floats("uncertainty_mm", _MM),
+            at_most=table.floats("at_most_mm", _MM),
             body=table.texts("body"),
             obstacle=table.texts("obstacle"),
             planned_distance=table.floats("planned_distance_mm", _MM),
             obstacles=tuple(table.names[i].removesuffix("_mm") for i in own),
             distances=table.matrix_at(own, _MM),
-            planned_distances=table.matrix_at(range(8, len(table.names), 2), _MM),
+            planned_distances=table.matrix_at(range(9, len(table.names), 2), _MM),
         )
 
 
@@ -123,5 +128,5 @@ def no_clearance(obstacles: tuple[str, ...] = ()) -> ClearanceTable:
     """A table without rows."""
     nothing, nowhere = np.empty(0), np.empty((0, len(obstacles)))
     return ClearanceTable(
-        nothing, (), nothing, nothing, (), (), nothing, obstacles, nowhere, nowhere
+        nothing, (), nothing, nothing, nothing, (), (), nothing, obstacles, nowhere, nowhere
     )

@@ -10,6 +10,7 @@ import numpy as np
 from cdpr.clearance import ClearanceModel, Nearest
 from cdpr.poses import Array, Pose
 from executor.clearance_table import ClearanceTable, no_clearance
+from tracking.measured_clearance import MeasuredClearance
 
 #: What a clearance from drive positions may be off by: counts, torque resolution, one cycle, [m].
 ENCODER_UNCERTAINTY = 1e-4
@@ -23,7 +24,8 @@ class ClearanceRow:
         time: [s].
         source: ``tag`` or ``encoder``.
         measured: At the measured pose.
-        uncertainty: Of the smallest of them, [m].
+        uncertainty: How much less than the smallest of them the smallest true one may be, [m].
+        at_most: The smallest true one is no more than this, [m].
         planned: At the planned pose of the same time.
     """
 
@@ -31,7 +33,24 @@ class ClearanceRow:
     source: str
     measured: tuple[Nearest, ...]
     uncertainty: float
+    at_most: float
     planned: tuple[Nearest, ...]
+
+    @classmethod
+    def by_tags(
+        cls, time: float, clearance: MeasuredClearance, planned: tuple[Nearest, ...]
+    ) -> ClearanceRow:
+        """The row of a pose that a camera measured."""
+        measured, spread = clearance.nearest, clearance.uncertainty
+        return cls(time, "tag", measured, spread, clearance.at_most, planned)
+
+    @classmethod
+    def by_drives(
+        cls, time: float, measured: tuple[Nearest, ...], planned: tuple[Nearest, ...]
+    ) -> ClearanceRow:
+        """The row of a pose that follows from the drives' positions."""
+        at_most = min((n.distance for n in measured), default=np.inf) + ENCODER_UNCERTAINTY
+        return cls(time, "encoder", measured, ENCODER_UNCERTAINTY, at_most, planned)
 
 
 def encoder_rows(
@@ -39,9 +58,7 @@ def encoder_rows(
 ) -> list[ClearanceRow]:
     """A row for each pose that follows from the drives' positions."""
     return [
-        ClearanceRow(
-            float(time), "encoder", model.obstacles(at), ENCODER_UNCERTAINTY, model.obstacles(due)
-        )
+        ClearanceRow.by_drives(float(time), model.obstacles(at), model.obstacles(due))
         for time, at, due in zip(times, measured, planned, strict=True)
     ]
 
@@ -58,6 +75,7 @@ def clearance_table(names: tuple[str, ...], rows: Sequence[ClearanceRow]) -> Cle
         source=tuple(row.source for row in rows),
         distance=measured.min(axis=1),
         uncertainty=np.array([row.uncertainty for row in rows]),
+        at_most=np.array([row.at_most for row in rows]),
         body=tuple(n.first for n in nearest),
         obstacle=tuple(n.second for n in nearest),
         planned_distance=planned.min(axis=1),

@@ -14,14 +14,12 @@ from cdpr.clearance import ClearanceModel
 from cdpr.poses import Array, Pose
 from cdpr.rig import Camera, Rig
 from cdpr.scene import Scene
+from executor.near_watch import NearWatch
 from executor.pose_table import OK
 from executor.run_folder import RunFolder
 from tracking.measured_clearance import MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
-
-#: So many pictures in a row must show too little clearance before the run is stopped for it.
-NEAR_PICTURES = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +109,7 @@ class Observer:
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._tracker = Tracker(rig, camera)
         self._clearance = ClearanceModel(rig, scene)
-        self._limit, self._near_pictures = scene.obstacle_clearance, 0
+        self._watch = NearWatch(scene.obstacle_clearance)
         self.too_near = ""
         """Between what clearance was below the scene's limit in the last pictures, or nothing."""
 
@@ -137,7 +135,7 @@ class Observer:
         if not isinstance(found, PoseMeasurement):
             return replace(unseen(trigger.frame, time, found.reason), picture=kept)
         clearance = clearance_of(self._clearance, found)
-        self._watch(clearance)
+        self.too_near = self._watch.take(clearance)
         return Look(
             trigger.frame,
             time,
@@ -149,22 +147,6 @@ class Observer:
             kept,
             clearance,
         )
-
-    def _watch(self, clearance: MeasuredClearance | None) -> None:
-        """Notes clearance that is below the limit by more than its uncertainty, picture by picture.
-
-        One picture alone may be wrong for a reason that its covariance does not know.
-        """
-        if clearance is None or clearance.distance + clearance.uncertainty >= self._limit:
-            self._near_pictures, self.too_near = 0, ""
-            return
-        self._near_pictures += 1
-        if self._near_pictures >= NEAR_PICTURES:
-            nearest = min(clearance.nearest, key=lambda n: n.distance)
-            self.too_near = (
-                f"{nearest.first} to {nearest.second}: {clearance.distance * 1e3:.1f} ± "
-                f"{clearance.uncertainty * 1e3:.1f} mm; the scene asks for {self._limit * 1e3:g} mm"
-            )
 
 
 MakeObserver = Callable[[], Observer]

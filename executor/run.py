@@ -111,13 +111,7 @@ def _poses(positions: Array, quaternions: Array) -> list[Pose]:
 def _clearance(prepared: PreparedRun, cycles: CycleTable, looks: Sequence[Look]) -> ClearanceTable:
     model = ClearanceModel(prepared.rig, prepared.scene)
     rows = [
-        ClearanceRow(
-            look.time,
-            "tag",
-            look.clearance.nearest,
-            look.clearance.uncertainty,
-            model.obstacles(planned),
-        )
+        ClearanceRow.by_tags(look.time, look.clearance, model.obstacles(planned))
         for look, planned in zip(looks, _planned(looks, cycles), strict=True)
         if look.clearance is not None
     ]

@@ -191,12 +191,13 @@ def distances(clearance: ClearanceTable, required: float) -> list[Check]:
 
 
 def _against_required(rows: ClearanceTable, required: float, teller: str) -> Check:
-    reach = rows.distance + rows.uncertainty
-    passed = not bool(np.any(reach < required - ROUNDING))
-    worst = int(np.nanargmin(rows.distance if passed else reach))
+    passed = not bool(np.any(rows.at_most < required - ROUNDING))
+    worst = int(np.nanargmin(rows.distance if passed else rows.at_most))
     distance, spread = rows.distance[worst] * 1e3, rows.uncertainty[worst] * 1e3
+    at_most = f"mm, surely at most {rows.at_most[worst] * 1e3:.1f} mm"
+    size = f"± {spread:.1f} mm" if passed else at_most
     text = (
-        f"The smallest clearance seen by {teller} was {distance:.1f} ± {spread:.1f} mm"
+        f"The smallest clearance seen by {teller} was {distance:.1f} {size}"
         f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
         f" the scene asks for {required * 1e3:g} mm."
     )
@@ -205,16 +206,17 @@ def _against_required(rows: ClearanceTable, required: float, teller: str) -> Che
 
 def _against_plan(rows: ClearanceTable) -> Check:
     shortfall = rows.planned_distance - rows.distance
-    beyond = shortfall - rows.uncertainty
+    beyond = rows.planned_distance - rows.at_most
     passed = not bool(np.any(beyond > ROUNDING))
     worst = int(np.nanargmax(shortfall if passed else beyond))
-    short, spread = shortfall[worst] * 1e3, rows.uncertainty[worst] * 1e3
+    short, at_most = shortfall[worst] * 1e3, rows.at_most[worst] * 1e3
     text = (
         f"Measured clearance was at most {max(short, 0.0):.2f} mm below the planned one,"
-        f" within its uncertainty of {spread:.2f} mm there."
+        f" within its uncertainty of {at_most - rows.distance[worst] * 1e3:.2f} mm there."
         if passed
         else f"Measured clearance was {short:.2f} mm below the planned one at"
-        f" {rows.time[worst]:.1f} s, more than its uncertainty of {spread:.2f} mm."
+        f" {rows.time[worst]:.1f} s: surely at most {at_most:.2f} mm,"
+        f" planned {rows.planned_distance[worst] * 1e3:.2f} mm."
     )
     return Check("clearance_plan", passed, text)
 

@@ -45,6 +45,23 @@ class MeasuredClearance:
         lows = [n.distance - u for n, u in zip(self.nearest, self.uncertainties, strict=True)]
         return self.distance - float(min(lows))
 
+    @property
+    def surely_nearest(self) -> int:
+        """Number of the obstacle that `at_most` is of."""
+        return int(np.argmin(self._highs))
+
+    @property
+    def at_most(self) -> float:
+        """The smallest true distance is no more than this, [m].
+
+        Each obstacle counts with its own uncertainty: one that is known badly hides no other.
+        """
+        return float(np.min(self._highs))
+
+    @property
+    def _highs(self) -> Array:
+        return np.array([n.distance for n in self.nearest]) + self.uncertainties
+
 
 def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
     """Clearance to every obstacle at a measured pose; None in a scene without obstacles.

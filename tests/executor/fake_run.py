@@ -275,11 +275,13 @@ def _clearance(
     wanted = np.vstack([planned, planned[seen]])
     times = np.concatenate([time, time[seen]])
     closest = np.argmin(rows, axis=1)
+    spread = np.concatenate([np.full(len(time), 5e-5), np.full(len(seen), 0.0009)])
     return ClearanceTable(
         time=times,
         source=("encoder",) * len(time) + ("tag",) * len(seen),
         distance=rows.min(axis=1),
-        uncertainty=np.concatenate([np.full(len(time), 5e-5), np.full(len(seen), 0.0009)]),
+        uncertainty=spread,
+        at_most=rows.min(axis=1) + spread,
         body=tuple(str(bodies[min(np.searchsorted(some, t), len(some) - 1)]) for t in times),
         obstacle=tuple(scene.obstacles[i].name for i in closest),
         planned_distance=wanted.min(axis=1),

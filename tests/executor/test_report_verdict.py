@@ -35,6 +35,7 @@ def rows(
         (source,),
         one,
         np.array([uncertainty_mm / 1e3]),
+        np.array([(distance_mm + uncertainty_mm) / 1e3]),
         ("cable 3",),
         ("box",),
         planned,
@@ -207,7 +208,7 @@ def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
     )
     check = distances(both, 0.010)[0]
     assert not check.passed
-    assert "9.9 ± 0.1 mm" in check.text or "9.9 ± 0.0 mm" in check.text
+    assert "9.9 mm, surely at most 9.9" in check.text or "at most 10.0 mm" in check.text
 
 
 def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRun) -> None:

@@ -198,6 +198,7 @@ def test_clearances_of_obstacles_of_any_name_round_trip(
         ("tag",) * 3,
         column,
         column,
+        column,
         ("cable 1",) * 3,
         (names[0],) * 3,
         column,
@@ -217,6 +218,7 @@ def test_names_of_obstacles_that_look_like_columns_do_no_harm(
     table = ClearanceTable(
         one,
         ("tag",),
+        one,
         one,
         one,
         ("b",),

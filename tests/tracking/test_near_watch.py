@@ -1,0 +1,93 @@
+"""A run is stopped, and does not pass, when an obstacle is too near whatever the camera is off by.
+
+What is surely too near is asked obstacle by obstacle here; one that is known badly must not hide
+another that is known well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from cdpr.clearance import Nearest
+from executor.measured import ClearanceRow, clearance_table
+from executor.near_watch import NEAR_PICTURES, NearWatch
+from executor.verdict import distances
+from tracking.measured_clearance import MeasuredClearance
+
+#: The scene asks for so much, [mm].
+LIMIT_MM = 20.0
+
+#: Distance and uncertainty of each obstacle, [mm].
+OBSTACLES = st.lists(
+    st.tuples(st.floats(-5.0, 60.0), st.floats(0.5, 40.0)), min_size=1, max_size=4
+).filter(lambda each: all(abs(d + u - LIMIT_MM) > 1e-3 for d, u in each))
+
+
+def nearest(distances_mm: list[float]) -> tuple[Nearest, ...]:
+    nowhere = np.zeros(3)
+    return tuple(
+        Nearest("platform", f"post {i}", d / 1e3, nowhere, nowhere)
+        for i, d in enumerate(distances_mm)
+    )
+
+
+def measured(obstacles_mm: list[tuple[float, float]]) -> MeasuredClearance:
+    uncertainties = np.array([u / 1e3 for _, u in obstacles_mm])
+    return MeasuredClearance(nearest([d for d, _ in obstacles_mm]), uncertainties)
+
+
+def surely_too_near(obstacles_mm: list[tuple[float, float]]) -> bool:
+    return any(d + u < LIMIT_MM for d, u in obstacles_mm)
+
+
+@given(obstacles_mm=OBSTACLES)
+@example(obstacles_mm=[(10.0, 1.0), (30.0, 30.0)])
+@example(obstacles_mm=[(10.0, 15.0), (12.0, 1.0)])
+def test_the_run_stops_exactly_when_one_obstacle_is_surely_too_near(
+    obstacles_mm: list[tuple[float, float]],
+) -> None:
+    watch = NearWatch(LIMIT_MM / 1e3)
+    told = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_PICTURES)]
+    assert not any(told[:-1])
+    assert bool(told[-1]) is surely_too_near(obstacles_mm)
+
+
+@given(obstacles_mm=OBSTACLES)
+@example(obstacles_mm=[(10.0, 1.0), (30.0, 30.0)])
+@example(obstacles_mm=[(10.0, 15.0), (12.0, 1.0)])
+def test_the_verdict_is_that_of_the_obstacle_that_is_surely_too_near(
+    obstacles_mm: list[tuple[float, float]],
+) -> None:
+    row = ClearanceRow.by_tags(1.0, measured(obstacles_mm), nearest([d for d, _ in obstacles_mm]))
+    names = tuple(f"post {i}" for i in range(len(obstacles_mm)))
+    required, against_plan = distances(clearance_table(names, [row]), LIMIT_MM / 1e3)
+    assert required.passed is not surely_too_near(obstacles_mm)
+    assert against_plan.passed
+
+
+def test_nearer_than_planned_counts_the_upper_side_too() -> None:
+    found = measured([(30.0, 1.0), (50.0, 40.0)])  # planned at 35 mm, at most 31 mm truly
+    row = ClearanceRow.by_tags(1.0, found, nearest([35.0, 50.0]))
+    _, against_plan = distances(clearance_table(("post 0", "post 1"), [row]), LIMIT_MM / 1e3)
+    assert not against_plan.passed
+    assert "at most 31.00 mm" in against_plan.text
+
+
+def test_what_is_told_names_the_obstacle_that_is_surely_too_near() -> None:
+    watch = NearWatch(LIMIT_MM / 1e3)
+    told = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
+    assert told == "platform to post 1: 12.0 ± 1.0 mm; the scene asks for 20 mm"
+
+
+@given(obstacles_mm=OBSTACLES, shares=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
+def test_the_smallest_true_distance_is_within_both_sides(
+    obstacles_mm: list[tuple[float, float]], shares: list[float]
+) -> None:
+    found = measured(obstacles_mm)
+    truly = min(d + s * u for (d, u), s in zip(obstacles_mm, shares, strict=False)) / 1e3
+    assert truly <= found.at_most + 1e-12
+    assert truly >= found.distance - found.uncertainty - 1e-12
+    assert found.at_most == pytest.approx(min(d + u for d, u in obstacles_mm) / 1e3)
