@@ -164,6 +164,15 @@ class Custody:
             self._latch.release()
             raise
 
+    def take(self, reference: ReferenceDocument) -> None:
+        """A new reference, made between `begin` and `end`.
+
+        Raises:
+            Refused: It cannot be kept.
+        """
+        if self._is_kept:
+            self.file.write(reference)
+
     def prevented(self) -> None:
         """Nothing moved after all."""
         if self._is_kept:

@@ -215,7 +215,7 @@ class Latch:
     def _refusal(self, latched: Latched | None) -> Refused:
         if latched is not None and self.held_by_another():
             return Refused(
-                f"a run or a reset (process {latched.process}) is under way on this bus",
+                f"a motion or a reset (process {latched.process}) is under way on this bus",
                 where=f"bus {self._bus}",
                 next_step="wait for its end, or stop it with `cdpr stop` (`sudo cdpr stop` where it"
                 " is another user's)",

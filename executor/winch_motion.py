@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from executor.custody import Custody
 from executor.loop import SETTLING
 from executor.machine import State
 from executor.records import CycleRecord, LoopEvent
+from executor.reference import ReferenceDocument
 from executor.winch_laws import WinchLaw
 from executor.winch_loop import WinchLoop
 from executor.wishes import WishBoard
@@ -155,6 +156,7 @@ def move_winches(
     *,
     record: Path,
     anew: bool,
+    at_rest: Callable[[WinchesStand], ReferenceDocument | None],
     on_cycle: Callable[[CycleRecord], None],
     on_event: Callable[[LoopEvent], None],
 ) -> WinchesStand:
@@ -169,6 +171,8 @@ def move_winches(
         custody: Of the rig as its file is.
         record: What the latch names, should this not come to its end.
         anew: The drives are to be referenced again afterwards.
+        at_rest: Called after a motion that came to its end, while nobody else may move the drives;
+            the reference that it makes is kept.
         on_cycle: Called after every cycle.
         on_event: Called for every event.
 
@@ -193,17 +197,24 @@ def move_winches(
     custody.begin(record, custody.still_counts(law.reach[0]), anew=anew)
     try:
         loop.run()
+        stand = _stand(rig, loop, last)
+        reference = at_rest(stand) if stand.state is State.FINISHED else None
+        if reference is not None:
+            custody.take(reference)
     finally:
         not_kept = _kept(custody, loop, record, last)
     if not_kept:
         on_event(LoopEvent(last[-1].cycle if last else 0, clock.time, "recorder", not_kept))
-    state, cause = loop.machine.state, loop.cause
-    state, cause = (State.LATCHED, cause or not_kept) if not_kept else (state, cause)
+        stand = replace(stand, state=State.LATCHED, cause=stand.cause or not_kept)
+    return stand
+
+
+def _stand(rig: Rig, loop: WinchLoop, last: Sequence[CycleRecord]) -> WinchesStand:
     unknown = [np.full(rig.cable_count, np.nan)]
     torques = np.array([cycle.torques for cycle in last] or unknown, dtype=np.float64)
     counts = np.array([cycle.actual for cycle in last] or unknown, dtype=np.float64)
     tensions = rig.tensions_by(torques.mean(axis=0))
-    return WinchesStand(state, cause, counts.mean(axis=0), tensions)
+    return WinchesStand(loop.machine.state, loop.cause, counts.mean(axis=0), tensions)
 
 
 def _kept(custody: Custody, loop: WinchLoop, record: Path, last: Sequence[CycleRecord]) -> str:

@@ -125,8 +125,9 @@ def home(
     def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
         return TakeUp(as_set_up, counts, target=target, limit=limit, reach=reach, speed=speed)
 
-    def at_rest(stand: WinchesStand, drives: ReadyDrives, board: WishBoard) -> None:
+    def at_rest(stand: WinchesStand, drives: ReadyDrives, board: WishBoard) -> ReferenceDocument:
         made.append(_referenced(the_rig, stand, drives, board, known, camera, pictures))
+        return made[0]
 
     lost = PowerLoss.drawn(
         the_rig, 0, simulated_slack_mm / 1000.0, on_a_stand=camera is None
@@ -137,8 +138,6 @@ def home(
     )  # fmt: skip
     carry_out_by_law(motion, at_rest)
     (reference,) = made
-    if not in_process:
-        custody.file.write(reference)
     where = None if in_process else str(custody.file.path)
     if as_json:
         show_json({"file": where, **reference.model_dump(mode="json")})

@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cdpr.rig import Rig
-    from executor.real_time_job import ReadyDrives
     from executor.winch_laws import WinchLaw
-    from executor.winch_motion import WinchesStand
-    from executor.wishes import WishBoard
 
 
 def jog_cable(
@@ -87,14 +84,11 @@ def jog_cable(
             as_set_up, counts, cable=cable - 1, way=mm / 1000.0, limit=limit, speed=speed
         )
 
-    def at_rest(_stand: WinchesStand, _drives: ReadyDrives, _board: WishBoard) -> None:
-        """Nothing more to see while the drives are there."""
-
     motion = WinchMotion(
         rig, rig.home, limit, speed, make_law, None, fast, without_real_time, as_json,
         anew=False, name="jog-cable",
     )  # fmt: skip
-    stand = carry_out_by_law(motion, at_rest)
+    stand = carry_out_by_law(motion, lambda _stand, _drives, _board: None)
     moved = (stand.counts[cable - 1] - begun[0][cable - 1]) / winch.counts_per_metre * 1000.0
     tensions = [round(float(t), 2) for t in stand.tensions]
     if as_json:

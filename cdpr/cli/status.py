@@ -12,6 +12,7 @@ from cdpr.cli.motion_options import ChannelOption, InterfaceOption
 
 if TYPE_CHECKING:
     from cdpr.rig import Rig
+    from executor.latch import Latch, Latched
 
 
 def status(
@@ -42,8 +43,7 @@ def status(
     require_other_process(the_rig)
     settings = BusSettings.of(the_rig)
     latch, custody = Latch(settings), Custody(the_rig)
-    latched = latch.read()
-    under_way = latched is not None and latch.held_by_another()
+    latched, under_way = _latch_of(latch)
     told: dict[str, Any] = {
         "rig": the_rig.name,
         "bus": str(settings),
@@ -65,6 +65,17 @@ def status(
         _show(the_rig, told)
     if missing is not None:
         raise missing
+
+
+def _latch_of(latch: Latch) -> tuple[Latched | None, bool]:
+    """What is latched, and whether a motion is under way, both of one moment."""
+    latched = latch.read()
+    while True:
+        under_way = latch.held_by_another()
+        again = latch.read()
+        if again == latched:
+            return latched, latched is not None and under_way
+        latched = again
 
 
 def _seen(rig: Rig, custody: Any) -> dict[str, Any]:
@@ -133,7 +144,7 @@ def _show(rig: Rig, told: dict[str, Any]) -> None:
 
     latched = told["latched"] or "none"
     if told["run"] is not None:
-        latched = f"a run or a reset is under way (process {told['run']}); see `cdpr monitor`"
+        latched = f"none; process {told['run']} moves or resets it, see `cdpr monitor`"
     facts = [
         ("rig", rig.name),
         ("bus", told["bus"]),

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from drivers.drive_group import CycleStatus
     from executor.real_time_job import ReadyDrives
     from executor.records import CycleRecord, LoopEvent
+    from executor.reference import ReferenceDocument
     from executor.status import WinchStatus
     from executor.winch_laws import WinchLaw
     from executor.winch_motion import WinchesStand
@@ -82,14 +83,15 @@ def speed_of(rig: Rig, speed_mm_s: float) -> float:
 
 
 def carry_out_by_law(
-    motion: WinchMotion, at_rest: Callable[[WinchesStand, ReadyDrives, WishBoard], None]
+    motion: WinchMotion,
+    at_rest: Callable[[WinchesStand, ReadyDrives, WishBoard], ReferenceDocument | None],
 ) -> WinchesStand:
     """Moves, in this process; ends with the drives holding by themselves.
 
     Args:
         motion: What is wished.
         at_rest: Called after a motion that came to its end, while the drives are still there; they
-            must have held all the while.
+            must have held all the while before the reference that it makes is kept.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
@@ -130,11 +132,14 @@ def carry_out_by_law(
     ):
         as_set_up, counts = limited[0]
         law = motion.make_law(as_set_up, counts)
-        stand = _moved(motion, as_set_up, law, drives, board, status)
-        status.take_end(stand.state, stand.cause)
-        if stand.state is State.FINISHED:
-            at_rest(stand, drives, board)
+
+        def settled(stand: WinchesStand) -> ReferenceDocument | None:
+            reference = at_rest(stand, drives, board)
             require_held(rig, stand, drives.group.read_positions())
+            return reference
+
+        stand = _moved(motion, as_set_up, law, drives, board, status, settled)
+        status.take_end(stand.state, stand.cause)
     if stand.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="begin anew when all is well")
     if stand.state is not State.FINISHED:
@@ -156,6 +161,7 @@ def _moved(
     drives: ReadyDrives,
     board: WishBoard,
     status: WinchStatus,
+    settled: Callable[[WinchesStand], ReferenceDocument | None],
 ) -> WinchesStand:
     from contextlib import nullcontext
 
@@ -203,6 +209,7 @@ def _moved(
             custody,
             record=kept.folder if kept is not None else custody.file.path,
             anew=motion.anew,
+            at_rest=settled,
             on_cycle=on_cycle,
             on_event=on_event,
         )

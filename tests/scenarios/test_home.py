@@ -16,7 +16,7 @@ from cdpr.cli.jog_way import straight_way
 from cdpr.errors import Fault, Refused, StoppedByOperator
 from cdpr.plan import plan_from_document
 from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, load_rig
+from cdpr.rig import Rig, load_rig, rig_from_document
 from cdpr.scene import nothing_in_the_way
 from drivers.bus import BusSettings, open_bus
 from drivers.bus_faults import BusDown
@@ -27,7 +27,7 @@ from executor.custody import Custody
 from executor.machine import State
 from executor.prepare import PreparedRun, prepare
 from executor.records import CycleRecord, LoopEvent
-from executor.reference import reference_at, referenced
+from executor.reference import ReferenceDocument, reference_at, referenced
 from executor.rest_pose import rest_pose
 from executor.run_folder import RunFolder
 from executor.standing_pose import standing_pose
@@ -65,6 +65,8 @@ class Place:
     as_set_up: Rig
     counts: list[int]
     script: Callable[[Place, int], None] = lambda _place, _cycle: None
+    at_rest: Callable[[WinchesStand], ReferenceDocument | None] = lambda _stand: None
+    custody: Custody | None = None
     board: OwnBoard = field(default_factory=OwnBoard)
     records: list[CycleRecord] = field(default_factory=list)
     events: list[LoopEvent] = field(default_factory=list)
@@ -88,9 +90,10 @@ class Place:
             self.group,
             SimulatedClock(0.01),
             self.board,
-            Custody(self.rig),
+            self.custody or Custody(self.rig),
             record=Path("nowhere"),
             anew=True,
+            at_rest=self.at_rest,
             on_cycle=on_cycle,
             on_event=self.events.append,
         )
@@ -128,6 +131,26 @@ def after_power_loss(
 
 def lost(seed: int, slack_mm: float = 3.0, *, on_a_stand: bool) -> PowerLoss:
     return PowerLoss.drawn(load_rig(RIG), seed, slack_mm / 1000.0, on_a_stand=on_a_stand)
+
+
+def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
+    rig = load_rig(RIG)
+    bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
+    kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
+    custody = Custody(kept)
+
+    def at_rest(stand: WinchesStand) -> ReferenceDocument:
+        with pytest.raises(Refused, match="under way"):
+            Custody(kept).require_free()
+        return reference_at(kept, kept.home, stand.counts, stand.tensions, "stated pose", 0.0)
+
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+        place.custody, place.at_rest = custody, at_rest
+        assert place.take_up().state is State.FINISHED
+    Custody(kept).require_free()
+    reference = Custody(kept).reference()
+    assert reference is not None
+    assert not reference.lost
 
 
 @pytest.mark.parametrize("on_a_stand", [True, False])
@@ -477,7 +500,7 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         law = TakeUp(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
         stand = move_winches(
             limited, law, group, SimulatedClock(0.01), OwnBoard(), Custody(rig),
-            record=Path("nowhere"), anew=True,
+            record=Path("nowhere"), anew=True, at_rest=lambda _stand: None,
             on_cycle=lambda _record: None, on_event=lambda _event: None,
         )  # fmt: skip
         assert stand.state is State.FINISHED, stand.cause

@@ -56,7 +56,7 @@ def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
         running.engage("rig", tmp_path)
         answer = call("status", counting, *bus)
         assert answer.code == 0, answer
-        assert re.search(r"latched fault +a run or a reset is under way \(process", answer.out)
+        assert re.search(r"latched fault +none; process \d+ moves or resets it", answer.out)
         assert "never referenced: cable 1 (drive 1)" in answer.out.replace("\n", " ")
         assert "switch on disabled" not in answer.out, "who runs them must not be disturbed"
 
