@@ -36,11 +36,13 @@ class ReadyDrives:
         group: All of them.
         true_pose: Where the simulated platform is; None on a real bus.
         carry: Gives the simulated platform another load; on a real bus it happens by itself.
+        restarted: Nodes that were found without this program's set-up when they were opened.
     """
 
     group: DriveGroup
     true_pose: Callable[[], Pose] | None
     carry: Callable[[Load], None]
+    restarted: tuple[int, ...]
 
 
 #: Opens the bus and configures the drives; called in the process that will move them.

@@ -67,6 +67,22 @@ def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"winches": winches_here}))
 
 
+def set_up_here(rig: Rig, told: CycleStatus) -> tuple[Rig, float]:
+    """What drives are set up for that move nothing: their limits lie about where they stand.
+
+    The rig file's counts are no guide: a drive that is enabled beyond its own position limits runs
+    to them.
+
+    Args:
+        rig: The robot.
+        told: Where its drives stand.
+
+    Returns:
+        The rig, see `counted_here`, and the largest tension, [N].
+    """
+    return counted_here(rig, told.positions.tolist(), rig.home), rig.max_tension
+
+
 def careful(rig: Rig, *, limit: float, speed: float) -> Rig:
     """The rig as gate and watch see it while winches move by a law; drives are not set up by it.
 

@@ -52,6 +52,12 @@ def open_drives(
 
     custody = Custody(rig)
     settings = BusSettings.of(rig)
+    restarted: set[int] = set()
+
+    def note_restarted(nodes: tuple[int, ...]) -> None:
+        restarted.update(nodes)
+        custody.found_restarted(nodes)
+
     with ExitStack() as stack:
         bus = open_bus(settings)
         stack.callback(bus.shutdown)
@@ -69,15 +75,15 @@ def open_drives(
         group = make_drive_group(rig, bus, pump)
         stack.callback(group.close)
         if set_up_as is not None:
-            group.configure(to_reset=to_reset, on_restarted=custody.found_restarted)
+            group.configure(to_reset=to_reset, on_restarted=note_restarted)
             counted, max_tension = set_up_as(group.read_positions())
             group.close()
             group = make_drive_group(counted, bus, pump, max_tension=max_tension)
             stack.callback(group.close)
-        remarks = group.configure(to_reset=to_reset, on_restarted=custody.found_restarted)
+        remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
         for remark in remarks:
             err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
-        yield ReadyDrives(group, true_pose, carry)
+        yield ReadyDrives(group, true_pose, carry, tuple(sorted(restarted)))
 
 
 def _happens_by_itself(_load: Load) -> None:

@@ -90,11 +90,15 @@ def _released(rig: Rig, custody: Custody) -> CycleStatus:
     Raises:
         CdprError: They could not be set up, or were not released; then a fault is latched.
     """
+    from functools import partial
+
     from cdpr.cli.drives import open_drives
     from cdpr.scene import nothing_in_the_way
     from executor.machine import State
+    from executor.winch_motion import set_up_here
 
-    with open_drives(rig, rig.home, nothing_in_the_way(rig).load) as drives:
+    load = nothing_in_the_way(rig).load
+    with open_drives(rig, rig.home, load, set_up_as=partial(set_up_here, rig)) as drives:
         stands = drives.group.read_positions().positions.tolist()
         record = custody.file.path.parent
         custody.begin(record, custody.still_counts(stands))

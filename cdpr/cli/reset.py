@@ -85,6 +85,8 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
     Raises:
         CdprError: A drive does not answer, may not be reset now, or stays in fault.
     """
+    from functools import partial
+
     from cdpr.cli.drives import open_drives
     from cdpr.cli.reference_facts import reference_told
     from cdpr.errors import Fault, HardwareMissing
@@ -93,9 +95,13 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
     from executor.clock import RealClock
     from executor.custody import Custody
     from executor.safety.watch import MISSING_CYCLES
+    from executor.winch_motion import set_up_here
 
     clock = RealClock(rig.document.bus.cycle_ms / 1000.0)
-    with open_drives(rig, rig.home, nothing_in_the_way(rig).load, to_reset=True) as drives:
+    load = nothing_in_the_way(rig).load
+    with open_drives(
+        rig, rig.home, load, to_reset=True, set_up_as=partial(set_up_here, rig)
+    ) as drives:
         group = drives.group
         status = group.read_positions()
         if status.state is GroupState.FAULT:
@@ -127,11 +133,11 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
                 next_step="check power and wiring, then reset again; the latch stays engaged",
             )
         custody, stands = Custody(rig), status.positions.tolist()
-        if held and not group.restarted:
+        if held and not drives.restarted:
             custody.found_held(stands)
         return {
             "drives": list(drive_states(rig, status.status_words.tolist())),
-            "restarted": list(group.restarted),
+            "restarted": list(drives.restarted),
             "reference": reference_told(custody, stands),
         }
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from cdpr.errors import HardwareMissing, Refused
 from cdpr.rig import Rig
+from cdpr.winches import WinchMap
 from drivers.bus import hears_itself
 from drivers.bus_load import TESTED_HZ, check_bus_load, heartbeat_cycles
 from drivers.cia402.configure import configure_drives
@@ -31,6 +32,7 @@ from drivers.drive_group import (
 from drivers.own_frames import OwnFrames
 from drivers.reply_check import largest_steps
 from drivers.torque import winding_signs
+from drivers.travel import position_limits
 
 STEP_TIMEOUT = 1.0
 """For enabling and for releasing, [s]: a brake takes a few tenths to open or close."""
@@ -295,9 +297,32 @@ class Cia402Group(CyclicGroup):
 
     def _begin_release(self) -> None:
         self._refuse_latched("release the drives")
+        self._require_within_limits()
         self._goal, self._cycles_to_goal = Goal.RELEASE, 0
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
+
+    def _require_within_limits(self) -> None:
+        """The way out of quick stop enables the drives: one beyond its limits would run to them.
+
+        Raises:
+            Refused: A drive stands beyond its position limits (607Dh).
+        """
+        winch_map = WinchMap(self._rig)
+        for drive, (node, position) in enumerate(
+            zip(self._nodes, self._watch.positions, strict=True)
+        ):
+            low, high = position_limits(self._rig, drive, winch_map)
+            if not low <= position <= high:
+                raise Refused(
+                    f"{self._rig.drive_names[node]} stands at {position} counts, beyond its"
+                    f" position limits of {low} and {high}",
+                    where="drive group",
+                    why="once enabled it would run to its limit (607Dh)",
+                    next_step="set the drives up for where they stand, or reference them with"
+                    " `cdpr home RIG`; nothing was enabled",
+                    values={"node": node},
+                )
 
     def _reset_fault(self) -> None:
         """Clears the latch; a drive in fault is reset only when no other holds the platform."""

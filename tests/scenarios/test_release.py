@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from executor.latch import Latch
 from executor.prepare import PreparedRun
 from executor.reference import as_in_the_file
 from simulation.drive import SimulatedDrive
+from simulation.power_loss import PowerLoss
 from tests.cli.plans import RIG
 from tests.cli.program import call
 from tests.scenarios.test_real_time import drives_on
@@ -73,6 +75,44 @@ def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
         if not braked:
             assert "released by the operator" in told["reference"]["why_not"]
     Latch(BusSettings("udp_multicast", channel)).require_released()
+
+
+@pytest.mark.slow
+def test_drives_that_count_from_anywhere_stay_where_they_are(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    channel = f"239.74.163.33:{20000 + (os.getpid() * 29) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
+    with drives_on(channel, prepared) as rehearsal:
+        loss = PowerLoss.drawn(prepared.rig, 3, 0.0, on_a_stand=True)
+        loss.happen_to(prepared.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+        hold(rehearsal.drives)
+        stood = [round(drive.motor.position) for drive in rehearsal.drives]
+        reset = call("reset", rig, *bus, "--yes", "--json")
+        assert reset.code == 0, reset
+        assert json.loads(reset.out)["restarted"] == list(range(1, 9))
+        assert all(_within_limits(drive) for drive in rehearsal.drives)
+        aims: list[tuple[float, float]] = []
+        for drive in rehearsal.drives:
+            enable = drive._command_enable
+
+            def aimed(drive: SimulatedDrive = drive, enable: Callable[[], None] = enable) -> None:
+                aims.append((drive._target, drive.motor.position))
+                enable()
+
+            drive._command_enable = aimed  # type: ignore[method-assign]
+        answer = call("release", rig, *bus, "--yes")
+        assert answer.code == 0, answer
+        assert len(aims) >= 8
+        assert all(target == round(position) for target, position in aims)
+        assert [round(drive.motor.position) for drive in rehearsal.drives] == stood
+
+
+def _within_limits(drive: SimulatedDrive) -> bool:
+    low, high = (drive.objects[0x607D, sub] for sub in (1, 2))
+    return bool(low <= drive.motor.position <= high)
 
 
 def _on(channel: str, file: Path) -> Rig:
