@@ -240,7 +240,8 @@ class Loop:
         state = self.machine.state
         if wishes.stop and state in _STOPPABLE:
             if wishes.too_near:
-                self._tell_cause("clearance_low", f"{_TOO_NEAR}; slowing down {self.way}")
+                near = f"{_TOO_NEAR}: {wishes.too_near}"
+                self._tell_cause("clearance_low", f"{near}; slowing down {self.way}")
             else:
                 self._tell_cause("stop", f"stop requested; slowing down {self.way}")
             self._feed.stop()

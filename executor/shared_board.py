@@ -13,10 +13,11 @@ from executor.wishes import Wishes
 #: The supervisor has hung if nothing is heard of it for so long, [s].
 SILENCE = 2.0
 
-_STOP, _HOLD, _PERCENT, _NEAR, _BEAT, _TROUBLE = 0, 1, 2, 3, 8, 16
-_LONGEST_TROUBLE = 400
-_SIZE = _TROUBLE + 2 + _LONGEST_TROUBLE
 _BEATS, _LENGTH = struct.Struct("<Q"), struct.Struct("<H")
+_LONGEST_TEXT = 400
+_STOP, _HOLD, _PERCENT, _BEAT, _TROUBLE = 0, 1, 2, 8, 16
+_NEAR = _TROUBLE + _LENGTH.size + _LONGEST_TEXT
+_SIZE = _NEAR + _LENGTH.size + _LONGEST_TEXT
 
 
 class SharedBoard:
@@ -28,10 +29,10 @@ class SharedBoard:
         self.memory.view[_PERCENT] = 100
         self._beats = 0
 
-    def ask_stop(self, too_near: bool = False) -> None:
+    def ask_stop(self, too_near: str = "") -> None:
         """See `WishBoard`."""
-        if too_near and not self.memory.view[_STOP]:
-            self.memory.view[_NEAR] = 1  # before the stop: whoever reads that knows why
+        if not self.memory.view[_STOP]:
+            _write(self.memory, _NEAR, too_near)  # before the stop: whoever reads that knows why
         self.memory.view[_STOP] = 1
 
     def ask_hold(self, hold: bool) -> None:
@@ -57,12 +58,8 @@ class SharedBoard:
 
     def complain(self, trouble: str) -> None:
         """The run cannot be supervised any more, for this reason; the first one is kept."""
-        if _LENGTH.unpack_from(self.memory.view, _TROUBLE)[0]:
-            return
-        content = trouble.encode()[:_LONGEST_TROUBLE]
-        begin = _TROUBLE + _LENGTH.size
-        self.memory.view[begin : begin + len(content)] = content
-        _LENGTH.pack_into(self.memory.view, _TROUBLE, len(content))
+        if not _text(self.memory, _TROUBLE):
+            _write(self.memory, _TROUBLE, trouble)
 
 
 class Supervised:
@@ -92,12 +89,24 @@ class Supervised:
             return "the process that supervises the run is gone"
         if now - self._heard > SILENCE:
             return f"the process that supervises the run was silent for {SILENCE:g} s"
-        length = _LENGTH.unpack_from(self._memory.view, _TROUBLE)[0]
-        begin = _TROUBLE + _LENGTH.size
-        return bytes(self._memory.view[begin : begin + length]).decode(errors="replace")
+        return _text(self._memory, _TROUBLE)
 
 
 def _read(memory: SharedMemory) -> Wishes:
     view = memory.view
-    stop, hold, near = (bool(view[place]) for place in (_STOP, _HOLD, _NEAR))
+    stop, hold = bool(view[_STOP]), bool(view[_HOLD])
+    near = _text(memory, _NEAR) if stop else ""
     return Wishes(stop, hold, view[_PERCENT] / 100.0, too_near=near)
+
+
+def _write(memory: SharedMemory, place: int, text: str) -> None:
+    content = text.encode()[:_LONGEST_TEXT]
+    begin = place + _LENGTH.size
+    memory.view[begin : begin + len(content)] = content
+    _LENGTH.pack_into(memory.view, place, len(content))  # last: no text is read half-written
+
+
+def _text(memory: SharedMemory, place: int) -> str:
+    length = _LENGTH.unpack_from(memory.view, place)[0]
+    begin = place + _LENGTH.size
+    return bytes(memory.view[begin : begin + length]).decode(errors="replace")

@@ -12,7 +12,8 @@ class Wishes:
 
     Attributes:
         stop: End the run along the path.
-        too_near: The stop is wished because the camera saw the robot too near to an obstacle.
+        too_near: The stop is wished because the camera saw this: what was too near to what, with
+            numbers; else nothing.
         hold: Come to rest on the path and wait there.
         speed: Share of the planned speed along the path, from 0.01 to 1.
         lost: Why nobody supervises the run any more; nothing while somebody does.
@@ -22,7 +23,7 @@ class Wishes:
     hold: bool = False
     speed: float = 1.0
     lost: str = ""
-    too_near: bool = False
+    too_near: str = ""
 
 
 #: Slowest and fastest feed that may be asked for, [% of the planned speed].
@@ -32,8 +33,12 @@ SLOWEST, FASTEST = 1, 100
 class WishBoard(Protocol):
     """Where wishes are put up. A stop cannot be taken back."""
 
-    def ask_stop(self, too_near: bool = False) -> None:
-        """The run is to end along the path; because the robot is too near to an obstacle."""
+    def ask_stop(self, too_near: str = "") -> None:
+        """The run is to end along the path.
+
+        Args:
+            too_near: What the camera saw too near to what, with numbers, if it is for that.
+        """
 
     def ask_hold(self, hold: bool) -> None:
         """The run is to wait on the path, or to go on."""
@@ -52,11 +57,12 @@ class OwnBoard:
         """Nothing is wished yet."""
         # One attribute each: a signal that interrupts one wish cannot undo another.
         self._stop, self._hold, self._speed = False, False, 1.0
-        self._too_near = False
+        self._too_near = ""
 
-    def ask_stop(self, too_near: bool = False) -> None:
+    def ask_stop(self, too_near: str = "") -> None:
         """See `WishBoard`."""
-        self._too_near = self._too_near or (too_near and not self._stop)
+        if not self._stop:
+            self._too_near = too_near
         self._stop = True
 
     def ask_hold(self, hold: bool) -> None:

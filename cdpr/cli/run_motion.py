@@ -99,6 +99,8 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
     """The motion and its pictures; `cdpr stop` and its like reach the run all the time."""
     from contextlib import ExitStack
 
+    from rich.markup import escape
+
     from cdpr.cli.cameras import open_camera
     from cdpr.cli.output import err, progress_bar
     from executor.command_server import serving
@@ -132,8 +134,8 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
                 assert camera is not None
                 camera.trigger(time, asked, true_pose)
                 if camera.near and job.clearance_stop and not board.read().stop:
-                    board.ask_stop(too_near=True)
-                    err.print(f"[red]too near[/] {camera.near}", soft_wrap=True)
+                    board.ask_stop(too_near=camera.near)
+                    err.print(f"[red]too near[/] {escape(camera.near)}", soft_wrap=True)
                 if camera.sees_nothing and not told:
                     told.append("the camera saw no tags so far: is it where the rig file says?")
                     recorder.take_event(LoopEvent(0, asked, "camera_sees_nothing", told[0]))
@@ -194,6 +196,8 @@ def _move_in_real_time(
 ) -> Outcome:
     from functools import partial
 
+    from rich.markup import escape
+
     from cdpr.cli.drives import drives_of
     from cdpr.cli.output import err
     from drivers.bus import IN_PROCESS
@@ -203,7 +207,7 @@ def _move_in_real_time(
     def armed(denied: str) -> None:
         if denied:
             recorder.take_event(LoopEvent(0, 0.0, "no_real_time", denied))
-            err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
+            err.print(f"[yellow]remark[/] {escape(denied)}", soft_wrap=True)
         before_motion()
 
     prepared = job.prepared

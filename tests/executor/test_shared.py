@@ -182,6 +182,23 @@ def test_wishes_reach_the_other_side_and_stay(board, clock):
     assert other.read() == board.read() == Wishes(stop=True, speed=0.3)
 
 
+@pytest.mark.parametrize("text", ["platform to post: 6.0 ± 1.0 mm", "ü" * 1000])
+def test_what_was_too_near_reaches_the_other_side(board, clock, text):
+    other = Supervised(board.memory, os.getppid())
+    board.ask_stop(too_near=text)
+    board.ask_stop()
+    near = other.read().too_near
+    assert near == board.read().too_near
+    assert near
+    assert text.startswith(near.rstrip("�"))
+
+
+def test_a_stop_that_was_wished_before_was_not_for_being_too_near(board, clock):
+    board.ask_stop()
+    board.ask_stop(too_near="platform to post")
+    assert board.read() == Wishes(stop=True)
+
+
 def test_a_process_that_is_asked_to_end_stops(board, clock):
     other = Supervised(board.memory, os.getppid())
     other.ask_stop()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ from tests.scenarios.stage import at, staged
 
 #: The platform truly stands so far towards the block, [m].
 OFF = np.array([-0.005, 0.0, 0.0])
+#: What a camera may have seen.
+NEAR = "platform to block: 6.0 ± 1.0 mm; the scene asks for 10 mm"
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +65,7 @@ def narrow_plan(rig_file: Path) -> Path:
         "goal": {"position_mm": list(GOAL_MM)},
         "obstacles": [
             {
-                "name": "block",
+                "name": "block [/left]",  # no markup
                 "box": {"size_mm": [40.0, 40.0, 40.0]},
                 "position_mm": [-97.0, 15.0, 480.0],
             }
@@ -92,6 +95,9 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     codes = list(events_of(run))
     assert codes.count("clearance_low") == 1
     assert codes.index("clearance_low") < codes.index("held")
+    (low,) = (event["text"] for event in summary["events"] if event["code"] == "clearance_low")
+    assert re.search(r"to block \[/left\]: \d+\.\d ± \d\.\d mm; the scene asks for 10 mm", low)
+    assert "to block [/left]: " in answer.said
     assert "docs/faults/clearance_low.md" in answer.out + answer.said
 
 
@@ -110,14 +116,14 @@ def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
 
 def test_the_loop_tells_who_wanted_the_stop(prepared: PreparedRun, tmp_path: Path) -> None:
     with staged(
-        prepared, tmp_path / "run", at(150, lambda s: s.board.ask_stop(too_near=True))
+        prepared, tmp_path / "run", at(150, lambda s: s.board.ask_stop(too_near=NEAR))
     ) as stage:
         outcome = stage.run()
     assert outcome.state is State.STOPPED
-    assert "less clearance than the scene asks for" in outcome.cause
-    codes = [event.code for event in stage.events()]
-    assert "clearance_low" in codes
-    assert "stop" not in codes
+    assert f"less clearance than the scene asks for: {NEAR}; slowing down" in outcome.cause
+    events = {event.code: event.text for event in stage.events()}
+    assert events["clearance_low"] == outcome.cause
+    assert "stop" not in events
 
 
 class Rendered:
