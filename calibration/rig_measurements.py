@@ -81,13 +81,21 @@ class RigMeasurements:
 
 
 def joined(parts: Sequence[RigMeasurements]) -> RigMeasurements:
-    """Several sources as one."""
+    """Several sources as one; a place with the numbers of an earlier one is told as unused."""
     arrays = {
         key: read_only(np.concatenate([getattr(part, key) for part in parts])) for key in _ARRAYS
     }
     names = tuple(name for part in parts for name in part.names)
     unused = {name: why for part in parts for name, why in part.unused.items()}
-    return RigMeasurements(names=names, unused=unused, **arrays)
+    first: dict[bytes, str] = {}
+    new = np.ones(len(names), dtype=bool)
+    for k, name in enumerate(names):
+        numbers = b"".join(arrays[key][k].tobytes() for key in _ARRAYS[:-1])
+        earlier = first.setdefault(numbers, name)
+        if earlier is not name:
+            new[k] = False
+            unused[name] = f"has the same numbers as {earlier}"
+    return RigMeasurements(names=names, unused=unused, **arrays).part(new)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

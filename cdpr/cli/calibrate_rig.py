@@ -124,18 +124,39 @@ def _measured(rig: Rig, data: list[Path]) -> tuple[Rig, RigMeasurements]:
     """The rig as the drives counted, and all places.
 
     Raises:
-        BadInput: A file cannot be read, or is of another rig.
+        BadInput: A file cannot be read, is of another rig, or is named twice.
     """
     from calibration.rig_data_file import read_rig_data
     from calibration.rig_measurements import joined
     from calibration.rig_result import require_one_drawing
 
+    _require_once(data)
     runs = [(str(path), _rig_of(path)) for path in data if path.is_dir()]
     counted = require_one_drawing(rig, runs)
     parts = [
         _places_of(path) if path.is_dir() else read_rig_data(path, rig.cable_count) for path in data
     ]
     return counted, joined(parts)
+
+
+def _require_once(data: list[Path]) -> None:
+    """Places count once.
+
+    Raises:
+        BadInput: A file or folder is named twice.
+    """
+    from cdpr.errors import BadInput
+
+    named: dict[Path, Path] = {}
+    for path in data:
+        if path.resolve() in named:
+            raise BadInput(
+                f"{path} is named twice",
+                where="DATA",
+                why=f"it is the same as {named[path.resolve()]}",
+                next_step="name each file and each run once",
+            )
+        named[path.resolve()] = path
 
 
 def _rig_of(run: Path) -> Rig:

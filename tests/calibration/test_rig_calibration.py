@@ -382,3 +382,15 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
     )
     assert blind.unused == {"blind, rest 2": "no picture taken there gave a pose"}
     assert len(joined([found, blind])) == 3
+
+
+def test_a_place_with_the_numbers_of_an_earlier_one_counts_once(turned: Truth) -> None:
+    data = turned.measured
+    copy = replace(data, names=tuple(f"copy of {name}" for name in data.names))
+    both = joined([data, copy])
+    assert both.names == data.names
+    assert both.unused["copy of place 3"] == "has the same numbers as place 3"
+    assert len(both.unused) == len(data)
+    again = replace(copy, positions=copy.positions + 1e-6)  # measured anew at the same place
+    assert len(joined([data, again])) == 2 * len(data)
+    assert len(joined([data.without_poses(), again.without_poses()])) == len(data)

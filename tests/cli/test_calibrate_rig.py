@@ -153,6 +153,12 @@ def test_a_file_that_cannot_be_used_is_refused_with_its_place(
     assert not list(folder.glob("*")) if folder.exists() else True
 
 
+def test_a_file_that_is_named_twice_is_refused(file: Path) -> None:
+    done = call("calibrate", "rig", RIG, file, file.parent / ".." / file.parent.name / file.name)
+    assert done.code == 2, done
+    assert "named twice" in done.err
+
+
 def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
     done = call("calibrate", "rig", RIG, finished_run, "--json")
     assert done.code == 2
