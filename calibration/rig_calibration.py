@@ -145,7 +145,7 @@ def calibrate_rig(
         length_deviation: Of a cable's length as a drive tells it, [m].
 
     Raises:
-        BadInput: Too few places, or nothing to look for.
+        BadInput: Too few places, a pose outside the rig, or nothing to look for.
         Fault: The measurements cannot be fitted.
     """
     if len(measured) < FEWEST_PLACES:
@@ -154,6 +154,7 @@ def calibrate_rig(
             where="calibrate rig",
             next_step="measure in more places: `cdpr calibrate poses` plans them",
         )
+    _require_within(rig, measured)
     parameters = Parameters.of(rig, deviations)
     if not len(parameters):
         raise BadInput(
@@ -171,6 +172,30 @@ def calibrate_rig(
         _covariance(parameters, measured, fit, observability, length_deviation),
         held_out(parameters, measured, length_deviation),
     )
+
+
+def _require_within(rig: Rig, measured: RigMeasurements) -> None:
+    """Poses are where the platform can be: numbers in another unit are not.
+
+    Raises:
+        BadInput: One is outside the box around outlets, home and workspace.
+    """
+    corners = np.vstack([rig.outlets, rig.workspace_lower, rig.workspace_upper, rig.home.position])
+    lower, upper = corners.min(axis=0), corners.max(axis=0)
+    outside = ((measured.positions < lower) | (measured.positions > upper)).any(axis=1)
+    if outside.any():
+        k = int(np.argmax(outside))
+        raise BadInput(
+            f"the pose ({_mm(measured.positions[k])}) is outside the rig, whose outlets and"
+            f" workspace reach from ({_mm(lower)}) to ({_mm(upper)})",
+            where=measured.names[k],
+            why="another unit or frame, or a pose that was mistaken",
+            next_step="check units and axes of x_mm, y_mm, z_mm, or leave out the line",
+        )
+
+
+def _mm(point: Array) -> str:
+    return ", ".join(f"{x * 1e3:.4g}" for x in point) + " mm"
 
 
 def _covariance(

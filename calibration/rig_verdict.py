@@ -14,6 +14,8 @@ from calibration.verdict import Lack, Verdict
 from cdpr.poses import Array, matrix_from_rotation_vector
 from cdpr.rig import Rig
 
+FAR = 5.0
+"""No number should be farther from the rig file, in the standard deviations that were stated."""
 _INSET = 0.15
 """The workspace is judged at its centre and this share inside its corners."""
 
@@ -52,7 +54,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    lacks = []
+    lacks = _far_numbers(result)
     if missed > wanted:
         what = "places" if out.poses else "lengths of cables at places"
         lacks.append(
@@ -88,6 +90,26 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     error = max(missed, level, turned)
     verdict = Verdict.of(error, wanted, f"turned by up to {math.degrees(tilt):.3g}°", lacks)
     return RigQuality(verdict, before, after, level, turned, tilt)
+
+
+def _far_numbers(result: RigCalibration) -> list[Lack]:
+    """The number farthest from the rig file, where it is too far to be believed."""
+    parameters, values = result.parameters, result.fit.values
+    times = np.abs(values) / parameters.deviations
+    k = int(np.argmax(times))
+    if times[k] <= FAR:
+        return []
+    group = next(g for g, place in parameters.slices().items() if place.start <= k < place.stop)
+    share = group == "drum_scale"
+    far = f"{abs(values[k]) * 1e2:.3g} %" if share else f"{abs(values[k]) * 1e3:.3g} mm"
+    option = "--drum-scale-percent" if share else f"--{group}-mm"
+    return [
+        Lack(
+            f"{parameters.names[k]} is {far} from the rig file, {times[k]:.3g} times {option}",
+            "check units, the order of the cables and the rig file; where it is truly that far"
+            f" off, pass a larger {option}",
+        )
+    ]
 
 
 def judged_places(rig: Rig, tilt: float) -> tuple[Array, Array]:

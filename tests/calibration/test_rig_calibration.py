@@ -384,6 +384,32 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
     assert len(joined([found, blind])) == 3
 
 
+def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, turned: Truth) -> None:
+    """Winches 1 and 2 changed over; the drums' largest error is 0.8 % of 0.5."""
+    counts = turned.measured.counts.copy()
+    counts[:, [0, 1]] = counts[:, [1, 0]]
+    swapped = replace(turned.measured, counts=counts)
+    verdicts = [
+        judge_rig(calibrate_rig(rig, data, deviations, LENGTH_DEVIATION), 1e-3, 0.0).verdict
+        for data, deviations in (
+            (swapped, DEFAULT_DEVIATIONS),
+            (turned.measured, {**DEFAULT_DEVIATIONS, "drum_scale": 2e-4}),
+        )
+    ]
+    assert not any(verdict.good for verdict in verdicts)
+    assert "from the rig file" in verdicts[0].reasons[0]
+    assert "order of the cables" in verdicts[0].next_steps[0]
+    assert "% from the rig file" in verdicts[1].reasons[0]
+    assert "--drum-scale-percent" in verdicts[1].next_steps[0]
+
+
+def test_a_pose_outside_the_rig_is_refused_by_name(rig: Rig, turned: Truth) -> None:
+    metres = replace(turned.measured, positions=turned.measured.positions / 1e3)
+    with pytest.raises(BadInput, match="outside the rig") as told:
+        calibrate_rig(rig, metres, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    assert told.value.where == "place 0"
+
+
 def test_a_place_with_the_numbers_of_an_earlier_one_counts_once(turned: Truth) -> None:
     data = turned.measured
     copy = replace(data, names=tuple(f"copy of {name}" for name in data.names))
