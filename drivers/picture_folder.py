@@ -12,10 +12,11 @@ import numpy as np
 
 from cdpr.errors import BadInput
 from cdpr.rig import Camera
-from drivers.cameras import Frame, Image, refuse_wrong_size
+from drivers.cameras import Frame, Image
 
 #: Endings of picture files, in lower case.
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
+_NO_PICTURE, _CAMERA = "is no picture that can be read", "the camera has"
 
 
 class ImageFolder:
@@ -25,7 +26,11 @@ class ImageFolder:
         folder: Where they are.
         camera: The camera that took them.
         rate: Pictures a second; the camera's when left out.
-        on_unreadable: Told the name of each file that is no picture; the others are still used.
+        on_unused: Told the name of each file that cannot be used, and why; the others are used.
+
+    Attributes:
+        files: All that end like pictures.
+        unused: Why files were not used, by name.
 
     Raises:
         BadInput: The folder is missing or has no pictures.
@@ -36,35 +41,40 @@ class ImageFolder:
         folder: Path,
         camera: Camera,
         rate: float | None = None,
-        on_unreadable: Callable[[str], None] | None = None,
+        on_unused: Callable[[str, str], None] | None = None,
     ) -> None:
         self.files = picture_files(folder)
-        self.unreadable: list[str] = []
+        self.unused: dict[str, str] = {}
         self._folder, self._camera = folder, camera
         self._rate = rate or camera.rate
-        self._on_unreadable = on_unreadable
+        self._on_unused = on_unused
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __iter__(self) -> Iterator[Frame]:
-        """The readable pictures.
+        """The pictures of the camera's size.
 
         Raises:
-            BadInput: One is not of the camera's size, or none can be read.
+            BadInput: None can be read, or none is of the camera's size.
         """
-        self.unreadable.clear()
+        self.unused.clear()
+        wanted = (self._camera.width, self._camera.height)
+        none_read = True
         for number, path in enumerate(self.files):
             image = read_picture(path)
-            if image is None:
-                self.unreadable.append(path.name)
-                if self._on_unreadable is not None:
-                    self._on_unreadable(path.name)
+            none_read &= image is None
+            if image is not None and _size(image) == wanted:
+                yield Frame(number / self._rate, image, path.name)
                 continue
-            refuse_wrong_size(image, self._camera, str(path))
-            yield Frame(number / self._rate, image, path.name)
-        if len(self.unreadable) == len(self.files):
+            why = _NO_PICTURE if image is None else _other_size(_size(image), _CAMERA, wanted)
+            self.unused[path.name] = why
+            if self._on_unused is not None:
+                self._on_unused(path.name, why)
+        if none_read:
             raise _no_picture(self._folder, len(self.files))
+        if len(self.unused) == len(self.files):
+            raise _wrong_sizes(self._folder, self.unused, wanted)
 
 
 class OneCamerasPictures:
@@ -95,7 +105,7 @@ class OneCamerasPictures:
         for path in files:
             image = read_picture(path)
             if image is None:
-                self.unused[path.name] = "is no picture that can be read"
+                self.unused[path.name] = _NO_PICTURE
             else:
                 sizes[path] = _size(image)
         if not sizes:
@@ -107,12 +117,10 @@ class OneCamerasPictures:
                 sizes, self.upright = as_stored, False
         counted = Counter(sizes.values())
         self.size = wanted or max(counted, key=lambda size: (counted[size], size))
-        whose = "the camera has" if wanted else "most have"
         for path, size in sizes.items():
             if size != self.size:
-                self.unused[path.name] = (
-                    f"has {size[0]} x {size[1]} px, {whose} {self.size[0]} x {self.size[1]} px"
-                )
+                whose = _CAMERA if wanted else "most have"
+                self.unused[path.name] = _other_size(size, whose, self.size)
         if self.size not in counted:
             raise _wrong_sizes(folder, self.unused, self.size)
         self._files = [path for path in sizes if path.name not in self.unused]
@@ -165,6 +173,10 @@ def read_picture(path: Path, upright: bool = True) -> Image | None:
     except cv2.error:
         return None
     return None if picture is None else np.asarray(picture, dtype=np.uint8)
+
+
+def _other_size(size: tuple[int, int], whose: str, wanted: tuple[int, int]) -> str:
+    return f"has {size[0]} x {size[1]} px, {whose} {wanted[0]} x {wanted[1]} px"
 
 
 def _size(image: Image | None) -> tuple[int, int]:

@@ -107,7 +107,11 @@ def track(
     for path in logs.values():
         check_output(path, force)
     the_scene = _scene(scene, plan)
-    opened = [picture_source(the_rig, the_scene, eye, name, plan) for eye, name in eyes.items()]
+    unused: dict[str, dict[str, str]] = {eye.name: {} for eye in eyes}
+    opened = [
+        picture_source(the_rig, the_scene, eye, name, plan, unused[eye.name])
+        for eye, name in eyes.items()
+    ]
     totals = [total for _, total in opened if total is not None]
     total = min(totals) if len(totals) == len(opened) else None
     model = ClearanceModel(the_rig, the_scene) if the_scene and the_scene.obstacles else None
@@ -144,7 +148,7 @@ def track(
         write_track_mcap(mcap, logged, began)
     facts = _facts(logged, output, count, (time.time_ns() - began) * 1e-9)
     if as_json:
-        show_json(facts)
+        show_json({**facts, "unused": _by_file(unused)})
     else:
         show_facts(f"poses in {output}", [(k.replace("_", " "), str(v)) for k, v in facts.items()])
 
@@ -152,6 +156,16 @@ def track(
 def _own_file(output: Path, name: str) -> Path:
     """Where one of several cameras is logged alone: ``poses-front.csv`` beside ``poses.csv``."""
     return output.with_name(f"{output.stem}-{name}{output.suffix}")
+
+
+def _by_file(unused: dict[str, dict[str, str]]) -> dict[str, str]:
+    """Why files are not used, by name; of several cameras by ``NAME/FILE``."""
+    several = len(unused) > 1
+    return {
+        f"{camera}/{name}" if several else name: why
+        for camera, files in unused.items()
+        for name, why in files.items()
+    }
 
 
 def _all_of(

@@ -55,9 +55,23 @@ def eyes_of(rig: Rig, sources: list[str], wanted: str | None) -> dict[Camera, st
 
 
 def picture_source(
-    rig: Rig, scene: Scene | None, camera: Camera, source: str, plan: Path | None
+    rig: Rig,
+    scene: Scene | None,
+    camera: Camera,
+    source: str,
+    plan: Path | None,
+    unused: dict[str, str],
 ) -> tuple[Iterable[Picture], int | None]:
-    """The pictures, and how many there are where that is known."""
+    """The pictures, and how many there are where that is known.
+
+    Args:
+        rig: What they show.
+        scene: What else a rendered one shows.
+        camera: The rig's camera that takes them.
+        source: Where they come from.
+        plan: The path that rendered ones show.
+        unused: Becomes why files of a folder are not used, by name, as they are met.
+    """
     from cdpr.cli.cameras import SYNTHETIC
     from cdpr.cli.output import err
     from cdpr.cli.picture_sources import require_camera_source
@@ -82,9 +96,12 @@ def picture_source(
         )
     path = Path(source)
     if path.is_dir():
-        folder = ImageFolder(
-            path, camera, on_unreadable=lambda name: err.print(f"skipped, no picture: {name}")
-        )
+
+        def skipped(name: str, why: str) -> None:
+            unused[name] = why
+            err.print(f"skipped: {name} {why}", markup=False, highlight=False)
+
+        folder = ImageFolder(path, camera, on_unused=skipped)
         return folder, len(folder)
     if path.is_file():
         video = VideoFile(path, camera)

@@ -13,11 +13,14 @@ import pytest
 from mcap.reader import make_reader
 
 from cdpr.rig import load_rig
-from tests.cli.plans import RIG, write_short_plan
+from drivers.picture_folder import picture_files
+from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 from tracking.measurement import NoPose
 from tracking.overlay import USED, drawn_over
 from tracking.pose_log import CLEARANCE_COLUMNS, POSE_COLUMNS
+
+SESSION = CONFIGS.parent / "examples" / "rig_session" / "pictures"
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,19 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
     assert picture is not None
     greenish = np.all(np.abs(picture.astype(int) - USED) < 60, axis=-1)
     assert greenish.sum() > 100, "outlines of the tags"
+
+
+def test_a_picture_of_another_size_is_skipped_and_told(tmp_path: Path) -> None:
+    for picture in picture_files(SESSION)[:2]:
+        (tmp_path / picture.name).write_bytes(picture.read_bytes())
+    cv2.imwrite(str(tmp_path / "a[0].png"), np.zeros((48, 64), np.uint8))
+    rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
+    answer = call("track", rig, tmp_path, "-o", tmp_path / "poses.csv", "--json")
+    assert answer.code == 0, answer
+    told = json.loads(answer.out)
+    assert told["pictures"] == 2
+    assert told["unused"] == {"a[0].png": "has 64 x 48 px, the camera has 1280 x 720 px"}
+    assert "skipped: a[0].png has 64 x 48 px" in " ".join(answer.err.split())
 
 
 def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -> None:

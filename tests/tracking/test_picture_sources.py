@@ -46,10 +46,11 @@ def test_a_broken_file_among_good_ones_is_named_and_skipped(
 ) -> None:
     (folder / "frame_9.png").write_bytes(b"\x89PNG\r\n\x1a\n cut short")
     (folder / "frame_10.png").write_bytes(b"")
-    told: list[str] = []
-    source = ImageFolder(folder, camera, on_unreadable=told.append)
+    told: dict[str, str] = {}
+    source = ImageFolder(folder, camera, on_unused=told.__setitem__)
     results = list(track(source, Tracker(rig, camera)))
-    assert told == ["frame_9.png", "frame_10.png"] == source.unreadable
+    assert list(told) == ["frame_9.png", "frame_10.png"]
+    assert told == source.unused
     assert [r.name for r in results] == ["frame_8.png", "frame_11.png"]
     for result, truth in zip(results, (TRUTH[0], TRUTH[3]), strict=True):
         assert isinstance(result.observation, PoseMeasurement)
@@ -70,11 +71,25 @@ def test_an_empty_or_missing_folder_is_refused(tmp_path: Path, camera: Camera) -
         ImageFolder(tmp_path / "nowhere", camera)
 
 
-def test_pictures_of_another_size_are_refused_by_name(tmp_path: Path, camera: Camera) -> None:
+def test_a_picture_of_another_size_among_good_ones_is_named_and_skipped(
+    folder: Path, camera: Camera
+) -> None:
+    cv2.imwrite(str(folder / "frame_9.png"), np.zeros((480, 640), dtype=np.uint8))
+    told: dict[str, str] = {}
+    source = ImageFolder(folder, camera, on_unused=told.__setitem__)
+    assert [frame.name for frame in source] == ["frame_8.png", "frame_10.png", "frame_11.png"]
+    assert told == {"frame_9.png": "has 640 x 480 px, the camera has 1280 x 720 px"}
+
+
+def test_pictures_that_are_all_of_another_size_are_refused_by_name(
+    tmp_path: Path, camera: Camera
+) -> None:
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((480, 640), dtype=np.uint8))
-    with pytest.raises(BadInput, match="640 x 480 px, camera 'front' has 1280 x 720") as told:
+    (tmp_path / "broken.png").write_bytes(b"nothing")
+    with pytest.raises(BadInput, match="none of the 2 pictures has the camera's 1280 x 7") as told:
         list(ImageFolder(tmp_path, camera))
-    assert "small.png" in told.value.where
+    assert "small.png has 640 x 480 px" in told.value.why
+    assert "broken.png is no picture" in told.value.why
 
 
 def test_a_video_is_measured_picture_by_picture(
