@@ -56,7 +56,7 @@ class ResultDocument(Document, ABC):
     @property
     def file_name(self) -> str:
         """What its file is called."""
-        return f"calibration_{self.kind}_{self.name}_{self.date}.yaml"
+        return result_file_name(self.kind, self.name, self.date)
 
     @property
     def stated(self) -> dict[str, Interval]:
@@ -134,6 +134,11 @@ def common_keys(
         "next_steps": list(verdict.next_steps),
         "unused": dict(unused),
     }
+
+
+def result_file_name(kind: str, name: str, day: str) -> str:
+    """What the file of a result is called."""
+    return f"calibration_{kind}_{name}_{day}.yaml"
 
 
 def require_file_name(name: str, where: str) -> None:

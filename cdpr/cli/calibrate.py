@@ -78,15 +78,13 @@ def camera(
 
       cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
     """
-    from datetime import UTC, datetime
-
     from calibration.camera import calibrate_camera
     from calibration.camera_page import camera_page
     from calibration.camera_result import camera_result
     from calibration.camera_verdict import judge_camera
     from calibration.result_file import require_file_name
     from cdpr.cli.calibrate_live import take_pictures
-    from cdpr.cli.calibration_output import finish
+    from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.output import progress_bar
     from cdpr.cli.picture_sources import Pictures, told
     from cdpr.cli.workers import make_folder
@@ -102,8 +100,7 @@ def camera(
             where="calibrate camera",
             next_step="pass --live CAMERA too, or leave them out: a folder's pictures are all used",
         )
-    if output is not None:
-        make_folder(output, force)
+    today = begin("camera", name, output, force)
     if live is not None:
         make_folder(folder, force)
         take_pictures(live, folder, the_board, pictures or 40, size_px or (1280, 720))
@@ -112,7 +109,7 @@ def camera(
     with progress_bar("looking for the board", source.count, not as_json) as advance:
         result = calibrate_camera(told(source, advance), the_board, source.unused)
     quality = judge_camera(result, wanted_mm / 1000.0, distance_m)
-    document = camera_result(result, quality, name, datetime.now(UTC).date())
+    document = camera_result(result, quality, name, today)
     page = camera_page(result, quality, name, document.date)
     finish(document, page, _facts(result, quality), output, as_json)
 

@@ -61,27 +61,22 @@ def extrinsics(
 
       cdpr calibrate extrinsics rig.yaml runs/first/pictures --poses runs/first
     """
-    from datetime import UTC, datetime
-
     from calibration.extrinsics import judge_extrinsics
     from calibration.extrinsics_page import extrinsics_page, moved_rows
     from calibration.extrinsics_result import extrinsics_result
     from calibration.result_file import require_file_name
-    from cdpr.cli.calibration_output import finish
+    from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.cameras import named_camera
-    from cdpr.cli.workers import make_folder
     from cdpr.rig import load_rig
 
     the_rig = calibrated_rig(load_rig(rig), calibration)
     the_camera = named_camera(the_rig, camera)
     require_file_name(the_camera.name, "cameras")
     known = None if poses is None else _known_poses(poses)
-    if output is not None:
-        make_folder(output, force)
+    today = begin("extrinsics", the_camera.name, output, force)
     found = _located(the_rig, the_camera, source, pictures, known, survey_mm / 1e3, not as_json)
     verdict = judge_extrinsics(found, wanted_mm / 1e3)
-    today = datetime.now(UTC).date()
     document = extrinsics_result(found, verdict, the_rig.document, today)
     before = the_camera.world_from_camera
     finish(

@@ -81,7 +81,6 @@ def rig(
 
       cdpr calibrate rig rig.yaml lengths.csv --without-poses --known drum_scale
     """
-    from datetime import UTC, datetime
     from math import radians
 
     import numpy as np
@@ -91,9 +90,8 @@ def rig(
     from calibration.rig_page import rig_page
     from calibration.rig_result import rig_result
     from calibration.rig_verdict import judge_rig
-    from cdpr.cli.calibration_output import finish
+    from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.output import spinner
-    from cdpr.cli.workers import make_folder
     from cdpr.rig import load_rig
 
     require_file_name(name, "--name")
@@ -110,12 +108,11 @@ def rig(
     measured = measured.with_doubt(of_poses)
     if without_poses:
         measured = measured.without_poses()
-    if output is not None:
-        make_folder(output, force)
+    today = begin("rig", name, output, force)
     with spinner("fitting", not as_json):
         result = calibrate_rig(the_rig, measured, wanted, length_mm / 1e3)
         quality = judge_rig(result, wanted_mm / 1e3, radians(tilt_deg))
-    document = rig_result(result, quality, name, datetime.now(UTC).date())
+    document = rig_result(result, quality, name, today)
     page = rig_page(result, quality, name, document.date)
     finish(document, page, _facts(result, quality), output, as_json)
 

@@ -38,35 +38,31 @@ def tags(
 
       cdpr calibrate tags rig.yaml pictures/ --calibration calibration_camera_front_2026-03-01.yaml
     """
-    from datetime import UTC, datetime
-
     from calibration.result_file import require_file_name
     from calibration.tag_layout import measure_layout, require_tags
     from calibration.tag_sights import sights_of
     from calibration.tags_page import change_rows, tags_page
     from calibration.tags_result import tags_result
     from calibration.tags_verdict import judge_layout
-    from cdpr.cli.calibration_output import finish
+    from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.cameras import named_camera
     from cdpr.cli.output import progress_bar
     from cdpr.cli.picture_sources import pictures_of, told
-    from cdpr.cli.workers import make_folder
     from cdpr.rig import load_rig
 
     the_rig = calibrated_rig(load_rig(rig), calibration)
     the_camera = named_camera(the_rig, camera)
     require_file_name(the_rig.name, "name")
     require_tags(the_rig, fixed_tag)
-    if output is not None:
-        make_folder(output, force)
+    today = begin("tags", the_rig.name, output, force)
     images = pictures_of(source, the_camera, pictures)
     numbers = [tag.id for tag in the_rig.platform_tags]
     with progress_bar("looking for tags", images.count, not as_json) as advance:
         sights = sights_of(told(images, advance), the_rig, the_camera, numbers, images.unused)
     found = measure_layout(the_rig, the_camera, sights, fixed_tag)
     verdict = judge_layout(found, wanted_mm / 1e3)
-    document = tags_result(found, verdict, the_rig.document, datetime.now(UTC).date())
+    document = tags_result(found, verdict, the_rig.document, today)
     facts = [
         ("pictures", f"{len(found.errors)} used, corners {found.reprojection:.3f} px off (RMS)"),
         *(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,9 +15,39 @@ if TYPE_CHECKING:
 FolderOption = Annotated[
     Path | None, typer.Option("-o", "--output", help="folder for the result and its report")
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="replace what the folder holds")]
+ForceOption = Annotated[
+    bool, typer.Option("--force", help="replace the result of the same name and day")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
 WantedOption = Annotated[float, typer.Option(min=0.001, help="what is good enough, 95 %")]
+
+
+def begin(kind: str, name: str, output: Path | None, force: bool) -> date:
+    """Before the work, so that it is not lost: makes the folder; returns the result's date.
+
+    Args:
+        kind: Of the result.
+        name: Of what is calibrated.
+        output: The folder; None to write nothing.
+        force: Whether files that exist are replaced.
+
+    Raises:
+        BadInput: The folder cannot be made or written to, or holds such a result or report.
+    """
+    from datetime import UTC, datetime
+
+    from calibration.result_file import result_file_name
+    from cdpr.cli.plan import check_output
+    from cdpr.cli.workers import make_place
+
+    today = datetime.now(UTC).date()
+    if output is not None:
+        result = output / result_file_name(kind, name, today.isoformat())
+        if output.is_dir():
+            for file in (result, result.with_suffix(".html")):
+                check_output(file, force)
+        make_place(output)
+    return today
 
 
 def finish(
@@ -44,9 +75,10 @@ def finish(
 
     files = []
     if output is not None:
-        files = [("result", str(write_result(output, result)))]
-        write_atomic(output / "report.html", page)
-        files.append(("report", str(output / "report.html")))
+        written = write_result(output, result)
+        report = written.with_suffix(".html")
+        write_atomic(report, page)
+        files = [("result", str(written)), ("report", str(report))]
     if as_json:
         show_json(result.model_dump(mode="json"))
     else:

@@ -34,19 +34,30 @@ def make_folder(folder: Path, force: bool) -> None:
     """
     from cdpr.errors import BadInput
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        taken = any(folder.iterdir())
-    except OSError as error:
-        raise BadInput(
-            "the folder cannot be made", where=str(folder), why=str(error.strerror)
-        ) from error
-    if taken and not force:
+    make_place(folder)
+    if any(folder.iterdir()) and not force:
         raise BadInput(
             "the folder is not empty",
             where=str(folder),
             next_step="choose another name, or pass --force to write into it",
         )
+
+
+def make_place(folder: Path) -> None:
+    """Makes a folder where there is none; one that holds something will do.
+
+    Raises:
+        BadInput: It cannot be made or written to.
+    """
+    from cdpr.errors import BadInput
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        next(folder.iterdir(), None)
+    except OSError as error:
+        raise BadInput(
+            "the folder cannot be made", where=str(folder), why=str(error.strerror)
+        ) from error
     if not os.access(folder, os.W_OK):
         raise BadInput("the folder is read-only", where=str(folder))
 

@@ -74,7 +74,7 @@ def test_a_folder_is_calibrated_and_what_is_of_no_use_is_named(folder, tmp_path)
     assert found["verdict"].startswith("good enough for" if answer.code == 0 else "not good enough")
     (saved,) = (tmp_path / "out").glob("calibration_camera_camera_*.yaml")
     assert yaml.safe_load(saved.read_text()) == found
-    page = (tmp_path / "out" / "report.html").read_text()
+    page = saved.with_suffix(".html").read_text()
     assert "broken.jpg" in page
     assert "<script" not in page
 

@@ -83,7 +83,7 @@ def test_the_tags_are_found_where_they_were_glued_and_the_result_used(folder, tm
     assert found["rms_px"] < 0.1
     (saved,) = out.glob("calibration_tags_gachon_8_6_*.yaml")
     assert yaml.safe_load(saved.read_text()) == found
-    page = (out / "report.html").read_text()
+    page = saved.with_suffix(".html").read_text()
     assert "Tags against the drawing" in page
     truth, drawn = as_glued().platform_tags, load_rig(RIG).platform_tags
     shift = drawn[0].pose.compose(truth[0].pose.inverse())
@@ -93,7 +93,15 @@ def test_the_tags_are_found_where_they_were_glued_and_the_result_used(folder, tm
         for tag, true in zip(tags, truth, strict=True)
     ]
     assert np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1))) < 0.15e-3
-    again = call("calibrate", "tags", RIG, folder, "--calibration", saved, "--json")
+    with nothing_written(out):
+        twice = call("calibrate", "tags", RIG, folder, "-o", out)
+    one_message(twice, 2, saved.name, "--force")
+    saved.rename(out / "of_another_verb.yaml")
+    saved.with_suffix(".html").unlink()
+    saved = out / "of_another_verb.yaml"
+    more = ("--calibration", saved, "-o", out, "--json")  # a folder that holds other results
+    again = call("calibrate", "tags", RIG, folder, *more)
+    assert len(list(out.iterdir())) == 3
     moved = json.loads(again.out)
     for tag, other in zip(found["platform"], moved["platform"], strict=True):
         assert tag["position_mm"] == pytest.approx(other["position_mm"], abs=0.05)
