@@ -15,12 +15,12 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "faults"
 HEADINGS = ["## What it means", "## Likely cause", "## State of the machine", "## Next step"]
 #: Which argument of a call is the code of an event.
-PLACES = {"Finding": 1, "LoopEvent": 2, "_fault": 0, "_tell": 0, "_tell_cause": 0}
+PLACES = {"Finding": 1, "LoopEvent": 2, "RunEvent": 1, "_fault": 0, "_tell": 0, "_tell_cause": 0}
 
 
 def codes_in_the_source() -> Iterator[str]:
     """Codes that are written where events are made; and those of faults of the bus."""
-    for path in [*(ROOT / "executor").rglob("*.py"), ROOT / "cdpr/cli/run_motion.py"]:
+    for path in [*(ROOT / "executor").rglob("*.py"), *(ROOT / "cdpr").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
                 continue
@@ -38,8 +38,17 @@ CODES = sorted(set(codes_in_the_source()) - ORDINARY)
 
 
 def test_codes_are_found_in_the_source() -> None:
-    assert len(CODES) >= 29
-    assert {"slack", "late", "gate_denied", "drive_stuck", "bus_off", "no_real_time"} <= set(CODES)
+    assert len(CODES) >= 31
+    assert {
+        "camera",
+        "pictures_dropped",
+        "slack",
+        "late",
+        "gate_denied",
+        "drive_stuck",
+        "bus_off",
+        "no_real_time",
+    } <= set(CODES)
 
 
 @pytest.mark.parametrize("code", CODES)
