@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cdpr.cli.calibrations import CalibrationOption
-from cdpr.cli.motion_options import ChannelOption, InterfaceOption
+from cdpr.cli.motion_options import ChannelOption, InterfaceOption, WithoutRealTimeOption
 
 if TYPE_CHECKING:
     from cdpr.rig import Rig
     from drivers.drive_group import CycleStatus
     from executor.custody import Custody
     from executor.real_time_job import ReadyDrives
+    from executor.wishes import WishBoard
 
-#: All drives must be without torque within so many seconds.
-WITHIN_S = 3.0
 _RELEASED = "released by the operator"
 
 
@@ -27,6 +27,7 @@ def release(
     channel: ChannelOption = None,
     calibration: CalibrationOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
+    without_real_time: WithoutRealTimeOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
     """End the day: with the platform on a support, close the brakes and take the torque off.
@@ -67,7 +68,7 @@ def release(
         asks=not yes,
         as_json=as_json,
     )
-    status = _released(the_rig, custody)
+    status = _released(the_rig, custody, without_real_time)
     stands = status.positions.tolist()
     told: dict[str, Any] = {
         "drives": list(drive_states(the_rig, status.status_words.tolist())),
@@ -84,69 +85,78 @@ def _braked(rig: Rig) -> bool:
     return all(winch.brake for winch in rig.winches)
 
 
-def _released(rig: Rig, custody: Custody) -> CycleStatus:
+def _released(rig: Rig, custody: Custody, without_real_time: bool) -> CycleStatus:
     """The drives' last word, without torque.
 
     Raises:
+        StoppedByOperator: The operator stopped it.
         CdprError: They could not be set up, or were not released; then a fault is latched.
     """
     from functools import partial
 
     from cdpr.cli.drives import open_drives
+    from cdpr.errors import StoppedByOperator
     from cdpr.scene import nothing_in_the_way
-    from executor.machine import State
+    from executor.arming import require_capabilities
+    from executor.command_server import serving
+    from executor.running import announced, stop_requests
+    from executor.status import WinchStatus
     from executor.winch_motion import set_up_here
+    from executor.wishes import OwnBoard
 
+    board = OwnBoard()
     load = nothing_in_the_way(rig).load
-    with open_drives(rig, rig.home, load, set_up_as=partial(set_up_here, rig)) as drives:
+    with (
+        stop_requests(board),
+        announced() as listeners,
+        serving(listeners, board, WinchStatus(rig, board, simulated_time=False)),
+        open_drives(rig, rig.home, load, set_up_as=partial(set_up_here, rig)) as drives,
+    ):
+        require_capabilities(drives.group.capabilities, rig.document.bus.cycle_ms / 1000.0)
         stands = drives.group.read_positions().positions.tolist()
-        record = custody.file.path.parent
+        if board.read().stop:
+            raise StoppedByOperator("stopped before anything was released; the drives hold")
+        return _in_custody(rig, custody, drives, stands, board, without_real_time)
+
+
+def _in_custody(
+    rig: Rig,
+    custody: Custody,
+    drives: ReadyDrives,
+    stands: Sequence[int],
+    board: WishBoard,
+    without_real_time: bool,
+) -> CycleStatus:
+    """Takes the torque off; what becomes of the bus and the reference is kept."""
+    from cdpr.cli.output import err
+    from cdpr.errors import CdprError, Refused
+    from executor.clock import RealClock
+    from executor.machine import State
+    from executor.realtime import real_time, require_real_time
+    from executor.torque_off import take_torque_off
+
+    record = custody.file.path.parent
+    clock = RealClock(rig.document.bus.cycle_ms / 1000.0)
+    with real_time() as denied:
+        require_real_time(denied, needed=not without_real_time)
+        if denied:
+            err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
         custody.begin(record, custody.still_counts(stands))
         try:
-            status = _cycled(rig, drives)
+            status = take_torque_off(rig, drives.group, clock, lambda: board.read().stop)
+        except Refused:  # nothing was enabled
+            custody.prevented()
+            raise
         except BaseException as error:
-            cause = f"the drives were being released: {str(error) or type(error).__name__}"
+            what = error.what if isinstance(error, CdprError) else "the program was ended"
+            cause = f"the drives were being released: {what}"
             custody.end(State.LATCHED, cause, record, holding=False, stands_at=None)
             raise
-        custody.end(
-            State.FINISHED,
-            _RELEASED,
-            record,
-            holding=_braked(rig),
-            stands_at=status.positions.tolist(),
-        )
-    return status
-
-
-def _cycled(rig: Rig, drives: ReadyDrives) -> CycleStatus:
-    """Lets the group go its way, cycle by cycle.
-
-    Raises:
-        Fault: It did not come to its end.
-    """
-    from cdpr.errors import Fault
-    from drivers.drive_group import GroupCommand, GroupState
-    from executor.clock import RealClock
-    from executor.realtime import real_time
-
-    group, cycle = drives.group, rig.document.bus.cycle_ms / 1000.0
-    clock = RealClock(cycle)
-    with real_time():
-        group.command(GroupCommand.RELEASE)
-        for _ in range(round(WITHIN_S / cycle)):
-            clock.next_cycle()
-            group.send_cycle(group.targets.tolist())
-            status = group.receive(clock.time_left())
-            if status.state is GroupState.RELEASED:
-                return status
-            if status.state is GroupState.FAULT:
-                break
-    group.quick_stop_now()
-    told = "; ".join(text for _, text in status.faults)
-    raise Fault(
-        told or f"the drives were not without torque within {WITHIN_S:g} s",
-        where="release",
-        why="a drive did not go the way of all; those under torque hold",
-        next_step="look at the drives, then `cdpr reset RIG`; where none can be released, cut the"
-        " motor power with the emergency stop once the platform is supported",
+    custody.end(
+        State.FINISHED,
+        _RELEASED,
+        record,
+        holding=_braked(rig),
+        stands_at=status.positions.tolist(),
     )
+    return status

@@ -82,6 +82,7 @@ class Cia402Group(CyclicGroup):
         self._faults = []
         self._cycle = 0
         self._cycles_to_goal = 0
+        self._left_stop = False  # told "enable operation" since the last release began
         self._known = False
 
     @property
@@ -169,6 +170,8 @@ class Cia402Group(CyclicGroup):
         self._discard_stale()
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._released)
+        if ControlWord.ENABLE_OPERATION in words:
+            self._left_stop = True
         self._demands = self._targets if self._known else list(self._watch.positions)
         if following:
             self._targets = [int(target) for target in targets]
@@ -218,12 +221,24 @@ class Cia402Group(CyclicGroup):
         found = self._watch.news()
         if not powered:  # an emergency of a drive that moves nothing becomes its state's reason
             found = [(node, text) for node, text in found if node in self._watch.restarted]
-        dropped = self._watch.dropped()
-        if self._goal is Goal.ENABLE:
-            found += dropped
+        found += self._stopped_by_themselves()
         found += self._watch.state_faults(powered=powered)
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
+
+    def _stopped_by_themselves(self) -> list[tuple[int, str]]:
+        """Drives that left OPERATION ENABLED although they were not told to.
+
+        On the way to a release they leave it for SWITCHED ON; one that is back in quick stop after
+        it was enabled must not be enabled again.
+        """
+        dropped = self._watch.dropped()
+        if self._goal is Goal.ENABLE:
+            return dropped
+        if not (self._goal is Goal.RELEASE and self._left_stop):
+            return []
+        states = dict(zip(self._nodes, self._watch.states, strict=True))
+        return [f for f in dropped if states[f[0]] is DriveState.QUICK_STOP_ACTIVE]
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:
@@ -243,19 +258,19 @@ class Cia402Group(CyclicGroup):
             if all(state is DriveState.OPERATION_ENABLED for state in states):
                 self._state = GroupState.ENABLED
             elif self._cycles_to_goal > self._patience:
-                self._latch(self._late(DriveState.OPERATION_ENABLED))
+                self._latch(self._late((DriveState.OPERATION_ENABLED,)))
         elif self._goal is Goal.RELEASE:
             if all(state in _WITHOUT_TORQUE for state in states):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > self._patience:
-                self._latch(self._late(DriveState.READY_TO_SWITCH_ON))
+                self._latch(self._late(_WITHOUT_TORQUE))
 
-    def _late(self, wanted: DriveState) -> list[tuple[int, str]]:
+    def _late(self, wanted: tuple[DriveState, ...]) -> list[tuple[int, str]]:
         names = self._rig.drive_names
         return [
-            (node, f"{names[node]} stays in {state.value} on the way to {wanted.value}")
+            (node, f"{names[node]} stays in {state.value} on the way to {wanted[-1].value}")
             for node, state in zip(self._nodes, self._watch.states, strict=True)
-            if state is not wanted
+            if state not in wanted
         ]
 
     def _status(self) -> CycleStatus:
@@ -298,7 +313,7 @@ class Cia402Group(CyclicGroup):
     def _begin_release(self) -> None:
         self._refuse_latched("release the drives")
         self._require_within_limits()
-        self._goal, self._cycles_to_goal = Goal.RELEASE, 0
+        self._goal, self._cycles_to_goal, self._left_stop = Goal.RELEASE, 0, False
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
 

@@ -64,7 +64,7 @@ def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
         watched(rehearsal.drives, words)
         assert call("release", file, *bus, answers="n\n").code == 130
         assert call("reset", file, *bus, "--yes").code == 0
-        answer = call("release", file, *bus, "--yes", "--json")
+        answer = call("release", file, *bus, "--yes", "--without-real-time", "--json")
         assert answer.code == 0, answer
         told = json.loads(answer.out)
         assert told["drives"] == ["ready to switch on"] * 8
@@ -103,7 +103,7 @@ def test_drives_that_count_from_anywhere_stay_where_they_are(
                 enable()
 
             drive._command_enable = aimed  # type: ignore[method-assign]
-        answer = call("release", rig, *bus, "--yes")
+        answer = call("release", rig, *bus, "--yes", "--without-real-time")
         assert answer.code == 0, answer
         assert len(aims) >= 8
         assert all(target == round(position) for target, position in aims)
@@ -129,7 +129,7 @@ def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
         hold(rehearsal.drives)
         stuck = rehearsal.drives[3]
         stuck._command_shutdown = lambda: None  # type: ignore[method-assign]
-        answer = call("release", RIG, *bus, "--yes")
+        answer = call("release", RIG, *bus, "--yes", "--without-real-time")
     assert answer.code == 1
     assert "cable 4 (drive 4) stays in" in answer.err
     latched = Latch(BusSettings("udp_multicast", channel)).read()
