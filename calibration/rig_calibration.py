@@ -14,6 +14,7 @@ from calibration.rig_held_out import HeldOut, held_out
 from calibration.rig_measurements import RigMeasurements
 from calibration.rig_model import RigModel
 from calibration.rig_observability import Observability, identified, sentences
+from calibration.rig_outliers import without_outliers
 from calibration.rig_parameters import Parameters, RigGeometry, rig_with
 from cdpr.cables import cables_to
 from cdpr.errors import BadInput
@@ -35,7 +36,7 @@ class RigCalibration:
 
     Attributes:
         parameters: The unknowns and the drawing.
-        measured: What they are from.
+        measured: What they are from, without places that contradict the others.
         fit: The best fit that leaves what cannot be identified as in the drawing.
         observability: What the data tell.
         covariance: Of the unknowns, shape (p, p), [m] or share; what is not identified has that of
@@ -164,6 +165,10 @@ def calibrate_rig(
             next_step="leave out --known for one of them",
         )
     fit, observability = identified(parameters, measured, length_deviation)
+    agreeing = without_outliers(measured, fit, length_deviation, FEWEST_PLACES)
+    if len(agreeing) < len(measured):
+        measured = agreeing
+        fit, observability = identified(parameters, measured, length_deviation)
     return RigCalibration(
         parameters,
         measured,
@@ -208,7 +213,7 @@ def _covariance(
     """Larger than the deviations that were stated say where the residuals are."""
     known, unknown = observability.known, observability.unknown
     told = known.T @ fit.information @ known + np.eye(known.shape[1])
-    squares = float(np.sum((fit.residuals / length_deviation) ** 2))
+    squares = float(np.sum(fit.weights * (fit.residuals / length_deviation) ** 2))
     freedom = fit.residuals.size - known.shape[1] - 6 * int((~measured.posed).sum())
     larger = max(1.0, squares / max(freedom, 1))
     inner = larger * known @ np.linalg.solve(told, known.T) + unknown @ unknown.T

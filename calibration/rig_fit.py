@@ -41,6 +41,10 @@ class RigFit:
         positions: World frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
         residuals: Of cable lengths, shape (n, m), [m].
+        weights: How much of each residual's square counts, shape (n, m); less than 1 where it is
+            far off.
+        pose_misfits: Of the poses from the measured ones, in standard deviations, shape (n,); 0
+            where there is none.
         information: What the data alone say of the unknowns, shape (p, p), per variance of the
             drawing: eigenvalues above 1 are known better from the data than from the drawing.
     """
@@ -49,6 +53,8 @@ class RigFit:
     positions: Array
     rotations: Array
     residuals: Array
+    weights: Array
+    pose_misfits: Array
     information: Array
 
 
@@ -169,7 +175,15 @@ class RigFitter:
         zero = np.zeros(len(values))
         system = self._system(values, zero, spread, positions, rotations)
         residuals = self._model.residuals(values, positions, rotations)
-        return RigFit(values, positions, rotations, residuals, system.reduced())
+        return RigFit(
+            values,
+            positions,
+            rotations,
+            residuals,
+            _share(np.sqrt(self._length_weight) * np.abs(residuals), CABLE_BEND),
+            self._distances(self._pose_errors(positions, rotations)),
+            system.reduced(),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
