@@ -20,6 +20,8 @@ LEAST_VIEWS = 4
 """Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
 _FAR_OFF, _OFF = 4.0, 0.5
 """A view is left out whose error is so many times the median, and so many pixels at least."""
+_SAME = 0.01
+"""Corners of two pictures that are nearer to each other, RMS, are of one: noise is larger, [px]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,12 +109,21 @@ def calibrate_camera(
         if seen is None:
             left_out[name] = "does not show the board"
             example = image if example is None else example
+        elif first := next((n for n, before in views.items() if _same(seen, before)), None):
+            left_out[name] = f"is the same picture as {first}"
         else:
             views[name] = seen
             left_out |= {f"{name}, {k}": "is seen more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, example)
     return calibrate_from_views(views, size, left_out)
+
+
+def _same(seen: Seen, before: Seen) -> bool:
+    """Whether two pictures are copies, which together tell no more than one."""
+    if not np.array_equal(seen.points, before.points):
+        return False
+    return bool(np.mean(np.sum((seen.corners - before.corners) ** 2, axis=1)) < _SAME**2)
 
 
 def calibrate_from_views(

@@ -61,6 +61,8 @@ def sights_of(
     """Looks for tags.
 
     A number that is seen twice in a picture is left out there: nobody knows which is the rig's.
+    A copy of a picture is left out: it tells nothing more. Pictures of a camera that stands still
+    differ by their noise at least.
 
     Args:
         pictures: Names and grey pictures of the camera's size.
@@ -77,7 +79,12 @@ def sights_of(
     found: dict[str, Mapping[int, RefinedTag]] = {}
     left_out = dict(unused or {})
     example: tuple[str, Image] | None = None
+    names: dict[bytes, str] = {}
     for name, image in pictures:
+        first = names.setdefault(hashlib.sha256(image.tobytes()).digest(), name)
+        if first != name:
+            left_out[name] = f"is the same picture as {first}"
+            continue
         mine = [d for d in detector.detect_all(image) if d.id in wanted]
         twice = [number for number, count in Counter(d.id for d in mine).items() if count > 1]
         left_out |= {f"{name}, tag {number}": "is seen more than once" for number in twice}

@@ -210,8 +210,14 @@ def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pi
 def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
     blank = np.full((720, 1280), 100, np.uint8)
-    sights = sights_of([*pictures, ("blank.png", blank)], rig, camera, numbers(rig))
-    assert sights.unused == {"blank.png": "shows none of the tags whole"}
+    first, image = pictures[0]
+    more = [("blank.png", blank), ("copy.png", image.copy())]
+    sights = sights_of([*pictures, *more], rig, camera, numbers(rig))
+    assert sights.unused == {
+        "blank.png": "shows none of the tags whole",
+        "copy.png": f"is the same picture as {first}",
+    }
+    assert sights.squares.keys() == {name for name, _ in pictures}
     with pytest.raises(BadInput, match="none of the tag36h11 tags 401, 402, 403, 404"):
         sights_of([("blank.png", blank)], rig, camera, numbers(rig))
 
