@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import date
 from typing import Any, ClassVar, Literal, Self
 
@@ -12,7 +12,7 @@ from pydantic import Field
 from calibration.result_file import ResultDocument, common_keys
 from calibration.rig_calibration import RigCalibration
 from calibration.rig_verdict import RigQuality, judged_places
-from cdpr.document_types import NonNegative, Number, Positive, Vector
+from cdpr.document_types import Finding, NonNegative, Number, Positive, Vector
 from cdpr.errors import BadInput
 from cdpr.poses import Array
 from cdpr.rig import Rig, rig_from_document
@@ -51,6 +51,19 @@ class RigResult(ResultDocument):
     )
     cable_residuals_mm: list[NonNegative] = Field(description="RMS, one a cable")
 
+    def rules(self) -> Sequence[Callable[[], list[Finding]]]:
+        """Those of every result, and one entry a cable."""
+        return (*super().rules(), self._one_a_cable)
+
+    def _one_a_cable(self) -> list[Finding]:
+        cables = len(self.outlets_mm)
+        keys = ("anchors_mm", "drums_mm_per_rev", "home_counts", "cable_residuals_mm")
+        return [
+            ((key,), f"has {len(getattr(self, key))} entries, outlets_mm has {cables}")
+            for key in keys
+            if len(getattr(self, key)) != cables
+        ]
+
     def apart_mm(self, other: Self) -> float:
         """How far apart both say that the platform goes, RMS over the workspace, [mm].
 
@@ -75,6 +88,12 @@ class RigResult(ResultDocument):
             BadInput: The result is of another rig.
         """
         self.require_basis(drawing_of(rig), _WHAT)
+        if len(self.outlets_mm) != len(rig.winches):
+            raise BadInput(
+                f"this result is of {len(self.outlets_mm)} cables, the rig has {len(rig.winches)}",
+                where=f"calibration {self.kind} {self.name}, {self.date}",
+                next_step="run `cdpr calibrate rig` again; the file was changed after it was made",
+            )
         return _with_numbers(
             rig,
             self.outlets_mm,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -109,12 +111,34 @@ def rig(
     if without_poses:
         measured = measured.without_poses()
     today = begin("rig", name, output, force)
-    with spinner("fitting", not as_json):
+    with spinner("fitting", not as_json), _told_of(rig, data):
         result = calibrate_rig(the_rig, measured, wanted, length_mm / 1e3)
         quality = judge_rig(result, wanted_mm / 1e3, radians(tilt_deg))
-    document = rig_result(result, quality, name, today)
+        document = rig_result(result, quality, name, today)
     page = rig_page(result, quality, name, document.date)
     finish(document, page, _facts(result, quality), output, as_json)
+
+
+@contextmanager
+def _told_of(rig: Path, data: list[Path]) -> Iterator[None]:
+    """What goes wrong in the mathematics of a rig that no data are of is told of rig and data.
+
+    Raises:
+        BadInput: It did.
+    """
+    from cdpr.cables import NoCable
+    from cdpr.errors import BadInput, Fault, Refused
+
+    try:
+        yield
+    except (Fault, NoCable, Refused) as error:
+        raise BadInput(
+            f"the measurements do not fit the rig file {rig}",
+            where=", ".join(map(str, data)),
+            why=error.what,
+            next_step="check units, the order of the cables, the reference of the drives and the"
+            " rig file",
+        ) from error
 
 
 def _measured(rig: Rig, data: list[Path]) -> tuple[Rig, RigMeasurements]:

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.kinds import calibrated
+from calibration.kinds import calibrated, load_result
 from calibration.rig_calibration import RigCalibration, calibrate_rig
 from calibration.rig_fit import RigFitter
 from calibration.rig_measurements import Recording, RigMeasurements, at_rest, joined
@@ -23,7 +24,7 @@ from calibration.rig_page import rig_page
 from calibration.rig_parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.rig_result import RigResult, require_one_drawing, rig_result
 from calibration.rig_verdict import judge_rig, judged_places
-from cdpr.errors import BadInput
+from cdpr.errors import BadInput, InvalidFile
 from cdpr.kinematics import poses_near
 from cdpr.poses import Array, matrix_from_rotation_vector, rotation_vector_from_matrix
 from cdpr.rig import Rig, load_rig, rig_from_document
@@ -304,6 +305,30 @@ def test_a_result_file_is_applied_to_its_own_rig_only(
     page = rig_page(found, quality, "rig", "2026-03-14")
     assert "good enough" in page
     assert "cable 8" in page
+
+
+@pytest.mark.parametrize("key", ["anchors_mm", "drums_mm_per_rev", "home_counts"])
+def test_a_result_file_with_a_cable_too_few_is_refused_by_name(
+    rig: Rig, found: RigCalibration, tmp_path: Path, key: str
+) -> None:
+    document = rig_result(found, judge_rig(found, 1e-3, 0.0), "rig", TODAY).model_dump(mode="json")
+    document[key] = document[key][:-1]
+    path = tmp_path / "edited.yaml"
+    path.write_text(yaml.safe_dump(document), encoding="utf-8")
+    with pytest.raises(InvalidFile, match=f"{key}.*has 7 entries, outlets_mm has 8") as told:
+        load_result(path)
+    assert "edited.yaml" in str(told.value)
+
+
+def test_a_result_with_fewer_cables_throughout_is_told_of_the_result(
+    rig: Rig, found: RigCalibration
+) -> None:
+    result = rig_result(found, judge_rig(found, 1e-3, 0.0), "rig", TODAY)
+    keys = ("outlets_mm", "anchors_mm", "drums_mm_per_rev", "home_counts", "cable_residuals_mm")
+    fewer = result.model_copy(update={key: getattr(result, key)[:-1] for key in keys})
+    with pytest.raises(BadInput, match="of 7 cables, the rig has 8") as told:
+        calibrated(rig, [fewer])
+    assert told.value.where == "calibration rig rig, 2026-03-14"
 
 
 def test_two_results_are_compared_by_where_the_platform_goes(

@@ -159,6 +159,24 @@ def test_a_file_that_is_named_twice_is_refused(file: Path) -> None:
     assert "named twice" in done.err
 
 
+def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path) -> None:
+    """x in inches: near the middle of the rig, and the outlets that would fit cannot hold home."""
+    names, *lines = (SESSION / "places.csv").read_text(encoding="utf-8").splitlines()
+    x, rows = names.split(",").index("x_mm"), [line.split(",") for line in lines]
+    for row in rows:
+        row[x] = f"{float(row[x]) / 25.4:.6f}"
+    path = tmp_path / "inch.csv"
+    path.write_text("\n".join([names, *map(",".join, rows)]) + "\n", encoding="utf-8")
+    folder = tmp_path / "out"
+    done = call("calibrate", "rig", RIG, path, "-o", folder, "--json")
+    assert done.code == 2, done
+    told = json.loads(done.out)
+    assert str(RIG) in told["what"]
+    assert str(path) in told["where"]
+    assert told["next_step"].startswith("check units, the order of the cables")
+    assert not list(folder.glob("*"))
+
+
 def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
     done = call("calibrate", "rig", RIG, finished_run, "--json")
     assert done.code == 2
