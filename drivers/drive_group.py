@@ -124,7 +124,7 @@ class DrivesSeen:
         torques: Positive where they pull the cable in, shape (m,), [per mille of rated torque].
         status_words: Shape (m,); `drive_states` tells what they say.
         restarted: Nodes that do not hold this program's set-up: switched on since, or never set up.
-            None of drives that keep their settings without power.
+            Of drives that keep their settings without power all whose encoder is not absolute.
     """
 
     positions: Counts

@@ -186,6 +186,7 @@ class Custody:
         *,
         holding: bool,
         stands_at: Sequence[int] | None,
+        let_go: str = "",
     ) -> None:
         """The motion is over: the bus is released when it ended well, else latched.
 
@@ -195,6 +196,8 @@ class Custody:
             record: Where it is on record.
             holding: Every cable was held to the end.
             stands_at: Where the drives stand, [counts]; None when nobody heard it.
+            let_go: Why cables are not held any more where that was wished; what the reference was
+                lost by.
 
         Raises:
             Refused: The reference cannot be kept, then the bus stays latched; or the latch cannot.
@@ -202,17 +205,17 @@ class Custody:
         if not self._is_kept:
             return
         try:
-            self._note_end(cause, holding, stands_at)
+            lost = let_go or f"drives let go of cables under tension ({cause})"
+            self._note_end(lost, holding, stands_at)
         except Refused as error:
             self._latch.settle(self._rig.name, State.LATCHED, cause or error.what, record)
             raise
         self._latch.settle(self._rig.name, state, cause, record)
 
-    def _note_end(self, cause: str, holding: bool, stands_at: Sequence[int] | None) -> None:
+    def _note_end(self, lost: str, holding: bool, stands_at: Sequence[int] | None) -> None:
         """What the end of a motion means for the reference."""
         if not holding:
             reference = self._readable() or as_in_the_file(self._rig)
-            lost = f"drives let go of cables under tension ({cause})"
             self.file.write(reference.model_copy(update={"lost": reference.lost or lost}))
         elif self._counted_from is not None and stands_at is not None:
             stand = {"stands_at": list(stands_at)}

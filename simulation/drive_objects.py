@@ -162,6 +162,7 @@ def _drive_profile() -> list[tuple[Key, str, int, bool]]:
         ((0x6040, 0), "<H", 0, True),
         ((0x6041, 0), "<H", 0, False),
         ((0x605A, 0), "<h", 2, True),
+        ((0x605C, 0), "<h", 1, True),
         ((0x605E, 0), "<h", 2, True),
         ((0x6060, 0), "<b", 0, True),
         ((0x6061, 0), "<b", 0, False),

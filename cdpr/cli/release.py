@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from executor.real_time_job import ReadyDrives
     from executor.wishes import WishBoard
 
-_RELEASED = "released by the operator"
+#: By what the reference is lost where no brake holds the drums.
+_RELEASED = "the drives were released by the operator, and no brake holds the cables"
 
 
 def release(
@@ -55,11 +56,12 @@ def release(
     custody = Custody(the_rig)
     custody.require_free()
     braked = _braked(the_rig)
+    kept = reference_text(reference_told(custody))
     facts = [
         ("rig", the_rig.name),
         ("bus", str(BusSettings.of(the_rig))),
         ("afterwards", "the brakes hold the drums" if braked else "nothing holds the cables"),
-        ("reference", "as it is" if braked else "given up: `cdpr home` before the next motion"),
+        ("reference", kept if braked else "given up: `cdpr home` before the next motion"),
     ]
     show_and_ask(
         partial(show_facts, "ready to take the torque off", facts),
@@ -154,9 +156,10 @@ def _in_custody(
             raise
     custody.end(
         State.FINISHED,
-        _RELEASED,
+        "",
         record,
         holding=_braked(rig),
         stands_at=status.positions.tolist(),
+        let_go=_RELEASED,
     )
     return status

@@ -222,23 +222,25 @@ class Cia402Group(CyclicGroup):
         if not powered:  # an emergency of a drive that moves nothing becomes its state's reason
             found = [(node, text) for node, text in found if node in self._watch.restarted]
         found += self._stopped_by_themselves()
-        found += self._watch.state_faults(powered=powered)
+        told = {text for _, text in (*self._faults, *found)}
+        found += self._watch.state_faults(told, powered=powered)
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
 
     def _stopped_by_themselves(self) -> list[tuple[int, str]]:
-        """Drives that left OPERATION ENABLED although they were not told to.
+        """Drives that left OPERATION ENABLED although they were not told to; not those in fault.
 
         On the way to a release they leave it for SWITCHED ON; one that is back in quick stop after
         it was enabled must not be enabled again.
         """
         dropped = self._watch.dropped()
-        if self._goal is Goal.ENABLE:
-            return dropped
-        if not (self._goal is Goal.RELEASE and self._left_stop):
-            return []
         states = dict(zip(self._nodes, self._watch.states, strict=True))
-        return [f for f in dropped if states[f[0]] is DriveState.QUICK_STOP_ACTIVE]
+        if self._goal is Goal.ENABLE:
+            return [fault for fault in dropped if states[fault[0]] not in FAULTED]
+        if self._goal is Goal.RELEASE and self._left_stop:
+            back = DriveState.QUICK_STOP_ACTIVE
+            return [fault for fault in dropped if states[fault[0]] is back]
+        return []
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:

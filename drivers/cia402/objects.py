@@ -243,6 +243,11 @@ def _reactions(rig: Rig, drive: int, cycle: float) -> tuple[Setting, ...]:
         Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
         Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
         Setting(
+            *(0x605C, 0, "<h", 1, "disable operation option code", "ramp down before torque off"),
+            instead="what a drive does when operation is disabled is its maker's choice: read its"
+            " manual before `cdpr release`",
+        ),
+        Setting(
             *(0x605E, 0, "<h", 2, "fault reaction option code", "ramp down before torque off"),
             instead="what a drive does in a fault is its maker's choice: read its manual",
         ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 from drivers.cia402.frames import (
     EMCY_BASE,
@@ -107,20 +107,23 @@ class DriveWatch:
         dropped, self._dropped = self._dropped, []
         return dropped
 
-    def state_faults(self, *, powered: bool) -> list[tuple[int, str]]:
+    def state_faults(self, told: Container[str], *, powered: bool) -> list[tuple[int, str]]:
         """What is wrong with the drives as they stand, by node.
 
         How often a drive may be silent is the executor's to say (`executor.safety.watch`).
 
         Args:
+            told: Faults known already; a drive whose emergency is among them is not told again.
             powered: The group is under power or on its way there; replies that cannot be believed
                 are a fault then.
         """
         found: list[tuple[int, str]] = []
         for node, state in zip(self.nodes, self.states, strict=True):
-            if state in FAULTED:
-                cause = self._emergencies.get(node, "it sent no reason")
-                found.append((node, f"{self._names[node]} is in {state.value}: {cause}"))
+            if state not in FAULTED:
+                continue
+            name, cause = self._names[node], self._emergencies.get(node, "it sent no reason")
+            if f"{name}: {cause}" not in told:
+                found.append((node, f"{name} is in {state.value}: {cause}"))
         return found + (self._check.faults() if powered else [])
 
     def forget_emergencies(self) -> None:

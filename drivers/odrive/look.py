@@ -57,5 +57,6 @@ def look(rig: Rig, document: OdriveDocument, bus: can.BusABC, pump: Pump | None)
         positions=np.array(watch.positions, dtype=np.int64),
         torques=np.rint(np.array(watch.torques) * per_mille).astype(np.int64),
         status_words=np.array(watch.status_words, dtype=np.int64),
-        restarted=(),
+        # Their settings outlive their power, so nothing tells whether it was gone.
+        restarted=tuple(winch.node_id for winch in rig.winches if not winch.absolute),
     )

@@ -59,7 +59,7 @@ VARIABLES: dict[int, tuple[int, int]] = {
     0x60B2: (INTEGER16, 0),
     0x6502: (UNSIGNED32, 0x1ED),
 }
-"""Not there, as in many drives: 1007h, 1029h, 1400h:05 (no RPDO deadline), 605Eh."""
+"""Not there, as in many drives: 1007h, 1029h, 1400h:05 (no RPDO deadline), 605Ch, 605Eh."""
 
 
 def dictionary(missing: frozenset[int] = frozenset()) -> canopen.ObjectDictionary:

@@ -212,7 +212,9 @@ def test_a_fault_of_one_while_moving_stops_the_others(bench: Bench) -> None:
     states = [d.state for d in bench.drives]
     assert states == [HOLDING] * 2 + [DriveState.FAULT] + [HOLDING] * 5
     assert bench.group.state is GroupState.FAULT
-    assert any(node == 3 and "over-current" in text for node, text in bench.status.faults)
+    told = [text for node, text in bench.status.faults if node == 3]
+    assert len(told) == 1, "the emergency, and not its state once more"
+    assert "over-current" in told[0]
 
 
 def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:

@@ -27,6 +27,7 @@ def final_values(rig: Rig, drive: int) -> dict[tuple[int, int], int]:
 def test_stops_end_in_holding_and_time_outs_are_armed(rig: Rig) -> None:
     values = final_values(rig, 2)
     assert values[0x6007, 0] == 3  # bus lost: quick stop
+    assert values[0x605C, 0] == 1  # disable operation: ramp, then torque off
     assert values[0x605A, 0] == 6  # quick stop: ramp, then hold
     assert values[0x6060, 0] == 8  # cyclic synchronous position
     assert (values[0x60C2, 1], values[0x60C2, 2]) == (10, -3)

@@ -410,3 +410,13 @@ def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) 
     assert status.state is GroupState.RELEASED
     assert status.holding
     assert states(bench) == {AxisState.IDLE}
+
+
+def test_who_only_looks_believes_no_count_that_may_have_begun_anew() -> None:
+    """As `configure` has it: an ODrive does not tell whether its power was gone."""
+    document = odrive_rig().document
+    counting = [winch.model_copy(update={"encoder": "incremental"}) for winch in document.winches]
+    rig = rig_from_document(document.model_copy(update={"winches": counting}))
+    with odrive_bench(rig) as bench:
+        seen = look_at_drives(rig, bench.group._bus, bench.rehearsal.pump)
+        assert seen.restarted == bench.group.restarted == tuple(range(1, 9))

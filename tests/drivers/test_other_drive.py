@@ -60,7 +60,7 @@ def until(group: DriveGroup, clock: SteppedClock, state: GroupState) -> None:
 def test_it_is_set_up_enabled_moved_and_stopped(rig: Rig, late: float) -> None:
     with beside_others(rig, late=late) as (group, other, clock):
         remarks = group.configure()
-        for missing in ("1007h", "1029h", "1400h:05", "605Eh", "1016h has 2"):
+        for missing in ("1007h", "1029h", "1400h:05", "605Ch", "605Eh", "1016h has 2"):
             assert any(missing in remark for remark in remarks), remarks
         place = group.read_positions().positions[PLACE]
         assert place == other.position
