@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection
 
 from cdpr.errors import CdprError, Fault
 from cdpr.poses import Pose
+from executor.camera_sight import CameraSight
 from executor.observer import Look, MakeObserver, Trigger
 from executor.spawning import interrupts_blocked
 
@@ -21,19 +22,15 @@ from executor.spawning import interrupts_blocked
 START_TIMEOUT = 60.0
 
 
-#: So many pictures without a pose mean that the camera looks elsewhere or the light is gone.
-BLIND_PICTURES = 10
-
-
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """So many pictures were measured, so many of them gave a pose.
+    """So many pictures were measured; so many in a row, up to the last, gave no pose.
 
     ``near`` says with which obstacle the measured clearance fell below the limit, if it did.
     """
 
     measured: int
-    seen: int
+    blind: int
     near: str = ""
 
 
@@ -61,7 +58,9 @@ class CameraProcess:
         self.dropped = 0
         self.triggered = 0
         self._measured = 0
-        self._seen = 0
+        self._sight = CameraSight()
+        self.trouble = ""
+        """Why no pose was measured any more when a picture was last due; nothing if it was."""
         self.near = ""
         """Between what the measured clearance fell below the limit, with numbers; else nothing."""
         self._may_wait = may_wait
@@ -82,11 +81,6 @@ class CameraProcess:
             self.close()
             raise
 
-    @property
-    def sees_nothing(self) -> bool:
-        """So many pictures were measured, and none gave a pose."""
-        return self._measured >= BLIND_PICTURES and self._seen == 0
-
     def trigger(self, time: float, asked: float, true_pose: Pose | None) -> None:
         """Asks for a picture now.
 
@@ -102,12 +96,15 @@ class CameraProcess:
         while self._link.poll() or (self._may_wait and self._measured < self.triggered):
             answer = self._receive()
             if isinstance(answer, _Progress):
-                self._measured, self._seen = answer.measured, answer.seen
+                self._measured = answer.measured
+                self._sight.answer(answer.blind)
                 self.near = self.near or answer.near
+        self.trouble = self._sight.trouble(asked)
         if not self._may_wait and self._measured < self.triggered:
             self.dropped += 1
             return
         self._send(Trigger(self.triggered, time, asked, true_pose))
+        self._sight.ask(asked)
         self.triggered += 1
 
     def finish(self, progress: Callable[[float], None]) -> list[Look]:
@@ -162,11 +159,11 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
             with make_observer() as observer:
                 _say(link, _Progress(0, 0))
                 looks: list[Look] = []
-                seen = 0
+                blind = 0
                 while (trigger := _next_trigger(link)) is not None:
                     looks.append(observer.look(trigger))
-                    seen += looks[-1].pose is not None
-                    _say(link, _Progress(len(looks), seen, observer.too_near))
+                    blind = 0 if looks[-1].pose is not None else blind + 1
+                    _say(link, _Progress(len(looks), blind, observer.too_near))
                 _say(link, looks)
         except CdprError as error:
             _say(link, _Failure(error))

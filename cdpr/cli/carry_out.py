@@ -62,12 +62,13 @@ def carry_out(
     from functools import partial
 
     from cdpr.cli.run_motion import run_prepared
-    from cdpr.cli.run_summary import show_prepared, show_summary
+    from cdpr.cli.run_summary import clearance_fact, show_prepared, show_summary
     from drivers.bus import IN_PROCESS
 
     in_process = prepared.rig.document.bus.interface == IN_PROCESS
+    near = clearance_fact(prepared, camera_name, clearance_stop)
     show_and_ask(
-        partial(show_prepared, prepared, in_process),
+        partial(show_prepared, prepared, near, in_process),
         "Move the platform now?",
         "nothing was moved",
         asks=not (in_process or yes),

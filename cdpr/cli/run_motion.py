@@ -128,18 +128,19 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
         if isinstance(board, SharedBoard):
             stack.callback(board.close)
         with progress_bar("moving", rows, not job.quiet) as advance:
-            told: list[str] = []
+            told = ""
 
             def picture(time: float, asked: float, true_pose: Pose | None) -> None:
+                nonlocal told
                 assert camera is not None
                 camera.trigger(time, asked, true_pose)
                 if camera.near and job.clearance_stop and not board.read().stop:
                     board.ask_stop(too_near=camera.near)
                     err.print(f"[red]too near[/] {escape(camera.near)}", soft_wrap=True)
-                if camera.sees_nothing and not told:
-                    told.append("the camera saw no tags so far: is it where the rig file says?")
-                    recorder.take_event(LoopEvent(0, asked, "camera_sees_nothing", told[0]))
-                    err.print(f"[yellow]remark[/] {told[0]}", soft_wrap=True)
+                if camera.trouble and not told:
+                    recorder.take_event(LoopEvent(0, asked, "camera_sees_nothing", camera.trouble))
+                    err.print(f"[yellow]remark[/] {camera.trouble}", soft_wrap=True)
+                told = camera.trouble
 
             recorder = Recorder(
                 prepared,

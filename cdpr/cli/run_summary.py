@@ -19,8 +19,32 @@ if TYPE_CHECKING:
 COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
 
 
-def show_prepared(prepared: PreparedRun, simulated: bool, on: Console) -> None:
-    """What is going to happen."""
+def clearance_fact(prepared: PreparedRun, camera: str | None, wanted: bool) -> str:
+    """What stops the run when it comes too near to an obstacle, or why nothing does.
+
+    Args:
+        prepared: The run.
+        camera: From `choose_camera`.
+        wanted: Whether the operator wants it stopped.
+    """
+    if not wanted:
+        return "off (--no-clearance-stop)"
+    if camera is None:
+        return "off (no camera)"
+    if not prepared.scene.obstacles:
+        return "off (no obstacles in the scene)"
+    return f"camera {camera}, below {prepared.scene.obstacle_clearance * 1000:g} mm"
+
+
+def show_prepared(prepared: PreparedRun, clearance_stop: str, simulated: bool, on: Console) -> None:
+    """What is going to happen.
+
+    Args:
+        prepared: The run.
+        clearance_stop: From `clearance_fact`.
+        simulated: On simulated drives.
+        on: Where it is shown.
+    """
     rig, bus = prepared.rig, prepared.rig.document.bus
     start, goal = prepared.scene.start.position * 1000, prepared.scene.goal.position * 1000
     table = prepared.checked.table
@@ -38,6 +62,7 @@ def show_prepared(prepared: PreparedRun, simulated: bool, on: Console) -> None:
             ),
             ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),
             *_reference(rig),
+            ("clearance stop", clearance_stop),
             ("bus", f"{bus.interface} {bus.channel}{', simulated drives' if simulated else ''}"),
         ],
         on,

@@ -87,6 +87,7 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     run = tmp_path / "run"
     answer = call("run", narrow_plan, "--rig", rig_file, "-o", run, "--fast")
     assert answer.code == 1, answer
+    assert "camera synthetic, below 10 mm" in answer.out
     assert "too near" in answer.said
     assert "the scene asks for 10 mm" in answer.said
     summary: dict[str, Any] = RunFolder.open(run).summary()
@@ -109,6 +110,7 @@ def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
     answer = call("run", narrow_plan, *arguments)
     assert answer.code == 1, answer
     summary = RunFolder.open(run).summary()
+    assert "off (--no-clearance-stop)" in answer.out
     assert summary["final_state"] != "stopped"
     assert "clearance_low" not in list(events_of(run))
     assert "clearance_tag" in [c["name"] for c in summary["checks"] if not c["passed"]]

@@ -1,0 +1,44 @@
+"""A camera that loses the platform, or hangs, is told as often as it happens."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from executor.camera_sight import BLIND_PICTURES, SILENCE, CameraSight
+
+
+def looked(seen: list[bool]) -> list[str]:
+    """What is told after each picture, ten a second, each answered at once."""
+    sight, blind, told = CameraSight(), 0, []
+    for frame, pose in enumerate(seen):
+        sight.ask(frame / 10)
+        blind = 0 if pose else blind + 1
+        sight.answer(blind)
+        told.append(sight.trouble(frame / 10))
+    return told
+
+
+@given(seen=st.lists(st.booleans(), max_size=40))
+def test_it_is_in_trouble_exactly_while_the_last_pictures_gave_no_pose(seen: list[bool]) -> None:
+    for frame, told in enumerate(looked(seen)):
+        last = seen[max(0, frame + 1 - BLIND_PICTURES) : frame + 1]
+        assert bool(told) is (len(last) == BLIND_PICTURES and not any(last))
+
+
+def test_a_camera_that_saw_once_and_then_loses_the_tags_is_told() -> None:
+    told = looked([True] + [False] * BLIND_PICTURES)
+    assert not any(told[:-1])
+    assert "10 pictures in a row gave no pose; clearance is not measured" in told[-1]
+
+
+@pytest.mark.parametrize("blind", [0, BLIND_PICTURES])
+def test_a_camera_that_hangs_is_told_until_it_answers(blind: int) -> None:
+    sight = CameraSight()
+    sight.ask(100.0)
+    assert sight.trouble(100.0 + SILENCE) == ""
+    assert "no answer for 2 s" in sight.trouble(100.001 + SILENCE)
+    sight.answer(blind)
+    assert "no answer" not in sight.trouble(200.0)
+    assert bool(sight.trouble(200.0)) is (blind > 0)
