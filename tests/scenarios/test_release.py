@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from simulation.drive import SimulatedDrive
 from simulation.power_loss import PowerLoss
 from tests.cli.plans import RIG
 from tests.cli.program import call
+from tests.scenarios.test_processes import program
 from tests.scenarios.test_real_time import drives_on
 
 
@@ -135,3 +137,32 @@ def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
     latched = Latch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
     assert "being released" in latched.cause
+
+
+@pytest.mark.slow
+def test_ctrl_c_on_the_way_stops_all_and_says_what_is_left(prepared: PreparedRun) -> None:
+    channel = f"239.74.163.34:{20000 + (os.getpid() * 29) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    with drives_on(channel, prepared) as rehearsal:
+        hold(rehearsal.drives)
+        for drive in rehearsal.drives:
+            drive._command_shutdown = lambda: None  # type: ignore[method-assign]
+        first = rehearsal.drives[0]
+        with program("release", RIG, *bus, "--yes", "--without-real-time") as process:
+            enable = first._command_enable
+
+            def interrupted() -> None:
+                enable()
+                process.send_signal(signal.SIGINT)
+
+            first._command_enable = interrupted  # type: ignore[method-assign]
+            _, err = process.communicate(timeout=60)
+        assert process.returncode == 130, err
+        assert DriveState.OPERATION_ENABLED not in {drive.state for drive in rehearsal.drives}
+    assert "a fault is latched, and the drives have to be referenced again" in err.replace(
+        "\n", " "
+    )
+    latched = Latch(BusSettings("udp_multicast", channel)).read()
+    assert latched is not None
+    assert "stopped while the torque was being taken off" in latched.cause
+    assert "next:" not in latched.cause
