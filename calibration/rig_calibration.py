@@ -42,6 +42,7 @@ class RigCalibration:
         covariance: Of the unknowns, shape (p, p), [m] or share; what is not identified has that of
             the drawing.
         held_out: Places left out of fits.
+        length_deviation: Of a cable's length as a drive tells it, [m].
     """
 
     parameters: Parameters
@@ -50,6 +51,7 @@ class RigCalibration:
     observability: Observability
     covariance: Array
     held_out: HeldOut
+    length_deviation: float
 
     @property
     def rig(self) -> Rig:
@@ -176,6 +178,7 @@ def calibrate_rig(
         observability,
         _covariance(parameters, measured, fit, observability, length_deviation),
         held_out(parameters, measured, length_deviation),
+        length_deviation,
     )
 
 

@@ -165,3 +165,12 @@ class CountedLengths:
         paid_out = self.paid_out * (1.0 + geometry.drum_scale)
         lengths: Array = (self.at_home(geometry) + paid_out) * self.stretch - self._behind
         return lengths
+
+    def by_compliance(self, geometry: RigGeometry) -> Array:
+        """Derivative of `by` by the cables' compliance, 1 / stiffness, shape (n, m), [m N]."""
+        stiffness, at_home = self._rig.cable_stiffness, self.at_home(geometry)
+        there, home = (stiffness * (s - 1.0) for s in (self.stretch, self.stretch_at_home))
+        unstrained = at_home + self.paid_out * (1.0 + geometry.drum_scale)
+        less = (at_home - geometry.offsets) * home / self.stretch_at_home
+        change: Array = unstrained * there - self.stretch * less
+        return change

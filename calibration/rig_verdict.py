@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.interval import CONFIDENCE
 from calibration.rig_calibration import RigCalibration
+from calibration.rig_stiffness import compliance_told
 from calibration.verdict import Lack, Verdict
 from cdpr.poses import Array, matrix_from_rotation_vector
 from cdpr.rig import Rig
@@ -54,7 +55,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    lacks = _far_numbers(result)
+    lacks = _far_numbers(result) + _other_stiffness(result)
     if missed > wanted:
         what = "places" if out.poses else "lengths of cables at places"
         lacks.append(
@@ -108,6 +109,19 @@ def _far_numbers(result: RigCalibration) -> list[Lack]:
             f"{parameters.names[k]} is {far} from the rig file, {times[k]:.3g} times {option}",
             "check units, the order of the cables and the rig file; where it is truly that far"
             f" off, pass a larger {option}",
+        )
+    ]
+
+
+def _other_stiffness(result: RigCalibration) -> list[Lack]:
+    compliance = compliance_told(result)
+    if compliance is None or not compliance.contradicts:
+        return []
+    return [
+        Lack(
+            f"the data tell a stiffness of the cables of {compliance}, the rig file"
+            f" {result.rig.cable_stiffness:.6g} N",
+            "check cables: stiffness_n of the rig file, and the tensions that the drives tell",
         )
     ]
 

@@ -21,8 +21,9 @@ from calibration.rig_measurements import Recording, RigMeasurements, at_rest, jo
 from calibration.rig_model import RigModel
 from calibration.rig_observability import Observability, sentences
 from calibration.rig_page import rig_page
-from calibration.rig_parameters import DEFAULT_DEVIATIONS, Parameters
+from calibration.rig_parameters import DEFAULT_DEVIATIONS, CountedLengths, Parameters
 from calibration.rig_result import RigResult, require_one_drawing, rig_result
+from calibration.rig_stiffness import compliance_told
 from calibration.rig_verdict import judge_rig, judged_places
 from cdpr.errors import BadInput, InvalidFile
 from cdpr.kinematics import poses_near
@@ -443,6 +444,47 @@ def test_a_pose_outside_the_rig_is_refused_by_name(rig: Rig, turned: Truth) -> N
     with pytest.raises(BadInput, match="outside the rig") as told:
         calibrate_rig(rig, metres, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     assert told.value.where == "place 0"
+
+
+@pytest.mark.parametrize("poses", [True, False])
+def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool) -> None:
+    """The data are of cables with 6000 N, and the file of the paper's rig says 848230 N."""
+    drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
+    data = turned.measured if poses else turned.measured.without_poses()
+    result = calibrate_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    compliance = compliance_told(result)
+    assert compliance is not None
+    assert 1.0 / compliance.told == pytest.approx(6000.0, rel=0.05 if poses else 0.35)
+    verdict = judge_rig(result, 1e-3, 0.0).verdict
+    assert not verdict.good
+    assert any("848230 N" in reason for reason in verdict.reasons)
+    assert any("stiffness_n" in step for step in verdict.next_steps)
+
+
+def test_the_true_stiffness_is_not_doubted(
+    found: RigCalibration, found_level: RigCalibration
+) -> None:
+    for result in (found, found_level):
+        compliance = compliance_told(result)
+        assert compliance is not None
+        assert not compliance.contradicts
+        assert compliance.deviation < 0.05 / 6000.0
+
+
+def test_the_derivative_by_compliance_is_that_of_finite_differences(
+    rig: Rig, turned: Truth, found: RigCalibration
+) -> None:
+    step, data = 1e-9, turned.measured
+    ends = [
+        CountedLengths(
+            replace(rig, cable_stiffness=1.0 / (1.0 / rig.cable_stiffness + sign * step)),
+            data.counts,
+            data.tensions,
+        ).by(found.geometry)
+        for sign in (1.0, -1.0)
+    ]
+    slope = CountedLengths(rig, data.counts, data.tensions).by_compliance(found.geometry)
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=1e-4, abs=1e-4)
 
 
 def test_a_place_with_the_numbers_of_an_earlier_one_counts_once(turned: Truth) -> None:
