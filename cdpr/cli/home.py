@@ -15,6 +15,7 @@ from cdpr.cli.motion_options import (
     InterfaceOption,
     WithoutRealTimeOption,
     YesOption,
+    require_unused,
 )
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 #: A cable is taken up no further than this, [mm], and no faster than that, [mm/s].
 FURTHEST_MM, FASTEST_MM_S = 200.0, 10.0
+#: Defaults: reach and speed as above, pictures, and how slack simulated cables hang, [mm].
+REACH_MM, SPEED_MM_S, PICTURES, SLACK_MM = 50.0, 2.0, 20, 5.0
 
 
 def home(
@@ -59,16 +62,18 @@ def home(
     ] = None,
     reach_mm: Annotated[
         float, typer.Option(min=0.1, max=FURTHEST_MM, help="take up at most so much of a cable")
-    ] = 50.0,
+    ] = REACH_MM,
     speed_mm_s: Annotated[
         float, typer.Option(min=0.01, max=FASTEST_MM_S, help="no winch is faster")
-    ] = 2.0,
-    pictures: Annotated[int, typer.Option(min=5, max=1000, help="to measure the pose in")] = 20,
+    ] = SPEED_MM_S,
+    pictures: Annotated[
+        int, typer.Option(min=5, max=1000, help="to measure the pose in")
+    ] = PICTURES,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     simulated_slack_mm: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="how slack simulated cables hang at most")
-    ] = 5.0,
+    ] = SLACK_MM,
     fast: FastOption = False,
     yes: YesOption = False,
     without_real_time: WithoutRealTimeOption = False,
@@ -103,6 +108,20 @@ def home(
     in_process = the_rig.document.bus.interface == IN_PROCESS
     require_own_time(fast, in_process)
     if as_rig_file and not (at_home or pose_mm or camera):
+        require_unused(
+            "cdpr home",
+            {
+                "--tension-n": tension_n,
+                "--limit-n": limit_n,
+                "--reach-mm": reach_mm != REACH_MM,
+                "--speed-mm-s": speed_mm_s != SPEED_MM_S,
+                "--pictures": pictures != PICTURES,
+                "--simulated-slack-mm": simulated_slack_mm != SLACK_MM,
+                "--fast": fast,
+                "--without-real-time": without_real_time,
+            },
+            "--as-rig-file moves nothing and measures nothing",
+        )
         _go_by_the_rig_file(Custody(the_rig), yes or in_process, as_json)
         return
     known = _known_pose(the_rig, at_home, pose_mm, camera, in_process, as_rig_file)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +14,7 @@ from cdpr.cli.motion_options import (
     InterfaceOption,
     WithoutRealTimeOption,
     YesOption,
+    require_unused,
 )
 
 if TYPE_CHECKING:
@@ -95,7 +95,8 @@ def jog(
     in_process = the_rig.document.bus.interface == IN_PROCESS
     require_own_time(fast, in_process)
     if cable is not None or mm is not None:
-        _require_unused(
+        require_unused(
+            "cdpr jog",
             {
                 "--by-mm": by_mm,
                 "--to-home": to_home,
@@ -108,7 +109,9 @@ def jog(
         )
         _one_cable(the_rig, cable, mm, limit_n, fast, yes, without_real_time, as_json)
         return
-    _require_unused({"--limit-n": limit_n}, "only with --cable; a path has the rig's own limits")
+    require_unused(
+        "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path has the rig's own limits"
+    )
     if (by_mm is None) != to_home:
         raise BadInput(
             "say how far: --by-mm X Y Z, --to-home, or --cable N --mm X",
@@ -161,24 +164,6 @@ def _one_cable(
         rig, cable, mm, limit_n=limit_n, fast=fast, yes=yes, without_real_time=without_real_time,
         as_json=as_json,
     )  # fmt: skip
-
-
-def _require_unused(options: Mapping[str, object], why: str) -> None:
-    """Refuses options that would have no effect: whoever gave one expects something else.
-
-    Raises:
-        BadInput: One was given; with the names of all.
-    """
-    from cdpr.errors import BadInput
-
-    given = [name for name, value in options.items() if value is not None and value is not False]
-    if given:
-        raise BadInput(
-            f"no effect here: {', '.join(given)}",
-            where="cdpr jog",
-            why=why,
-            next_step="leave them out, or see `cdpr jog --help`",
-        )
 
 
 def _slow(rig: Rig, speed_mm_s: float) -> Rig:

@@ -14,6 +14,7 @@ from cdpr.cli.motion_options import (
     InterfaceOption,
     WithoutRealTimeOption,
     YesOption,
+    require_unused,
 )
 
 if TYPE_CHECKING:
@@ -73,6 +74,9 @@ def run(
     the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     in_process = the_rig.document.bus.interface == IN_PROCESS
     camera_name = choose_camera(the_rig, camera, no_camera, in_process)
+    if camera_name is None:
+        why = "without a camera no clearance is measured, and nothing stops the run for it"
+        require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
     start = _simulated_start(simulated_start_mm, in_process, fast)
     RunFolder.require_free(output)
     Custody(the_rig).require_free()

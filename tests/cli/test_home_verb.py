@@ -32,6 +32,8 @@ def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (("--at-home", "--camera", "synthetic"), 2, "how the platform's pose is known"),
         (("--at-home", "--pose-mm", "0", "0", "445"), 2, "how the platform's pose is known"),
         (("--at-home", "--as-rig-file"), 2, "how the platform's pose is known"),
+        (("--as-rig-file", "--tension-n", "7"), 2, "no effect here: --tension-n"),
+        (("--as-rig-file", "--pictures", "9", "--fast"), 2, "no effect here: --pictures, --fast"),
         (("--pose-mm", "0", "0", "4450"), 2, "outside the workspace"),
         (("--pose-mm", "0", "0", "nan"), 2, "outside the workspace"),
         (("--at-home", "--limit-n", "5"), 3, "limit of 5 N"),

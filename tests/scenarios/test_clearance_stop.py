@@ -116,6 +116,17 @@ def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
     assert "clearance_tag" in [c["name"] for c in summary["checks"] if not c["passed"]]
 
 
+def test_to_leave_out_a_stop_that_no_camera_could_make_is_refused(
+    rig_file: Path, narrow_plan: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    arguments = ("--rig", rig_file, "-o", run, "--fast", "--no-camera", "--no-clearance-stop")
+    answer = call("run", narrow_plan, *arguments)
+    assert answer.code == 2, answer
+    assert "no effect here: --no-clearance-stop" in answer.err
+    assert not run.exists()
+
+
 def test_the_loop_tells_who_wanted_the_stop(prepared: PreparedRun, tmp_path: Path) -> None:
     with staged(
         prepared, tmp_path / "run", at(150, lambda s: s.board.ask_stop(too_near=NEAR))
