@@ -26,10 +26,19 @@ def load_result(path: Path) -> ResultDocument:
     """Reads a result file.
 
     Raises:
-        BadInput: The file cannot be read, or is no calibration result.
+        BadInput: The file cannot be read, is no calibration result, or was edited.
         InvalidFile: With every problem and its place.
     """
-    return load_yaml(path, _kind_of(path))
+    result = load_yaml(path, _kind_of(path))
+    if result.hash != result.sealed().hash:
+        raise BadInput(
+            "the result's hash does not match its content",
+            where=str(path),
+            why="the file was edited or damaged, or written by a program with other defaults",
+            next_step=f"run `cdpr calibrate {result.kind}` again; numbers of your own belong into"
+            " the rig file",
+        )
+    return result
 
 
 def _kind_of(path: Path) -> type[ResultDocument]:

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field
 from calibration.interval import Interval
 from calibration.verdict import Verdict
 from cdpr.document_types import Document, NonNegative, Number
-from cdpr.documents import content_hash, write_atomic
+from cdpr.documents import content_hash, document_hash, write_atomic
 from cdpr.errors import BadInput
 from cdpr.rig_file import RigDocument
 
@@ -52,11 +52,16 @@ class ResultDocument(Document, ABC):
     good_enough: bool
     next_steps: list[str]
     unused: dict[str, str] = Field(default={}, description="why data were left out, by name")
+    hash: str = Field(default="", description="over everything else in the file")
 
     @property
     def file_name(self) -> str:
         """What its file is called."""
         return result_file_name(self.kind, self.name, self.date)
+
+    def sealed(self) -> Self:
+        """The result with its hash, by which one that was edited is told."""
+        return self.model_copy(update={"hash": document_hash(self, {"hash"})})
 
     @property
     def stated(self) -> dict[str, Interval]:
@@ -156,13 +161,13 @@ def require_file_name(name: str, where: str) -> None:
 
 
 def write_result(folder: Path, result: ResultDocument) -> Path:
-    """Writes a result into a folder, whole or not at all; returns the file.
+    """Writes a result into a folder, sealed, whole or not at all; returns the file.
 
     Raises:
         BadInput: The folder cannot be written to.
     """
     path = folder / result.file_name
-    plain = result.model_dump(mode="json")
+    plain = result.sealed().model_dump(mode="json")
     write_atomic(path, yaml.safe_dump(plain, sort_keys=False, allow_unicode=True))
     return path
 

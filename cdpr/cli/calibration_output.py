@@ -80,7 +80,7 @@ def finish(
         write_atomic(report, page)
         files = [("result", str(written)), ("report", str(report))]
     if as_json:
-        show_json(result.model_dump(mode="json"))
+        show_json(result.sealed().model_dump(mode="json"))
     else:
         lines = [("verdict", result.verdict), *(("next", step) for step in result.next_steps)]
         lines += [(name, str(interval)) for name, interval in result.stated.items()]

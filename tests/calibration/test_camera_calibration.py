@@ -156,7 +156,7 @@ def test_the_result_file_is_dated_and_has_the_keys_of_the_rig_file(tmp_path: Pat
     result = camera_result(found, judge_camera(found, 1e-3), "front", date(2026, 3, 1))
     path = write_result(tmp_path, result)
     assert path.name == "calibration_camera_front_2026-03-01.yaml"
-    assert load_result(path) == result
+    assert load_result(path) == result.sealed()
     read = yaml.safe_load(path.read_text())
     assert read["date"] == "2026-03-01"
     assert read["fx_px"] == pytest.approx(found.matrix[0, 0])

@@ -170,7 +170,7 @@ def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_pat
     path = write_result(tmp_path, result)
     assert path.name == "calibration_extrinsics_front_2026-03-02.yaml"
     read = load_result(path)
-    assert read == result
+    assert read == result.sealed()
     better = calibrated(rig, [read])
     assert better.cameras[0].world_from_camera.distance_to(found.world_from_camera) < 1e-8
     assert result.apart_mm(result) == pytest.approx(0.0, abs=1e-9)

@@ -28,7 +28,32 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
     result = camera_result_of()
     path = write_result(tmp_path, result)
     assert path.name == "calibration_camera_front_2026-03-01.yaml"
-    assert load_result(path) == result
+    assert load_result(path) == result.sealed()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("fx_px: 905.0", "fx_px: 906.0"),
+        ("good_enough: true", "good_enough: false"),
+        ("a.png: is bad", "a.png: is good"),
+        ("hash: sha256:", "hash: sha256:0"),
+        ("\nhash: ", "\n# "),
+    ],
+)
+def test_a_result_that_was_edited_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    path = write_result(tmp_path, camera_result_of())
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(BadInput, match="hash does not match its content"):
+        load_result(path)
+
+
+@given(value=st.floats(1e-9, 1e12))
+def test_a_seal_outlives_the_file_whatever_the_number(tmp_path_factory, value: float) -> None:
+    path = write_result(tmp_path_factory.mktemp("result"), camera_result_of(fx=value))
+    assert load_result(path).stated  # read, so the hash fits
 
 
 def test_a_camera_result_takes_the_place_of_the_rig_files_numbers(rig: Rig) -> None:

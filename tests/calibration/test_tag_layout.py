@@ -223,7 +223,7 @@ def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> 
     path = write_result(tmp_path, result)
     assert path.name == "calibration_tags_gachon_8_6_2026-03-04.yaml"
     read = load_result(path)
-    assert read == result
+    assert read == result.sealed()
     better = calibrated(rig, [read])
     for tag, own in zip(better.platform_tags, found.tags, strict=True):
         assert tag.pose.distance_to(own.pose) < 1e-8
