@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 
 from calibration.board import Board, Seen, mirrored
+from calibration.data_hash import data_hash
 from calibration.interval import Interval
 from calibration.uncertainty import NAMES, Uncertainty, uncertainty_of
 from cdpr.errors import BadInput
@@ -145,9 +145,6 @@ def calibrate_from_views(
             left_out[name] = f"has corners that are {error:.2f} px off, far more than the others"
             del used[name]
         fit = _fit(used, size)
-    digest = hashlib.sha256()
-    for name, seen in used.items():
-        digest.update(name.encode() + np.ascontiguousarray(np.round(seen.corners, 6)).tobytes())
     return CameraCalibration(
         size=size,
         matrix=read_only(fit.matrix),
@@ -166,7 +163,9 @@ def calibrate_from_views(
         },
         view_errors=fit.errors,
         unused=left_out,
-        data_hash=digest.hexdigest(),
+        data_hash=data_hash(
+            name.encode() + np.round(seen.corners, 6).tobytes() for name, seen in used.items()
+        ),
     )
 
 

@@ -44,7 +44,7 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
             (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
             ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
             ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
-            ("data", result.data_hash[:16]),
+            ("data", result.data_hash[:23]),
         ]
     )
 

@@ -38,7 +38,7 @@ def extrinsics_page(
                         *interval_rows(document.stated),
                         ("rotation_wxyz", quaternion),
                         ("work space", f"seen within {verdict.error * 1e3:.2g} mm (95 %)"),
-                        ("data", document.data_sha256[:16]),
+                        ("data", document.data_sha256[:23]),
                     ]
                 ),
                 turn,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.data_hash import data_hash
 from cdpr.poses import Array, read_only
 
 SHORTEST_REST = 0.4
@@ -52,10 +52,8 @@ class RigMeasurements:
     @property
     def data_hash(self) -> str:
         """Hash of all numbers."""
-        digest = hashlib.sha256()
-        for values in (self.counts, self.tensions, self.positions, self.rotations):
-            digest.update(np.ascontiguousarray(np.round(values, 12)).tobytes())
-        return f"sha256:{digest.hexdigest()}"
+        numbers = (self.counts, self.tensions, self.positions, self.rotations)
+        return data_hash(np.round(values, 12).tobytes() for values in numbers)
 
     def part(self, chosen: NDArray[np.bool_]) -> RigMeasurements:
         """Some of the places."""

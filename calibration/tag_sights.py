@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.data_hash import data_hash
 from cdpr.errors import BadInput
 from cdpr.rig import Camera, Rig
 from tracking.detector import Detection, TagDetector
@@ -43,12 +44,11 @@ class TagSights:
 
     def data_hash(self) -> str:
         """Hash of what was seen."""
-        digest = hashlib.sha256()
-        for name, squares in self.squares.items():
-            digest.update(name.encode())
-            for number, square in sorted(squares.items()):
-                digest.update(f"{number}".encode() + np.round(square.corners, 6).tobytes())
-        return digest.hexdigest()
+        return data_hash(
+            f"{name} {number}".encode() + np.round(square.corners, 6).tobytes()
+            for name, squares in self.squares.items()
+            for number, square in sorted(squares.items())
+        )
 
 
 def sights_of(

@@ -41,7 +41,7 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: Verdict) -> str:
                         ("corners off, RMS", f"{result.reprojection:.3f} px"),
                         ("tags located", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
                         ("size by the drawing", f"{result.scale:.5f}"),
-                        ("data", document.data_sha256[:16]),
+                        ("data", document.data_sha256[:23]),
                     ]
                 ),
             ),

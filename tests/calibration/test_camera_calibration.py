@@ -172,3 +172,4 @@ def test_other_data_have_another_hash() -> None:
     first = calibrate_from_views(views(8, 0.0), SIZE)
     second = calibrate_from_views(views(8, 0.01), SIZE)
     assert first.data_hash != second.data_hash
+    assert first.data_hash.startswith("sha256:")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -485,6 +486,16 @@ def test_the_derivative_by_compliance_is_that_of_finite_differences(
     ]
     slope = CountedLengths(rig, data.counts, data.tensions).by_compliance(found.geometry)
     assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=1e-4, abs=1e-4)
+
+
+def test_the_hash_of_the_data_is_of_every_number(turned: Truth) -> None:
+    data = turned.measured
+    assert re.fullmatch("sha256:[0-9a-f]{64}", data.data_hash)
+    assert replace(data, counts=data.counts.copy()).data_hash == data.data_hash
+    for key in ("counts", "tensions", "positions", "rotations"):
+        values = getattr(data, key).copy()
+        values.flat[-1] += 1e-6
+        assert replace(data, **{key: values}).data_hash != data.data_hash
 
 
 def test_a_place_with_the_numbers_of_an_earlier_one_counts_once(turned: Truth) -> None:
