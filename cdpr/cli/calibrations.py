@@ -24,11 +24,20 @@ CalibrationOption = Annotated[
 def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
     """The rig with the results of files in place of its file's numbers, in memory only.
 
+    Of each result that was not good enough it is told why: it may be used all the same.
+
     Raises:
         BadInput: A file cannot be used, or is not about this rig.
     """
     if not files:
         return rig
     from calibration.kinds import calibrated, load_result
+    from cdpr.cli.output import err
 
-    return calibrated(rig, [load_result(file) for file in files])
+    results = [load_result(file) for file in files]
+    better = calibrated(rig, results)
+    for result in results:
+        if not result.good_enough:
+            what = f"calibration {result.kind} {result.name}, {result.date}"
+            err.print(f"note: {what}: {result.verdict}", markup=False, soft_wrap=True)
+    return better
