@@ -20,7 +20,8 @@ SourceArgument = Annotated[
     typer.Argument(help="folder of pictures, video file or camera index", metavar="SOURCE"),
 ]
 PicturesOption = Annotated[
-    int, typer.Option(min=1, help="how many to take of a video or of a camera")
+    int | None,
+    typer.Option(min=1, help="how many to take of a video or of a camera (default: 20; tags: 40)"),
 ]
 CameraOption = Annotated[
     str | None, typer.Option(help="name of the camera in the rig file (default: the first)")
@@ -41,7 +42,7 @@ def extrinsics(
     survey_mm: Annotated[
         float, typer.Option(min=0.0, help="how well corners of frame tags were surveyed, deviation")
     ] = 0.5,
-    pictures: PicturesOption = 20,
+    pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 1.0,
     output: FolderOption = None,
@@ -96,7 +97,7 @@ def _located(
     rig: Rig,
     camera: Camera,
     source: str,
-    most: int,
+    wanted: int | None,
     poses: dict[str, Pose] | None,
     survey: float,
     shown: bool,
@@ -110,7 +111,7 @@ def _located(
     if poses is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if poses is None else rig.platform_tags
-    images = pictures_of(source, camera, most)
+    images = pictures_of(source, camera, wanted, usual=20)
     with progress_bar("looking for tags", images.count, shown) as advance:
         sights = sights_of(
             told(images, advance), rig, camera, [tag.id for tag in tags], images.unused

@@ -20,7 +20,7 @@ def tags(
         int | None,
         typer.Option(min=0, help="this tag is as drawn (default: all fit the drawing best)"),
     ] = None,
-    pictures: PicturesOption = 40,
+    pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.2,
     output: FolderOption = None,
@@ -55,8 +55,8 @@ def tags(
     the_camera = named_camera(the_rig, camera)
     require_file_name(the_rig.name, "name")
     require_tags(the_rig, fixed_tag)
+    images = pictures_of(source, the_camera, pictures, usual=40)
     today = begin("tags", the_rig.name, output, force)
-    images = pictures_of(source, the_camera, pictures)
     numbers = [tag.id for tag in the_rig.platform_tags]
     with progress_bar("looking for tags", images.count, not as_json) as advance:
         sights = sights_of(told(images, advance), the_rig, the_camera, numbers, images.unused)

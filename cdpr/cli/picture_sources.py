@@ -29,23 +29,32 @@ class Pictures:
     unused: Mapping[str, str] = field(default_factory=dict)
 
 
-def pictures_of(source: str, camera: Camera, most: int) -> Pictures:
+def pictures_of(source: str, camera: Camera, wanted: int | None, usual: int) -> Pictures:
     """The pictures of a source.
 
     Args:
         source: A folder, a video file, a camera's index or its address.
         camera: The rig's camera that took them.
-        most: How many to take of a camera, or of a video, spread over it.
+        wanted: How many to take of a camera, or of a video, spread over it.
+        usual: How many where that is left out.
 
     Raises:
-        BadInput: It is none of these, or its pictures are of another size.
+        BadInput: It is none of these, its pictures are of another size, or a number is wanted of
+            a folder.
         HardwareMissing: The camera does not open.
     """
     from drivers.cameras import VideoFile
     from drivers.picture_folder import OneCamerasPictures
 
     path = Path(source)
+    most = wanted or usual
     if path.is_dir():
+        if wanted is not None:
+            raise BadInput(
+                "--pictures is for a video or a camera",
+                where=source,
+                next_step="leave it out: a folder's pictures are all used",
+            )
         folder = OneCamerasPictures(path, (camera.width, camera.height))
         return Pictures(folder, len(folder.names), folder.unused)
     if path.is_file():

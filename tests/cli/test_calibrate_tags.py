@@ -120,6 +120,7 @@ def test_people_read_what_changed_against_the_drawing(folder) -> None:
     [
         (("--fixed-tag", "7"), "no tag 7 on the platform"),
         (("--camera", "side"), "no camera 'side'"),
+        (("--pictures", "2"), "--pictures is for a video or a camera"),
     ],
 )
 def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: str) -> None:
