@@ -40,7 +40,7 @@ class Chessboard:
             BadInput: Fewer than three inner corners a side, or a square without a size.
         """
         require_board(
-            min(self.columns, self.rows) >= 3, "a chessboard needs 3 inner corners a side"
+            min(self.columns, self.rows) >= 3, "a chessboard needs at least 3 inner corners a side"
         )
         require_board(self.square > 0.0, "the side of a square must be above 0 mm")
 

@@ -109,7 +109,7 @@ class RigFitter:
         raise Fault(
             "the rig's numbers could not be fitted to the measurements",
             where="calibrate rig",
-            why="they contradict each other, or the drawing is far off",
+            why="they contradict each other, or the rig file is far off",
             next_step="check units, the order of the cables and the reference of the drives",
         )
 

@@ -146,7 +146,7 @@ def _rigid(group: str, what: str, points: Array, scaled: Callable[..., Array]) -
 def _by_parts(direction: Array, parameters: Parameters) -> str:
     largest = np.argsort(-np.abs(direction))[:LARGEST_PARTS]
     parts = ", ".join(f"{parameters.names[i]} {direction[i]:+.2f}" for i in largest)
-    return f"one of them mostly {parts} (in deviations of the drawing)"
+    return f"one of them mostly {parts} (in standard deviations of the rig file)"
 
 
 def identified(

@@ -32,7 +32,7 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
                 "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in told) + "</ul>"
                 if told
                 else "<p>Everything that was looked for was found.</p>",
-                "Left as in the rig file. It does not matter where the platform was measured.",
+                "Left as in the rig file. It makes no difference at the places that were measured.",
             ),
             Section(
                 "Information of each direction",

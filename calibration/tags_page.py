@@ -13,16 +13,16 @@ from calibration.verdict import Verdict
 
 def tags_page(result: TagLayout, document: TagsResult, verdict: Verdict) -> str:
     """The whole page."""
-    gauge = "The platform's frame is put where all tags fit the drawing best."
+    gauge = "The platform's frame is put where all tags fit the rig file best."
     if result.fixed is not None:
-        gauge = f"Tag {result.fixed} is taken to be as drawn."
+        gauge = f"Tag {result.fixed} is taken to be as in the rig file."
     return page_of(
         f"Tags on the platform of {document.name}",
         f"{document.date}, {len(result.errors)} pictures used",
         verdict,
         [
             Section(
-                "Tags against the drawing",
+                "Tags against the rig file",
                 table_of(
                     change_rows(result),
                     ("tag", "moved [mm]", "turned [°]", "x, y, z [mm]", "seen in"),
@@ -40,7 +40,7 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: Verdict) -> str:
                     [
                         ("corners off, RMS", f"{result.reprojection:.3f} px"),
                         ("tags located", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
-                        ("size by the drawing", f"{result.scale:.5f}"),
+                        ("size by the rig file", f"{result.scale:.5f}"),
                         ("data", document.data_sha256[:23]),
                     ]
                 ),

@@ -29,8 +29,8 @@ class TagsResult(ResultDocument):
 
     kind: Literal["tags"] = "tags"
     platform: Annotated[list[TagDocument], Field(min_length=2)]
-    fixed_tag: int | None = Field(description="that is as drawn; null: all fit the drawing best")
-    scale: Positive = Field(description="size of the layout by that of the drawing")
+    fixed_tag: int | None = Field(description="that is as in the rig file; null: all fit it best")
+    scale: Positive = Field(description="size of the layout by that of the rig file")
     rms_px: NonNegative
     picture_errors_px: dict[str, NonNegative]
     seen: dict[str, int] = Field(description="in how many pictures each tag was")

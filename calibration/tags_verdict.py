@@ -65,7 +65,7 @@ def _about_tags(result: TagLayout) -> list[Lack]:
     for tag, drawn in zip(result.tags, result.drawn, strict=True):
         shift, turn = drawn.pose.distance_to(tag.pose) * 1e3, drawn.pose.angle_to(tag.pose)
         if shift > FAR_MM or np.degrees(turn) > FAR_DEG:
-            what = f"tag {tag.id} is {shift:.1f} mm and {np.degrees(turn):.1f}° from its drawing"
+            what = f"tag {tag.id} is {shift:.1f} mm and {np.degrees(turn):.1f}° from the rig file"
             step = f"check that tag {tag.id} is where, and turned as, the rig file says"
             lacks.append(Lack(what, step))
     return lacks

@@ -83,7 +83,7 @@ def camera(
     from calibration.camera_result import camera_result
     from calibration.camera_verdict import judge_camera
     from calibration.result_file import require_file_name
-    from cdpr.cli.calibrate_live import take_pictures
+    from cdpr.cli.calibrate_live import require_source, take_pictures
     from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.output import progress_bar
     from cdpr.cli.picture_sources import Pictures, told
@@ -102,6 +102,7 @@ def camera(
         )
     today = begin("camera", name, output, force)
     if live is not None:
+        require_source(live)
         make_folder(folder, force)
         take_pictures(live, folder, the_board, pictures or 40, size_px or (1280, 720))
     images = OneCamerasPictures(folder)
@@ -116,13 +117,15 @@ def camera(
 
 def _facts(result: CameraCalibration, quality: CameraQuality) -> list[tuple[str, str]]:
     """What was found beside the numbers, for people."""
+    from calibration.camera_verdict import FULL_COVERAGE
+
     return [
         ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
         (
             "boards were",
             f"{quality.nearest:.3g} to {quality.farthest:.3g} m away; if not, the sizes are wrong",
         ),
-        ("covered", f"{quality.covered:.0%} of the picture"),
+        ("covered", f"{quality.covered:.0%} of the picture, {FULL_COVERAGE:.0%} are good"),
         (
             "precision",
             f"{quality.verdict.error * 1e3:.2g} mm at {quality.distance:.2f} m (95 %); two halves"

@@ -12,6 +12,18 @@ if TYPE_CHECKING:
     from tracking.picture import Image
 
 
+def require_source(source: str) -> None:
+    """Before a folder is made for pictures of it.
+
+    Raises:
+        BadInput: It is no camera and no file.
+    """
+    from cdpr.cli.picture_sources import require_camera_source
+
+    if not Path(source).is_file():
+        require_camera_source(source)
+
+
 def take_pictures(
     source: str, folder: Path, board: Board, wanted: int, size: tuple[int, int]
 ) -> None:
@@ -63,13 +75,11 @@ def take_pictures(
 def _frames(source: str, size: tuple[int, int]) -> Iterator[Iterator[Image]]:
     """Grey pictures of a camera or a video."""
     from calibration.plain_camera import plain_camera
-    from cdpr.cli.picture_sources import require_camera_source
     from drivers.cameras import LiveCamera, VideoFile, video_size
 
     path = Path(source)
     if path.is_file():
         yield (frame.image for frame in VideoFile(path, plain_camera(video_size(path), source)))
         return
-    require_camera_source(source)
     with LiveCamera(source, plain_camera(size, source)) as live:
         yield (frame.image for frame in live)

@@ -76,6 +76,12 @@ def print_(
     from cdpr.documents import write_bytes_atomic
     from cdpr.errors import BadInput
 
+    if output.suffix.lower() != ".pdf":
+        raise BadInput(
+            "prints are PDF files",
+            where=str(output),
+            next_step=f"name it {output.with_suffix('.pdf').name}",
+        )
     check_output(output, force)
     sizes = {"square": square_mm, "marker": marker_mm, "tag": tag_mm, "gap": gap_mm}
     if rig is not None:

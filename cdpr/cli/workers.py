@@ -56,10 +56,17 @@ def make_place(folder: Path) -> None:
         next(folder.iterdir(), None)
     except OSError as error:
         raise BadInput(
-            "the folder cannot be made", where=str(folder), why=str(error.strerror)
+            "the folder cannot be made",
+            where=str(folder),
+            why=str(error.strerror),
+            next_step="name a folder, not a file, in a place where you may write",
         ) from error
     if not os.access(folder, os.W_OK):
-        raise BadInput("the folder is read-only", where=str(folder))
+        raise BadInput(
+            "the folder is read-only",
+            where=str(folder),
+            next_step="name a folder in a place where you may write",
+        )
 
 
 @contextmanager

@@ -69,6 +69,14 @@ def test_cameras_that_are_none_are_told(tmp_path: Path, options, code: int, name
     one_message(answer, code, named)
 
 
+def test_a_video_that_is_missing_leaves_no_folder_behind(tmp_path: Path) -> None:
+    with nothing_written(tmp_path):
+        answer = call(
+            "calibrate", "camera", tmp_path / "taken", "--live", tmp_path / "no.mp4", *BOARD
+        )
+    one_message(answer, 2, "neither a folder of pictures, nor a video file, nor a camera")
+
+
 def test_pictures_of_before_are_not_mixed_with_new_ones(video: Path, tmp_path: Path) -> None:
     (tmp_path / "old.png").write_bytes(b"old")
     with nothing_written(tmp_path):

@@ -51,6 +51,12 @@ def test_prints_that_cannot_be_are_refused(tmp_path: Path, options, named: str) 
     one_message(answer, 2, named)
 
 
+def test_a_print_is_named_as_what_it_is(tmp_path: Path) -> None:
+    with nothing_written(tmp_path):
+        answer = call("calibrate", "print", tmp_path / "board.txt", *BOARD)
+    one_message(answer, 2, "prints are PDF files", "name it board.pdf")
+
+
 def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
     (tmp_path / "board.pdf").write_text("mine")
     answer = call("calibrate", "print", tmp_path / "board.pdf", *BOARD)

@@ -177,6 +177,12 @@ def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path
     assert not list(folder.glob("*"))
 
 
+def test_a_file_in_place_of_the_folder_is_told_with_a_next_step(file: Path) -> None:
+    done = call("calibrate", "rig", RIG, file, "-o", file, "--json")
+    assert done.code == 2, done
+    assert "name a folder, not a file" in json.loads(done.out)["next_step"]
+
+
 def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
     done = call("calibrate", "rig", RIG, finished_run, "--json")
     assert done.code == 2

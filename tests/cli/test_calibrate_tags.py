@@ -84,7 +84,7 @@ def test_the_tags_are_found_where_they_were_glued_and_the_result_used(folder, tm
     (saved,) = out.glob("calibration_tags_gachon_8_6_*.yaml")
     assert yaml.safe_load(saved.read_text()) == found
     page = saved.with_suffix(".html").read_text()
-    assert "Tags against the drawing" in page
+    assert "Tags against the rig file" in page
     truth, drawn = as_glued().platform_tags, load_rig(RIG).platform_tags
     shift = drawn[0].pose.compose(truth[0].pose.inverse())
     tags = [TagDocument.model_validate(tag) for tag in found["platform"]]
