@@ -15,6 +15,9 @@ CELLS = (8, 6)
 """Columns and rows of the map of what is covered."""
 GOOD_VIEWS, GOOD_COVERAGE, GOOD_TILT, GOOD_ERROR = 12, 0.6, 20.0, 1.0
 """Pictures, share of the map, degrees to either side of both axes together, pixels."""
+GOOD_PIXELS = 1.0
+"""Of points all over the picture, 95 %, [px]: unlike millimetres, no wrong size of squares changes
+them."""
 FULL_COVERAGE = 0.9
 """Share of the map beyond which nothing is gained by more of it."""
 EDGES = "bring the board near the edges and corners of the picture"
@@ -60,9 +63,11 @@ def judge_camera(
     Args:
         result: The calibration.
         wanted: What is good enough, [m].
-        distance: At which the camera will measure, [m]; that of the boards when left out.
+        distance: At which the camera will measure, [m]; that of the boards when left out, which
+            is true only if the told size of the squares is: pixels are judged as well then.
     """
     away = [float(np.linalg.norm(pose.position)) for pose in result.boards.values()]
+    told = distance is not None
     distance = float(np.median(away)) if distance is None else distance
     coverage, tilts = _coverage(result), _tilts(result)
     slopes = _slopes(result)
@@ -77,7 +82,13 @@ def judge_camera(
         *_about_pictures(result, coverage, tilts),
         *_about_errors(result, coverage, error, halves, wanted, distance),
     ]
-    verdict = Verdict.of(error, wanted, f"at {distance:.2g} m", lacks)
+    where = f"at {distance:.2g} m"
+    if not told:
+        where += f", if the boards were {min(away):.2g} to {max(away):.2g} m away"
+        if not error / scale <= GOOD_PIXELS:
+            what = f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is needed"
+            lacks.append(Lack(what, "take more pictures, or pass --distance-m"))
+    verdict = Verdict.of(error, wanted, where, lacks)
     return CameraQuality(verdict, coverage, tilts, distance, min(away), max(away), halves)
 
 

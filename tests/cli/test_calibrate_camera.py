@@ -80,10 +80,19 @@ def test_a_folder_is_calibrated_and_what_is_of_no_use_is_named(folder, tmp_path)
 
 
 def test_people_read_the_verdict_first(folder) -> None:
-    answer = call("calibrate", "camera", folder, *BOARD, "--wanted-mm", "5")
+    known = ("--wanted-mm", "5", "--distance-m", "0.5")
+    answer = call("calibrate", "camera", folder, *BOARD, *known)
     assert answer.code == 0, answer
     assert answer.out.splitlines()[1].split()[:3] == ["verdict", "good", "enough"]
     assert "small.png has 320 x 240 px, most have 640 x 480 px" in answer.out
+
+
+def test_squares_told_too_small_do_not_make_a_result_good(folder) -> None:
+    """All millimetres shrink with the squares, pixels do not."""
+    answer = call("calibrate", "camera", folder, *BOARD, "--wanted-mm", "5", "--square-mm", "2")
+    assert answer.code == 3, answer
+    assert "1 px is needed" in answer.said
+    assert "pass --distance-m" in answer.said
 
 
 def test_a_poor_set_with_small_errors_is_not_good_enough(tmp_path) -> None:
