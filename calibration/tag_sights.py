@@ -12,7 +12,7 @@ import numpy as np
 from calibration.data_hash import data_hash
 from cdpr.errors import BadInput
 from cdpr.rig import Camera, Rig
-from tracking.detector import Detection, TagDetector
+from tracking.detector import Detection
 from tracking.detectors import make_detector
 from tracking.edges import RefinedTag, refine
 from tracking.marks import modules_across
@@ -119,9 +119,6 @@ def _nothing_seen(
     if example is not None:
         name, image = example
         why += f"; {name} shows {what_else_is_seen(image, family, list(wanted))}"
-        flipped = np.ascontiguousarray(image[:, ::-1])
-        if any(d.id in wanted for d in TagDetector(family).detect(flipped)):
-            why += "; flipped over they are there, so the pictures are mirrored"
     return BadInput(
         f"none of the {family} tags {', '.join(map(str, wanted))} is to be seen whole",
         where=f"camera {camera.name}",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from cdpr.tag_families import APRILTAG_FAMILIES
 from tracking.detector import TagDetector
 from tracking.picture import Image
@@ -14,14 +16,21 @@ TOLD = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000
 
 
 def what_else_is_seen(image: Image, family: str, expected: Sequence[int]) -> str:
-    """Says which tags a picture shows that are not the expected ones, for an error message."""
+    """Says which tags a picture shows that are not the expected ones, for an error message.
+
+    Also whether the expected ones are there once it is flipped over.
+    """
     seen = []
     for other in (family, *(name for name in TOLD if not _same(name, family))):
         wanted = set(expected) if other == family else set()
         numbers = [d.id for d in TagDetector(other).detect(image) if d.id not in wanted]
         if numbers:
             seen.append(f"{other} {', '.join(map(str, numbers))}")
-    return "; ".join(seen) or "no tag of any known family"
+    told = "; ".join(seen) or "no tag of any known family"
+    flipped = np.ascontiguousarray(image[:, ::-1])
+    if any(d.id in expected for d in TagDetector(family).detect(flipped)):
+        told += "; flipped over they are there, so the pictures are mirrored"
+    return told
 
 
 def _same(name: str, family: str) -> bool:

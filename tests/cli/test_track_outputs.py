@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 from cdpr.rig import load_rig
-from drivers.picture_folder import picture_files
+from drivers.picture_folder import picture_files, read_picture
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 from tracking.measurement import NoPose
@@ -72,6 +72,15 @@ def test_a_picture_of_another_size_is_skipped_and_told(tmp_path: Path) -> None:
     assert told["pictures"] == 2
     assert told["unused"] == {"a[0].png": "has 64 x 48 px, the camera has 1280 x 720 px"}
     assert "skipped: a[0].png has 64 x 48 px" in " ".join(answer.err.split())
+
+
+def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
+    grey = read_picture(picture_files(SESSION)[0])
+    assert grey is not None
+    cv2.imwrite(str(tmp_path / "a.png"), grey[:, ::-1])
+    rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
+    answer = call("track", rig, tmp_path, "-o", tmp_path / "poses.csv")
+    one_message(answer, 2, "a.png shows no tag of any known family; flipped over they are there")
 
 
 def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -> None:
