@@ -167,7 +167,8 @@ def _about_errors(
         lacks.append(Lack(what, MORE))
         share = float(np.mean(coverage > 0))
         if GOOD_COVERAGE <= share < FULL_COVERAGE:
-            lacks.append(Lack(f"the board covered {share:.0%} of the picture", EDGES))
+            what = f"the board covered {share:.0%} of the picture, {FULL_COVERAGE:.0%} are good"
+            lacks.append(Lack(what, EDGES))
     if not halves <= 2.0 * wanted:
         what = f"two halves of the pictures see them {halves * 1e3:.2g} mm apart"
         lacks.append(Lack(what, MORE))

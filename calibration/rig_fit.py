@@ -15,6 +15,7 @@ import numpy as np
 from calibration.rig_measurements import RigMeasurements
 from calibration.rig_model import RigModel
 from calibration.rig_parameters import Parameters
+from calibration.robust import huber, share_of
 from cdpr.cables import NoCable
 from cdpr.errors import Fault
 from cdpr.kinematics import ForwardSolution, forward_kinematics
@@ -146,17 +147,17 @@ class RigFitter:
             return float("inf")
         cables = np.sqrt(self._length_weight) * np.abs(residuals)
         poses = self._distances(self._pose_errors(positions, rotations))
-        return float(z @ z + _huber(cables, CABLE_BEND).sum() + _huber(poses, POSE_BEND).sum())
+        return float(z @ z + huber(cables, CABLE_BEND).sum() + huber(poses, POSE_BEND).sum())
 
     def _system(
         self, values: Array, z: Array, spread: Array, positions: Array, rotations: Array
     ) -> _System:
         line = self._model.linearised(values, positions, rotations)
-        weights = self._length_weight * _share(
+        weights = self._length_weight * share_of(
             np.sqrt(self._length_weight) * np.abs(line.residuals), CABLE_BEND
         )
         errors = self._pose_errors(positions, rotations)
-        share = _share(self._distances(errors), POSE_BEND)
+        share = share_of(self._distances(errors), POSE_BEND)
         pose_weights = share[:, None, None] * self._pose_weights
         by_z = line.by_values @ spread
         weighted = weights[..., None] * line.by_pose
@@ -180,7 +181,7 @@ class RigFitter:
             positions,
             rotations,
             residuals,
-            _share(np.sqrt(self._length_weight) * np.abs(residuals), CABLE_BEND),
+            share_of(np.sqrt(self._length_weight) * np.abs(residuals), CABLE_BEND),
             self._distances(self._pose_errors(positions, rotations)),
             system.reduced(),
         )
@@ -239,17 +240,6 @@ def poses_from_lengths(rig: Rig, lengths: Array) -> list[ForwardSolution]:
             tries = [forward_kinematics(rig, wanted, tolerance=START_TOLERANCE)]
         found.append(min(tries, key=lambda solution: solution.worst))
     return found
-
-
-def _huber(distances: Array, bend: float) -> Array:
-    cost: Array = np.where(distances <= bend, distances**2, 2.0 * bend * distances - bend**2)
-    return cost
-
-
-def _share(distances: Array, bend: float) -> Array:
-    """The weight that makes a square of what counts less."""
-    share: Array = bend / np.maximum(distances, bend)
-    return share
 
 
 def _turned(rotations: Array, turns: Array) -> Array:
