@@ -78,6 +78,7 @@ def track(
     count = count or TrackCount()
     reasons: Counter[str] = Counter()
     last: Picture | None = None
+    seen: set[int] = set()
     for picture in source:
         start = monotonic()
         observation = tracker.observe(picture.image, picture.time)
@@ -89,6 +90,7 @@ def track(
             clearance = clearance_of(model, observation) if model is not None else None
         else:
             reasons[_reason(observation)] += 1
+            seen.update(observation.seen)
             last = picture
         logged = LoggedPicture(picture.name, observation, clearance)
         if on_picture is not None:
@@ -97,7 +99,7 @@ def track(
         if count.poses == 0 and count.pictures == give_up_after:
             break
     if count.poses == 0:
-        raise _nothing_seen(tracker, count.pictures, reasons, last)
+        raise _nothing_seen(tracker, count.pictures, reasons, last, seen)
 
 
 def _reason(observation: NoPose) -> str:
@@ -105,19 +107,24 @@ def _reason(observation: NoPose) -> str:
 
 
 def _nothing_seen(
-    tracker: Tracker, pictures: int, reasons: Counter[str], last: Picture | None
+    tracker: Tracker, pictures: int, reasons: Counter[str], last: Picture | None, seen: set[int]
 ) -> NoPlatformSeen:
     where = f"camera {tracker.camera.name!r}"
     if last is None:
         return NoPlatformSeen("the source has no pictures", where=where)
     wanted = ", ".join(map(str, tracker.expected_tags))
     instead = what_else_is_seen(last.image, tracker.rig.tag_family, tracker.expected_tags)
+    next_step = (
+        "check that the camera sees the platform, that the light suffices and that the rig file"
+        " names the family and numbers of the printed tags"
+    )
+    if len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
+        next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
     return NoPlatformSeen(
         f"none of {pictures} picture{'s' if pictures != 1 else ''} gives a pose of the platform:"
         f" {reasons.most_common(1)[0][0]}",
         where=where,
         why=f"expected are {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
-        next_step="check that the camera sees the platform, that the light suffices and that the"
-        " rig file names the family and numbers of the printed tags",
+        next_step=next_step,
         values={"pictures": pictures, "family": tracker.rig.tag_family, "expected": wanted},
     )

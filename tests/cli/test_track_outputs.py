@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,13 +13,16 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from cdpr.errors import BadInput
 from cdpr.rig import load_rig
-from drivers.picture_folder import picture_files, read_picture
+from drivers.picture_folder import ImageFolder, picture_files, read_picture
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 from tracking.measurement import NoPose
 from tracking.overlay import USED, drawn_over
 from tracking.pose_log import CLEARANCE_COLUMNS, POSE_COLUMNS
+from tracking.track import track as tracked
+from tracking.tracker import Tracker
 
 SESSION = CONFIGS.parent / "examples" / "rig_session" / "pictures"
 
@@ -81,6 +85,22 @@ def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
     rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
     answer = call("track", rig, tmp_path, "-o", tmp_path / "poses.csv")
     one_message(answer, 2, "a.png shows no tag of any known family; flipped over they are there")
+
+
+def test_tags_that_are_not_as_told_are_named_as_the_cause(tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    picture = picture_files(SESSION)[0]
+    (tmp_path / "pictures" / picture.name).write_bytes(picture.read_bytes())
+    rig = load_rig(CONFIGS / "gachon_8_6_rehearsal.yaml")
+    tags = tuple(replace(tag, size=0.4 * tag.size) for tag in rig.platform_tags)
+    wrong = replace(rig, platform_tags=tags)
+    with pytest.raises(BadInput) as told:
+        list(
+            tracked(
+                ImageFolder(tmp_path / "pictures", rig.cameras[0]), Tracker(wrong, rig.cameras[0])
+            )
+        )
+    assert "size_mm, position_mm and rotation_wxyz of tags.platform" in told.value.next_step
 
 
 def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -> None:
