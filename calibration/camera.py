@@ -95,7 +95,7 @@ def calibrate_camera(
     views: dict[str, Seen] = {}
     left_out = dict(unused or {})
     size: tuple[int, int] | None = None
-    example: Image | None = None
+    example: tuple[str, Image] | None = None
     for name, image in pictures:
         own = (image.shape[1], image.shape[0])
         size = size or own
@@ -108,7 +108,7 @@ def calibrate_camera(
         seen = board.find(image)
         if seen is None:
             left_out[name] = "does not show the board"
-            example = image if example is None else example
+            example = example or (name, image)
         elif first := next((n for n, before in views.items() if _same(seen, before)), None):
             left_out[name] = f"is the same picture as {first}"
         else:
@@ -198,14 +198,17 @@ def _undetermined() -> BadInput:
 
 
 def _too_few(
-    views: Mapping[str, Seen], unused: Mapping[str, str], board: Board, example: Image | None
+    views: Mapping[str, Seen],
+    unused: Mapping[str, str],
+    board: Board,
+    example: tuple[str, Image] | None,
 ) -> BadInput:
     count = len(views) + len(unused)
     why = f"{board} was looked for"
-    if example is not None and mirrored(board, example):
+    if example is not None and mirrored(board, example[1]):
         why += "; flipped over it is there, so the pictures are mirrored, or the board's print is"
-    elif example is not None and (instead := board.instead(example)):
-        why += f"; a picture shows {instead}"
+    elif example is not None and (instead := board.instead(example[1])):
+        why += f"; {example[0]} shows {instead}"
     told = [f"{name} {reason}" for name, reason in unused.items()]
     if told:
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""

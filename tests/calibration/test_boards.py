@@ -113,6 +113,7 @@ def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
         calibrate_camera([("a", image), ("b", image)], wrong)
     assert "is to be seen in 0 of 2 pictures" in caught.value.what
     assert told in caught.value.why
+    assert "; a shows " in caught.value.why
 
 
 @pytest.mark.parametrize(("board", "number"), [(CHARUCO, 8), (TAGS, 27)])
