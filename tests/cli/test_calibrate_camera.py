@@ -126,7 +126,7 @@ def test_a_board_of_another_number_of_corners_is_told(tmp_path) -> None:
     save(tmp_path / "a.png", pictures(1, 0.0)[0])
     options = ("--columns", "11", "--rows", "7", "--square-mm", "25")
     answer = call("calibrate", "camera", tmp_path, *options)
-    one_message(answer, 2, "a picture shows a chessboard of 9 x 6 inner corners")
+    one_message(answer, 2, "png shows a chessboard of 9 x 6 inner corners")
 
 
 def test_a_wrong_size_of_squares_shows_in_the_distance_of_the_boards(folder) -> None:
