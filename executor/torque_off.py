@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from cdpr.errors import CdprError, Fault, HardwareMissing, StoppedByOperator
+from cdpr.errors import CdprError, Fault, StoppedByOperator
 from cdpr.rig import Rig
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
 from executor.clock import Clock
-from executor.safety.watch import MISSING_CYCLES
+from executor.silence import Silence
 
 #: All drives must be without torque within so many seconds.
 WITHIN_S = 3.0
@@ -50,7 +50,7 @@ def _cycles(rig: Rig) -> int:
 def _cycled(
     rig: Rig, group: DriveGroup, clock: Clock, is_stop_wished: Callable[[], bool]
 ) -> CycleStatus:
-    silent = [0] * rig.cable_count
+    silence = Silence(rig)
     for _ in range(_cycles(rig)):
         clock.next_cycle()
         if is_stop_wished():
@@ -65,27 +65,14 @@ def _cycled(
             return status
         if status.state is GroupState.FAULT:
             raise _not_released("; ".join(text for _, text in status.faults))
-        silent = [
-            n + 1 if is_missing else 0
-            for n, is_missing in zip(silent, status.missing.tolist(), strict=True)
-        ]
-        _require_heard(rig, silent)
-    raise _not_released(f"the drives were not without torque within {WITHIN_S:g} s")
-
-
-def _require_heard(rig: Rig, silent: list[int]) -> None:
-    gone = [
-        name
-        for name, n in zip(rig.drive_names.values(), silent, strict=True)
-        if n >= MISSING_CYCLES
-    ]
-    if gone:
-        raise HardwareMissing(
-            f"{', '.join(gone)} fell silent while the torque was being taken off",
+        silence.take(status)
+        silence.require_none(
+            "while the torque was being taken off",
             where="release",
             why="it lost power or the bus; the others were stopped and hold",
             next_step="check power and wiring, then `cdpr reset RIG`",
         )
+    raise _not_released(f"the drives were not without torque within {WITHIN_S:g} s")
 
 
 def _not_released(what: str) -> Fault:

@@ -12,7 +12,6 @@ from cdpr.cli.motion_options import ChannelOption, InterfaceOption
 
 if TYPE_CHECKING:
     from cdpr.rig import Rig
-    from drivers.drive_group import CycleStatus
 
 #: Cycles in which a drive leaves its fault, and the others are seen to hold.
 SETTLING_CYCLES = 30
@@ -89,12 +88,12 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
 
     from cdpr.cli.drives import open_drives
     from cdpr.cli.reference_facts import reference_told
-    from cdpr.errors import Fault, HardwareMissing
+    from cdpr.errors import Fault
     from cdpr.scene import nothing_in_the_way
     from drivers.drive_group import GroupCommand, GroupState, drive_states
     from executor.clock import RealClock
     from executor.custody import Custody
-    from executor.safety.watch import MISSING_CYCLES
+    from executor.silence import Silence
     from executor.winch_motion import set_up_here
 
     clock = RealClock(rig.document.bus.cycle_ms / 1000.0)
@@ -106,12 +105,12 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
         status = group.read_positions()
         if status.state is GroupState.FAULT:
             group.command(GroupCommand.RESET_FAULT)
-        silent, held = [0] * rig.cable_count, status.holding
+        silence, held = Silence(rig), status.holding
         for _ in range(SETTLING_CYCLES):
             clock.next_cycle()
             group.send_cycle(status.positions.tolist())
             status = group.receive(clock.time_left())
-            silent = _counted(silent, status)
+            silence.take(status)
             held = held and status.holding
         if status.state is GroupState.FAULT:
             raise Fault(
@@ -120,18 +119,12 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
                 why="the cause is still there",
                 next_step="remove it, then reset again; the latch stays engaged",
             )
-        gone = [
-            name
-            for name, n in zip(rig.drive_names.values(), silent, strict=True)
-            if n >= MISSING_CYCLES
-        ]
-        if gone:
-            raise HardwareMissing(
-                f"{', '.join(gone)} fell silent while the drives settled",
-                where="reset",
-                why="it lost power or the bus since it was set up",
-                next_step="check power and wiring, then reset again; the latch stays engaged",
-            )
+        silence.require_none(
+            "while the drives settled",
+            where="reset",
+            why="it lost power or the bus since it was set up",
+            next_step="check power and wiring, then reset again; the latch stays engaged",
+        )
         custody, stands = Custody(rig), status.positions.tolist()
         if held and not drives.restarted:
             custody.found_held(stands)
@@ -140,13 +133,3 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
             "restarted": list(drives.restarted),
             "reference": reference_told(custody, stands),
         }
-
-
-def _counted(silent: list[int], status: CycleStatus) -> list[int]:
-    """Cycles in a row without an answer of each drive; what was too many stays too many."""
-    from executor.safety.watch import MISSING_CYCLES
-
-    return [
-        n + 1 if missing else (n if n >= MISSING_CYCLES else 0)
-        for n, missing in zip(silent, status.missing.tolist(), strict=True)
-    ]
