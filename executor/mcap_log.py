@@ -197,8 +197,13 @@ def _tags(poses: PoseTable, start: int) -> Iterator[Message]:
 
 def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
     near, planned = _rows(clearance.distances * 1e3), _rows(clearance.planned_distances * 1e3)
-    keys = ("distance_mm", "uncertainty_mm", "planned_distance_mm")
-    columns = (clearance.distance, clearance.uncertainty, clearance.planned_distance)
+    keys = ("distance_mm", "uncertainty_mm", "at_most_mm", "planned_distance_mm")
+    columns = (
+        clearance.distance,
+        clearance.uncertainty,
+        clearance.at_most,
+        clearance.planned_distance,
+    )
     values = zip(*(_column(column * 1e3) for column in columns), strict=True)
     for i, row in enumerate(values):
         each = zip(clearance.obstacles, near[i], planned[i], strict=True)

@@ -97,6 +97,7 @@ CLEARANCE = _object(
     source=_TEXT,
     distance_mm=_NUMBER,
     uncertainty_mm=_NUMBER,
+    at_most_mm=_NUMBER,
     planned_distance_mm=_NUMBER,
     body=_TEXT,
     obstacle=_TEXT,

@@ -9,10 +9,11 @@ Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, 
 ``following_error_mm`` {``max``, ``rms``, ``limit``}, ``encoder_error_mm``
 {``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``, ``frames_without_pose``} or null
 without a camera, ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
-``measured_uncertainty``, ``pair``, ``at_s``, ``source``} or null without obstacles, ``tension_n``
-{``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``, ``upper_limit``},
-``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time, ``final_state``, ``events``
-[{``time_s``, ``code``, ``text``}], ``versions``. A number that is not known is null.
+``measured_uncertainty``, ``measured_at_most``, ``pair``, ``at_s``, ``source``} or null without
+obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``,
+``upper_limit``}, ``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time,
+``final_state``, ``events`` [{``time_s``, ``code``, ``text``}], ``versions``. A number that is not
+known is null.
 """
 
 from __future__ import annotations
@@ -170,6 +171,7 @@ def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | N
                 "planned_min": _number(np.nanmin(clearance.planned_distance) * 1e3),
                 "measured_min": _number(rows.distance[at] * 1e3),
                 "measured_uncertainty": _number(rows.uncertainty[at] * 1e3),
+                "measured_at_most": _number(rows.at_most[at] * 1e3),
                 "pair": [rows.body[at], rows.obstacle[at]],
                 "at_s": _number(rows.time[at]),
                 "source": source,

@@ -56,6 +56,7 @@ def _clearance(clearance: MeasuredClearance) -> dict[str, Any]:
         "source": "tag",
         "distance_mm": clearance.distance * 1e3,
         "uncertainty_mm": clearance.uncertainty * 1e3,
+        "at_most_mm": clearance.at_most * 1e3,
         "planned_distance_mm": None,
         "body": nearest.first,
         "obstacle": nearest.second,

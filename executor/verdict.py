@@ -193,11 +193,11 @@ def distances(clearance: ClearanceTable, required: float) -> list[Check]:
 def _against_required(rows: ClearanceTable, required: float, teller: str) -> Check:
     passed = not bool(np.any(rows.at_most < required - ROUNDING))
     worst = int(np.nanargmin(rows.distance if passed else rows.at_most))
-    distance, spread = rows.distance[worst] * 1e3, rows.uncertainty[worst] * 1e3
-    at_most = f"mm, surely at most {rows.at_most[worst] * 1e3:.1f} mm"
-    size = f"± {spread:.1f} mm" if passed else at_most
+    distance, high = rows.distance[worst] * 1e3, rows.at_most[worst] * 1e3
+    low = distance - rows.uncertainty[worst] * 1e3
+    surely = f"{low:.1f} to {high:.1f} mm" if passed else f"at most {high:.1f} mm"
     text = (
-        f"The smallest clearance seen by {teller} was {distance:.1f} {size}"
+        f"The smallest clearance seen by {teller} was {distance:.1f} mm, surely {surely}"
         f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
         f" the scene asks for {required * 1e3:g} mm."
     )

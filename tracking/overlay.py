@@ -92,9 +92,10 @@ def _lines(found: Observation, clearance: MeasuredClearance | None) -> list[str]
     ]
     if clearance is not None:
         nearest = min(clearance.nearest, key=lambda n: n.distance)
+        low, high = clearance.distance - clearance.uncertainty, clearance.at_most
         text.append(
-            f"clearance {clearance.distance * 1e3:.1f} +- {clearance.uncertainty * 1e3:.1f} mm"
-            f"  {nearest.first} to {nearest.second}"
+            f"clearance {clearance.distance * 1e3:.1f} mm, surely {low * 1e3:.1f} to"
+            f" {high * 1e3:.1f}  {nearest.first} to {nearest.second}"
         )
     return text
 

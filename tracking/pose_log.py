@@ -40,7 +40,13 @@ POSE_COLUMNS = (
 
 
 #: Further columns where obstacles are known.
-CLEARANCE_COLUMNS = ("clearance_mm", "clearance_uncertainty_mm", "body", "obstacle")
+CLEARANCE_COLUMNS = (
+    "clearance_mm",
+    "clearance_uncertainty_mm",
+    "clearance_at_most_mm",
+    "body",
+    "obstacle",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +112,8 @@ def _clearance_values(clearance: MeasuredClearance | None) -> tuple[str, ...]:
     if clearance is None:
         return ("",) * len(CLEARANCE_COLUMNS)
     nearest = min(clearance.nearest, key=lambda n: n.distance)
-    distance, spread = clearance.distance * 1e3, clearance.uncertainty * 1e3
-    return (f"{distance:.6f}", f"{spread:.6f}", nearest.first, nearest.second)
+    values = (clearance.distance, clearance.uncertainty, clearance.at_most)
+    return (*(f"{value * 1e3:.6f}" for value in values), nearest.first, nearest.second)
 
 
 def _quoted(text: str) -> str:

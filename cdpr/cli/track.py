@@ -242,4 +242,5 @@ def _facts(
         nearest = min(clearances, key=lambda c: c.distance)
         facts["smallest_clearance_mm"] = round(nearest.distance * 1000, 3)
         facts["clearance_uncertainty_mm"] = round(nearest.uncertainty * 1000, 3)
+        facts["clearance_at_most_mm"] = round(nearest.at_most * 1000, 3)
     return facts

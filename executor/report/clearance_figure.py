@@ -59,11 +59,9 @@ def _sources(clearance: ClearanceTable) -> list[ClearanceTable]:
 def _smallest(axes: Axes, run: RunData) -> None:
     for rows in _sources(run.clearance):
         source = rows.source[0]
-        time, distance, spread = with_gaps(rows.time, rows.distance * 1e3, rows.uncertainty * 1e3)
+        time, distance, low, high = with_gaps(rows.time, *_band(rows))
         colour = STAND_IN[source]
-        axes.fill_between(
-            time, distance - spread, distance + spread, color=colour, alpha=0.22, linewidth=0
-        )
+        axes.fill_between(time, low, high, color=colour, alpha=0.22, linewidth=0)
         axes.plot(time, distance, color=colour, label=_NAMES[source], linewidth=1.3)
     reference = _sources(run.clearance)[0]
     _planned(axes, reference.time, reference.planned_distance * 1e3)
@@ -76,13 +74,19 @@ def _smallest(axes: Axes, run: RunData) -> None:
     legend_above(axes)
 
 
+def _band(rows: ClearanceTable) -> tuple[Array, Array, Array]:
+    """The smallest distance, and between what the true one lies, [mm]."""
+    low = rows.distance - rows.uncertainty
+    return rows.distance * 1e3, low * 1e3, rows.at_most * 1e3
+
+
 def _difference(axes: Axes, run: RunData) -> None:
     """The best measurement less the plan; zero outside the band would be a contradiction."""
     rows = _sources(run.clearance)[0]
-    off = (rows.distance - rows.planned_distance) * 1e3
-    time, off, spread = with_gaps(rows.time, off, rows.uncertainty * 1e3)
+    planned = rows.planned_distance * 1e3
+    time, off, low, high = with_gaps(rows.time, *(values - planned for values in _band(rows)))
     colour = STAND_IN[rows.source[0]]
-    axes.fill_between(time, off - spread, off + spread, color=colour, alpha=0.22, linewidth=0)
+    axes.fill_between(time, low, high, color=colour, alpha=0.22, linewidth=0)
     axes.plot(time, off, color=colour, linewidth=1.0)
     axes.axhline(0.0, color=STAND_IN["planned"], linestyle=(0, (4, 2)), linewidth=1.2)
     axes.set_title(f"{_NAMES[rows.source[0]]} less planned, with its uncertainty".capitalize())
@@ -134,6 +138,7 @@ def _alternative(run: RunData) -> str:
     return (
         f"Line chart of the smallest clearance over time. Planned at least {key['planned_min']:.1f}"
         f" mm, measured at least {key['measured_min']:.1f} mm with an uncertainty of"
-        f" {key['measured_uncertainty']:.1f} mm, between {key['pair'][0]} and {key['pair'][1]};"
+        f" {key['measured_uncertainty']:.1f} mm below it and surely at most"
+        f" {key['measured_at_most']:.1f} mm, between {key['pair'][0]} and {key['pair'][1]};"
         f" required {key['required']:g} mm."
     )

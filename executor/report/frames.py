@@ -41,11 +41,12 @@ def _clearance(run: RunData, row: int) -> str:
     if not near.size:
         return ""
     k = int(near[0])
-    distance, spread, planned = (
+    distance, spread, at_most, planned = (
         float(values[k]) * 1e3
-        for values in (rows.distance, rows.uncertainty, rows.planned_distance)
+        for values in (rows.distance, rows.uncertainty, rows.at_most, rows.planned_distance)
     )
-    return f"clearance {distance:.1f} ± {spread:.1f} mm (plan {planned:.1f})"
+    span = f"{distance - spread:.1f} to {at_most:.1f}"
+    return f"clearance {distance:.1f} mm, surely {span} (plan {planned:.1f})"
 
 
 def _measured(run: RunData, row: int) -> str:

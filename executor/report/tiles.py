@@ -73,10 +73,18 @@ def _clearance(key: dict[str, Any] | None) -> list[str]:
         return []
     by = "camera" if key["source"] == "tag" else "drives"
     note = (
-        f"± {known(key['measured_uncertainty'], 1, 'mm')} by the {by};"
+        f"surely {_span(key)} mm by the {by};"
         f" planned {known(key['planned_min'], 1, '')}, required {key['required']:g}"
     )
     return [_tile("Smallest clearance", known(key["measured_min"], 1, "mm"), note)]
+
+
+def _span(key: dict[str, Any]) -> str:
+    """Between what the smallest true clearance lies."""
+    if key["measured_min"] is None:
+        return "–"
+    low = key["measured_min"] - key["measured_uncertainty"]
+    return f"{low:.1f} to {key['measured_at_most']:.1f}"
 
 
 def _following(key: dict[str, Any]) -> str:

@@ -47,6 +47,8 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
     nearest = min(float(row["clearance_mm"]) for row in rows)
     assert nearest == pytest.approx(facts["smallest_clearance_mm"], abs=1e-3)
     assert all(float(row["clearance_uncertainty_mm"]) > 0.5 for row in rows)
+    at_most = [float(row["clearance_at_most_mm"]) for row in rows]
+    assert all(high > float(row["clearance_mm"]) for high, row in zip(at_most, rows, strict=True))
     assert {row["obstacle"] for row in rows} == {"block"}
     with mcap.open("rb") as stream:
         messages = [
@@ -57,6 +59,8 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
     assert counted == {"/tag_pose": 3, "/tag_status": 3, "/clearance": 3}
     distances = [content["distance_mm"] for topic, content in messages if topic == "/clearance"]
     assert distances == pytest.approx([float(row["clearance_mm"]) for row in rows], abs=1e-5)
+    highs = [content["at_most_mm"] for topic, content in messages if topic == "/clearance"]
+    assert highs == pytest.approx(at_most, abs=1e-5)
     names = sorted(path.name for path in drawn.iterdir())
     assert names == ["rendered_0.png", "rendered_1.png", "rendered_2.png"]
     picture = cv2.imread(str(drawn / names[0]))

@@ -77,6 +77,9 @@ def test_numbers_are_those_of_the_tables(run: fake_run.FakeRun, messages: Messag
     _, pose = messages["/encoder_pose"][33]
     assert pose["pose"]["position"]["y"] == run.cycles.encoder[33, 1]
     assert pose["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    highs = [m["at_most_mm"] for _, m in messages["/clearance"]]
+    order = np.argsort(run.clearance.time, kind="stable")
+    np.testing.assert_allclose(highs, run.clearance.at_most[order] * 1e3)
     _, status = messages["/tag_status"][0]
     np.testing.assert_array_equal(
         np.array(status["covariance"]).reshape(6, 6), run.poses.covariance[0]
