@@ -97,8 +97,8 @@ def _clearance(run: RunData) -> str:
     if not len(run.clearance):
         return paragraph("The scene has no obstacles.")
     text = (
-        "Distances between surfaces. In the shaded band lies the true one, as the measurement itself"
-        " states; planned is the pose that was commanded at the same time."
+        "Distances between surfaces. The true one lies in the shaded band, as the measurement"
+        " itself states; planned is the pose that was commanded at the same time."
     )
     return paragraph(text) + chart(clearance_figure(run))
 
