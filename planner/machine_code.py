@@ -11,7 +11,7 @@ import hashlib
 from pathlib import Path
 from typing import Literal
 
-from planner.exact.compiled import cache_folder
+from cdpr.compiled import cache_folder
 
 Task = Literal["optimal", "turning", "paper", "maps"]
 """What was done once when its code is there: a plan of one of three searches, or a map."""

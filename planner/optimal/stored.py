@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cdpr.compiled import cache_folder
 from cdpr.documents import content_hash
-from planner.exact.compiled import cache_folder
 
 Kind = TypeVar("Kind", bound=np.generic)
 

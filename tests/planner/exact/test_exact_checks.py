@@ -7,12 +7,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from cdpr.poses import Pose, matrix_from_rotation_vector
 from cdpr.rig import load_rig
 from cdpr.scene import load_scene
-from planner.exact import compiled
 from planner.exact.checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
 
 ROOT = Path(__file__).parents[3]
@@ -64,31 +62,3 @@ def test_importing_the_checks_compiles_nothing() -> None:
         "assert not any(k.signatures for k in kernels)"
     )
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, timeout=120)
-
-
-def test_the_cache_is_the_given_folder_and_none_where_nothing_can_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kernels = Path(compiled.__file__).parent
-    find = compiled.cache_folder.__wrapped__
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
-    folder = find(kernels)
-    assert folder is not None
-    assert folder.parent == tmp_path / "given"
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert find(kernels) == tmp_path / "cdpr" / "kernels" / folder.name
-    (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert find(kernels) is None
-
-
-def test_kernels_without_a_cache_still_run(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(compiled, "cache_folder", lambda sources: None)
-
-    def twice(value: float) -> float:
-        return 2.0 * value
-
-    assert compiled.kernel(twice)(1.5) == 3.0

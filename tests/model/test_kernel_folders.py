@@ -1,4 +1,4 @@
-"""Which folders of machine code are kept, and which are thrown away."""
+"""Where machine code is kept, which folders of it stay, and which are thrown away."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from planner.exact.cache import UNUSED, throw_away_unused, use_folder
+from cdpr import compiled
+from cdpr.kernel_folders import UNUSED, throw_away_unused, use_folder
 
 NOW = 1.8e9
 OLD, RECENT = NOW - UNUSED - 1.0, NOW - UNUSED + 1.0
@@ -69,3 +70,55 @@ def test_a_folder_that_the_user_named_is_left_alone(
     old = made(tmp_path, "a" * 16, 1e9)
     assert use_folder("b" * 16) == tmp_path / ("b" * 16)
     assert old.exists()
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> Path:
+    """A folder of kernels."""
+    folder = tmp_path / "sources"
+    folder.mkdir()
+    (folder / "line.py").write_text("a kernel")
+    return folder
+
+
+def test_the_cache_is_the_given_folder_and_none_where_nothing_can_be_written(
+    sources: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = compiled.cache_folder.__wrapped__
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
+    folder = find(sources)
+    assert folder is not None
+    assert folder.parent == tmp_path / "given"
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert find(sources) == tmp_path / "cdpr" / "kernels" / folder.name
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert find(sources) is None
+
+
+@pytest.mark.parametrize("changed", ["own", "called"])
+def test_a_change_of_a_kernel_or_of_one_that_it_calls_begins_a_new_folder(
+    changed: str, sources: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find, version = compiled.cache_folder.__wrapped__, compiled._version
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
+    called = tmp_path / "called"
+    called.mkdir()
+    (called / "point.py").write_text("another")
+    before = find(sources, called)
+    version.cache_clear()
+    assert find(sources, called) == before
+    assert find(sources) != before
+    (sources / "line.py" if changed == "own" else called / "point.py").write_text("a kernel, new")
+    version.cache_clear()
+    assert find(sources, called) != before
+
+
+def test_kernels_without_a_cache_still_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "cache_folder", lambda sources: None)
+
+    def twice(value: float) -> float:
+        return 2.0 * value
+
+    assert compiled.compiled(twice)(1.5) == 3.0

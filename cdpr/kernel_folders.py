@@ -1,6 +1,6 @@
 """Where machine code is kept between runs, and when old code is thrown away.
 
-Every state of the kernels has a folder of its own (`planner.exact.compiled`). A process holds a
+Every state of the kernels has a folder of its own (`cdpr.compiled`). A process holds a
 shared lock in each folder it uses until it ends; beginning a new one throws away those that nobody
 holds and nobody began to use for two days. Folders that the user named (``NUMBA_CACHE_DIR``) are
 left alone.
