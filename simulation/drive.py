@@ -87,7 +87,6 @@ class SimulatedDrive:
         self.node = node
         self._bus_send = send
         self.motor = Motor(position, position, top_speed)
-        self.torque = 0.0
         self.silent = False
         self._sdo_ids = SDO_REQUEST_BASE + node
         self.power_on()
@@ -103,7 +102,7 @@ class SimulatedDrive:
             SDO_REQUEST_BASE + self.node, SDO_REPLY_BASE + self.node, self.objects
         )
         self._server.network = _Replies(self)  # type: ignore[assignment]
-        self.state = DriveState.SWITCH_ON_DISABLED
+        self.state, self.torque = DriveState.SWITCH_ON_DISABLED, 0.0
         self.nmt = NmtState.PRE_OPERATIONAL
         self.motor.release()
         self._control_word = 0
@@ -358,7 +357,7 @@ class SimulatedDrive:
 
     def _power_off(self, state: DriveState) -> None:
         """Brake closed, torque off."""
-        self.state = state
+        self.state, self.torque = state, 0.0
         self.motor.release()
         self._error_time = 0.0
 

@@ -20,7 +20,7 @@ from cdpr.winches import WinchMap
 FORCE_TOLERANCE = 1e-7
 """Largest force [N] and moment over the platform's reach [N] left at an equilibrium."""
 
-QUICK_STEPS = 8
+QUICK_STEPS = 12
 MAX_STEPS = 200
 
 
@@ -105,37 +105,49 @@ class Plant:
         if self._on_a_stand:
             self.tensions = read_only(self._pulled(self.pose)[1])
             self._on_a_stand = bool(self.tensions.min() < self._rig.min_tension)
-        if not (self._on_a_stand or self._settle_taut()):
+        if not (self._on_a_stand or self._settle_quickly()):
             self._settle_anyhow()
 
-    def _settle_taut(self) -> bool:
-        """The quick way, for an equilibrium in which every cable is taut.
+    def _settle_quickly(self) -> bool:
+        """The quick way: from the cables that pulled before to those that pull in the end.
 
-        Newton's method with cables that push as well: on the way a step of the drums may press some
-        of them together. False when one would push in the end, or it does not come to an end.
+        Newton's method in which the cables that pull may push as well, and the others do neither:
+        on the way a step of the drums may press some of them together. Where it comes to rest with
+        one that pushes, or with a slack one that is stretched, it goes on with those that pull
+        there. False when it does not come to an end, or ends where the platform is not stable.
         """
-        pose = self.pose
+        pose, pull = self.pose, self.tensions > 0.0
         for _ in range(QUICK_STEPS):
             try:
                 cables = cables_at(self._rig, pose)
             except ValueError:  # an anchor inside its pulley
                 return False
             strain = (cables.lengths + self._behind) / self._unstrained - 1.0
-            tensions = self._axial * strain
+            tensions = np.where(pull, self._axial * strain, 0.0)
             columns = _columns(pose, cables)
             gradient = self._gradient(pose, columns, tensions)
             if self._small(gradient):
-                if tensions.min() < 0.0:
-                    return False
-                self.pose, self.tensions = pose, read_only(tensions)
-                return True
-            axial = self._axial / self._unstrained
+                if np.array_equal(pull, strain > 0.0):
+                    return self._comes_to_rest(pose, cables, tensions)
+                pull = strain > 0.0
+                continue
+            axial = np.where(pull, self._axial / self._unstrained, 0.0)
             stiffness = self._stiffness(pose, cables, axial, np.maximum(tensions, 0.0))
             try:
                 pose = _moved(pose, np.asarray(np.linalg.solve(stiffness, -gradient)))
             except np.linalg.LinAlgError:
                 return False
         return False
+
+    def _comes_to_rest(self, pose: Pose, cables: Cables, tensions: Array) -> bool:
+        """Takes over an equilibrium, unless the platform would fall or tip from it."""
+        taut = np.where(tensions > 0.0, self._axial / self._unstrained, 0.0)
+        try:
+            np.linalg.cholesky(self._stiffness(pose, cables, taut, tensions))
+        except np.linalg.LinAlgError:
+            return False
+        self.pose, self.tensions = pose, read_only(tensions)
+        return True
 
     def _settle_anyhow(self) -> None:
         """Down the energy, step by step, with cables that only pull."""

@@ -31,6 +31,8 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
     """CiA 402 drives and their platform; as in real drives, their time is locked to SYNC.
 
     One cycle passes from one SYNC to the next, however they jitter, and more only while none comes.
+    Positions that a SYNC asks for are those at that SYNC. Torques are those that the drives felt
+    when all stood as at the SYNC before, as in a drive that filters them: one cycle old.
     """
 
     def __init__(
@@ -100,10 +102,11 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
             handler(message.data)
 
     def _on_sync(self, data: Frame) -> None:
+        """The drives answer before the platform's place is found, which may take a cycle long."""
         self.cycles += 1
-        self._feel()
         for drive in self.drives:
             drive.on_sync()
+        self._feel()
 
     def _on_nmt(self, data: Frame) -> None:
         if len(data) == 2:
