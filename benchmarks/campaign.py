@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from cdpr.cli.cameras import SYNTHETIC
+from cdpr.cli.cameras import choose_cameras
 from cdpr.cli.carry_out import prepared_run
 from cdpr.cli.demo import RIG, configs
 from cdpr.cli.run_motion import run_prepared
@@ -109,12 +109,12 @@ def run_one(
     begin = time.perf_counter()
     with TemporaryDirectory(prefix="cdpr-campaign-") as place:
         output = Path(place) / "run"
-        name = SYNTHETIC if camera else None
+        eyes = choose_cameras(rig, [], not camera, in_process=True)
         prepared = prepared_run(load_plan(path), rig, quiet=True)
         summary = run_prepared(
             prepared,
             output,
-            name,
+            eyes,
             fast=True,
             start=None,
             without_real_time=False,

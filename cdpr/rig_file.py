@@ -197,6 +197,7 @@ class RigDocument(Document):
             self._tags_once,
             self._tags_of_the_family,
             self._cameras_once,
+            self._camera_names,
             self._home_inside,
             self._simulation_fits,
         )
@@ -258,6 +259,14 @@ class RigDocument(Document):
     def _cameras_once(self) -> list[Finding]:
         names = [(("cameras", i, "name"), camera.name) for i, camera in enumerate(self.cameras)]
         return _repeated("camera name", names)
+
+    def _camera_names(self) -> list[Finding]:
+        what = "is part of file names and of NAME=SOURCE, so it must hold no / and no ="
+        return [
+            (("cameras", i, "name"), what)
+            for i, camera in enumerate(self.cameras)
+            if set(camera.name) & set("/=")
+        ]
 
     def _home_inside(self) -> list[Finding]:
         box = zip(

@@ -1,37 +1,31 @@
-"""The camera's own process, so that pictures never delay the loop.
+"""A camera's own process, so that pictures never delay the loop, nor one camera another.
 
-The loop triggers; the process takes (or renders) a picture, measures the pose, says so, and gives
-all its answers at the end. In real time a trigger that comes too early is dropped and counted.
+It takes (or renders) a picture when it is asked, measures the pose, and says so at once. In real
+time it is not asked again before it has answered, and a picture that was due is counted as dropped.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
 from cdpr.errors import CdprError, Fault
-from cdpr.poses import Pose
-from executor.camera_sight import CameraSight
 from executor.observer import Look, MakeObserver, Trigger
 from executor.spawning import interrupts_blocked
 
 #: How long the process may take to import its libraries and open its camera, [s].
 START_TIMEOUT = 60.0
+#: In simulated time, and at the end of a run, an answer is waited for no longer than this, [s].
+PATIENCE = 20.0
+#: How long a process may take to end, [s].
+END_TIMEOUT = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Progress:
-    """So many pictures were measured; so many in a row, up to the last, gave no pose.
-
-    ``near`` says with which obstacle the measured clearance fell below the limit, if it did.
-    """
-
-    measured: int
-    blind: int
-    near: str = ""
+class _Ready:
+    """The camera is open."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,86 +36,75 @@ class _Failure:
 
 
 class CameraProcess:
-    """Takes pictures when told to and measures the platform in them."""
+    """Takes pictures with one camera when told to, and measures the platform in them."""
 
-    def __init__(self, make_observer: MakeObserver, *, may_wait: bool) -> None:
-        """Starts the process and waits until its camera is ready.
+    def __init__(self, name: str, make_observer: MakeObserver, *, may_wait: bool) -> None:
+        """Starts the process; `require_ready` waits until its camera is.
 
         Args:
+            name: Of the camera.
             make_observer: Called in the process; picklable.
-            may_wait: In simulated time a trigger waits until the picture before is measured. In
-                real time it is dropped instead, so that no picture is older than it says.
-
-        Raises:
-            CdprError: The camera cannot be used, for the reason told.
+            may_wait: In simulated time answers are waited for, so that the same run sees the same
+                every time.
         """
-        self.dropped = 0
-        self.triggered = 0
-        self._measured = 0
-        self._sight = CameraSight()
-        self.trouble = ""
-        """Why no pose was measured any more when a picture was last due; nothing if it was."""
-        self.near = ""
-        """Between what the measured clearance fell below the limit, with numbers; else nothing."""
-        self._may_wait = may_wait
+        self.name = name
+        self._may_wait = self._waits = may_wait
+        self._asked: Trigger | None = None
         self._closed = False
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(make_observer, far_end), name="cdpr-camera", daemon=True
+            target=_serve, args=(make_observer, far_end), name=f"cdpr-camera-{name}", daemon=True
         )
         with interrupts_blocked():
             self._process.start()
         far_end.close()
-        try:
-            if not self._link.poll(START_TIMEOUT):
-                raise Fault(f"the camera's process was not ready within {START_TIMEOUT:.0f} s")
-            self._receive()
-        except BaseException:
-            self.close()
-            raise
 
-    def trigger(self, time: float, asked: float, true_pose: Pose | None) -> None:
-        """Asks for a picture now.
+    def require_ready(self) -> None:
+        """Waits until the camera is open.
 
-        Args:
-            time: Since the start of the run, [s].
-            asked: The same moment on the monotonic clock, [s].
-            true_pose: Where the simulated platform is; None with a real camera.
+        Raises:
+            CdprError: It cannot be used, for the reason told.
+        """
+        if not self._link.poll(START_TIMEOUT):
+            raise Fault(
+                f"the process of camera {self.name} was not ready within {START_TIMEOUT:.0f} s"
+            )
+        self._receive()
+
+    @property
+    def unanswered(self) -> Trigger | None:
+        """What was asked for last, while there is no answer to it."""
+        return self._asked
+
+    def ask(self, trigger: Trigger) -> None:
+        """Asks for a picture; the one before must have been answered.
 
         Raises:
             CdprError: The process is gone, for the reason told.
         """
-        # Simulated time waits for the picture before: a stop comes at the same place every time.
-        while self._link.poll() or (self._may_wait and self._measured < self.triggered):
-            answer = self._receive()
-            if isinstance(answer, _Progress):
-                self._measured = answer.measured
-                self._sight.answer(answer.blind)
-                self.near = self.near or answer.near
-        self.trouble = self._sight.trouble(asked)
-        if not self._may_wait and self._measured < self.triggered:
-            self.dropped += 1
-            return
-        self._send(Trigger(self.triggered, time, asked, true_pose))
-        self._sight.ask(asked)
-        self.triggered += 1
+        if self._asked is not None:
+            raise ValueError(f"camera {self.name} has not answered yet")
+        try:
+            self._link.send(trigger)
+        except OSError:  # the process is gone; why, it may have told before
+            while True:
+                self._receive()
+        self._asked = trigger
 
-    def finish(self, progress: Callable[[float], None]) -> list[Look]:
-        """Waits until the last picture is measured; returns all of them and ends the process.
+    def answer(self) -> Look | None:
+        """The answer to what was asked, if it is there; waited for in simulated time.
+
+        One that does not come is waited for only once: the others must go on.
 
         Raises:
             CdprError: The process failed, for the reason told.
         """
-        try:
-            self._send(None)
-            while True:
-                answer = self._receive()
-                if isinstance(answer, list):
-                    return answer
-                progress(float(answer.measured))
-        finally:
-            self.close()
+        return self._answer_within(PATIENCE if self._waits else 0.0)
+
+    def last_answer(self) -> Look | None:
+        """As `answer`, at the end of the run: it is waited for in real time too."""
+        return self._answer_within(PATIENCE)
 
     def close(self) -> None:
         """Ends the process, whatever it does; further calls change nothing."""
@@ -129,42 +112,43 @@ class CameraProcess:
             return
         self._closed = True
         self._link.close()
-        self._process.join(timeout=2.0)
+        self._process.join(END_TIMEOUT)
         if self._process.is_alive():
             self._process.terminate()
+            self._process.join(END_TIMEOUT)
+        if self._process.is_alive():  # a process that is stopped is ended by nothing else
+            self._process.kill()
             self._process.join()
         self._process.close()
 
-    def _send(self, item: Trigger | None) -> None:
-        try:
-            self._link.send(item)
-        except OSError:  # the process is gone; why, it may have told before
-            while True:
-                self._receive()
+    def _answer_within(self, patience: float) -> Look | None:
+        if not self._link.poll(patience if self._asked is not None else 0.0):
+            self._waits = self._waits and self._asked is None
+            return None
+        look = self._receive()
+        if not isinstance(look, Look):
+            raise TypeError(f"camera {self.name} answered {look!r}")
+        self._asked, self._waits = None, self._may_wait
+        return look
 
-    def _receive(self) -> list[Look] | _Progress:
+    def _receive(self) -> Look | _Ready:
         try:
             answer = self._link.recv()
         except (EOFError, ConnectionResetError):
-            raise Fault("the camera's process ended without an answer") from None
+            raise Fault(f"the process of camera {self.name} ended without an answer") from None
         if isinstance(answer, _Failure):
             raise answer.error if isinstance(answer.error, CdprError) else Fault(answer.error)
         return answer  # type: ignore[no-any-return]  # what our own process sends
 
 
 def _serve(make_observer: MakeObserver, link: Connection) -> None:
-    """The process: a picture a trigger, then all answers at once; it ends with its parent."""
+    """The process: an answer a trigger; it ends with its parent."""
     with suppress(_NobodyThere):
         try:
             with make_observer() as observer:
-                _say(link, _Progress(0, 0))
-                looks: list[Look] = []
-                blind = 0
-                while (trigger := _next_trigger(link)) is not None:
-                    looks.append(observer.look(trigger))
-                    blind = 0 if looks[-1].pose is not None else blind + 1
-                    _say(link, _Progress(len(looks), blind, observer.too_near))
-                _say(link, looks)
+                _say(link, _Ready())
+                while True:
+                    _say(link, observer.look(_next_trigger(link)))
         except CdprError as error:
             _say(link, _Failure(error))
         except Exception as error:
@@ -176,14 +160,14 @@ class _NobodyThere(BaseException):
     """The parent is gone; there is nothing left to do, and nobody to tell."""
 
 
-def _say(link: Connection, what: list[Look] | _Progress | _Failure) -> None:
+def _say(link: Connection, what: Look | _Ready | _Failure) -> None:
     try:
         link.send(what)
     except OSError:
         raise _NobodyThere from None
 
 
-def _next_trigger(link: Connection) -> Trigger | None:
+def _next_trigger(link: Connection) -> Trigger:
     try:
         return link.recv()  # type: ignore[no-any-return]  # what our own parent sends
     except (EOFError, OSError):

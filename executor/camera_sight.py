@@ -1,4 +1,4 @@
-"""Whether the camera measures the platform now, or has lost it."""
+"""Whether a camera measures the platform now, or has lost it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ SILENCE = 2.0
 
 
 class CameraSight:
-    """Knows what was asked of the camera, and what came back."""
+    """Knows what was asked of a camera, and what came back."""
 
     def __init__(self) -> None:
         """Nothing was asked for yet."""
@@ -21,25 +21,25 @@ class CameraSight:
         """A picture was asked for, at this time, [s]."""
         self._asked = at
 
-    def answer(self, blind: int) -> None:
+    def answer(self, seen: bool) -> None:
         """That picture is measured.
 
         Args:
-            blind: So many pictures in a row, this one the last, gave no pose.
+            seen: It gave a pose.
         """
-        self._asked, self._blind = None, blind
+        self._asked, self._blind = None, 0 if seen else self._blind + 1
 
     def trouble(self, now: float) -> str:
-        """Why no pose is measured any more; nothing while all is well.
+        """Why no pose is measured any more, as what the camera does; nothing while all is well.
 
         Args:
             now: On the clock of `ask`, [s].
         """
         if self._asked is not None and now - self._asked > SILENCE:
-            return f"the camera gave no answer for {SILENCE:g} s; clearance is not measured"
+            return f"gave no answer for {SILENCE:g} s"
         if self._blind >= BLIND_PICTURES:
             return (
-                f"{BLIND_PICTURES} pictures in a row gave no pose; clearance is not measured:"
-                " is the camera where the rig file says, are tags in view and lit?"
+                f"gave no pose in {BLIND_PICTURES} pictures in a row (is it where the rig file"
+                " says, are tags in view and lit?)"
             )
         return ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,15 @@ from executor.cycle_table import CycleTable
 from executor.fused_table import FusedTable
 from executor.mcap_scene import robot_messages, scene_messages
 from executor.mcap_schemas import CHANNELS
-from executor.mcap_values import WORLD, Message, nanoseconds, pose_value, stamp_of
+from executor.mcap_values import (
+    WORLD,
+    Message,
+    channel_of,
+    nanoseconds,
+    pose_value,
+    stamp_of,
+    topic_of,
+)
 from executor.pose_table import PoseTable
 from executor.run_folder import RunFolder
 from executor.summary import RunContext
@@ -33,6 +41,7 @@ def write_mcap(
     poses: PoseTable,
     clearance: ClearanceTable,
     fused: FusedTable,
+    alone: Mapping[str, PoseTable],
 ) -> Path:
     """Writes ``run.mcap``; times in it are the start of the run plus run time.
 
@@ -43,6 +52,7 @@ def write_mcap(
         poses: Every picture's pose, or why there is none.
         clearance: Every row.
         fused: Every row.
+        alone: What each of several cameras measured, by its name; nothing for a single one.
 
     Raises:
         Fault: The disk is full or gone; no part of the file is left.
@@ -53,10 +63,11 @@ def write_mcap(
         *robot_messages(context.rig, cycles, start),
         *_cycles(cycles, start),
         *_tags(poses, start),
+        *(message for name in alone for message in _tags(alone[name], start, name)),
         *_clearance(clearance),
         *_poses_of("/fused_pose", fused.time, fused.position, fused.rotation, start),
         *_events(context, start),
-        *_pictures(folder, poses, start),
+        *_all_pictures(folder, poses, alone, start),
     ]
     write_messages(folder.mcap, messages, start)
     return folder.mcap
@@ -67,7 +78,8 @@ def write_messages(path: Path, messages: Sequence[Message], start: int) -> None:
 
     Args:
         path: The file.
-        messages: Of the channels in `executor.mcap_schemas.CHANNELS`.
+        messages: Of the channels in `executor.mcap_schemas.CHANNELS`, or of one of them for a
+            camera alone (`executor.mcap_values.topic_of`).
         start: What their times count from, [ns since 1970].
 
     Raises:
@@ -89,11 +101,15 @@ def _write(path: Path, messages: Sequence[Message], start: int) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="", library="cdpr")
-        channels = {}
+        schemas, channels = {}, {}
         for topic, (name, schema) in CHANNELS.items():
-            number = writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
+            data = json.dumps(schema).encode()
+            schemas[topic] = writer.register_schema(name, "jsonschema", data)
+        of_cameras = {topic for topic, _, _ in messages} - CHANNELS.keys()
+        for topic in (*CHANNELS, *sorted(of_cameras)):
+            number = schemas[channel_of(topic)]
             channels[topic] = writer.register_channel(topic, "json", number)
-        counts = dict.fromkeys(CHANNELS, 0)
+        counts = dict.fromkeys(channels, 0)
         for topic, time, content in messages:
             at = start + nanoseconds(time)
             data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
@@ -172,8 +188,9 @@ def _drives(cycles: CycleTable) -> Iterator[Message]:
         yield "/drives", time, content
 
 
-def _tags(poses: PoseTable, start: int) -> Iterator[Message]:
-    yield from _poses_of("/tag_pose", poses.time, poses.position, poses.rotation, start)
+def _tags(poses: PoseTable, start: int, camera: str = "") -> Iterator[Message]:
+    topic = topic_of("/tag_pose", camera)
+    yield from _poses_of(topic, poses.time, poses.position, poses.rotation, start)
     covariances = _rows(poses.covariance.reshape(-1, 36))
     rows = zip(
         poses.time.tolist(),
@@ -192,7 +209,7 @@ def _tags(poses: PoseTable, start: int) -> Iterator[Message]:
             "reprojection_px": reprojection,
             "covariance": covariance,
         }
-        yield "/tag_status", time, content
+        yield topic_of("/tag_status", camera), time, content
 
 
 def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
@@ -232,13 +249,24 @@ def _events(context: RunContext, start: int) -> Iterator[Message]:
         yield "/events", event.time_s, content
 
 
-def _pictures(folder: RunFolder, poses: PoseTable, start: int) -> Iterator[Message]:
+def _all_pictures(
+    folder: RunFolder, poses: PoseTable, alone: Mapping[str, PoseTable], start: int
+) -> Iterator[Message]:
+    if not alone:
+        yield from _pictures(folder, poses, start)
+    for name, table in alone.items():
+        yield from _pictures(folder, table, start, name)
+
+
+def _pictures(
+    folder: RunFolder, poses: PoseTable, start: int, camera: str = ""
+) -> Iterator[Message]:
     for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
         if name:
             content = {
                 "timestamp": stamp_of(start, time),
-                "frame_id": "camera",
+                "frame_id": camera or "camera",
                 "data": base64.b64encode(folder.picture(name)).decode(),
                 "format": "jpeg",
             }
-            yield "/pictures", time, content
+            yield topic_of("/pictures", camera), time, content

@@ -10,6 +10,16 @@ Message = tuple[str, float, dict[str, Any]]
 WORLD = "world"
 
 
+def topic_of(channel: str, camera: str) -> str:
+    """The channel of all cameras together, or that of one of several alone."""
+    return f"{channel}/{camera}" if camera else channel
+
+
+def channel_of(topic: str) -> str:
+    """The channel that a topic is of, whichever camera it is for."""
+    return "/" + topic.split("/")[1]
+
+
 def nanoseconds(time: float) -> int:
     """[s] as whole nanoseconds."""
     return round(time * 1e9)

@@ -1,24 +1,21 @@
-"""What the camera's process does with a trigger: a picture, a pose, a clearance."""
+"""What a camera's process does with a trigger: a picture, and the pose in it."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdpr.clearance import ClearanceModel
-from cdpr.poses import Array, Pose
+from cdpr.poses import Pose
 from cdpr.rig import Camera, Rig
-from cdpr.scene import Scene
-from executor.near_watch import NearWatch
-from executor.pose_table import OK
 from executor.run_folder import RunFolder
-from tracking.measured_clearance import MeasuredClearance, clearance_of
-from tracking.measurement import PoseMeasurement
+from tracking.measured_clearance import MeasuredClearance
+from tracking.measurement import NoPose, Observation
 from tracking.tracker import Tracker
 
 
@@ -27,7 +24,7 @@ class Trigger:
     """Asks for one picture.
 
     Attributes:
-        frame: Its number.
+        frame: Number of the moment, the same for all cameras.
         time: Since the start of the run, [s].
         asked: When, monotonic, [s].
         true_pose: Where the simulated platform is; None with a real camera.
@@ -41,35 +38,26 @@ class Trigger:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """What came of one picture; the arrays are NaN where there is no pose.
+    """What came of one picture, or of the pictures that several cameras took at one moment.
 
     Attributes:
-        frame: Its number.
-        time: Of the picture, since the start of the run, [s].
-        status: ``ok``, or why there is no pose.
-        pose: ``world_from_platform`` as measured, or None.
-        covariance: Of position and rotation vector, world axes, shape (6, 6), [m, rad].
-        tags: Numbers of the tags used.
-        reprojection: RMS of the corners, [px].
+        frame: Number of the moment.
+        found: The pose, or why there is none; its time is since the start of the run, [s].
         picture: Name of the kept picture in the run folder, or nothing.
+        seconds: How long measuring took, [s]; NaN where nothing was measured.
         clearance: Distances at the measured pose, or None.
     """
 
     frame: int
-    time: float
-    status: str
-    pose: Pose | None
-    covariance: Array
-    tags: tuple[int, ...]
-    reprojection: float
-    picture: str
-    clearance: MeasuredClearance | None
+    found: Observation
+    picture: str = ""
+    seconds: float = float("nan")
+    clearance: MeasuredClearance | None = None
 
 
 def unseen(frame: int, time: float, reason: str) -> Look:
-    """What is known of a picture that gave no pose, or was asked for and never taken."""
-    unknown = np.full((6, 6), np.nan)
-    return Look(frame, time, reason, None, unknown, (), float("nan"), "", None)
+    """What is known of a picture that was asked for and never measured."""
+    return Look(frame, NoPose(time, reason))
 
 
 class PictureSource(Protocol):
@@ -85,33 +73,31 @@ class PictureSource(Protocol):
 
 
 class Observer:
-    """Takes pictures and measures them, as a context manager."""
+    """Takes pictures with one camera and measures them, as a context manager."""
 
     def __init__(
         self,
         rig: Rig,
-        scene: Scene,
         camera: Camera,
         source: PictureSource,
         folder: RunFolder,
         keep_every: int,
+        *,
+        named: bool,
     ) -> None:
         """Prepares to look.
 
         Args:
             rig: The robot with its tags.
-            scene: Its obstacles.
             camera: The camera that the source is.
             source: Where pictures come from.
             folder: Where some of them are kept.
             keep_every: Every how many pictures one is kept.
+            named: Kept pictures bear the camera's name: there are others.
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
+        self._prefix = f"{camera.name}_" if named else ""
         self._tracker = Tracker(rig, camera)
-        self._clearance = ClearanceModel(rig, scene)
-        self._watch = NearWatch(scene.obstacle_clearance)
-        self.too_near = ""
-        """Between what clearance was below the scene's limit in the last pictures, or nothing."""
 
     def __enter__(self) -> Observer:
         return self
@@ -127,26 +113,12 @@ class Observer:
     def look(self, trigger: Trigger) -> Look:
         """Takes a picture and measures the platform in it."""
         image, delay = self._source.picture(trigger)
-        time = trigger.time + delay
         kept = ""
         if trigger.frame % self._keep_every == 0:
-            kept = self._folder.write_picture(trigger.frame, image)
-        found = self._tracker.observe(image, time)
-        if not isinstance(found, PoseMeasurement):
-            return replace(unseen(trigger.frame, time, found.reason), picture=kept)
-        clearance = clearance_of(self._clearance, found)
-        self.too_near = self._watch.take(clearance)
-        return Look(
-            trigger.frame,
-            time,
-            OK,
-            found.pose,
-            found.covariance,
-            found.tags,
-            found.reprojection,
-            kept,
-            clearance,
-        )
+            kept = self._folder.write_picture(trigger.frame, image, self._prefix)
+        began = time.monotonic()
+        found = self._tracker.observe(image, trigger.time + delay)
+        return Look(trigger.frame, found, kept, time.monotonic() - began)
 
 
 MakeObserver = Callable[[], Observer]

@@ -55,8 +55,6 @@ class Recorder:
         self._began: float | None = None
         self.last = 0.0
         """When the last cycle began, on the loop's clock, [s]."""
-        self.asked: list[float] = []
-        """When pictures were asked for, since the start of the run, [s]."""
 
     def wants_pose(self, cycle: int) -> bool:
         """Whether a picture will be asked for in this cycle."""
@@ -82,8 +80,7 @@ class Recorder:
             return
         self._progress(record.index)
         if self._trigger is not None:
-            self.asked.append(record.at - self._began)
-            self._trigger(self.asked[-1], record.at, true_pose)
+            self._trigger(record.at - self._began, record.at, true_pose)
 
     def take_event(self, event: LoopEvent) -> None:
         """Something happened; it is on disk when this returns.

@@ -16,12 +16,14 @@ from executor.fused_table import fused_table
 from executor.mcap_log import write_mcap
 from executor.measured import ClearanceRow, clearance_table, encoder_rows
 from executor.observer import Look
-from executor.pose_table import PoseTable, no_poses
+from executor.pose_table import OK, PoseTable, no_poses
 from executor.prepare import PreparedRun
 from executor.report import build_report
+from executor.run_cameras import Seen
 from executor.run_folder import RunFolder
 from executor.summary import RunContext, summarize
 from executor.versions import versions
+from tracking.measurement import NoPose, PoseMeasurement
 
 #: Clearances from drive positions are computed this often along a run, [Hz].
 CLEARANCE_RATE = 10.0
@@ -31,7 +33,7 @@ def conclude(
     prepared: PreparedRun,
     outcome: Outcome,
     folder: RunFolder,
-    looks: Sequence[Look],
+    seen: Seen,
     *,
     interface: str,
     simulated: bool,
@@ -39,14 +41,26 @@ def conclude(
 ) -> dict[str, Any]:
     """Writes everything that the run left behind, its summary and its report.
 
+    Args:
+        prepared: What was run.
+        outcome: What the motion left behind.
+        folder: The run's folder.
+        seen: What the cameras saw.
+        interface: Of the bus.
+        simulated: The drives were simulated.
+        fast: Time was simulated.
+
     Returns:
         The summary.
     """
     cycles = outcome.log.table()
-    poses = _pose_table(looks, cycles)
-    clearance = _clearance(prepared, cycles, looks)
+    poses = _pose_table(seen.together, cycles)
+    alone = {name: _pose_table(looks, cycles) for name, looks in seen.alone.items()}
+    clearance = _clearance(prepared, cycles, seen.together)
     folder.write_cycles(cycles)
     folder.write_poses(poses)
+    for name, table in alone.items():
+        folder.write_poses_of(name, table)
     folder.write_clearance(clearance)
     together = fused_table(cycles, poses)
     folder.write_fused(together)
@@ -62,10 +76,11 @@ def conclude(
         events=tuple(folder.events()),
         versions=versions(),
         cause=outcome.cause,
+        cameras=seen.cameras,
     )
     summary = summarize(context, cycles, poses, clearance)
     folder.write_summary(summary)
-    write_mcap(folder, context, cycles, poses, clearance, together)
+    write_mcap(folder, context, cycles, poses, clearance, together, alone)
     build_report(folder)
     return summary
 
@@ -78,18 +93,25 @@ def _duration(cycles: CycleTable, cycle: float) -> float:
 def _pose_table(looks: Sequence[Look], cycles: CycleTable) -> PoseTable:
     if not looks:
         return no_poses()
-    nowhere = Pose(np.full(3, np.nan), np.full((3, 3), np.nan))
-    poses = [look.pose or nowhere for look in looks]
-    unknown = np.full(4, np.nan)
+    unknown = PoseMeasurement(
+        float("nan"),
+        Pose(np.full(3, np.nan), np.full((3, 3), np.nan)),
+        np.full((6, 6), np.nan),
+        (),
+        float("nan"),
+        "",
+    )
+    found = [k.found if isinstance(k.found, PoseMeasurement) else unknown for k in looks]
+    nothing = np.full(4, np.nan)
     return PoseTable(
         frame=np.array([look.frame for look in looks], dtype=np.int64),
-        time=np.array([look.time for look in looks]),
-        status=tuple(look.status for look in looks),
-        position=np.array([pose.position for pose in poses]),
-        rotation=np.array([look.pose.quaternion if look.pose else unknown for look in looks]),
-        covariance=np.array([look.covariance for look in looks]),
-        tags=tuple(" ".join(map(str, look.tags)) for look in looks),
-        reprojection=np.array([look.reprojection for look in looks]),
+        time=np.array([look.found.time for look in looks]),
+        status=tuple(k.found.reason if isinstance(k.found, NoPose) else OK for k in looks),
+        position=np.array([one.pose.position for one in found]),
+        rotation=np.array([nothing if one is unknown else one.pose.quaternion for one in found]),
+        covariance=np.array([one.covariance for one in found]),
+        tags=tuple(" ".join(map(str, one.tags)) for one in found),
+        reprojection=np.array([one.reprojection for one in found]),
         planned=np.array([pose.position for pose in _planned(looks, cycles)]),
         picture=tuple(look.picture for look in looks),
     )
@@ -97,7 +119,7 @@ def _pose_table(looks: Sequence[Look], cycles: CycleTable) -> PoseTable:
 
 def _planned(looks: Sequence[Look], cycles: CycleTable) -> list[Pose]:
     """Where the platform should have been when each picture was taken."""
-    times = np.array([look.time for look in looks])
+    times = np.array([look.found.time for look in looks])
     axes = [np.interp(times, cycles.time, cycles.planned[:, i]) for i in range(3)]
     nearest = np.clip(np.searchsorted(cycles.time, times), 0, len(cycles) - 1)
     return _poses(np.column_stack(axes), cycles.planned_rotation[nearest])
@@ -111,7 +133,7 @@ def _poses(positions: Array, quaternions: Array) -> list[Pose]:
 def _clearance(prepared: PreparedRun, cycles: CycleTable, looks: Sequence[Look]) -> ClearanceTable:
     model = ClearanceModel(prepared.rig, prepared.scene)
     rows = [
-        ClearanceRow.by_tags(look.time, look.clearance, model.obstacles(planned))
+        ClearanceRow.by_tags(look.found.time, look.clearance, model.obstacles(planned))
         for look, planned in zip(looks, _planned(looks, cycles), strict=True)
         if look.clearance is not None
     ]

@@ -26,7 +26,7 @@ from executor.pose_table import PoseTable
 
 PLAN, RIG, SUMMARY, EVENTS = "plan.json", "rig.json", "summary.json", "events.jsonl"
 CYCLES, POSES, CLEARANCE = "cycles.csv", "poses.csv", "clearance.csv"
-FUSED = "fused.csv"
+FUSED, POSES_OF = "fused.csv", "poses-{}.csv"
 MCAP, REPORT, PICTURES = "run.mcap", "report.html", "pictures"
 NEEDED = (PLAN, RIG, CYCLES, POSES, CLEARANCE, SUMMARY, EVENTS)
 JPEG_QUALITY = 88
@@ -200,6 +200,19 @@ class RunFolder:
         """Reads ``poses.csv``."""
         return PoseTable.read_csv(self.path / POSES)
 
+    def write_poses_of(self, camera: str, table: PoseTable) -> None:
+        """Writes ``poses-<camera>.csv``: what one of several cameras measured alone."""
+        table.write_csv(self.path / POSES_OF.format(camera))
+
+    def poses_by_camera(self) -> dict[str, PoseTable]:
+        """Reads what each of several cameras measured alone; nothing of a run with one."""
+        begin, end = POSES_OF.split("{}")
+        names = [path.name for path in self.path.glob(POSES_OF.format("*"))]
+        return {
+            name.removeprefix(begin).removesuffix(end): PoseTable.read_csv(self.path / name)
+            for name in sorted(names)
+        }
+
     def write_clearance(self, table: ClearanceTable) -> None:
         """Writes ``clearance.csv``."""
         table.write_csv(self.path / CLEARANCE)
@@ -262,18 +275,23 @@ class RunFolder:
                 raise BadInput("not an event", where=f"{self.path / EVENTS}:{number}") from None
         return events
 
-    def write_picture(self, frame: int, image: NDArray[np.uint8]) -> str:
+    def write_picture(self, frame: int, image: NDArray[np.uint8], prefix: str = "") -> str:
         """Keeps a camera picture, grey or BGR, as JPEG.
 
+        Args:
+            frame: Number of the moment at which it was taken.
+            image: Shape (height, width) or (height, width, 3).
+            prefix: Which of several cameras took it.
+
         Returns:
-            Its name inside the folder, ``pictures/frame_<frame>.jpg``.
+            Its name inside the folder, ``pictures/<prefix>frame_<frame>.jpg``.
 
         Raises:
             Fault: The disk is full or gone.
         """
         import cv2
 
-        name = f"{PICTURES}/frame_{frame:06d}.jpg"
+        name = f"{PICTURES}/{prefix}frame_{frame:06d}.jpg"
         done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
             raise ValueError(f"no picture: shape {image.shape}, type {image.dtype}")

@@ -4,7 +4,9 @@ Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, 
 ``elapsed_s``, ``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``feed_percent`` (of
 the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
 ``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``rejected_frames``,
-``error_frames``, ``drives`` [{``node``, ``state``,
+``error_frames``, ``cameras`` [{``name``, ``source``, ``pictures``, ``poses``, ``dropped``,
+``pictures_per_second`` (of the run's time), ``measuring_ms``, ``tags`` (seen last), ``trouble``
+(what keeps it from measuring, or nothing)}], ``drives`` [{``node``, ``state``,
 ``position_counts``, ``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``,
 ``text``}], the newest last. A number that is not known is null; before the first cycle ``state``
 is ``preparing`` and ``drives`` is empty; at the end ``cause`` says why it did not end well. Winches
@@ -138,6 +140,7 @@ class MotionStatus(ABC):
         """A motion that is being prepared."""
         self._rig, self._board = rig, board
         self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
+        self._cameras: list[dict[str, Any]] = []
         self.folder: Path | None = None
         """Where it is on record, if anywhere."""
 
@@ -151,6 +154,7 @@ class MotionStatus(ABC):
             **whose(self._rig, self.folder),
             **self._cycles.as_dict(),
             **self._place(),
+            "cameras": self._cameras,
             **wished(self._board),
             "events": self._told(),
         }
@@ -178,6 +182,10 @@ class RunStatus(MotionStatus):
     def take_cycle(self, record: CycleRecord) -> None:
         """A cycle is over."""
         self._cycles.take(record)
+
+    def take_cameras(self, cameras: list[dict[str, Any]]) -> None:
+        """How each camera does now."""
+        self._cameras = cameras
 
     def take_event(self, event: RunEvent) -> None:
         """Something happened."""

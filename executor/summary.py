@@ -4,11 +4,12 @@ Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, 
 ``reasons`` (the sentences that decided), ``checks`` [{``name``, ``passed``, ``text``}], ``rig``,
 ``scene``, ``plan_hash``, ``rig_hash``, ``interface``, ``simulated``, ``fast``, ``started`` (ISO
 8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``rejected_frames``,
-``error_frames``, ``path_length_mm``,
-``travelled_mm``, ``stops`` [{``name``, ``kind``, ``reached_s``, ``left_s``}],
-``following_error_mm`` {``max``, ``rms``, ``limit``}, ``encoder_error_mm``
-{``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``, ``frames_without_pose``} or null
-without a camera, ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
+``error_frames``, ``path_length_mm``, ``travelled_mm``, ``stops`` [{``name``, ``kind``,
+``reached_s``, ``left_s``}], ``following_error_mm`` {``max``, ``rms``, ``limit``},
+``encoder_error_mm`` {``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``,
+``frames_without_pose``} or null without a camera, ``cameras`` [{``name``, ``source``, ``pictures``,
+``poses``, ``dropped``, ``measuring_ms`` (median), ``failed`` (why it gave no pictures any more, or
+nothing)}], ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
 ``measured_uncertainty``, ``measured_at_most``, ``pair``, ``at_s``, ``source``} or null without
 obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``,
 ``upper_limit``}, ``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time,
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from cdpr.plan import Plan
 from cdpr.poses import Array
 from cdpr.rig import Rig
+from executor.camera_eye import CameraRecord
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
 from executor.pose_table import PoseTable
@@ -51,6 +53,7 @@ class RunContext:
         events: What happened, in order.
         versions: Of the programs that took part, by name.
         cause: Why the run did not finish; when left out, what the last event says.
+        cameras: What became of each camera's pictures.
     """
 
     plan: Plan
@@ -64,6 +67,7 @@ class RunContext:
     events: tuple[RunEvent, ...]
     versions: dict[str, str] = field(default_factory=dict)
     cause: str = ""
+    cameras: tuple[CameraRecord, ...] = ()
 
 
 def summarize(
@@ -81,6 +85,7 @@ def summarize(
         cycles,
         poses,
         clearance,
+        context.cameras,
     )
     return {
         "schema_version": 1,
@@ -115,6 +120,7 @@ def summarize(
         },
         "encoder_error_mm": _size(cycles.encoder_error * 1e3),
         "tag_error_mm": _tag_error(poses),
+        "cameras": [asdict(camera) for camera in context.cameras],
         "clearance_mm": _clearance(clearance, context.plan.scene.obstacle_clearance),
         "tension_n": _tension(cycles, context.rig),
         "lateness_ms": None if context.fast else _lateness(cycles.lateness * 1e3),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cdpr.rig import Rig
 from cdpr.scene import Scene
+from executor.camera_eye import CameraRecord
 from executor.clearance_table import ClearanceTable
 from executor.cycle_table import CycleTable
 from executor.pose_table import PoseTable
@@ -69,6 +71,7 @@ def judge(
     cycles: CycleTable,
     poses: PoseTable,
     clearance: ClearanceTable,
+    cameras: Sequence[CameraRecord] = (),
 ) -> Verdict:
     """The verdict over a run.
 
@@ -79,15 +82,16 @@ def judge(
         rig: The rig that was run.
         scene: Its scene.
         cycles: What the drives did.
-        poses: What the camera saw.
+        poses: What the cameras saw together.
         clearance: How near it came.
+        cameras: What became of each camera's pictures.
     """
     measured = [
         following(cycles, rig.motion.following_error),
         replies(cycles, simulated),
         *tensions(cycles, rig),
         *distances(clearance, scene.obstacle_clearance),
-        *camera(poses),
+        *camera(poses, cameras),
     ]
     failures = [check for check in measured if not check.passed]
     at = f"after {_time(cycles):.1f} s and {_travelled(cycles):.0f} mm"
@@ -221,8 +225,11 @@ def _against_plan(rows: ClearanceTable) -> Check:
     return Check("clearance_plan", passed, text)
 
 
-def camera(poses: PoseTable) -> list[Check]:
-    """The camera saw the platform in at least one picture; nothing for a run without one."""
+def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
+    """A camera saw the platform, and not all failed; nothing for a run without a camera."""
+    failed = [one for one in cameras if one.failed]
+    if failed and len(failed) == len(cameras):
+        return [Check("camera", False, "; ".join(f"{one.failed}" for one in failed))]
     if not len(poses):
         return []
     seen = int(poses.ok.sum())
@@ -232,7 +239,19 @@ def camera(poses: PoseTable) -> list[Check]:
     error = poses.error[poses.ok] * 1e3
     rms = float(np.sqrt(np.mean(error**2)))
     text = (
-        f"The camera measured {seen} of {len(poses)} pictures, {rms:.2f} mm RMS from the plan"
+        f"{_who(cameras)} measured {seen} of {len(poses)} pictures, {rms:.2f} mm RMS from the plan"
         f" (largest {error.max():.2f} mm)."
     )
+    if len(cameras) > 1:
+        text += f" Alone: {', '.join(map(_of_one, cameras))}."
     return [Check("camera", True, text)]
+
+
+def _who(cameras: Sequence[CameraRecord]) -> str:
+    return f"{len(cameras)} cameras together" if len(cameras) > 1 else "The camera"
+
+
+def _of_one(record: CameraRecord) -> str:
+    """How often one of several cameras saw the platform, and why it saw it no more."""
+    failed = f" ({record.failed})" if record.failed else ""
+    return f"{record.name} {record.poses} of {record.pictures}{failed}"

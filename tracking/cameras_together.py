@@ -23,6 +23,18 @@ PLACE = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
 GATE = 27.9
 
 
+def at_once(seen: Mapping[str, Observation], within: float) -> Observation:
+    """As `together`, of pictures taken at about the same time as the first camera's.
+
+    Args:
+        seen: What each camera measured, by its name, in the order of the cameras; not empty.
+        within: Pictures taken farther apart in time than this are not taken together, [s].
+    """
+    first = next(iter(seen.values())).time
+    near = {name: one for name, one in seen.items() if abs(one.time - first) <= within}
+    return together(near)
+
+
 def together(seen: Mapping[str, Observation]) -> Observation:
     """The mean of all poses, each by the weight of its information.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from cdpr.clearance import ClearanceModel
-from tracking.cameras_together import together
+from tracking.cameras_together import at_once
 from tracking.measured_clearance import clearance_of
 from tracking.measurement import PoseMeasurement
 from tracking.pose_log import LoggedPicture
@@ -36,13 +36,7 @@ def track_together(
     running = {name: _without_end(stream) for name, stream in streams.items()}
     for group in zip(*running.values(), strict=False):
         alone = dict(zip(running, group, strict=True))
-        first = group[0].observation.time
-        seen = {
-            name: one.observation
-            for name, one in alone.items()
-            if abs(one.observation.time - first) <= within
-        }
-        found = together(seen)
+        found = at_once({name: one.observation for name, one in alone.items()}, within)
         clearance = None
         if isinstance(found, PoseMeasurement):
             count += 1

@@ -1,15 +1,15 @@
-"""Opens the camera of a run, real or synthetic, in its own process."""
+"""Opens the cameras of a run, real or synthetic, each in its own process."""
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
 from cdpr.errors import BadInput, Fault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     import numpy as np
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from cdpr.scene import Scene
     from cdpr.scene_file import SceneDocument
     from drivers.cameras import LiveCamera
-    from executor.camera_process import CameraProcess
     from executor.observer import Observer, PictureSource, Trigger
+    from executor.run_cameras import RunCameras
     from simulation.camera import SyntheticCamera
     from tracking.measurement import Observation
 
@@ -87,32 +87,92 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
     return wanted
 
 
-@contextmanager
-def open_camera(
-    rig: Rig, scene: Scene, name: str | None, folder: Path, pictures: int, simulated_time: bool
-) -> Iterator[CameraProcess | None]:
-    """Starts the camera's process; None without a camera.
+def choose_cameras(
+    rig: Rig, wanted: list[str], without: bool, in_process: bool
+) -> dict[Camera, str]:
+    """Which of the rig's cameras look at a run, and where the pictures of each come from.
 
     Args:
-        rig: The robot; its first camera is used.
-        scene: What the camera sees beside it.
-        name: From `choose_camera`.
+        rig: Its cameras.
+        wanted: One source, or for each of several cameras ``NAME=SOURCE``; ``synthetic`` alone, as
+            nothing at all, stands for all of them.
+        without: No camera is wanted.
+        in_process: The drives are simulated in this process.
+
+    Raises:
+        BadInput: The wish cannot be met; nothing is left out silently.
+    """
+    from cdpr.cli.track_sources import eyes_of
+
+    if not wanted:
+        source = choose_camera(rig, None, without, in_process)
+        return {} if source is None else dict.fromkeys(rig.cameras, source)
+    if wanted == [SYNTHETIC]:
+        choose_camera(rig, SYNTHETIC, without, in_process)
+        return dict.fromkeys(rig.cameras, SYNTHETIC)
+    if rig.cameras:
+        eyes = eyes_of(rig, wanted, None, "--camera")
+        for source in eyes.values():
+            choose_camera(rig, source, without, in_process)
+        return eyes
+    choose_camera(rig, wanted[0], without, in_process)
+    return {}
+
+
+def looked_with(eyes: Mapping[Camera, str]) -> str:
+    """The cameras of a run and their sources, in a few words."""
+    return ", ".join(f"{camera.name} ({source})" for camera, source in eyes.items())
+
+
+@contextmanager
+def open_cameras(
+    rig: Rig,
+    scene: Scene,
+    eyes: Mapping[Camera, str],
+    folder: Path,
+    pictures: int,
+    simulated_time: bool,
+) -> Iterator[RunCameras | None]:
+    """Starts a process for each camera; None without one.
+
+    Args:
+        rig: The robot.
+        scene: What the cameras see beside it.
+        eyes: From `choose_cameras`.
         folder: The run folder.
-        pictures: How many are expected; some of them are kept.
+        pictures: How many are expected of each; some of them are kept.
         simulated_time: A late picture holds the run up instead of being dropped.
     """
-    if name is None:
+    if not eyes:
         yield None
         return
+    from cdpr.clearance import ClearanceModel
+    from executor.camera_eye import CameraEye
     from executor.camera_process import CameraProcess
+    from executor.run_cameras import RunCameras
 
     keep_every = max(1, pictures // KEPT_PICTURES)
-    make = partial(make_observer, rig.document, scene.document, name, folder, keep_every)
-    process = CameraProcess(make, may_wait=simulated_time)
-    try:
-        yield process
-    finally:
-        process.close()
+    with ExitStack() as stack:
+        processes = {}
+        for camera, source in eyes.items():
+            place = (camera.name, source, folder, keep_every)
+            make = partial(make_observer, rig.document, scene.document, *place, named=len(eyes) > 1)
+            process = CameraProcess(camera.name, make, may_wait=simulated_time)
+            stack.callback(process.close)
+            processes[camera] = process
+        for process in processes.values():
+            process.require_ready()
+        yield RunCameras(
+            [CameraEye(process, eyes[camera]) for camera, process in processes.items()],
+            ClearanceModel(rig, scene),
+            scene.obstacle_clearance,
+            asked_rate(eyes),
+        )
+
+
+def asked_rate(eyes: Mapping[Camera, str]) -> float:
+    """How often all cameras are asked for a picture: as often as the slowest takes one, [Hz]."""
+    return min(camera.rate for camera in eyes)
 
 
 def look_at_rest(
@@ -155,20 +215,23 @@ def look_at_rest(
 def make_observer(
     rig_document: RigDocument,
     scene_document: SceneDocument,
-    name: str,
+    camera_name: str,
+    source: str,
     folder: Path,
     keep_every: int,
+    *,
+    named: bool,
 ) -> Observer:
-    """Builds the observer inside the camera's process."""
+    """Builds the observer inside its camera's process."""
     from cdpr.rig import rig_from_document
     from cdpr.scene import scene_from_document
     from executor.observer import Observer
     from executor.run_folder import RunFolder
 
     rig, scene = rig_from_document(rig_document), scene_from_document(scene_document)
-    camera = rig.cameras[0]
-    source = _source(rig, scene, camera, name)
-    return Observer(rig, scene, camera, source, RunFolder(folder), keep_every)
+    camera = named_camera(rig, camera_name)
+    pictures = _source(rig, scene, camera, source)
+    return Observer(rig, camera, pictures, RunFolder(folder), keep_every, named=named)
 
 
 def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rich.console import Console
 
     from cdpr.plan import Plan
     from cdpr.poses import Pose
-    from cdpr.rig import Rig
+    from cdpr.rig import Camera, Rig
     from executor.prepare import PreparedRun
 
 
@@ -33,7 +33,7 @@ def prepared_run(plan: Plan, rig: Rig, *, quiet: bool) -> PreparedRun:
 def carry_out(
     prepared: PreparedRun,
     folder: Path,
-    camera_name: str | None,
+    eyes: Mapping[Camera, str],
     *,
     fast: bool,
     start: Pose | None = None,
@@ -47,7 +47,7 @@ def carry_out(
     Args:
         prepared: The checked run.
         folder: The run folder to make.
-        camera_name: From `choose_camera`.
+        eyes: From `choose_cameras`; empty for none.
         fast: Simulated time.
         start: Where the simulated platform stands; None at the plan's start.
         yes: Do not ask.
@@ -66,9 +66,9 @@ def carry_out(
     from drivers.bus import IN_PROCESS
 
     in_process = prepared.rig.document.bus.interface == IN_PROCESS
-    near = clearance_fact(prepared, camera_name, clearance_stop)
+    near = clearance_fact(prepared, eyes, clearance_stop)
     show_and_ask(
-        partial(show_prepared, prepared, near, in_process),
+        partial(show_prepared, prepared, eyes, near, in_process),
         "Move the platform now?",
         "nothing was moved",
         asks=not (in_process or yes),
@@ -77,7 +77,7 @@ def carry_out(
     summary = run_prepared(
         prepared,
         folder,
-        camera_name,
+        eyes,
         fast=fast,
         start=start,
         without_real_time=without_real_time,

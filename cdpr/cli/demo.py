@@ -25,7 +25,7 @@ def demo(
 
       cdpr demo --environment 3
     """
-    from cdpr.cli.cameras import SYNTHETIC
+    from cdpr.cli.cameras import choose_cameras
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.output import out, show_facts
     from cdpr.cli.plan import planned, sentences_of
@@ -43,7 +43,9 @@ def demo(
     document = planned(rig, scene, OptimalSettings(seed=seed), True)
     show_facts("plan", sentences_of(document))
     prepared = prepared_run(plan_from_document(document), rig, quiet=False)
-    code = carry_out(prepared, folder, SYNTHETIC, fast=True)
+    code = carry_out(
+        prepared, folder, choose_cameras(rig, [], without=False, in_process=True), fast=True
+    )
     out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
     raise typer.Exit(code)
 

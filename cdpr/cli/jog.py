@@ -131,7 +131,7 @@ def jog(
     code = carry_out(
         prepared_run(plan_from_document(document), the_rig, quiet=as_json),
         folder,
-        None,
+        {},
         fast=fast,
         start=start,
         yes=yes,

@@ -164,14 +164,17 @@ def _number(value: float | None, form: str) -> str:
 
 def _plain(status: dict[str, Any]) -> str:
     """Everything as text without a terminal."""
+    from cdpr.cli.camera_line import camera_line
+
     drives = [
         f"  drive {d['node']:<3} {d['state']:<24} {d['position_counts']:>11}"
         f" ({d['position_counts'] - d['set_counts']:+d}) counts {d['tension_n']:8.2f} N"
         for d in status["drives"]
     ]
+    cameras = [f"  camera {camera_line(camera)}" for camera in status["cameras"]]
     events = [f"  {e['time_s']:9.3f} s  {e['code']}: {e['text']}" for e in status["events"]]
     first = f"process {status['process']}: {status['rig']} on {status['bus']}, {status['folder']}"
-    return "\n".join([first, _head(status), *drives, *events])
+    return "\n".join([first, _head(status), *drives, *cameras, *events])
 
 
 def _view(status: dict[str, Any]) -> Group:
@@ -180,6 +183,8 @@ def _view(status: dict[str, Any]) -> Group:
     from rich.progress_bar import ProgressBar
     from rich.table import Table
     from rich.text import Text
+
+    from cdpr.cli.camera_line import camera_line
 
     title = Text.assemble(
         (status["state"].upper(), _STATES.get(status["state"], "bold")),
@@ -196,9 +201,10 @@ def _view(status: dict[str, Any]) -> Group:
             f"{drive['position_counts'] - drive['set_counts']:+d}",
             f"{drive['tension_n']:.2f}",
         )
+    cameras = Text("\n".join(f"  camera {camera_line(one)}" for one in status["cameras"]))
     events = Table(box=None, show_header=False, padding=(0, 2))
     for event in status["events"]:
         events.add_row(f"{event['time_s']:.2f} s", event["code"], Text(event["text"]))
     bar = Table.grid()
     bar.add_row(ProgressBar(total=status["rows"], completed=status["row"] or 0.0, width=60))
-    return Group(title, Text(_head(status)), bar, drives, events)
+    return Group(title, Text(_head(status)), bar, drives, cameras, events)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import IO, Any, cast
+from typing import IO, Any, Protocol, cast
 
 import typer
 from rich.console import Console
@@ -67,20 +67,29 @@ def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> N
     on.print(table)
 
 
+class Advance(Protocol):
+    """Moves a bar."""
+
+    def __call__(self, value: float, note: str = "") -> None:
+        """So far it is now, with a remark beside it."""
+        ...
+
+
 @contextmanager
-def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr where somebody looks; the value given to the callback is how far it is."""
+def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Advance]:
+    """A bar on stderr where somebody looks; what is given back moves it."""
     columns = (
         TextColumn("[progress.description]{task.description}"),
         BarColumn(),
         TextColumn("{task.completed:.0f}/{task.total:.0f}" if total else "{task.completed:.0f}"),
         TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}", markup=False, style="dim"),
     )
     with Progress(
         *columns, console=err, transient=True, disable=not (shown and err.is_terminal)
     ) as bar:
-        task = bar.add_task(text, total=total)
-        yield lambda value: bar.update(task, completed=value)
+        task = bar.add_task(text, total=total, note="")
+        yield lambda value, note="": bar.update(task, completed=value, note=note)
 
 
 @contextmanager

@@ -29,9 +29,11 @@ def run(
     ],
     fast: FastOption = False,
     camera: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
-            help="'synthetic' (the default with the interface 'virtual'), or a camera's index"
+            help="a camera's index, or 'synthetic': all of the rig file's (the default with the"
+            " interface 'virtual'); for each of several cameras NAME=SOURCE, again and again",
+            metavar="SOURCE",
         ),
     ] = None,
     calibration: CalibrationOption = None,
@@ -60,9 +62,11 @@ def run(
       cdpr run plan.json --rig configs/gachon_8_6.yaml -o runs/first --fast
 
       cdpr run plan.json --rig rig.yaml -o runs/second --camera 0
+
+      cdpr run plan.json --rig rig.yaml -o runs/third --camera front=0 --camera side=1
     """
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.cameras import choose_camera
+    from cdpr.cli.cameras import choose_cameras
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.plan_for_rig import require_same_rig
@@ -73,8 +77,8 @@ def run(
 
     the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     in_process = the_rig.document.bus.interface == IN_PROCESS
-    camera_name = choose_camera(the_rig, camera, no_camera, in_process)
-    if camera_name is None:
+    eyes = choose_cameras(the_rig, camera or [], no_camera, in_process)
+    if not eyes:
         why = "without a camera no clearance is measured, and nothing stops the run for it"
         require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
     start = _simulated_start(simulated_start_mm, in_process, fast)
@@ -86,7 +90,7 @@ def run(
     code = carry_out(
         prepared_run(the_plan, the_rig, quiet=as_json),
         output,
-        camera_name,
+        eyes,
         fast=fast,
         start=start,
         yes=yes,

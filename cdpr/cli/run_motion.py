@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from cdpr.poses import Pose
-    from executor.camera_process import CameraProcess
+    from cdpr.rig import Camera
     from executor.execution import Outcome
-    from executor.observer import Look
     from executor.prepare import PreparedRun
     from executor.recorder import Recorder
+    from executor.run_cameras import Seen
     from executor.run_folder import RunFolder
     from executor.shared_board import SharedBoard
     from executor.wishes import OwnBoard
@@ -29,7 +31,7 @@ class _Job:
 
     prepared: PreparedRun
     folder: RunFolder
-    camera_name: str | None
+    eyes: Mapping[Camera, str]
     fast: bool
     start: Pose | None
     without_real_time: bool
@@ -40,7 +42,7 @@ class _Job:
 def run_prepared(
     prepared: PreparedRun,
     output: Path,
-    camera_name: str | None,
+    eyes: Mapping[Camera, str],
     *,
     fast: bool,
     start: Pose | None,
@@ -55,7 +57,7 @@ def run_prepared(
     Args:
         prepared: The checked run.
         output: The run folder to make.
-        camera_name: From `choose_camera`.
+        eyes: From `choose_cameras`; empty for none.
         fast: Simulated time.
         start: Where the simulated platform stands; None at the plan's start.
         without_real_time: Move drives on a bus even if real-time scheduling is denied.
@@ -68,7 +70,7 @@ def run_prepared(
     from executor.run_folder import RunFolder
 
     folder = RunFolder.create(output)
-    job = _Job(prepared, folder, camera_name, fast, start, without_real_time, clearance_stop, quiet)
+    job = _Job(prepared, folder, eyes, fast, start, without_real_time, clearance_stop, quiet)
     moved = False
 
     def before_motion() -> None:
@@ -78,7 +80,7 @@ def run_prepared(
     try:
         folder.write_plan(prepared.plan.plan.document)
         folder.write_rig(prepared.rig.document)
-        outcome, looks = _move_and_look(job, before_motion)
+        outcome, seen = _move_and_look(job, before_motion)
     finally:
         if not moved:
             folder.discard()
@@ -88,24 +90,24 @@ def run_prepared(
             prepared,
             outcome,
             folder,
-            looks,
+            seen,
             interface=interface,
             simulated=interface == IN_PROCESS,
             fast=fast,
         )
 
 
-def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcome, list[Look]]:
+def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcome, Seen]:
     """The motion and its pictures; `cdpr stop` and its like reach the run all the time."""
     from contextlib import ExitStack
 
-    from rich.markup import escape
-
-    from cdpr.cli.cameras import open_camera
+    from cdpr.cli.cameras import asked_rate, open_cameras
     from cdpr.cli.output import err, progress_bar
+    from cdpr.cli.run_watch import RunWatch
     from executor.command_server import serving
     from executor.recorder import Recorder
     from executor.records import LoopEvent
+    from executor.run_cameras import Seen
     from executor.running import announced, stop_requests
     from executor.shared_board import SharedBoard
     from executor.status import RunStatus
@@ -113,47 +115,41 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
 
     prepared = job.prepared
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
-    rate = prepared.rig.cameras[0].rate if job.camera_name else PROGRESS_RATE
+    rate = asked_rate(job.eyes) if job.eyes else PROGRESS_RATE
     pictures = int(prepared.duration * rate)
     board: OwnBoard | SharedBoard = OwnBoard() if job.fast else SharedBoard()
     status = RunStatus(prepared, job.folder.path, board, simulated_time=job.fast)
-    camera_at = (prepared.rig, prepared.scene, job.camera_name, job.folder.path)
+    cameras_at = (prepared.rig, prepared.scene, job.eyes, job.folder.path)
     with (
         ExitStack() as stack,
         stop_requests(board),
         announced() as listeners,
         serving(listeners, board, status),
-        open_camera(*camera_at, pictures, job.fast) as camera,
+        open_cameras(*cameras_at, pictures, job.fast) as cameras,
     ):
         if isinstance(board, SharedBoard):
             stack.callback(board.close)
         with progress_bar("moving", rows, not job.quiet) as advance:
-            told = ""
 
-            def picture(time: float, asked: float, true_pose: Pose | None) -> None:
-                nonlocal told
-                assert camera is not None
-                camera.trigger(time, asked, true_pose)
-                if camera.near and job.clearance_stop and not board.read().stop:
-                    board.ask_stop(too_near=camera.near)
-                    err.print(f"[red]too near[/] {escape(camera.near)}", soft_wrap=True)
-                if camera.trouble and not told:
-                    recorder.take_event(LoopEvent(0, asked, "camera_sees_nothing", camera.trouble))
-                    err.print(f"[yellow]remark[/] {camera.trouble}", soft_wrap=True)
-                told = camera.trouble
+            def tell(code: str, text: str, at: float) -> None:
+                recorder.take_event(LoopEvent(0, at, code, text))
 
+            stops = job.clearance_stop
+            watch = (
+                RunWatch(cameras, status, board, tell, clearance_stop=stops) if cameras else None
+            )
             recorder = Recorder(
                 prepared,
                 job.folder,
                 status,
-                trigger=picture if camera else None,
+                trigger=watch.trigger if watch else None,
                 every=max(1, round(1.0 / (rate * cycle))),
-                progress=advance,
+                progress=lambda row: advance(row, watch.rates if watch else ""),
                 announce=lambda text: None if job.quiet else err.print(text, markup=False),
             )
             outcome = _move(job, board, recorder, before_motion)
             status.take_end(outcome.state, outcome.cause)
-        return outcome, _looks(camera, recorder, job) if camera else []
+        return outcome, watch.finish(recorder.last, job.quiet) if watch else Seen()
 
 
 def _move(
@@ -223,24 +219,3 @@ def _move_in_real_time(
         need_real_time=not (simulated or job.without_real_time),
         before_motion=armed,
     )
-
-
-def _looks(camera: CameraProcess, recorder: Recorder, job: _Job) -> list[Look]:
-    """What the camera saw; when it failed, that it did, for every picture."""
-    from cdpr.cli.output import progress_bar
-    from cdpr.errors import CdprError
-    from executor.observer import unseen
-    from executor.run_folder import RunEvent
-
-    asked = recorder.asked
-    last = asked[-1] if asked else 0.0
-    with progress_bar("measuring pictures", camera.triggered, not job.quiet) as advance:
-        try:
-            looks = camera.finish(advance)
-        except CdprError as error:  # the motion is over; without pictures the run is still a record
-            job.folder.append_event(RunEvent(last, "camera", error.what))
-            return [unseen(k, time, error.what) for k, time in enumerate(asked)]
-    if camera.dropped:
-        told = f"{camera.dropped} of {len(asked)} pictures left out: the one before was not done"
-        job.folder.append_event(RunEvent(last, "pictures_dropped", told))
-    return looks

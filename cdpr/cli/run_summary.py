@@ -11,36 +11,45 @@ from cdpr.cli.output import out, show_facts, show_json
 from cdpr.cli.stop_facts import stop_facts
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rich.console import Console
 
-    from cdpr.rig import Rig
+    from cdpr.rig import Camera, Rig
     from executor.prepare import PreparedRun
 
 COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
 
 
-def clearance_fact(prepared: PreparedRun, camera: str | None, wanted: bool) -> str:
+def clearance_fact(prepared: PreparedRun, eyes: Mapping[Camera, str], wanted: bool) -> str:
     """What stops the run when it comes too near to an obstacle, or why nothing does.
 
     Args:
         prepared: The run.
-        camera: From `choose_camera`.
+        eyes: From `choose_cameras`.
         wanted: Whether the operator wants it stopped.
     """
     if not wanted:
         return "off (--no-clearance-stop)"
-    if camera is None:
+    if not eyes:
         return "off (no camera)"
     if not prepared.scene.obstacles:
         return "off (no obstacles in the scene)"
-    return f"camera {camera}, below {prepared.scene.obstacle_clearance * 1000:g} mm"
+    return f"below {prepared.scene.obstacle_clearance * 1000:g} mm, as the cameras see it"
 
 
-def show_prepared(prepared: PreparedRun, clearance_stop: str, simulated: bool, on: Console) -> None:
+def show_prepared(
+    prepared: PreparedRun,
+    eyes: Mapping[Camera, str],
+    clearance_stop: str,
+    simulated: bool,
+    on: Console,
+) -> None:
     """What is going to happen.
 
     Args:
         prepared: The run.
+        eyes: From `choose_cameras`.
         clearance_stop: From `clearance_fact`.
         simulated: On simulated drives.
         on: Where it is shown.
@@ -62,6 +71,7 @@ def show_prepared(prepared: PreparedRun, clearance_stop: str, simulated: bool, o
             ),
             ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),
             *_reference(rig),
+            ("cameras", _cameras(rig, eyes)),
             ("clearance stop", clearance_stop),
             ("bus", f"{bus.interface} {bus.channel}{', simulated drives' if simulated else ''}"),
         ],
@@ -84,6 +94,17 @@ def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
     for page in pages_of(event["code"] for event in summary["events"]):
         out.print(f"  more about it: {page}", markup=False, soft_wrap=True)
     out.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def _cameras(rig: Rig, eyes: Mapping[Camera, str]) -> str:
+    """Which cameras look, and which of the rig file's do not."""
+    from cdpr.cli.cameras import looked_with
+
+    used = {camera.name for camera in eyes}
+    unused = [camera.name for camera in rig.cameras if camera.name not in used]
+    parts = [looked_with(eyes)] if eyes else []
+    parts += [f"not used: {', '.join(unused)}"] if unused else []
+    return "; ".join(parts) or "none"
 
 
 def _reference(rig: Rig) -> list[tuple[str, str]]:

@@ -145,7 +145,7 @@ def track(
         write_pose_log(path, each[name], with_clearance=model is not None)
     write_pose_log(output, logged, with_clearance=model is not None)
     if mcap is not None:
-        write_track_mcap(mcap, logged, began)
+        write_track_mcap(mcap, logged, each if several else {}, began)
     facts = _facts(logged, output, count, (time.time_ns() - began) * 1e-9)
     if as_json:
         show_json({**facts, "unused": _by_file(unused)})

@@ -13,13 +13,16 @@ if TYPE_CHECKING:
     from tracking.track import Picture
 
 
-def eyes_of(rig: Rig, sources: list[str], wanted: str | None) -> dict[Camera, str]:
+def eyes_of(
+    rig: Rig, sources: list[str], wanted: str | None, where: str = "track"
+) -> dict[Camera, str]:
     """Which camera's pictures come from where.
 
     Args:
         rig: Its cameras.
         sources: One source, or for each of several cameras ``NAME=SOURCE``.
         wanted: The camera of a single source; None for the rig's first.
+        where: What names the sources, for messages.
 
     Raises:
         BadInput: A camera is not the rig's, is named twice, or not at all.
@@ -34,7 +37,7 @@ def eyes_of(rig: Rig, sources: list[str], wanted: str | None) -> dict[Camera, st
     if wanted is not None:
         raise BadInput(
             "--camera is for a single source without a name",
-            where="track",
+            where=where,
             next_step="leave it out, or name the camera in the source: NAME=SOURCE",
         )
     eyes: dict[Camera, str] = {}
@@ -42,13 +45,13 @@ def eyes_of(rig: Rig, sources: list[str], wanted: str | None) -> dict[Camera, st
         if not sign or not place:
             raise BadInput(
                 f"the source {name!r} does not say which camera it is of",
-                where="track",
+                where=where,
                 next_step=f"write NAME={name}, NAME one of: {', '.join(names)}",
             )
         camera = named_camera(rig, name)
         if camera in eyes:
             raise BadInput(
-                f"camera {name!r} has two sources", where="track", next_step="name each camera once"
+                f"camera {name!r} has two sources", where=where, next_step="name each camera once"
             )
         eyes[camera] = place
     return eyes

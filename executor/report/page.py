@@ -15,7 +15,7 @@ from executor.report.position_figure import position_figure
 from executor.report.run_data import RunData
 from executor.report.scene_picture import AZIMUTH, ELEVATION, scene_picture
 from executor.report.scene_view import SceneView, scene_view, viewer_data
-from executor.report.tables import event_table, facts, stop_table
+from executor.report.tables import camera_table, event_table, facts, stop_table
 from executor.report.tiles import chips, key_figures, verdict_banner
 
 #: Layer, its name on the page, the colour's role, whether it is shown at first.
@@ -105,7 +105,9 @@ def _clearance(run: RunData) -> str:
 
 def _position(run: RunData) -> str:
     text = "Drives: the pose that fits the drives' actual positions. Camera: the pose of the tags."
-    return paragraph(text) + chart(position_figure(run))
+    if run.alone:
+        text += " Together: all cameras, each by its weight; the others are each camera's own pose."
+    return paragraph(text) + chart(position_figure(run)) + camera_table(run)
 
 
 def _cables(run: RunData) -> str:

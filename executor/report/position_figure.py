@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 from executor.report.figure_style import (
@@ -18,6 +19,9 @@ from executor.report.stop_marks import mark_stops
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+#: Lines of single cameras, by which they are told apart.
+_DASHES = ((4, 1.5), (1, 1), (6, 1.5, 1, 1.5))
 
 
 def position_figure(run: RunData) -> str:
@@ -53,9 +57,21 @@ def _coordinate(axes: Axes, run: RunData, i: int) -> None:
 
 def _error(axes: Axes, run: RunData) -> None:
     cycles, poses = run.cycles, run.poses
+    for (name, alone), dashes in zip(run.alone.items(), cycle(_DASHES), strict=False):
+        if alone.ok.any():
+            time, error = with_gaps(alone.time[alone.ok], alone.error[alone.ok] * 1e3)
+            axes.plot(
+                time,
+                error,
+                color=STAND_IN["tag"],
+                linestyle=(0, dashes),
+                linewidth=0.8,
+                label=f"{name} alone",
+            )
     if poses.ok.any():
+        label = "cameras together" if run.alone else "camera"
         time, error = with_gaps(poses.time[poses.ok], poses.error[poses.ok] * 1e3)
-        axes.plot(time, error, color=STAND_IN["tag"], linewidth=1.0, label="camera")
+        axes.plot(time, error, color=STAND_IN["tag"], linewidth=1.0, label=label)
     time, error = thinned(cycles.time, cycles.encoder_error * 1e3)
     axes.plot(time, error, color=STAND_IN["encoder"], linewidth=1.2, label="drives")
     axes.set_title("Distance from the planned position")

@@ -15,13 +15,14 @@ from executor.run_folder import RunEvent, RunFolder
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunData:
-    """A run as it lies on disk."""
+    """A run as it lies on disk; ``alone`` is what each of several cameras measured, by its name."""
 
     folder: RunFolder
     plan: Plan
     rig: Rig
     cycles: CycleTable
     poses: PoseTable
+    alone: dict[str, PoseTable]
     clearance: ClearanceTable
     summary: dict[str, Any]
     events: tuple[RunEvent, ...]
@@ -44,6 +45,7 @@ def read_run(folder: RunFolder) -> RunData:
         rig=folder.rig(),
         cycles=folder.cycles(),
         poses=folder.poses(),
+        alone=folder.poses_by_camera(),
         clearance=folder.clearance(),
         summary=folder.summary(),
         events=tuple(folder.events()),

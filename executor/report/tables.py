@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from cdpr.legs import legs_of
 from cdpr.plan_file import OptimalPlannerDocument, PlannerDocument
 from executor.fault_pages import page_of
+from executor.pose_table import PoseTable
 from executor.report.markup import known, list_table, table
 from executor.report.run_data import RunData
 
@@ -40,6 +43,31 @@ def stop_table(run: RunData) -> str:
     ]
     head = ("Stop", "Kind", "Position", "Payload", "Reached", "Left")
     return list_table(head, rows) if rows else ""
+
+
+def camera_table(run: RunData) -> str:
+    """How each camera did; nothing of a run without one."""
+    rows = [
+        (
+            one["name"],
+            one["source"],
+            f"{one['poses']} of {one['pictures']}",
+            str(one["dropped"]),
+            known(one["measuring_ms"], 1, "ms"),
+            _alone(run.alone.get(one["name"])),
+            one["failed"],
+        )
+        for one in run.summary["cameras"]
+    ]
+    head = ("Camera", "Source", "Poses", "Left out", "Time a picture", "Alone to plan", "Failed")
+    return list_table(head, rows) if rows else ""
+
+
+def _alone(poses: PoseTable | None) -> str:
+    """How far one of several cameras saw the platform from the plan."""
+    if poses is None or not poses.ok.any():
+        return "–"
+    return f"{float(np.sqrt(np.mean(poses.error[poses.ok] ** 2))) * 1e3:.2f} mm RMS"
 
 
 def event_table(run: RunData) -> str:

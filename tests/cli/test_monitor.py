@@ -51,6 +51,19 @@ def status(**changes: Any) -> dict[str, Any]:
                 "tension_n": 20.5,
             }
         ],
+        "cameras": [
+            {
+                "name": "side",
+                "source": "rtsp://x/[y]",
+                "pictures": 12,
+                "poses": 3,
+                "dropped": 4,
+                "pictures_per_second": 9.8,
+                "measuring_ms": 5.31,
+                "tags": [301, 305],
+                "trouble": "gave no answer for 2 s",
+            }
+        ],
         "events": [{"time_s": 0.05, "code": "broken", "text": "what [drives] told"}],
         **changes,
     }
@@ -70,6 +83,8 @@ def test_everything_of_a_run_is_shown_as_it_is(shown: Any) -> None:
         *("holding", "gachon_8_6", "77", "runs/[first]", "10.0 of 58.3 mm", "0 % of 50 %"),
         *("late 0.06 ms, at most 0.20 ms", "following error – mm", "3 lost replies"),
         *("12", "operation enabled", "-4711", "-3", "20.50", "broken", "what [drives] told"),
+        "camera side (rtsp://x/[y]), 9.8 pictures/s, 5.3 ms, 2 tags, 3 of 12 with a pose, 4",
+        "4 dropped, gave no answer for 2 s",
     ):
         assert part.lower() in text.lower(), part
 

@@ -77,7 +77,7 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
         folder.append_event(event)
     folder.write_summary(run.summary)
     write_mcap(
-        folder, run.context, run.cycles, poses, run.clearance, fused_table(run.cycles, poses)
+        folder, run.context, run.cycles, poses, run.clearance, fused_table(run.cycles, poses), {}
     )
     return folder
 

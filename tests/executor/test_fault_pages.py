@@ -15,7 +15,15 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "faults"
 HEADINGS = ["## What it means", "## Likely cause", "## State of the machine", "## Next step"]
 #: Which argument of a call is the code of an event.
-PLACES = {"Finding": 1, "LoopEvent": 2, "RunEvent": 1, "_fault": 0, "_tell": 0, "_tell_cause": 0}
+PLACES = {
+    "CameraNews": 0,
+    "Finding": 1,
+    "LoopEvent": 2,
+    "RunEvent": 1,
+    "_fault": 0,
+    "_tell": 0,
+    "_tell_cause": 0,
+}
 
 
 def codes_in_the_source() -> Iterator[str]:

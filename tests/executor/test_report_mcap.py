@@ -157,5 +157,6 @@ def test_a_full_disk_leaves_no_broken_log(
             run.poses,
             run.clearance,
             fused_table(run.cycles, run.poses),
+            {},
         )
     assert not folder.mcap.exists()

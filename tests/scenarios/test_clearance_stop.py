@@ -19,6 +19,7 @@ from cdpr.rig import load_rig
 from cdpr.scene import scene_from_document
 from cdpr.scene_file import SceneDocument
 from executor.machine import State
+from executor.near_watch import NearWatch
 from executor.observer import Observer, Trigger
 from executor.prepare import PreparedRun
 from executor.run_folder import RunFolder
@@ -26,6 +27,8 @@ from simulation.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, straight_plan
 from tests.cli.program import call
 from tests.scenarios.stage import at, staged
+from tracking.measured_clearance import clearance_of
+from tracking.measurement import PoseMeasurement
 
 #: The platform truly stands so far towards the block, [m].
 OFF = np.array([-0.005, 0.0, 0.0])
@@ -87,7 +90,8 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     run = tmp_path / "run"
     answer = call("run", narrow_plan, "--rig", rig_file, "-o", run, "--fast")
     assert answer.code == 1, answer
-    assert "camera synthetic, below 10 mm" in answer.out
+    assert "below 10 mm, as the cameras see it" in answer.out
+    assert "front (synthetic)" in answer.out
     assert "too near" in answer.said
     assert "the scene asks for 10 mm" in answer.said
     summary: dict[str, Any] = RunFolder.open(run).summary()
@@ -159,9 +163,11 @@ def test_one_picture_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path
     near, far = Pose.level([-0.008, 0.02, 0.48]), Pose.level([0.05, 0.02, 0.48])
     assert min(n.distance for n in ClearanceModel(rig, scene).obstacles(near)) < 0.005
     folder = RunFolder.create(tmp_path / "run")
-    with Observer(rig, scene, rig.cameras[0], Rendered(eye), folder, 1000) as observer:
+    watch, model = NearWatch(scene.obstacle_clearance), ClearanceModel(rig, scene)
+    with Observer(rig, rig.cameras[0], Rendered(eye), folder, 1000, named=False) as observer:
         told = []
         for frame, pose in enumerate([near, far, near, near, far]):
-            observer.look(Trigger(frame, frame * 0.1, 0.0, pose))
-            told.append(bool(observer.too_near))
+            found = observer.look(Trigger(frame, frame * 0.1, 0.0, pose)).found
+            assert isinstance(found, PoseMeasurement)
+            told.append(bool(watch.take(clearance_of(model, found))))
     assert told == [False, False, False, True, False]

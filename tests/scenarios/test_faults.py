@@ -19,6 +19,7 @@ from executor.clock import SimulatedClock
 from executor.machine import State
 from executor.prepare import PreparedRun
 from executor.run import conclude
+from executor.run_cameras import Seen
 from executor.run_folder import NEEDED, RunEvent, RunFolder
 from executor.setpoints import SetpointTable
 from tests.cli.plans import RIG
@@ -156,7 +157,13 @@ def concluded(stage: Stage, outcome: Any) -> dict[str, Any]:
     stage.folder.write_plan(stage.prepared.plan.plan.document)
     stage.folder.write_rig(stage.prepared.rig.document)
     return conclude(
-        stage.prepared, outcome, stage.folder, [], interface="virtual", simulated=True, fast=True
+        stage.prepared,
+        outcome,
+        stage.folder,
+        Seen(),
+        interface="virtual",
+        simulated=True,
+        fast=True,
     )
 
 
@@ -313,7 +320,7 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
     from executor.camera_process import CameraProcess
 
     cycles, real = 0, SimulatedClock.next_cycle
-    finish = CameraProcess.finish
+    last_answer = CameraProcess.last_answer
 
     def next_cycle(clock: SimulatedClock) -> float:
         nonlocal cycles
@@ -322,22 +329,22 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
             die("killed")()
         return real(clock)
 
-    def finish_or_die(process: CameraProcess, progress: Callable[[float], None]) -> Any:
+    def die_or_answer(process: CameraProcess) -> Any:
         if cycles < cycle:
             die("killed")()
-        return finish(process, progress)
+        return last_answer(process)
 
     monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
-    monkeypatch.setattr(CameraProcess, "finish", finish_or_die)
+    monkeypatch.setattr(CameraProcess, "last_answer", die_or_answer)
     run = tmp_path / "run"
     answer = call("run", short_plan, "--rig", RIG, "-o", run, "--fast")
     assert answer.code == 1, answer
     assert "FAILED" in answer.out
-    assert "the camera's process ended" in answer.said
+    assert "the process of camera front ended" in answer.said
     folder = RunFolder.open(run)
     summary = folder.summary()
     assert summary["verdict"] == "FAILED"
-    assert any("the camera's process ended" in reason for reason in summary["reasons"])
+    assert any("camera front ended" in reason for reason in summary["reasons"])
     assert summary["final_state"] == ("latched" if cycle == CRUISING else "finished")
     assert folder.report.is_file()
 

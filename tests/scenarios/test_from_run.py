@@ -20,6 +20,7 @@ from cdpr.scene import Scene, load_scene
 from executor.machine import State
 from executor.prepare import PreparedRun, prepare
 from executor.run import conclude
+from executor.run_cameras import Seen
 from executor.run_end import continued, run_end
 from executor.run_folder import RunFolder
 from planner.check import verify
@@ -82,7 +83,7 @@ def ended(
         stage.folder.write_plan(prepared.plan.plan.document)
         stage.folder.write_rig(prepared.rig.document)
         conclude(
-            prepared, outcome, stage.folder, [], interface="virtual", simulated=True, fast=True
+            prepared, outcome, stage.folder, Seen(), interface="virtual", simulated=True, fast=True
         )
         return Ended(stage.folder, outcome.state, stage.rehearsal.pose)
 

@@ -1,0 +1,84 @@
+"""What the cameras of a run tell while it goes on: to the operator, the record and the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from rich.markup import escape
+
+from cdpr.cli.camera_line import rates
+from cdpr.cli.output import err, spinner
+
+if TYPE_CHECKING:
+    from cdpr.poses import Pose
+    from executor.run_cameras import RunCameras, Seen
+    from executor.status import RunStatus
+    from executor.wishes import WishBoard
+
+#: Takes in an event: its code, its text, and when it was, on the loop's clock [s].
+Tell = Callable[[str, str, float], None]
+
+
+class RunWatch:
+    """Asks the cameras for pictures, and stops the run when they see too little clearance."""
+
+    def __init__(
+        self,
+        cameras: RunCameras,
+        status: RunStatus,
+        board: WishBoard,
+        tell: Tell,
+        *,
+        clearance_stop: bool,
+    ) -> None:
+        """Nothing was asked for yet.
+
+        Args:
+            cameras: Those of the run.
+            status: Kept up to date for those who ask.
+            board: Where a stop is asked for.
+            tell: Takes in what happens.
+            clearance_stop: Ask for a stop when clearance is too small.
+        """
+        self.rates = ""
+        """How fast each camera is and how many tags it sees, for the progress bar."""
+        self._cameras, self._status, self._board = cameras, status, board
+        self._tell, self._clearance_stop = tell, clearance_stop
+
+    def trigger(self, time: float, asked: float, true_pose: Pose | None) -> None:
+        """A picture is due; arguments and errors as for `RunCameras.trigger`."""
+        self._cameras.trigger(time, asked, true_pose)
+        each = self._cameras.as_dict()
+        self._status.take_cameras(each)
+        self.rates = "; ".join(
+            f"{c['name']} {rates(c['pictures_per_second'], c['measuring_ms'], len(c['tags']))}"
+            for c in each
+        )
+        near = self._cameras.near
+        if near and self._clearance_stop and not self._board.read().stop:
+            self._board.ask_stop(too_near=near)
+            err.print(f"[red]too near[/] {escape(near)}", soft_wrap=True)
+        self._tell_news(asked)
+
+    def finish(self, at: float, quiet: bool) -> Seen:
+        """Waits for the last pictures.
+
+        Args:
+            at: The end of the run, on the loop's clock, [s].
+            quiet: Nothing shows that it waits.
+        """
+        with spinner("waiting for the last pictures", not quiet):
+            seen = self._cameras.finish()
+        self._tell_news(at)
+        for camera in seen.cameras:
+            if camera.dropped:
+                what = f"{camera.dropped} of {camera.dropped + camera.pictures} pictures left out"
+                text = f"camera {camera.name}: {what}, the one before was not done"
+                self._tell("pictures_dropped", text, at)
+        return seen
+
+    def _tell_news(self, at: float) -> None:
+        for news in self._cameras.news():
+            self._tell(news.code, news.text, at)
+            err.print(f"[yellow]remark[/] {escape(news.text)}", soft_wrap=True)

@@ -1,0 +1,278 @@
+"""Runs with two cameras: one pose, each camera's alone, and one that sees nothing or hangs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import re
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from cdpr.cli.cameras import choose_cameras
+from cdpr.plan import save_plan
+from cdpr.poses import Pose, matrix_from_rotation_vector
+from cdpr.rig import load_rig
+from executor import camera_process, camera_sight
+from executor import run as run_module
+from executor.clock import SimulatedClock
+from executor.run_folder import RunFolder
+from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
+from tests.cli.program import Answer, call, nothing_written, one_message
+
+#: A cycle in which the platform moves.
+MOVING = 60
+
+
+def with_two_cameras(path: Path, looks_away: bool = False) -> Path:
+    """The ready rig with a second camera, a quarter turn round the frame, or looking up."""
+    data = yaml.safe_load(RIG.read_text())
+    (front,) = load_rig(RIG).cameras
+    quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
+    place = front.world_from_camera
+    side = Pose(quarter @ place.position, quarter @ place.rotation)
+    where = {
+        "position_mm": (side.position * 1e3).tolist(),
+        "rotation_wxyz": [1.0, 0.0, 0.0, 0.0] if looks_away else side.quaternion.tolist(),
+    }
+    data["cameras"].append({**data["cameras"][0], "name": "side", "world_from_camera": where})
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.fixture(scope="module")
+def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return with_two_cameras(tmp_path_factory.mktemp("rig") / "rig.yaml")
+
+
+@pytest.fixture(scope="module")
+def plan(rig_file: Path) -> Path:
+    path = rig_file.parent / "plan.json"
+    scene = free_scene(START_MM, GOAL_MM)
+    save_plan(straight_plan(load_rig(rig_file), scene, [START_MM, GOAL_MM]), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def answer_and_folder(
+    rig_file: Path, plan: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Answer, RunFolder]:
+    path = tmp_path_factory.mktemp("two") / "run"
+    answer = call("run", plan, "--rig", rig_file, "-o", path, "--fast")
+    return answer, RunFolder.open(path)
+
+
+def test_all_cameras_of_the_rig_file_look_and_each_is_on_record(
+    answer_and_folder: tuple[Answer, RunFolder],
+) -> None:
+    answer, folder = answer_and_folder
+    assert answer.code == 0, answer
+    assert "front (synthetic), side (synthetic)" in answer.out
+    assert "PASSED" in answer.out
+    together, alone = folder.poses(), folder.poses_by_camera()
+    assert list(alone) == ["front", "side"]
+    assert together.ok.all()
+    for name, poses in alone.items():
+        assert poses.frame.tolist() == together.frame.tolist()
+        assert poses.ok.all()
+        assert (together.std[:, :3] < poses.std[:, :3]).all()
+        assert {p.split("/")[1].split("_")[0] for p in poses.picture if p} == {name}
+    numbers = [
+        {*a.split(), *b.split()} for a, b in zip(*(p.tags for p in alone.values()), strict=True)
+    ]
+    assert [set(tags.split()) for tags in together.tags] == numbers
+    summary = folder.summary()
+    told = [(c["name"], c["pictures"], c["poses"], c["failed"]) for c in summary["cameras"]]
+    assert told == [(name, len(together), len(together), "") for name in ("front", "side")]
+    assert all(c["measuring_ms"] > 0.0 for c in summary["cameras"])
+    page = folder.report.read_text()
+    assert "side alone" in page
+    assert "cameras together" in page
+
+
+def test_each_camera_has_its_own_channels(answer_and_folder: tuple[Answer, RunFolder]) -> None:
+    _, folder = answer_and_folder
+    counts: dict[str, int] = {}
+    with folder.mcap.open("rb") as file:
+        for _schema, channel, _message in make_reader(file).iter_messages():
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+    rows = len(folder.poses())
+    for channel in ("/tag_pose", "/tag_status"):
+        assert [counts[channel + name] for name in ("", "/front", "/side")] == [rows] * 3
+    kept = {name: sum(map(bool, p.picture)) for name, p in folder.poses_by_camera().items()}
+    assert counts["/pictures/front"] == kept["front"] > 0
+    assert counts["/pictures/side"] == kept["side"] > 0
+
+
+@pytest.mark.parametrize(
+    ("wanted", "chosen"),
+    [
+        ([], {"front": "synthetic", "side": "synthetic"}),
+        (["synthetic"], {"front": "synthetic", "side": "synthetic"}),
+        (["0"], {"front": "0"}),
+        (["side=synthetic"], {"side": "synthetic"}),
+        (["side=1", "front=rtsp://x/?a=b"], {"side": "1", "front": "rtsp://x/?a=b"}),
+    ],
+)
+def test_cameras_are_chosen_as_they_are_named(
+    rig_file: Path, wanted: list[str], chosen: dict[str, str]
+) -> None:
+    eyes = choose_cameras(load_rig(rig_file), wanted, without=False, in_process=True)
+    assert {camera.name: source for camera, source in eyes.items()} == chosen
+
+
+@pytest.mark.parametrize(
+    ("cameras", "parts"),
+    [
+        (["front=0", "back=1"], ["no camera 'back'", "front, side"]),
+        (["0", "side=1"], ["'0' does not say which camera it is of"]),
+        (["side=0", "side=1"], ["'side' has two sources"]),
+        (["front=0", "--no-camera"], ["--camera and --no-camera contradict"]),
+    ],
+)
+def test_cameras_that_are_not_said_clearly_are_refused(
+    rig_file: Path, plan: Path, tmp_path: Path, cameras: list[str], parts: list[str]
+) -> None:
+    wanted = [w for c in cameras for w in ((c,) if c.startswith("--") else ("--camera", c))]
+    with nothing_written(tmp_path):
+        answer = call("run", plan, "--rig", rig_file, "-o", tmp_path / "run", *wanted)
+    one_message(answer, 2, *parts)
+
+
+@pytest.fixture
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes longer than the run, and is read in one test only."""
+    monkeypatch.setattr(run_module, "build_report", lambda folder: folder.report)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_report")
+def test_a_camera_that_looks_away_is_told_and_the_other_measures(
+    plan: Path, tmp_path: Path
+) -> None:
+    rig = with_two_cameras(tmp_path / "rig.yaml", looks_away=True)
+    run = tmp_path / "run"
+    answer = call("run", plan, "--rig", rig, "-o", run, "--fast")
+    assert answer.code == 0, answer
+    folder = RunFolder.open(run)
+    assert folder.poses().ok.all()
+    events = [e["text"] for e in folder.summary()["events"] if e["code"] == "camera_sees_nothing"]
+    (text,) = events
+    assert "camera side gave no pose in 10 pictures in a row" in text
+    assert text.endswith("clearance is measured by front")
+    assert "camera side gave no pose" in " ".join(answer.err.split())
+    assert re.search(r"side 0 of \d+", answer.out)
+
+
+def camera_of(name: str) -> int:
+    """The process of a camera of the run that goes on in this one."""
+    (child,) = (c for c in multiprocessing.active_children() if c.name == f"cdpr-camera-{name}")
+    assert child.pid is not None
+    return child.pid
+
+
+@pytest.fixture
+def stop_in_motion(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Stops (SIGSTOP) a camera's process once the platform moves."""
+    monkeypatch.setattr(camera_process, "PATIENCE", 3.0)
+    monkeypatch.setattr(camera_process, "END_TIMEOUT", 0.2)
+
+    def stop(name: str) -> None:
+        cycles, real = 0, SimulatedClock.next_cycle
+
+        def next_cycle(clock: SimulatedClock) -> float:
+            nonlocal cycles
+            cycles += 1
+            if cycles == MOVING:
+                os.kill(camera_of(name), signal.SIGSTOP)
+            return real(clock)
+
+        monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
+
+    return stop
+
+
+def told_of(folder: RunFolder, code: str) -> list[dict[str, Any]]:
+    return [event for event in folder.summary()["events"] if event["code"] == code]
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_camera_that_hangs_is_told_and_the_run_goes_on_with_the_other(
+    rig_file: Path, plan: Path, tmp_path: Path, stop_in_motion: Callable[[str], None]
+) -> None:
+    stop_in_motion("side")
+    run = tmp_path / "run"
+    answer = call("run", plan, "--rig", rig_file, "-o", run, "--fast")
+    assert answer.code == 0, answer
+    folder = RunFolder.open(run)
+    hangs, end = told_of(folder, "camera_sees_nothing"), told_of(folder, "camera")
+    assert [e["text"] for e in hangs] == [
+        "camera side gave no answer for 2 s; clearance is measured by front"
+    ]
+    assert "camera side gave no answer any more from 0." in end[0]["text"]
+    moved = [e["time_s"] for e in folder.summary()["events"] if e["code"] == "held"]
+    assert hangs[0]["time_s"] < moved[0], "told while it moves"
+    assert folder.poses().ok.all()
+    alone = folder.poses_by_camera()
+    assert len(alone["front"]) == len(folder.poses()) > len(alone["side"]) > 1
+    assert alone["side"].status[-1].startswith("camera side gave no answer any more")
+    (front, side) = folder.summary()["cameras"]
+    assert side["dropped"] > 10
+    assert side["failed"]
+    assert not front["failed"]
+    assert "gave no answer" in answer.out, "told at the end"
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_run_whose_only_camera_hangs_comes_to_its_end_and_does_not_pass(
+    plan: Path, tmp_path: Path, stop_in_motion: Callable[[str], None]
+) -> None:
+    stop_in_motion("front")
+    run = tmp_path / "run"
+    answer = call("run", plan, "--rig", RIG, "-o", run, "--fast")
+    assert answer.code == 1, answer
+    folder = RunFolder.open(run)
+    summary = folder.summary()
+    assert summary["final_state"] == "finished"
+    (hangs,) = told_of(folder, "camera_sees_nothing")
+    assert hangs["text"] == "camera front gave no answer for 2 s; clearance is not measured"
+    assert any("gave no answer any more" in reason for reason in summary["reasons"])
+    assert folder.poses().ok[:-1].all(), "what was measured before is on record"
+    assert not folder.poses().ok[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_report")
+def test_a_camera_that_dies_leaves_the_run_to_the_other(
+    rig_file: Path, plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cycles, real = 0, SimulatedClock.next_cycle
+
+    def next_cycle(clock: SimulatedClock) -> float:
+        nonlocal cycles
+        cycles += 1
+        if cycles == MOVING:
+            os.kill(camera_of("front"), signal.SIGKILL)
+        return real(clock)
+
+    monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
+    run = tmp_path / "run"
+    answer = call("run", plan, "--rig", rig_file, "-o", run, "--fast")
+    assert answer.code == 0, answer
+    folder = RunFolder.open(run)
+    (event,) = told_of(folder, "camera")
+    assert "the process of camera front ended" in event["text"]
+    assert event["text"].endswith("clearance is measured by side")
+    assert folder.poses().ok.all()
+    assert len(folder.poses_by_camera()["side"]) == len(folder.poses())
+
+
+def test_silence_is_told_after_the_time_that_the_docs_say() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "faults" / "camera_sees_nothing.md").read_text()
+    assert f"no answer for {camera_sight.SILENCE:g} s" in page
