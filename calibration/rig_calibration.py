@@ -16,6 +16,7 @@ from calibration.rig_model import RigModel
 from calibration.rig_observability import Observability, identified, sentences
 from calibration.rig_outliers import without_outliers
 from calibration.rig_parameters import Parameters, RigGeometry, rig_with
+from calibration.rig_uncertainty import RigUncertainty, uncertainty_of_rig
 from cdpr.cables import cables_to
 from cdpr.errors import BadInput
 from cdpr.kinematics import poses_near
@@ -26,8 +27,6 @@ from cdpr.winches import WinchMap
 
 FEWEST_PLACES = 10
 """Fewer say too little to be fitted at all."""
-_SIGMAS = 1.959964
-"""Half the width of a 95 % interval in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +38,7 @@ class RigCalibration:
         measured: What they are from, without places that contradict the others.
         fit: The best fit that leaves what cannot be identified as in the drawing.
         observability: What the data tell.
-        covariance: Of the unknowns, shape (p, p), [m] or share; what is not identified has that of
-            the drawing.
+        uncertainty: Of the unknowns.
         held_out: Places left out of fits.
         length_deviation: Of a cable's length as a drive tells it, [m].
     """
@@ -49,7 +47,7 @@ class RigCalibration:
     measured: RigMeasurements
     fit: RigFit
     observability: Observability
-    covariance: Array
+    uncertainty: RigUncertainty
     held_out: HeldOut
     length_deviation: float
 
@@ -74,12 +72,6 @@ class RigCalibration:
         return sentences(self.observability, self.parameters)
 
     @cached_property
-    def deviations(self) -> Array:
-        """Standard deviations of the unknowns, shape (p,), [m] or share."""
-        deviations: Array = np.sqrt(np.diag(self.covariance))
-        return deviations
-
-    @cached_property
     def intervals(self) -> dict[str, Interval]:
         """What was found, by name with unit, 95 %."""
         geometry, m = self.geometry, self.rig.cable_count
@@ -91,10 +83,12 @@ class RigCalibration:
             "pulleys": (np.array([geometry.pulley_radius * 1e3]), "_mm", np.array([1e3])),
             "drum_scale": (drums * (1.0 + geometry.drum_scale), "_mm_per_rev", drums),
             "offsets": (geometry.offsets * 1e3, "_mm", np.full(m, 1e3)),
+            "stiffness": (np.array([geometry.stiffness]), "_n", np.array([geometry.stiffness])),
         }
+        half_widths = self.uncertainty.half_widths
         for group, place in self.parameters.slices().items():
             values, unit, scale = tables[group]
-            widths = _SIGMAS * self.deviations[place] * scale
+            widths = half_widths[place] * scale
             rows = zip(self.parameters.names[place], values, widths, strict=True)
             found |= {f"{n}{unit}": Interval(float(v), float(w)) for n, v, w in rows}
         return found
@@ -112,9 +106,7 @@ class RigCalibration:
         there = _sent_to(self.rig, positions, rotations)
         line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
         moved = -np.linalg.pinv(line.by_pose) @ line.by_values
-        covariances = np.einsum("kip,pq,kjq->kij", moved[:, :3], self.covariance, moved[:, :3])
-        worst: Array = _SIGMAS * np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
-        return worst
+        return self.uncertainty.worst(moved[:, :3])
 
     def reached(self, positions: Array, rotations: Array) -> Array:
         """Where the platform truly goes when the rig file's numbers are to bring it to poses.
@@ -176,7 +168,7 @@ def calibrate_rig(
         measured,
         fit,
         observability,
-        _covariance(parameters, measured, fit, observability, length_deviation),
+        uncertainty_of_rig(parameters, measured, fit, observability, length_deviation),
         held_out(parameters, measured, length_deviation),
         length_deviation,
     )
@@ -206,25 +198,6 @@ def _mm(point: Array) -> str:
     return ", ".join(f"{x * 1e3:.4g}" for x in point) + " mm"
 
 
-def _covariance(
-    parameters: Parameters,
-    measured: RigMeasurements,
-    fit: RigFit,
-    observability: Observability,
-    length_deviation: float,
-) -> Array:
-    """Larger than the deviations that were stated say where the residuals are."""
-    known, unknown = observability.known, observability.unknown
-    told = known.T @ fit.information @ known + np.eye(known.shape[1])
-    squares = float(np.sum(fit.weights * (fit.residuals / length_deviation) ** 2))
-    freedom = fit.residuals.size - known.shape[1] - 6 * int((~measured.posed).sum())
-    larger = max(1.0, squares / max(freedom, 1))
-    inner = larger * known @ np.linalg.solve(told, known.T) + unknown @ unknown.T
-    spread = parameters.deviations
-    covariance: Array = inner * np.outer(spread, spread)
-    return covariance
-
-
 def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:
     """Places with the drive positions of poses, by the drawing and under the tensions of home."""
     anchors = positions[:, None, :] + np.einsum("kij,mj->kmi", rotations, rig.anchors)
@@ -233,7 +206,7 @@ def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:
     return RigMeasurements(
         names=("",) * len(positions),
         counts=counts,
-        tensions=np.full_like(counts, np.nan),
+        tensions=np.tile(tensions, (len(counts), 1)),
         positions=positions,
         rotations=rotations,
         covariances=np.zeros((len(positions), 6, 6)),

@@ -15,6 +15,7 @@ import numpy as np
 from calibration.rig_measurements import RigMeasurements
 from calibration.rig_model import RigModel
 from calibration.rig_parameters import Parameters
+from calibration.rig_system import System
 from calibration.robust import huber, share_of
 from cdpr.cables import NoCable
 from cdpr.errors import Fault
@@ -46,8 +47,9 @@ class RigFit:
             far off.
         pose_misfits: Of the poses from the measured ones, in standard deviations, shape (n,); 0
             where there is none.
-        information: What the data alone say of the unknowns, shape (p, p), per variance of the
-            drawing: eigenvalues above 1 are known better from the data than from the drawing.
+        informations: What each place alone says of the unknowns, its pose projected out, shape
+            (n, p, p), per variance of the drawing.
+        scores: Half the slope of each place's squares by the unknowns in the same units, (n, p).
     """
 
     values: Array
@@ -56,7 +58,17 @@ class RigFit:
     residuals: Array
     weights: Array
     pose_misfits: Array
-    information: Array
+    informations: Array
+    scores: Array
+
+    @property
+    def information(self) -> Array:
+        """What the data alone say of the unknowns, shape (p, p), per variance of the drawing.
+
+        Eigenvalues above 1 are known better from the data than from the drawing.
+        """
+        total: Array = self.informations.sum(axis=0)
+        return total
 
 
 class RigFitter:
@@ -151,7 +163,7 @@ class RigFitter:
 
     def _system(
         self, values: Array, z: Array, spread: Array, positions: Array, rotations: Array
-    ) -> _System:
+    ) -> System:
         line = self._model.linearised(values, positions, rotations)
         weights = self._length_weight * share_of(
             np.sqrt(self._length_weight) * np.abs(line.residuals), CABLE_BEND
@@ -161,12 +173,12 @@ class RigFitter:
         pose_weights = share[:, None, None] * self._pose_weights
         by_z = line.by_values @ spread
         weighted = weights[..., None] * line.by_pose
-        return _System(
-            own=np.einsum("nmp,nm,nmq->pq", by_z, weights, by_z),
+        return System(
+            own=np.swapaxes(by_z, 1, 2) @ (weights[..., None] * by_z),
             prior=z,
             mixed=np.swapaxes(by_z, 1, 2) @ weighted,
             poses=np.swapaxes(line.by_pose, 1, 2) @ weighted + pose_weights,
-            pull=np.einsum("nmp,nm,nm->p", by_z, weights, line.residuals),
+            pull=np.einsum("nmp,nm,nm->np", by_z, weights, line.residuals),
             pose_pull=np.einsum("nmi,nm->ni", weighted, line.residuals)
             + np.einsum("nij,nj->ni", pose_weights, errors),
         )
@@ -183,41 +195,8 @@ class RigFitter:
             residuals,
             share_of(np.sqrt(self._length_weight) * np.abs(residuals), CABLE_BEND),
             self._distances(self._pose_errors(positions, rotations)),
-            system.reduced(),
+            *system.by_place(),
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _System:
-    """Normal equations: unknowns against each other, against each pose, and each pose alone."""
-
-    own: Array
-    prior: Array
-    mixed: Array
-    poses: Array
-    pull: Array
-    pose_pull: Array
-
-    def reduced(self, damping: float = 0.0) -> Array:
-        """Information of the data about the unknowns with the poses eliminated."""
-        gained = np.linalg.solve(self._poses(damping), np.swapaxes(self.mixed, 1, 2))
-        reduced: Array = self.own - np.einsum("npi,niq->pq", self.mixed, gained)
-        return (reduced + reduced.T) / 2.0
-
-    def solved(self, damping: float) -> tuple[Array, Array]:
-        """Steps of the unknowns, shape (r,), and twists of the poses, shape (n, 6)."""
-        poses = self._poses(damping)
-        alone = np.asarray(np.linalg.solve(poses, self.pose_pull[..., None]))[..., 0]
-        right = self.pull + self.prior - np.einsum("npi,ni->p", self.mixed, alone)
-        left = self.reduced(damping) + (1.0 + damping) * np.eye(len(right))
-        step: Array = -np.linalg.solve(left, right)
-        followed = np.linalg.solve(poses, np.einsum("npi,p->ni", self.mixed, step)[..., None])
-        return step, -alone - np.asarray(followed)[..., 0]
-
-    def _poses(self, damping: float) -> Array:
-        diagonal = np.einsum("nii->ni", self.poses)
-        damped: Array = self.poses + damping * diagonal[:, None, :] * np.eye(6)
-        return damped
 
 
 def poses_from_lengths(rig: Rig, lengths: Array) -> list[ForwardSolution]:

@@ -37,7 +37,9 @@ class RigModel:
     """Lengths of cables of a rig with unknown numbers, at n poses."""
 
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
-        """Takes the measurements; unmeasured tensions are the working ones of the pose.
+        """Takes the measurements; unmeasured tensions are the working ones of home.
+
+        Where some were not measured, nothing tells of the cables' stiffness.
 
         Raises:
             TensionInfeasible: The rig cannot hold its platform at home.
@@ -45,7 +47,9 @@ class RigModel:
         self.parameters = parameters
         rig = parameters.rig
         working = working_tensions(rig, rig.home).tensions
-        tensions = np.where(np.isfinite(measured.tensions), measured.tensions, working)
+        told = np.isfinite(measured.tensions)
+        tensions = np.where(told, measured.tensions, working)
+        self._stretch_is_told = bool(told.all())
         self.counted = CountedLengths(rig, measured.counts, tensions)
 
     def residuals(self, values: Array, positions: Array, rotations: Array) -> Array:
@@ -72,16 +76,19 @@ class RigModel:
         by_pose = -np.concatenate([cables.directions, np.cross(arms, cables.directions)], axis=-1)
         home = self.parameters.rig.home
         at_home = self._cables(geometry, home.position[None], home.rotation[None])
-        counted = self.counted.stretch[..., None] / self.counted.stretch_at_home[:, None]
+        stretch = self.counted.stretch(geometry)
+        counted = (stretch / self.counted.stretch_at_home(geometry))[..., None]
         by_values = self._by_geometry(geometry, cables, rotations)
         by_values -= counted * self._by_geometry(geometry, at_home, home.rotation[None])
         each, places = np.arange(cables.lengths.shape[1]), self.parameters.slices()
         if "drum_scale" in places:
-            by_values[:, each, places["drum_scale"].start + each] = (
-                -self.counted.paid_out * self.counted.stretch
-            )
+            by_values[:, each, places["drum_scale"].start + each] = -self.counted.paid_out * stretch
         if "offsets" in places:
-            by_values[:, each, places["offsets"].start + each] = -self.counted.stretch
+            by_values[:, each, places["offsets"].start + each] = -stretch
+        if "stiffness" in places and self._stretch_is_told:
+            by_values[:, :, places["stiffness"].start] = (
+                self.counted.by_compliance(geometry) / geometry.stiffness
+            )
         return Linearised(cables.lengths - self.counted.by(geometry), by_values, by_pose)
 
     def _by_geometry(self, geometry: RigGeometry, cables: Cables, rotations: Array) -> Array:

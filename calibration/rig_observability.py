@@ -129,6 +129,8 @@ def _named(parameters: Parameters) -> list[_Named]:
             drum_scale=np.ones(m),
         )
         found.append(_Named("the size of the whole rig", "", grown))
+    if "stiffness" in places:
+        found.append(_Named("the stiffness of the cables", "", scaled(stiffness=np.ones(1))))
     for number, name in enumerate(parameters.names):
         alone = zero.copy()
         alone[number] = 1.0

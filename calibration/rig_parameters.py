@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -15,6 +16,8 @@ from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
 
 AXES = ("x", "y", "z")
+_OF_ALL_CABLES = {"pulleys": "pulley_radius", "stiffness": "stiffness"}
+"""Groups of one number, and its name."""
 
 DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
     {
@@ -23,9 +26,11 @@ DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
         "pulleys": 0.5e-3,
         "drum_scale": 0.005,
         "offsets": 2e-3,
+        "stiffness": 0.2,
     }
 )
-"""How far off a drawing may be, one standard deviation: [m], drum_scale as a share."""
+"""How far off a rig file may be, one standard deviation: [m]; drum_scale and stiffness as a share.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +44,7 @@ class RigGeometry:
         drum_scale: Cable paid out for a count, as a share of the drawing's, less 1, shape (m,).
         offsets: Unstrained cable at the home counts beyond what reaches the home pose, shape (m,),
             [m]: by how much the reference was off.
+        stiffness: Axial, of a cable, [N].
     """
 
     outlets: Array
@@ -46,11 +52,14 @@ class RigGeometry:
     pulley_radius: float
     drum_scale: Array
     offsets: Array
+    stiffness: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
     """The layout of the vector of unknowns; each is a deviation from the drawing.
+
+    That of the stiffness is the logarithm of its share: near 0 the share less 1, never negative.
 
     Attributes:
         rig: The drawing.
@@ -105,12 +114,13 @@ class Parameters:
             pulley_radius=self.rig.pulley_radius + float(of("pulleys", 1)[0]),
             drum_scale=of("drum_scale", m),
             offsets=of("offsets", m),
+            stiffness=self.rig.cable_stiffness * math.exp(float(of("stiffness", 1)[0])),
         )
 
 
 def _names(group: str, m: int) -> list[str]:
-    if group == "pulleys":
-        return ["pulley_radius"]
+    if group in _OF_ALL_CABLES:
+        return [_OF_ALL_CABLES[group]]
     what = {"outlets": "outlet", "anchors": "anchor", "drum_scale": "drum", "offsets": "offset"}
     if group in ("outlets", "anchors"):
         return [f"{what[group]}_{i}_{axis}" for i in range(1, m + 1) for axis in AXES]
@@ -118,12 +128,13 @@ def _names(group: str, m: int) -> list[str]:
 
 
 def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
-    """The drawing's rig with other outlets, anchors and pulleys; its winches stay."""
+    """The drawing's rig with other outlets, anchors, pulleys and stiffness; its winches stay."""
     return replace(
         rig,
         outlets=read_only(geometry.outlets),
         anchors=read_only(geometry.anchors),
         pulley_radius=geometry.pulley_radius,
+        cable_stiffness=geometry.stiffness,
     )
 
 
@@ -131,9 +142,7 @@ class CountedLengths:
     """Cable lengths that drive positions and tensions tell.
 
     Attributes:
-        stretch: 1 + tension / stiffness, shape (n, m).
         paid_out: Unstrained cable since the home counts by the drawing's drums, shape (n, m), [m].
-        stretch_at_home: 1 + tension / stiffness at the home pose, shape (m,).
     """
 
     def __init__(self, rig: Rig, counts: Array, tensions: Array) -> None:
@@ -148,29 +157,38 @@ class CountedLengths:
             TensionInfeasible: The rig cannot hold its platform at home.
         """
         winches = WinchMap(rig)
-        self.stretch: Array = 1.0 + tensions / rig.cable_stiffness
         self.paid_out: Array = (counts - winches.home_counts) / winches.counts_per_metre
-        at_home = working_tensions(rig, rig.home).tensions
-        self.stretch_at_home: Array = 1.0 + at_home / rig.cable_stiffness
+        self._tensions, self._at_home = tensions, working_tensions(rig, rig.home).tensions
         self._rig, self._behind = rig, winches.behind_outlet
+
+    def stretch(self, geometry: RigGeometry) -> Array:
+        """1 + tension / stiffness, shape (n, m)."""
+        stretch: Array = 1.0 + self._tensions / geometry.stiffness
+        return stretch
+
+    def stretch_at_home(self, geometry: RigGeometry) -> Array:
+        """1 + tension / stiffness at the home pose, shape (m,)."""
+        stretch: Array = 1.0 + self._at_home / geometry.stiffness
+        return stretch
 
     def at_home(self, geometry: RigGeometry) -> Array:
         """Unstrained cable at the home counts, shape (m,), [m]."""
         lengths = cable_lengths(rig_with(self._rig, geometry), self._rig.home)
-        unstrained: Array = (lengths + self._behind) / self.stretch_at_home + geometry.offsets
+        reaching = (lengths + self._behind) / self.stretch_at_home(geometry)
+        unstrained: Array = reaching + geometry.offsets
         return unstrained
 
     def by(self, geometry: RigGeometry) -> Array:
         """Lengths from outlet to anchor with other numbers of the rig, shape (n, m), [m]."""
         paid_out = self.paid_out * (1.0 + geometry.drum_scale)
-        lengths: Array = (self.at_home(geometry) + paid_out) * self.stretch - self._behind
+        unstrained = self.at_home(geometry) + paid_out
+        lengths: Array = unstrained * self.stretch(geometry) - self._behind
         return lengths
 
     def by_compliance(self, geometry: RigGeometry) -> Array:
         """Derivative of `by` by the cables' compliance, 1 / stiffness, shape (n, m), [m N]."""
-        stiffness, at_home = self._rig.cable_stiffness, self.at_home(geometry)
-        there, home = (stiffness * (s - 1.0) for s in (self.stretch, self.stretch_at_home))
+        at_home = self.at_home(geometry)
         unstrained = at_home + self.paid_out * (1.0 + geometry.drum_scale)
-        less = (at_home - geometry.offsets) * home / self.stretch_at_home
-        change: Array = unstrained * there - self.stretch * less
+        less = (at_home - geometry.offsets) * self._at_home / self.stretch_at_home(geometry)
+        change: Array = unstrained * self._tensions - self.stretch(geometry) * less
         return change

@@ -23,7 +23,7 @@ _WHAT = "outlets, anchors, pulleys, winches, cables or home pose"
 
 
 class RigResult(ResultDocument):
-    """Outlets, anchors, pulleys, drums and counts at home, in the keys of the rig file."""
+    """Outlets, anchors, pulleys, winches and cables' stiffness, in the keys of the rig file."""
 
     order: ClassVar[int] = 3
 
@@ -32,6 +32,7 @@ class RigResult(ResultDocument):
     anchors_mm: list[Vector]
     pulley_radius_mm: Positive | None
     drums_mm_per_rev: list[Positive]
+    stiffness_n: Positive = Field(description="E·A of a cable")
     home_counts: list[Number] = Field(description="drive positions with the platform at home")
     groups: list[str] = Field(description="of numbers that were looked for")
     not_identified: list[str] = Field(description="left as in the rig file, in words")
@@ -100,6 +101,7 @@ class RigResult(ResultDocument):
             self.anchors_mm,
             self.pulley_radius_mm,
             self.drums_mm_per_rev,
+            self.stiffness_n,
             [round(home) for home in self.home_counts],
         )
 
@@ -110,6 +112,7 @@ def _with_numbers(
     anchors_mm: list[list[float]],
     pulley_radius_mm: float | None,
     drums_mm_per_rev: list[float],
+    stiffness_n: float,
     home_counts: list[int],
 ) -> RigDocument:
     """The rig file's content with other numbers."""
@@ -121,6 +124,7 @@ def _with_numbers(
         "outlets_mm": outlets_mm,
         "anchors_mm": anchors_mm,
         "winches": winches,
+        "cables": rig.cables.model_copy(update={"stiffness_n": stiffness_n}),
     }
     if rig.pulleys is not None and pulley_radius_mm is not None:
         changes["pulleys"] = rig.pulleys.model_copy(update={"radius_mm": pulley_radius_mm})
@@ -143,6 +147,7 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
         "anchors_mm": _rows(geometry.anchors),
         "pulley_radius_mm": geometry.pulley_radius * 1e3 if rig.pulley_radius else None,
         "drums_mm_per_rev": [float(x) for x in drums],
+        "stiffness_n": float(geometry.stiffness),
     }
     data = result.measured
     return RigResult(

@@ -1,8 +1,9 @@
 """Whether the data tell of another stiffness of the cables than the rig file.
 
-One step of the fit with the compliance (1 / stiffness) as one more number, all others and the poses
-eliminated: a wrong stiffness makes residuals grow with tension and length alike, and nothing else
-does. The other numbers would hide a part of it, and their intervals would be false.
+One step of the fit with the compliance (1 / stiffness) as one more number that the rig file does
+not tell, all others and the poses eliminated: a wrong stiffness makes residuals grow with tension
+and length alike, and nothing else does. The other numbers would hide a part of it, and their
+intervals would be false. Where the stiffness is among them, the doubt that was stated counts too.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class Compliance:
     Attributes:
         drawn: By the rig file, [1/N].
         told: By the data, [1/N].
-        deviation: Standard deviation of that, [1/N].
+        deviation: Standard deviation of the difference, [1/N].
     """
 
     drawn: float

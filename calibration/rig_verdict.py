@@ -101,9 +101,9 @@ def _far_numbers(result: RigCalibration) -> list[Lack]:
     if times[k] <= FAR:
         return []
     group = next(g for g, place in parameters.slices().items() if place.start <= k < place.stop)
-    share = group == "drum_scale"
+    share = group in ("drum_scale", "stiffness")
     far = f"{abs(values[k]) * 1e2:.3g} %" if share else f"{abs(values[k]) * 1e3:.3g} mm"
-    option = "--drum-scale-percent" if share else f"--{group}-mm"
+    option = f"--{group.replace('_', '-')}-{'percent' if share else 'mm'}"
     return [
         Lack(
             f"{parameters.names[k]} is {far} from the rig file, {times[k]:.3g} times {option}",

@@ -1,4 +1,4 @@
-"""`cdpr calibrate rig`: outlets, anchors, pulleys, drums and references, from places at rest."""
+"""`cdpr calibrate rig`: outlets, anchors, pulleys, winches, stiffness, from places at rest."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class GroupName(StrEnum):
     pulleys = "pulleys"
     drum_scale = "drum_scale"
     offsets = "offsets"
+    stiffness = "stiffness"
 
 
 def rig(
@@ -56,6 +57,7 @@ def rig(
     offsets_mm: Annotated[
         float, typer.Option(min=1e-6, help="cable at the reference (home)")
     ] = 2.0,
+    stiffness_percent: Annotated[float, typer.Option(min=1e-6, help="of the cables")] = 20.0,
     length_mm: Annotated[
         float, typer.Option(min=1e-6, help="how far off lengths by drive positions may be")
     ] = 0.1,
@@ -72,7 +74,9 @@ def rig(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find outlets, anchors, pulleys, drum scales and references, and say how well they are known.
+    """Find outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
+
+    How well they are known is told with each.
 
     Exit code 3 where they are not good enough. What cannot be identified stays as in the rig file,
     and is told.
@@ -103,6 +107,7 @@ def rig(
         "pulleys": pulleys_mm / 1e3,
         "drum_scale": drum_scale_percent / 1e2,
         "offsets": offsets_mm / 1e3,
+        "stiffness": stiffness_percent / 1e2,
     }
     wanted = {k: v for k, v in deviations.items() if k not in {g.value for g in known or []}}
     of_poses = np.array([pose_mm / 1e3] * 3 + [radians(pose_deg)] * 3)

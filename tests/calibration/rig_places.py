@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from calibration.interval import Interval
 from calibration.rig_measurements import RigMeasurements
 from cdpr.cables import cables_at
 from cdpr.poses import Array, Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig
+from cdpr.rig import Rig, rig_from_document
 from cdpr.statics.tension_solution import TensionInfeasible
 from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
@@ -71,6 +73,55 @@ def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) 
         np.array([pose.position for _, _, pose in rows]),
         np.array([pose.rotation for _, _, pose in rows]),
     )
+
+
+def built_otherwise(rig: Rig, seed: int) -> Rig:
+    """The same rig file, but built with other random errors, as large as are usually stated."""
+    random, document = np.random.default_rng(seed), rig.document
+    assert document.simulation is not None
+    assert document.simulation.as_built is not None
+    m, drums = rig.cable_count, [w.drum_mm_per_rev for w in document.winches]
+    homes = [w.home_counts for w in document.winches]
+    slips = 2e-3 * np.array([w.counts_per_metre for w in rig.winches])
+    built = document.simulation.as_built.model_copy(
+        update={
+            "outlets_mm": (1e3 * rig.outlets + 4.0 * random.standard_normal((m, 3))).tolist(),
+            "anchors_mm": (1e3 * rig.anchors + random.standard_normal((m, 3))).tolist(),
+            "drums_mm_per_rev": (drums * (1.0 + 0.005 * random.standard_normal(m))).tolist(),
+            "home_counts": (homes + slips * random.standard_normal(m)).tolist(),
+        }
+    )
+    simulation = document.simulation.model_copy(update={"as_built": built})
+    return rig_from_document(document.model_copy(update={"simulation": simulation}))
+
+
+def drawn_with(rig: Rig, stiffness: float) -> Rig:
+    """The rig with another stiffness in its file, [N]."""
+    cables = rig.document.cables.model_copy(update={"stiffness_n": stiffness})
+    return rig_from_document(rig.document.model_copy(update={"cables": cables}))
+
+
+def true_numbers(rig: Rig) -> dict[str, float]:
+    """As a calibration names them, without the offsets."""
+    truth = rig_as_built(rig)
+    found = {
+        f"{what}_{i}_{axis}_mm": 1e3 * float(value)
+        for what, points in (("outlet", truth.outlets), ("anchor", truth.anchors))
+        for i, point in enumerate(points, start=1)
+        for axis, value in zip("xyz", point, strict=True)
+    }
+    drums = enumerate((w.drum_mm_per_rev for w in truth.document.winches), start=1)
+    found |= {f"drum_{i}_mm_per_rev": drum for i, drum in drums}
+    return {**found, "stiffness_n": truth.cable_stiffness}
+
+
+def share_inside(intervals: Mapping[str, Interval], true: Mapping[str, float]) -> float:
+    """How many of the intervals hold what is true."""
+    found = [
+        abs(intervals[name].value - value) < intervals[name].half_width
+        for name, value in true.items()
+    ]
+    return sum(found) / len(found)
 
 
 def write_places(path: Path, measured: RigMeasurements, *, poses: bool = True) -> None:

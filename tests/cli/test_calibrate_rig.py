@@ -193,7 +193,8 @@ def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
     """The command line loads nothing heavy, so its defaults stand there once more."""
     options = inspect.signature(calibrate_rig.rig).parameters
     for group, deviation in DEFAULT_DEVIATIONS.items():
-        name, unit = (f"{group}_percent", 1e2) if group == "drum_scale" else (f"{group}_mm", 1e3)
+        share = group in ("drum_scale", "stiffness")
+        name, unit = (f"{group}_percent", 1e2) if share else (f"{group}_mm", 1e3)
         assert options[name].default == pytest.approx(deviation * unit), group
 
 
