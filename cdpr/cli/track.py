@@ -83,6 +83,7 @@ def track(
 
     from cdpr.clearance import ClearanceModel
     from cdpr.cli.calibrations import calibrated_rig
+    from cdpr.cli.camera_line import Pace
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
     from cdpr.cli.track_sources import eyes_of, picture_source
@@ -117,7 +118,7 @@ def track(
     model = ClearanceModel(the_rig, the_scene) if the_scene and the_scene.obstacles else None
     logged: list[LoggedPicture] = []
     each: dict[str, list[LoggedPicture]] = {eye.name: [] for eye in eyes}
-    count, board, began = TrackCount(), OwnBoard(), time.time_ns()
+    count, pace, board, began = TrackCount(), Pace(), OwnBoard(), time.time_ns()
     with (
         ExitStack() as drawing,
         stop_requests(board),
@@ -138,7 +139,7 @@ def track(
             logged.append(found)
             for name, one in alone.items():
                 each[name].append(one)
-            show(len(logged))
+            show(len(logged), pace.after(time.monotonic(), count.seconds, found.observation))
             if board.read().stop:
                 break
     for name, path in logs.items():

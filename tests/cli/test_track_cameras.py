@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from mcap.reader import make_reader
 
 from cdpr.plan import load_plan, save_plan
 from cdpr.poses import Pose, matrix_from_rotation_vector
@@ -54,7 +56,9 @@ def test_two_cameras_are_logged_together_and_alone(
 ) -> None:
     log = tmp_path / "poses.csv"
     sources = ("front=synthetic", "side=synthetic", "--plan", plan, "--pictures", "3")
-    answer = call("track", rig_file, *sources, "-o", log, "--overlay", tmp_path / "drawn", "--json")
+    mcap = tmp_path / "poses.mcap"
+    outputs = ("-o", log, "--overlay", tmp_path / "drawn", "--mcap", mcap, "--json")
+    answer = call("track", rig_file, *sources, *outputs)
     assert answer.code == 0, answer
     assert json.loads(answer.out)["poses"] == 3
     both = rows_of(log)
@@ -66,6 +70,10 @@ def test_two_cameras_are_logged_together_and_alone(
         numbers = {n for one in alone for n in one["tags"].split()}
         assert set(fused["tags"].split()) == numbers
     assert len(list((tmp_path / "drawn" / "side").iterdir())) == 3
+    with mcap.open("rb") as stream:
+        counted = Counter(channel.topic for _, channel, _ in make_reader(stream).iter_messages())
+    for channel in ("/tag_pose", "/tag_status", "/clearance"):
+        assert [counted[channel + name] for name in ("", "/front", "/side")] == [3, 3, 3]
 
 
 @pytest.mark.parametrize(

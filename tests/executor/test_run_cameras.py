@@ -1,0 +1,238 @@
+"""Several cameras of a run: late ones, ones that disagree, ones that never answer."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdpr.clearance import ClearanceModel
+from cdpr.cli.camera_line import Pace, camera_line
+from cdpr.errors import Fault
+from cdpr.poses import Pose
+from cdpr.rig import load_rig
+from executor import camera_process
+from executor.camera_eye import CameraEye
+from executor.camera_process import CameraProcess
+from executor.camera_sight import BLIND_PICTURES
+from executor.observer import Look, Trigger
+from executor.run_cameras import RunCameras
+from tests.cli.plans import RIG, free_scene
+from tracking.measurement import PoseMeasurement
+
+RATE = 10.0
+HERE = Pose.level([0.0, 0.0, 0.445])
+_RIG = load_rig(RIG)
+_SCENE = free_scene([0.0, 0.0, 445.0], [0.0, 30.0, 495.0])
+MODEL = ClearanceModel(_RIG, _SCENE)
+
+
+def seen_at(trigger: Trigger, shift: float = 0.0, deviation: float = 1e-4) -> Look:
+    """A look that finds the platform, so far off along x [m]."""
+    covariance = np.diag([deviation**2] * 3 + [1e-6] * 3)
+    pose = Pose(HERE.position + np.array([shift, 0.0, 0.0]), HERE.rotation)
+    found = PoseMeasurement(trigger.time, pose, covariance, (301, 303), 0.1, "tracked")
+    return Look(trigger.frame, found, seconds=0.005)
+
+
+class Scripted:
+    """A camera that answers after so many further moments; with -1 never, with -2 it dies."""
+
+    def __init__(self, name: str, delays: Sequence[int], shift: float = 0.0) -> None:
+        self.name, self.unanswered, self.shift = name, None, shift
+        self._delays, self._left = list(delays), 0
+
+    unanswered: Trigger | None
+
+    def ask(self, trigger: Trigger) -> None:
+        self._left = self._delays[trigger.frame % len(self._delays)]
+        if self._left == -2:
+            raise Fault(f"the process of camera {self.name} ended without an answer")
+        self.unanswered = trigger
+
+    def answer(self) -> Look | None:
+        if self.unanswered is None or self._left:
+            self._left -= self._left > 0
+            return None
+        return self.last_answer()
+
+    def last_answer(self) -> Look | None:
+        if self.unanswered is None or self._left < 0:
+            return None
+        look, self.unanswered = seen_at(self.unanswered, self.shift), None
+        return look
+
+
+def run_of(moments: int, *cameras: Any) -> tuple[RunCameras, list[str]]:
+    """Cameras after so many moments, and what was told."""
+    eyes = [CameraEye(camera, "here") for camera in cameras]
+    run, told = RunCameras(eyes, MODEL, _SCENE.obstacle_clearance, RATE), []
+    for k in range(moments):
+        run.trigger(k / RATE, 100.0 + k / RATE, None)
+        told += [news.text for news in run.news()]
+    return run, told
+
+
+DELAYS = st.lists(st.integers(0, 5), min_size=1, max_size=6)
+
+
+@given(front=DELAYS, side=DELAYS, moments=st.integers(1, 25))
+def test_however_late_cameras_answer_every_moment_is_told_once_and_nothing_is_lost(
+    front: list[int], side: list[int], moments: int
+) -> None:
+    run, _ = run_of(moments, Scripted("front", front), Scripted("side", side))
+    seen = run.finish()
+    frames = [look.frame for look in seen.together]
+    alone = {name: [look.frame for look in looks] for name, looks in seen.alone.items()}
+    assert frames == sorted(set(alone["front"]) | set(alone["side"]))
+    assert all(isinstance(look.found, PoseMeasurement) for look in seen.together)
+    for camera in seen.cameras:
+        assert len(alone[camera.name]) == camera.pictures == camera.poses
+        assert camera.pictures + camera.dropped == moments
+
+
+@given(late=st.integers(2, 5))
+def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
+    """Too little clearance is seen by the fast camera: the stop must not wait for the slow one."""
+    cameras: list[Any] = [Scripted("front", [0]), Scripted("side", [late])]
+    limit = 10.0  # everything is too near
+    run = RunCameras([CameraEye(camera, "here") for camera in cameras], MODEL, limit, RATE)
+    for k in range(5):
+        run.trigger(k / RATE, k / RATE, None)
+    assert "the scene asks for 10000 mm" in run.near
+
+
+def test_pictures_of_both_make_a_better_pose() -> None:
+    run, told = run_of(5, Scripted("front", [0]), Scripted("side", [0]))
+    seen = run.finish()
+    for look in seen.together:
+        assert isinstance(look.found, PoseMeasurement)
+        assert look.found.position_deviation == pytest.approx(np.full(3, 1e-4 / np.sqrt(2)))
+        assert look.clearance is not None
+    assert not told
+
+
+def test_cameras_that_disagree_are_told_once_and_clearance_is_not_measured() -> None:
+    run, told = run_of(25, Scripted("front", [0]), Scripted("side", [0], shift=0.02))
+    assert told == [
+        f"cameras front and side disagree by 20.0 mm, {BLIND_PICTURES} times in a row;"
+        " clearance is not measured"
+    ]
+    assert all(look.clearance is None for look in run.finish().together)
+
+
+def test_one_that_dies_is_told_and_the_last_one_ends_the_supervision() -> None:
+    _, told = run_of(4, Scripted("front", [0, 0, -2]), Scripted("side", [0]))
+    (text,) = told
+    assert "camera front failed (the process of camera front ended" in text
+    assert text.endswith("clearance is measured by side")
+    with pytest.raises(Fault, match="front ended"):
+        run_of(4, Scripted("front", [0, 0, -2]), Scripted("side", [0, -2]))
+
+
+def test_live_figures_are_those_of_the_newest_pictures() -> None:
+    run, _ = run_of(30, Scripted("front", [0]), Scripted("side", [1]))
+    front, side = run.as_dict()
+    assert (front["pictures_per_second"], side["pictures_per_second"]) == (10.0, 5.0)
+    assert front["measuring_ms"] == 5.0
+    assert camera_line(side) == (
+        "side (here), 5.0 pictures/s, 5.0 ms, 2 tags, 14 of 14 with a pose, 15 dropped"
+    )
+
+
+def test_the_pace_of_a_source_is_that_of_its_newest_pictures() -> None:
+    pace, look = Pace(), seen_at(Trigger(0, 0.0, 0.0, None))
+    lines = [pace.after(5.0 + k / 20, [0.004] * (k + 1), look.found) for k in range(30)]
+    assert lines[0] == "– pictures/s, 4.0 ms, 2 tags"
+    assert lines[-1] == "20.0 pictures/s, 4.0 ms, 2 tags"
+
+
+class Quick:
+    """An observer that finds the platform at once, or keeps silent for ever."""
+
+    def __init__(self, silent: bool) -> None:
+        self._silent = silent
+
+    def __enter__(self) -> Quick:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def look(self, trigger: Trigger) -> Look:
+        while self._silent and trigger.frame > 2:
+            signal.pause()
+        return seen_at(trigger)
+
+
+def quick() -> Quick:
+    return Quick(silent=False)
+
+
+def silent() -> Quick:
+    return Quick(silent=True)
+
+
+@pytest.mark.parametrize("how", ["stopped", "silent"])
+def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
+    monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """Real processes; the loop's clock is ours, so nobody has to wait for 2 s."""
+    monkeypatch.setattr(camera_process, "PATIENCE", 1.0)
+    monkeypatch.setattr(camera_process, "END_TIMEOUT", 0.2)
+    make = {"front": quick, "side": silent if how == "silent" else quick}
+    processes = [CameraProcess(name, make[name], may_wait=False) for name in make]  # type: ignore[arg-type]
+    try:
+        for process in processes:
+            process.require_ready()
+        eyes = [CameraEye(process, "here") for process in processes]
+        run, told, now = RunCameras(eyes, MODEL, 0.01, RATE), [], 0.0
+        while not told:
+            now += 1.0 / RATE
+            assert now < 60.0, "it is told soon"
+            run.trigger(now, now, None)
+            told += [news.text for news in run.news()]
+            if how == "stopped" and len(eyes[1].looks) == 3:
+                os.kill(child("side"), signal.SIGSTOP)
+            front_only = len(eyes[1].looks) >= 3
+            wait_for_answers(processes[:1] if front_only else processes)
+        seen = run.finish()
+    finally:
+        for process in processes:
+            process.close()
+    assert told == ["camera side gave no answer for 2 s; clearance is measured by front"]
+    front, side = seen.cameras
+    assert front.poses == front.pictures > 20
+    assert side.poses == side.pictures - 1 >= 3
+    assert "gave no answer any more" in side.failed
+    assert [n.code for n in run.news()] == ["camera"]
+    assert not [c for c in multiprocessing.active_children() if c.name.startswith("cdpr-camera")]
+
+
+def child(name: str) -> int:
+    (process,) = (c for c in multiprocessing.active_children() if c.name == f"cdpr-camera-{name}")
+    assert process.pid is not None
+    return process.pid
+
+
+def wait_for_answers(processes: Sequence[CameraProcess]) -> None:
+    for process in processes:
+        if process.unanswered is not None:
+            assert process._link.poll(20.0)
+
+
+def test_the_names_of_the_pictures_tell_the_camera(tmp_path: Path) -> None:
+    from executor.run_folder import RunFolder
+
+    folder = RunFolder.create(tmp_path / "run")
+    image = np.zeros((8, 8), np.uint8)
+    assert folder.write_picture(7, image, "side_") == "pictures/side_frame_000007.jpg"
+    assert folder.write_picture(7, image) == "pictures/frame_000007.jpg"
