@@ -71,6 +71,9 @@ class SimulatedCameraDocument(Document):
     )
     noise: NonNegative = Field(default=1.5, description="standard deviation, grey levels of 255")
     blur_px: NonNegative = Field(default=0.0, description="standard deviation")
+    exposure_ms: NonNegative = Field(
+        default=0.0, description="the platform's motion meanwhile is smeared; 0 for none"
+    )
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
     light: Positive = Field(default=1.0, description="share of full light")
     cables: bool = Field(default=True, description="cables hide what is behind them")

@@ -80,6 +80,7 @@ def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
         noise=truth.noise,
         vignetting=truth.vignetting,
         blur=truth.blur_px,
+        exposure=truth.exposure_ms / 1e3,
         light=truth.light,
         cables=truth.cables,
     )

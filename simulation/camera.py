@@ -6,6 +6,8 @@ What stands still is drawn once; a picture redraws the platform's surroundings a
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +26,19 @@ from simulation.camera_canvas import (
     Image32,
     Region,
     draw_quad,
+    pixels_of,
     region_of,
     sample_rays,
 )
+from simulation.motion import Motion
 from simulation.optics import Optics
 
 #: Brightness of the platform's faces in full light.
 PLATFORM = 168.0
+#: A platform that is nearer to the lens is not drawn, or not smeared, [m].
+NEAREST = 0.02
+#: A smear is drawn as so many poses that neighbours are this far apart, [px], but no more than:
+SMEAR_STEP, MOST_POSES = 0.5, 64
 #: Slack of the precomputed noise, in which each picture takes another place, [px].
 NOISE_SLACK = 96
 
@@ -68,16 +76,41 @@ class SyntheticCamera:
         self._depth = self._background.depth[1::SAMPLES, 1::SAMPLES].copy()
         self._noise = _noise(camera, self.optics.noise, seed)
 
-    def render(self, pose: Pose, frame: int = 0) -> Image8:
+    def render(self, pose: Pose, frame: int = 0, motion: Motion | None = None) -> Image8:
         """The picture with the platform at ``pose`` (``world_from_platform``).
 
         Args:
-            pose: Exact truth of the picture.
+            pose: Exact truth of the picture, in the middle of its exposure.
             frame: Number of the picture; it picks the noise.
+            motion: Of the platform meanwhile; left out, it stands still.
 
         Returns:
             Grey picture, shape (height, width).
         """
+        poses = self._while_exposed(pose, motion)
+        if len(poses) == 1:
+            return self._with_noise(self._at(pose), frame)
+        light = np.zeros(self._still.shape, np.float32)
+        for one in poses:
+            light += self._at(one)
+        return self._with_noise(np.asarray(light / len(poses) + 0.5, dtype=np.uint8), frame)
+
+    def _while_exposed(self, pose: Pose, motion: Motion | None) -> list[Pose]:
+        """Poses in the middles of equal parts of the exposure, so many that the smear is even."""
+        time = self.optics.exposure
+        if motion is None or time <= 0.0:
+            return [pose]
+        ends = (motion.moved(pose, share * time) for share in (-0.5, 0.5))
+        seen = [self._camera_from_world.apply(p.apply(self.rig.platform_corners)) for p in ends]
+        if min(float(corners[:, 2].min()) for corners in seen) < NEAREST:
+            return [pose]
+        first, last = (pixels_of(self.camera, corners) for corners in seen)
+        smear = float(np.linalg.norm(last - first, axis=1).max())
+        count = min(MOST_POSES, max(1, math.ceil(smear / SMEAR_STEP)))
+        return [motion.moved(pose, ((k + 0.5) / count - 0.5) * time) for k in range(count)]
+
+    def _at(self, pose: Pose) -> Image8:
+        """The picture of a platform that stands still, without noise."""
         picture, depth = self._still.copy(), self._depth
         region = self._platform_region(pose)
         if not region.empty:
@@ -90,11 +123,11 @@ class SyntheticCamera:
         if self.optics.cables:
             cables, radius = cables_at(self.rig, pose), self.rig.cable_radius
             draw_cables(picture, depth, self.camera, cables, self._camera_from_world, radius)
-        return self._with_noise(picture, frame)
+        return picture
 
     def _platform_region(self, pose: Pose) -> Region:
         corners = self._camera_from_world.apply(pose.apply(self.rig.platform_corners))
-        if np.all(corners[:, 2] < 0.02):
+        if np.all(corners[:, 2] < NEAREST):
             return Region(0, 0, 0, 0)
         return region_of(self.camera, corners, margin=8)
 

@@ -13,6 +13,7 @@ class Optics:
         noise: Standard deviation, [grey levels of 255].
         vignetting: Light lost in the corners of the picture, share of 1.
         blur: Standard deviation of the lens's and focus's blur, [px].
+        exposure: Time for which the platform's motion is smeared, [s]; 0 for sharp pictures.
         light: Share of full light; less leaves less contrast, more overexposes.
         cables: Cables hide what is behind them.
     """
@@ -20,5 +21,6 @@ class Optics:
     noise: float = 1.5
     vignetting: float = 0.25
     blur: float = 0.0
+    exposure: float = 0.0
     light: float = 1.0
     cables: bool = True

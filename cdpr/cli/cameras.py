@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from drivers.cameras import LiveCamera
     from executor.observer import Observer, PictureSource, Trigger
     from executor.run_cameras import RunCameras
-    from simulation.camera import SyntheticCamera
+    from simulation.motion import Film
     from tracking.measurement import Observation
 
 SYNTHETIC = "synthetic"
@@ -236,9 +236,10 @@ def make_observer(
 
 def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
     if name == SYNTHETIC:
+        from simulation.motion import Film
         from simulation.simulate import make_synthetic_camera
 
-        return RenderedPictures(make_synthetic_camera(rig, scene, camera))
+        return RenderedPictures(Film(make_synthetic_camera(rig, scene, camera)))
     from drivers.cameras import LiveCamera
 
     return LivePictures(LiveCamera(name, camera))
@@ -247,14 +248,14 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
 class RenderedPictures:
     """The synthetic camera as the run's source of pictures."""
 
-    def __init__(self, camera: SyntheticCamera) -> None:
-        self._camera = camera
+    def __init__(self, film: Film) -> None:
+        self._film = film
 
     def picture(self, trigger: Trigger) -> tuple[NDArray[np.uint8], float]:
         """Renders the platform where it truly is."""
         if trigger.true_pose is None:
             raise Fault("the synthetic camera was not told where the platform is")
-        return self._camera.render(trigger.true_pose, trigger.frame), 0.0
+        return self._film.picture(trigger.time, trigger.true_pose, trigger.frame), 0.0
 
     def close(self) -> None:
         """Nothing to let go of."""

@@ -131,8 +131,9 @@ def _rendered(
     rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
 ) -> Iterable[Picture]:
     from drivers.cameras import Frame
+    from simulation.motion import Film
     from simulation.simulate import make_synthetic_camera
 
-    synthetic = make_synthetic_camera(rig, scene, camera)
+    film = Film(make_synthetic_camera(rig, scene, camera))
     for number, (time, pose) in enumerate(looks):
-        yield Frame(time, synthetic.render(pose, number), f"rendered {number}")
+        yield Frame(time, film.picture(time, pose, number), f"rendered {number}")

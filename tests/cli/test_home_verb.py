@@ -98,11 +98,11 @@ def test_a_camera_that_is_not_there_is_found_out_before_anything_moves(
 def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
     render, shown = SyntheticCamera.render, []
 
-    def looked_at(camera: SyntheticCamera, pose: Pose, frame: int) -> object:
+    def looked_at(camera: SyntheticCamera, pose: Pose, frame: int, *moving: object) -> object:
         shown.append(frame)
         if shown == [0, 0, 1]:  # the first before anything moved
             os.kill(os.getpid(), signal.SIGINT)
-        return render(camera, pose, frame)
+        return render(camera, pose, frame, *moving)
 
     monkeypatch.setattr(SyntheticCamera, "render", looked_at)
     answer = call("home", RIG, "--camera", "synthetic", "--pictures", "20", "--fast")
