@@ -201,9 +201,8 @@ def test_pulleys_payload_and_disturbances_are_planned_and_checked(hall, ready_sc
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2, 3])
 @pytest.mark.parametrize("clearance_mm", [10, 20])
-def test_plans_of_several_seeds_pass_their_check(gachon, ready_scene, number, clearance_mm) -> None:
-    """A slice of `benchmarks/campaign.py`, which runs twenty seeds each."""
+def test_plans_of_other_seeds_pass_their_check(gachon, ready_scene, number, clearance_mm) -> None:
+    """Another seed each; `benchmarks/campaign.py` runs twenty."""
     scene = ready_scene(f"environment_{number}").changed(clearance=clearance_mm / 1000)
-    for seed in range(3):
-        document = proved(gachon, scene, PlannerSettings(seed=seed))
-        assert document.quality.obstacle_clearance.distance_mm >= clearance_mm
+    document = proved(gachon, scene, PlannerSettings(seed=number + clearance_mm))
+    assert document.quality.obstacle_clearance.distance_mm >= clearance_mm

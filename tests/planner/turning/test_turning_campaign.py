@@ -14,7 +14,7 @@ from planner.turning.problem import Problem, move_allowed
 from tests.planner.exact.sampled_oracle import random_scene
 from tests.planner.turning.turning_scenes import GACHON, HALL, Judge, problem_of, random_pose, row
 
-SCENES, MOVES, SAMPLES = 14, 30, 15
+SCENES, MOVES, SAMPLES = 14, 30, 9
 
 
 def pose_of(found: Array) -> Pose:
