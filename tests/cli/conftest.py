@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from planner import machine_code
 from tests.cli.plans import RIG, write_short_plan
 from tests.cli.program import Answer, call
 
@@ -15,13 +16,15 @@ from tests.cli.program import Answer, call
 def plain_terminal(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    """No colour forced from outside, and own folders for announcements and error files."""
+    """No colour forced from outside, own folders for announcements and error files, and nothing
+    told of machine code that this machine has not made yet."""
     for name in ("FORCE_COLOR", "PY_COLORS", "GITHUB_ACTIONS", "TTY_COMPATIBLE", "COLUMNS"):
         monkeypatch.delenv(name, raising=False)
     temporary = tmp_path_factory.mktemp("tmp")
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(machine_code, "is_compiled", lambda task: True)
     return temporary
 
 

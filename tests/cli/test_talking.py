@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import pytest
 
 from cdpr.cli.verbs import VERBS
+from planner import machine_code
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import Answer, call
 
@@ -77,6 +78,19 @@ def test_json_of_plan_and_check(tmp_path: Path) -> None:
     assert (checked.code, checked.err) == (0, "")
     assert document(checked)["passed"] is True
     assert document(checked)["hash"] == document(planned)["hash"]
+
+
+def test_compiling_is_told_where_it_does_not_disturb_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted: list[str] = []
+    monkeypatch.setattr(machine_code, "is_compiled", lambda task: False)
+    monkeypatch.setattr(machine_code, "note_compiled", noted.append)
+    scene = CONFIGS / "environment_1.yaml"
+    planned = call("plan", RIG, scene, "-o", tmp_path / "plan.json", "--json")
+    assert document(planned)["plan"] == str(tmp_path / "plan.json")
+    assert "compiling the planner for this machine, once" in planned.said
+    assert noted == ["optimal"]
 
 
 def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
