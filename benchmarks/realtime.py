@@ -33,8 +33,8 @@ from cdpr.plan import load_plan, save_plan
 from cdpr.poses import Array
 from cdpr.rig import Rig, load_rig, rig_from_document
 from cdpr.scene import load_scene
+from executor.path_in_real_time import run_in_real_time
 from executor.prepare import PreparedRun, prepare
-from executor.real_time_process import run_in_real_time
 from executor.recorder import Recorder
 from executor.run_folder import RunFolder
 from executor.shared_board import SharedBoard

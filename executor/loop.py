@@ -87,6 +87,11 @@ class Loop:
         require_at_start(self._course, np.array(actual, dtype=np.float64))
         self._exchange.actual, self._exchange.armed = actual, True
 
+    @property
+    def stands_at(self) -> tuple[int, ...]:
+        """Where the drives stood when they were last heard, from arming on, [counts]."""
+        return self._exchange.actual
+
     def run(self) -> State:
         """Runs to the end; returns the last state, and `cause` says why it is not FINISHED.
 
@@ -203,7 +208,7 @@ class Loop:
             cycle=self._cycle,
             at=self._clock.time,
             state=self.machine.state,
-            index=self._feed.index,
+            index=self._place(),
             rate=self._feed.rate if self.machine.state in ON_PATH else 0.0,
             targets=self._exchange.resting_targets,
             actual=self._exchange.actual,
@@ -217,6 +222,10 @@ class Loop:
         )
         self._cycle += 1
         self._told_outside(lambda: self._on_cycle(record))
+
+    def _place(self) -> float:
+        """Where in the motion this is, for the record."""
+        return self._feed.index
 
     def _told_outside(self, tell: Callable[[], None]) -> None:
         """A listener that fails does not break the loop; it leads to a stop along the path."""

@@ -7,11 +7,9 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from cdpr.errors import CdprError, Fault
-from cdpr.poses import Pose
-from executor.arming import require_still_referenced
+from drivers.drive_group import CycleStatus
 from executor.clock import RealClock
-from executor.loop import Loop
-from executor.machine import ON_PATH
+from executor.machine import State
 from executor.real_time_job import (
     CYCLE_SLOTS,
     EVENT_SLOTS,
@@ -20,6 +18,7 @@ from executor.real_time_job import (
     Failed,
     Go,
     Job,
+    Look,
     ReadyDrives,
 )
 from executor.realtime import real_time, require_real_time
@@ -57,49 +56,44 @@ def serve(job: Job, link: Connection, supervisor: int) -> None:
 
 
 def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Supervised) -> None:
-    course = job.course()
+    motion = job.motion
     cycles, events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
-    wire = RecordWire(course.rig.cable_count)
-
-    def true_pose(cycle: int) -> Pose | None:
-        wanted = job.pose_every and cycle % job.pose_every == 0
-        return drives.true_pose() if wanted and drives.true_pose else None
+    wire = RecordWire(motion.cables)
 
     def on_cycle(record: CycleRecord) -> None:
-        if record.state in ON_PATH:
-            for load in job.loads.due(record.index):
-                drives.carry(load)
-        cycles.put(wire.pack(record, true_pose(record.cycle)))
+        cycles.put(wire.pack(record, motion.after(record, drives)))
 
     def on_event(event: LoopEvent) -> None:
         events.put(pack_event(event, events.largest_content))
 
     with real_time() as denied:
         require_real_time(denied, needed=job.need_real_time)
-        loop = Loop(
-            course,
-            drives.group,
-            RealClock(course.cycle),
+        loop = motion.loop(
+            drives,
+            RealClock(motion.cycle),
             wishes=supervised.read,
             on_cycle=on_cycle,
             on_event=on_event,
         )
-        require_still_referenced(course.rig, job.reference, drives.group)
         loop.arm()
-        _say(link, Armed(denied))
-        if not _may_go(link):
+        _say(link, Armed(denied, loop.stands_at))
+        if not isinstance(_heard(link), Go):
             return
         state = loop.run()
-    _say(link, Ended(state, loop.cause, loop.holding))
+    _say(link, Ended(state, loop.cause, loop.holding, drives.true_pose_now()))
+    # After any other end the supervisor may hang, and nobody asks.
+    while state is State.FINISHED and isinstance(_heard(link), Look):
+        _say(link, drives.group.read_positions())
 
 
-def _may_go(link: Connection) -> bool:
+def _heard(link: Connection) -> object:
+    """The supervisor's next word; None when it changed its mind, is done, or is gone."""
     try:
-        return isinstance(link.recv(), Go)
-    except (EOFError, OSError):  # the supervisor changed its mind, or is gone
-        return False
+        return link.recv()
+    except (EOFError, OSError):
+        return None
 
 
-def _say(link: Connection, what: Armed | Ended | Failed) -> None:
+def _say(link: Connection, what: Armed | Ended | Failed | CycleStatus) -> None:
     with suppress(OSError):  # nobody is there to hear it; the drives hold all the same
         link.send(what)

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable
-from contextlib import suppress
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import wait
 
-from cdpr.errors import CdprError, Fault, StoppedByOperator
-from executor.announcing import load_changes
-from executor.course import course_of
-from executor.custody import Custody
-from executor.execution import Outcome
+from cdpr.errors import CdprError, Fault, Refused, StoppedByOperator
+from drivers.drive_group import CycleStatus
 from executor.machine import State
-from executor.prepare import PreparedRun
 from executor.real_time_child import serve
 from executor.real_time_job import (
     CYCLE_SLOTS,
@@ -26,10 +21,12 @@ from executor.real_time_job import (
     Failed,
     Go,
     Job,
+    Look,
     MakeDrives,
+    Motion,
+    Records,
 )
-from executor.recorder import Recorder
-from executor.records import LoopEvent
+from executor.records import CycleRecord, LoopEvent
 from executor.ring import Ring
 from executor.shared_board import SharedBoard
 from executor.spawning import interrupts_blocked, one_thread
@@ -41,77 +38,39 @@ LOOK = 0.01
 END_TIMEOUT = 10.0
 
 
-def run_in_real_time(
-    prepared: PreparedRun,
-    make_drives: MakeDrives,
-    board: SharedBoard,
-    recorder: Recorder,
-    *,
-    pose_every: int,
-    need_real_time: bool,
-    before_motion: Callable[[str], None],
-) -> Outcome:
-    """Moves along the path in a process of its own; ends with the drives holding by themselves.
+@contextmanager
+def real_time_process(
+    motion: Motion, make_drives: MakeDrives, board: SharedBoard, *, need_real_time: bool
+) -> Iterator[RealTimeProcess]:
+    """A process for one motion; it has ended when the block is left.
 
     Args:
-        prepared: The checked run.
+        motion: What to do.
         make_drives: Opens and configures the drives; called in that process; picklable.
         board: What the operator wants.
-        recorder: Takes in what happens.
-        pose_every: Cycles from one true pose of the simulated platform to the next; 0 for none.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
-        before_motion: Called when all is armed, with what was denied; what it raises prevents the
-            motion.
-
-    Raises:
-        CdprError: The bus is latched, or the process could not arm the drives, for the reason told;
-            nothing was enabled.
-        StoppedByOperator: The operator wanted to stop before anything moved.
     """
-    custody = Custody(prepared.rig)
-    reference = custody.require_ready()
-    course = course_of(prepared.checked)
-    job = Job.of(
-        course,
-        board.memory,
-        make_drives,
-        pose_every=pose_every,
-        loads=load_changes(prepared.scene, prepared.checked.table.stands),
-        need_real_time=need_real_time,
-        reference=reference,
-    )
-    process = _Process(job, board)
+    job = Job.of(motion, board.memory, make_drives, need_real_time=need_real_time)
     try:
-        denied = process.armed()
-        custody.begin(recorder.folder.path, reference)
+        process = RealTimeProcess(job, board)
         try:
-            before_motion(denied)
-        except BaseException:
-            custody.prevented()
-            raise
-        started = datetime.now(UTC)
-        ended = process.supervise(recorder)
-        try:
-            custody.end(
-                ended.state,
-                ended.cause,
-                recorder.folder.path,
-                holding=ended.holding,
-                stands_at=recorder.log.last_positions,
-            )
-        except CdprError as error:  # the motion is over: its record is finished all the same
-            ended = process.not_kept(recorder, ended, error)
-        return Outcome(ended.state, ended.cause, recorder.log, ended.holding, started)
+            yield process
+        finally:
+            process.close()
     finally:
-        process.close()
         job.close()
 
 
-class _Process:
+class RealTimeProcess:
+    """One motion in a process of its own; a `WinchMover`."""
+
     def __init__(self, job: Job, board: SharedBoard) -> None:
+        """Starts it; it opens the drives."""
         self._board = board
-        self._wire = RecordWire(len(job.rig.winches))
+        self._wire = RecordWire(job.motion.cables)
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
+        self._records: Records | None = None
+        self._last: CycleRecord | None = None
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
         self._process = context.Process(
@@ -121,12 +80,16 @@ class _Process:
             self._process.start()
         far_end.close()
 
-    def armed(self) -> str:
-        """Waits until the drives are armed; returns what the system denied.
+    def arm(self, records: Records) -> Armed:
+        """Waits until the drives are armed.
+
+        Args:
+            records: Takes in what happens from now on.
 
         Raises:
             CdprError: They could not be, or the operator wants to stop.
         """
+        self._records = records
         while True:
             self._board.beat()
             if self._board.read().stop:
@@ -134,11 +97,17 @@ class _Process:
             if wait([self._link, self._process.sentinel], LOOK):
                 said = self._heard()
                 if isinstance(said, Armed):
-                    return said.denied
+                    return said
                 raise said.error if isinstance(said, Failed) else self._died()
 
-    def supervise(self, recorder: Recorder) -> Ended:
-        """Says go, and takes in what happens until the motion is over."""
+    def run(self) -> Ended:
+        """Says go, and takes in what happens until the motion is over.
+
+        Raises:
+            Refused: It was not armed.
+        """
+        if self._records is None:
+            raise Refused("the motion was not armed", where="executor")
         self._board.beat()
         with suppress(OSError):  # it died since it was armed, which is told below
             self._link.send(Go())
@@ -149,19 +118,32 @@ class _Process:
             self._board.beat()
             if over:
                 said = self._heard()
-            self._take_in(recorder)
+            self._take_in(self._records)
         if isinstance(said, Ended):
             return said
         error = said.error if isinstance(said, Failed) else self._died()
-        self._record(partial(recorder.take_event, _lost(recorder, error)))
-        return Ended(State.LATCHED, error.what, holding=True)  # by themselves, as SYNC stays away
+        self.tell("real_time_lost", error.what)
+        # They hold by themselves, as SYNC stays away.
+        return Ended(State.LATCHED, error.what, holding=True, true_pose=None)
 
-    def not_kept(self, recorder: Recorder, ended: Ended, error: CdprError) -> Ended:
-        """The end of a motion whose latch or reference could not be written: it is a fault."""
-        text = f"{error.what} ({error.where}: {error.why})"
-        event = LoopEvent(len(recorder.log), recorder.last, "recorder", text)
-        self._record(partial(recorder.take_event, event))
-        return Ended(State.LATCHED, ended.cause or text, ended.holding)
+    def stands_now(self) -> CycleStatus:
+        """What the drives tell after the motion.
+
+        Raises:
+            CdprError: One does not answer, or the process is gone.
+        """
+        with suppress(OSError):  # told below
+            self._link.send(Look())
+        said = self._heard()
+        if isinstance(said, CycleStatus):
+            return said
+        raise said.error if isinstance(said, Failed) else self._died()
+
+    def tell(self, code: str, text: str) -> None:
+        """Records an event that happened after the last cycle."""
+        cycle, at = (self._last.cycle + 1, self._last.at) if self._last else (0, 0.0)
+        if self._records is not None:
+            self._record(partial(self._records.take_event, LoopEvent(cycle, at, code, text)))
 
     def close(self) -> None:
         """Waits for the process; whatever it does, it comes to rest and ends."""
@@ -192,12 +174,13 @@ class _Process:
             next_step="look at the platform first; then start again from where it is",
         )
 
-    def _take_in(self, recorder: Recorder) -> None:
+    def _take_in(self, records: Records) -> None:
         """Everything that was told since the last time; cycles first, they tell the time."""
         for content in self._cycles.take():
-            self._record(partial(recorder.take_cycle, *self._wire.unpack(content)))
+            self._last, true_pose = self._wire.unpack(content)
+            self._record(partial(records.take_cycle, self._last, true_pose))
         for content in self._events.take():
-            self._record(partial(recorder.take_event, unpack_event(content)))
+            self._record(partial(records.take_event, unpack_event(content)))
         lost = self._cycles.lost + self._events.lost
         if lost:
             self._board.complain(f"{lost} records of the run were lost: they came too fast")
@@ -210,7 +193,3 @@ class _Process:
             self._board.complain(f"what records the run failed: {error.what}")
         except Exception as error:
             self._board.complain(f"what records the run failed: {type(error).__name__}: {error}")
-
-
-def _lost(recorder: Recorder, error: CdprError) -> LoopEvent:
-    return LoopEvent(len(recorder.log), recorder.last, "real_time_lost", error.what)

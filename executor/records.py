@@ -15,7 +15,7 @@ class CycleRecord:
         cycle: Counted from the first one sent.
         at: When it began, on the loop's clock, [s].
         state: Where the run was.
-        index: Place in the table.
+        index: Place in the table; of winches that move without a path how much is done, [%].
         rate: Rows a cycle that the feed went.
         targets: What was sent, [counts].
         actual: What the drives answered, [counts].

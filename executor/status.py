@@ -209,25 +209,23 @@ class WinchStatus(MotionStatus):
     def __init__(self, rig: Rig, board: WishBoard, *, simulated_time: bool) -> None:
         """A motion that is being prepared."""
         super().__init__(rig, board, simulated_time=simulated_time)
-        self._progress = 0.0
         self._events: deque[LoopEvent] = deque(maxlen=EVENTS_TOLD)
 
-    def take_cycle(self, record: CycleRecord, progress: float) -> None:
-        """A cycle is over, and so much of the motion, 0 to 1."""
+    def take_cycle(self, record: CycleRecord) -> None:
+        """A cycle is over."""
         self._cycles.take(record)
-        self._progress = progress
 
     def take_event(self, event: LoopEvent) -> None:
         """Something happened."""
         self._events.append(event)
 
     def _place(self) -> dict[str, Any]:
-        row = None if self._cycles.last is None else round(100.0 * self._progress, 1)
+        row = None if self._cycles.last is None else round(self._cycles.last.index, 1)
         return {"row": row, "rows": 100, "path_mm": None, "path_length_mm": None}
 
     def _told(self) -> list[dict[str, Any]]:
         began = self._cycles.began
         return [
-            {"time_s": round(event.at - began, 3), "code": event.code, "text": event.text}
+            {"time_s": max(0.0, round(event.at - began, 3)), "code": event.code, "text": event.text}
             for event in list(self._events)
         ]

@@ -67,3 +67,7 @@ class WinchLoop(Loop):
                 self._judge(findings, "")
             if self.machine.state is state:
                 self._status = self._send(Purpose.MOVE, targets)
+
+    def _place(self) -> float:
+        """How much is done, [%]."""
+        return 100.0 * self._law.progress

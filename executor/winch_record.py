@@ -34,7 +34,7 @@ class WinchRecord:
         """Takes open files; they stay the caller's."""
         self.folder, self.cycles = folder, 0
         self._events, self._winches = events, winches
-        self._began: float | None = None
+        self._began = float("inf")  # until there is a cycle
 
     def take_cycle(self, record: CycleRecord) -> None:
         """A cycle is over."""
@@ -43,6 +43,7 @@ class WinchRecord:
             cables = range(1, len(record.actual) + 1)
             names = [f"{column}_{cable}" for column in columns for cable in cables]
             self._winches.write(f"cycle,time_s,state,{','.join(names)}\n")
+            self._began = record.at
         self.cycles += 1
         numbers = (*record.targets, *record.actual, *record.torques)
         row = (record.cycle, f"{self._time(record.at):.6f}", record.state.value, *numbers)
@@ -54,9 +55,8 @@ class WinchRecord:
         self._events.write(json.dumps(told, ensure_ascii=False) + "\n")
 
     def _time(self, at: float) -> float:
-        """Since the first cycle or event, [s]."""
-        self._began = at if self._began is None else self._began
-        return at - self._began
+        """Since the first cycle, [s]; 0 before it."""
+        return max(0.0, at - self._began)
 
 
 @contextmanager

@@ -179,7 +179,7 @@ def look_at_rest(
     rig: Rig,
     name: str,
     pictures: int,
-    true_pose: Callable[[], Pose] | None,
+    true_pose: Pose | None,
     before_each: Callable[[], None],
 ) -> list[Observation]:
     """Pictures of a platform that stands still, each measured.
@@ -204,8 +204,7 @@ def look_at_rest(
         for frame in range(pictures):
             before_each()
             asked = time.monotonic()
-            pose = true_pose() if true_pose is not None else None
-            image, _ = source.picture(Trigger(frame, frame / camera.rate, asked, pose))
+            image, _ = source.picture(Trigger(frame, frame / camera.rate, asked, true_pose))
             looks.append(tracker.observe(image, frame / camera.rate))
         return looks
     finally:

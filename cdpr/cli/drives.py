@@ -50,7 +50,7 @@ def open_drives(
     from executor.custody import Custody
     from executor.real_time_job import ReadyDrives
 
-    custody = Custody(rig)
+    custody, counted = Custody(rig), rig
     settings = BusSettings.of(rig)
     restarted: set[int] = set()
 
@@ -83,7 +83,7 @@ def open_drives(
         remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
         for remark in remarks:
             err.print(f"[yellow]remark[/] {remark}", soft_wrap=True)
-        yield ReadyDrives(group, true_pose, carry, tuple(sorted(restarted)))
+        yield ReadyDrives(counted, group, true_pose, carry, tuple(sorted(restarted)))
 
 
 def _happens_by_itself(_load: Load) -> None:
@@ -97,3 +97,28 @@ def drives_of(
     from cdpr.rig import rig_from_document
 
     return open_drives(rig_from_document(document), simulated_start, load)
+
+
+def unreferenced_drives_of(
+    document: RigDocument, about: Pose, limit: float, lost_power: PowerLoss | None
+) -> AbstractContextManager[ReadyDrives]:
+    """`open_drives` for a process of its own, for drives that count from anywhere.
+
+    Args:
+        document: The rig file.
+        about: Where the platform is about, ``world_from_platform``.
+        limit: Largest tension, [N]; none is set up that holds more.
+        lost_power: What became of drives that are simulated there.
+    """
+    from cdpr.rig import rig_from_document
+    from cdpr.scene import nothing_in_the_way
+    from executor.unreferenced import counted_here, require_below
+
+    rig = rig_from_document(document)
+
+    def set_up_as(told: CycleStatus) -> tuple[Rig, float]:
+        require_below(rig, told, limit)
+        return counted_here(rig, told.positions.tolist(), about), limit
+
+    load = nothing_in_the_way(rig).load
+    return open_drives(rig, about, load, lost_power=lost_power, set_up_as=set_up_as)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,9 +21,7 @@ if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
     from executor.custody import Custody
-    from executor.real_time_job import ReadyDrives
     from executor.reference import ReferenceDocument
-    from executor.winch_laws import WinchLaw
     from executor.winch_motion import WinchesStand
     from executor.wishes import WishBoard
 
@@ -141,18 +138,17 @@ def home(
     )
     made: list[ReferenceDocument] = []
 
-    def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
-        return TakeUp(as_set_up, counts, target=target, limit=limit, reach=reach, speed=speed)
-
-    def at_rest(stand: WinchesStand, drives: ReadyDrives, board: WishBoard) -> ReferenceDocument:
-        made.append(_referenced(the_rig, stand, drives, board, known, camera, pictures))
+    def at_rest(stand: WinchesStand, true_pose: Pose | None, board: WishBoard) -> ReferenceDocument:
+        made.append(_referenced(the_rig, stand, true_pose, board, known, camera, pictures))
         return made[0]
+
+    take_up = partial(TakeUp, target=target, limit=limit, reach=reach, speed=speed)
 
     lost = PowerLoss.drawn(
         the_rig, 0, simulated_slack_mm / 1000.0, on_a_stand=camera is None
     ) if in_process else None  # fmt: skip
     motion = WinchMotion(
-        the_rig, known or the_rig.home, limit, speed, make_law, lost, fast, without_real_time,
+        the_rig, known or the_rig.home, limit, speed, take_up, lost, fast, without_real_time,
         as_json, anew=True, name="home",
     )  # fmt: skip
     carry_out_by_law(motion, at_rest)
@@ -168,7 +164,7 @@ def _require_picture(rig: Rig, camera: str) -> None:
     """The camera is there and gives pictures, before anything is moved for it."""
     from cdpr.cli.cameras import look_at_rest
 
-    look_at_rest(rig, camera, 1, lambda: rig.home, lambda: None)
+    look_at_rest(rig, camera, 1, rig.home, lambda: None)
 
 
 def _known_pose(
@@ -252,7 +248,7 @@ def _target(rig: Rig, tension_n: float | None, limit: float) -> float:
 def _referenced(
     rig: Rig,
     stand: WinchesStand,
-    drives: ReadyDrives,
+    true_pose: Pose | None,
     board: WishBoard,
     known: Pose | None,
     camera: str | None,
@@ -280,7 +276,7 @@ def _referenced(
                 next_step="home again when all is well",
             )
 
-    looks = look_at_rest(rig, camera, pictures, drives.true_pose, unless_stopped)
+    looks = look_at_rest(rig, camera, pictures, true_pose, unless_stopped)
     found = rest_pose(rig, looks)
     how = f"tags in {found.pictures} of {pictures} pictures, camera {rig.cameras[0].name!r}"
     return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cdpr.rig import Rig
-    from executor.winch_laws import WinchLaw
 
 
 def jog_cable(
@@ -76,20 +74,13 @@ def jog_cable(
         asks=not (in_process or yes),
         as_json=as_json,
     )
-    begun: list[Sequence[int]] = []
-
-    def make_law(as_set_up: Rig, counts: Sequence[int]) -> WinchLaw:
-        begun.append(counts)
-        return CableStep(
-            as_set_up, counts, cable=cable - 1, way=mm / 1000.0, limit=limit, speed=speed
-        )
-
+    step = partial(CableStep, cable=cable - 1, way=mm / 1000.0, limit=limit, speed=speed)
     motion = WinchMotion(
-        rig, rig.home, limit, speed, make_law, None, fast, without_real_time, as_json,
+        rig, rig.home, limit, speed, step, None, fast, without_real_time, as_json,
         anew=False, name="jog-cable",
     )  # fmt: skip
-    stand = carry_out_by_law(motion, lambda _stand, _drives, _board: None)
-    moved = (stand.counts[cable - 1] - begun[0][cable - 1]) / winch.counts_per_metre * 1000.0
+    stand = carry_out_by_law(motion, lambda _stand, _true_pose, _board: None)
+    moved = (stand.counts - stand.began)[cable - 1] / winch.counts_per_metre * 1000.0
     tensions = [round(float(t), 2) for t in stand.tensions]
     if as_json:
         show_json({"cable": cable, "moved_mm": round(float(moved), 4), "tensions_n": tensions})

@@ -103,7 +103,7 @@ def _released(rig: Rig, custody: Custody, without_real_time: bool) -> CycleStatu
     from executor.command_server import serving
     from executor.running import announced, stop_requests
     from executor.status import WinchStatus
-    from executor.winch_motion import set_up_here
+    from executor.unreferenced import set_up_here
     from executor.wishes import OwnBoard
 
     board = OwnBoard()

@@ -94,7 +94,7 @@ def _drives_reset(rig: Rig) -> dict[str, Any]:
     from executor.clock import RealClock
     from executor.custody import Custody
     from executor.silence import Silence
-    from executor.winch_motion import set_up_here
+    from executor.unreferenced import set_up_here
 
     clock = RealClock(rig.document.bus.cycle_ms / 1000.0)
     load = nothing_in_the_way(rig).load

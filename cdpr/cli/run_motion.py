@@ -198,7 +198,7 @@ def _move_in_real_time(
     from cdpr.cli.drives import drives_of
     from cdpr.cli.output import err
     from drivers.bus import IN_PROCESS
-    from executor.real_time_process import run_in_real_time
+    from executor.path_in_real_time import run_in_real_time
     from executor.records import LoopEvent
 
     def armed(denied: str) -> None:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
     from cdpr.rig import Rig
-    from drivers.drive_group import CycleStatus
-    from executor.real_time_job import ReadyDrives
     from executor.records import CycleRecord, LoopEvent
     from executor.reference import ReferenceDocument
+    from executor.shared_board import SharedBoard
     from executor.status import WinchStatus
-    from executor.winch_laws import WinchLaw
     from executor.winch_motion import WinchesStand
-    from executor.wishes import WishBoard
+    from executor.winch_mover import MakeLaw, WinchMover
+    from executor.winch_record import WinchRecord
+    from executor.wishes import OwnBoard, WishBoard
     from simulation.power_loss import PowerLoss
 
 #: Where the limit lies between the smallest and the largest tension, unless one is named.
@@ -34,7 +35,8 @@ class WinchMotion:
         pose: Where its platform is about, ``world_from_platform``.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
-        make_law: From the rig as its drives count, limited, and where they stand, [counts].
+        make_law: From the rig as its drives count, limited, and where they stand, [counts]; it can
+            be sent to another process.
         lost_power: What became of drives that are simulated in this process.
         fast: Simulated time.
         without_real_time: Move even if real-time scheduling is denied.
@@ -47,7 +49,7 @@ class WinchMotion:
     pose: Pose
     limit: float
     speed: float
-    make_law: Callable[[Rig, Sequence[int]], WinchLaw]
+    make_law: MakeLaw
     lost_power: PowerLoss | None
     fast: bool
     without_real_time: bool
@@ -84,61 +86,61 @@ def speed_of(rig: Rig, speed_mm_s: float) -> float:
 
 def carry_out_by_law(
     motion: WinchMotion,
-    at_rest: Callable[[WinchesStand, ReadyDrives, WishBoard], ReferenceDocument | None],
+    at_rest: Callable[[WinchesStand, Pose | None, WishBoard], ReferenceDocument | None],
 ) -> WinchesStand:
-    """Moves, in this process; ends with the drives holding by themselves.
+    """Moves, in a process of its own or in simulated time; in the end drives hold by themselves.
 
     Args:
         motion: What is wished.
-        at_rest: Called after a motion that came to its end, while the drives are still there; they
-            must have held all the while before the reference that it makes is kept.
+        at_rest: Called after a motion that came to its end, with where the simulated platform is;
+            the drives must have held all the while before the reference that it makes is kept.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
         StoppedByOperator: The operator stopped it.
         CdprError: Nothing was enabled, for the reason told.
     """
-    from cdpr.cli.drives import open_drives
+    from contextlib import ExitStack, nullcontext
+
+    from cdpr.cli.output import progress_bar
+    from cdpr.cli.run_folders import free_folder
     from cdpr.errors import Fault, StoppedByOperator
-    from cdpr.scene import nothing_in_the_way
     from drivers.bus import IN_PROCESS
     from executor.command_server import serving
+    from executor.custody import Custody
     from executor.machine import State
     from executor.running import announced, stop_requests
+    from executor.shared_board import SharedBoard
     from executor.status import WinchStatus
-    from executor.winch_motion import careful, counted_here, require_below, require_held
+    from executor.winch_motion import move_winches
+    from executor.winch_record import recording
     from executor.wishes import OwnBoard
 
-    rig = motion.rig
-    limited: list[tuple[Rig, list[int]]] = []
-
-    def set_up_as(told: CycleStatus) -> tuple[Rig, float]:
-        require_below(rig, told, motion.limit)
-        counts = told.positions.tolist()
-        counted = counted_here(rig, counts, motion.pose)
-        limited.append((careful(counted, limit=motion.limit, speed=motion.speed), counts))
-        return counted, motion.limit
-
-    board = OwnBoard()
+    rig, custody = motion.rig, Custody(motion.rig)
+    in_process = rig.document.bus.interface == IN_PROCESS
+    board: OwnBoard | SharedBoard = OwnBoard() if motion.fast else SharedBoard()
     status = WinchStatus(rig, board, simulated_time=motion.fast)
-    load = nothing_in_the_way(rig).load
-    with (
-        stop_requests(board),
-        announced() as listeners,
-        serving(listeners, board, status),
-        open_drives(
-            rig, motion.pose, load, lost_power=motion.lost_power, set_up_as=set_up_as
-        ) as drives,
-    ):
-        as_set_up, counts = limited[0]
-        law = motion.make_law(as_set_up, counts)
-
-        def settled(stand: WinchesStand) -> ReferenceDocument | None:
-            reference = at_rest(stand, drives, board)
-            require_held(rig, stand, drives.group.read_positions())
-            return reference
-
-        stand = _moved(motion, as_set_up, law, drives, board, status, settled)
+    with ExitStack() as stack:
+        if isinstance(board, SharedBoard):
+            stack.callback(board.close)
+        stack.enter_context(stop_requests(board))
+        listeners = stack.enter_context(announced())
+        stack.enter_context(serving(listeners, board, status))
+        mover = stack.enter_context(_mover(motion, board))
+        kept = stack.enter_context(
+            nullcontext() if in_process else recording(free_folder(motion.name))
+        )
+        status.folder = None if kept is None else kept.folder
+        advance = stack.enter_context(progress_bar("moving, %", 100.0, not motion.quiet))
+        stand = move_winches(
+            mover,
+            rig,
+            custody,
+            _Told(status, kept, advance, motion.quiet),
+            record=kept.folder if kept is not None else custody.file.path,
+            anew=motion.anew,
+            at_rest=lambda stand, true_pose: at_rest(stand, true_pose, board),
+        )
         status.take_end(stand.state, stand.cause)
     if stand.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="begin anew when all is well")
@@ -147,69 +149,63 @@ def carry_out_by_law(
             stand.cause,
             where="winches",
             why="the motion was stopped, all drives together; they hold",
-            next_step="find the cause and look at the platform, then `cdpr reset RIG`"
-            if rig.document.bus.interface != IN_PROCESS
-            else "find the cause; simulated drives begin anew",
+            next_step="find the cause; simulated drives begin anew"
+            if in_process
+            else "find the cause and look at the platform, then `cdpr reset RIG`",
         )
     return stand
 
 
-def _moved(
-    motion: WinchMotion,
-    rig: Rig,
-    law: WinchLaw,
-    drives: ReadyDrives,
-    board: WishBoard,
-    status: WinchStatus,
-    settled: Callable[[WinchesStand], ReferenceDocument | None],
-) -> WinchesStand:
-    from contextlib import nullcontext
+@contextmanager
+def _mover(motion: WinchMotion, board: OwnBoard | SharedBoard) -> Iterator[WinchMover]:
+    """In real time the drives are opened and moved in a process of its own."""
+    from functools import partial
 
-    from cdpr.cli.output import err, progress_bar
-    from cdpr.cli.run_folders import free_folder
+    from cdpr.cli.drives import unreferenced_drives_of
     from drivers.bus import IN_PROCESS
-    from executor.clock import RealClock, SimulatedClock
-    from executor.custody import Custody
-    from executor.realtime import real_time, require_real_time
-    from executor.winch_motion import move_winches
-    from executor.winch_record import recording
+    from executor.clock import SimulatedClock
+    from executor.real_time_process import real_time_process
+    from executor.shared_board import SharedBoard
+    from executor.winch_mover import LawMotion, WinchesHere
 
-    cycle, custody = rig.document.bus.cycle_ms / 1000.0, Custody(motion.rig)
-    simulated = rig.document.bus.interface == IN_PROCESS
-    with (
-        nullcontext("") if motion.fast else real_time() as denied,
-        nullcontext() if simulated else recording(free_folder(motion.name)) as kept,
-        progress_bar("moving, %", 100.0, not motion.quiet) as advance,
-    ):
-        status.folder = None if kept is None else kept.folder
-        require_real_time(denied, needed=not (simulated or motion.without_real_time))
-        if denied:
-            err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
+    document = motion.rig.document
+    cycle = document.bus.cycle_ms / 1000.0
+    law = LawMotion(motion.rig.cable_count, cycle, motion.make_law, motion.limit, motion.speed)
+    make_drives = partial(
+        unreferenced_drives_of, document, motion.pose, motion.limit, motion.lost_power
+    )
+    if isinstance(board, SharedBoard):
+        needed = document.bus.interface != IN_PROCESS and not motion.without_real_time
+        with real_time_process(law, make_drives, board, need_real_time=needed) as process:
+            yield process
+    else:
+        with make_drives() as drives:
+            yield WinchesHere(law, drives, SimulatedClock(cycle), board)
 
-        def on_cycle(record: CycleRecord) -> None:
-            status.take_cycle(record, law.progress)
-            if kept is not None:
-                kept.take_cycle(record)
-            if record.cycle % 10 == 0:
-                advance(100.0 * law.progress)
 
-        def on_event(event: LoopEvent) -> None:
-            status.take_event(event)
-            if kept is not None:
-                kept.take_event(event)
-            if not (motion.quiet or event.code in _OF_COURSE):
-                err.print(f"{event.code}: {event.text}", markup=False, soft_wrap=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """Takes in what happens: for those who ask, for the record, and for who looks on."""
 
-        return move_winches(
-            rig,
-            law,
-            drives.group,
-            SimulatedClock(cycle) if motion.fast else RealClock(cycle),
-            board,
-            custody,
-            record=kept.folder if kept is not None else custody.file.path,
-            anew=motion.anew,
-            at_rest=settled,
-            on_cycle=on_cycle,
-            on_event=on_event,
-        )
+    status: WinchStatus
+    kept: WinchRecord | None
+    advance: Callable[[float], None]
+    quiet: bool
+
+    def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
+        self.status.take_cycle(record)
+        if self.kept is not None:
+            self.kept.take_cycle(record)
+        if record.cycle % 10 == 0:
+            self.advance(record.index)
+
+    def take_event(self, event: LoopEvent) -> None:
+        from cdpr.cli.output import err
+
+        self.status.take_event(event)
+        if self.kept is not None:
+            self.kept.take_event(event)
+        if event.code == "no_real_time":
+            err.print(f"[yellow]remark[/] {event.text}", soft_wrap=True)
+        elif not (self.quiet or event.code in _OF_COURSE):
+            err.print(f"{event.code}: {event.text}", markup=False, soft_wrap=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     assert before.keys() == status().keys()
     assert "preparing" in shown(before)
     for cycle in range(3):
-        told.take_cycle(_record(cycle), progress=0.25)
+        told.take_cycle(replace(_record(cycle), index=25.0))
     told.take_event(LoopEvent(1, 50.01, "moving", "winding in"))
     now = told.as_dict()
     assert now.keys() == status().keys()

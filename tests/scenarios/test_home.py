@@ -26,20 +26,16 @@ from executor.clock import SimulatedClock
 from executor.custody import Custody
 from executor.machine import State
 from executor.prepare import PreparedRun, prepare
+from executor.real_time_job import ReadyDrives
 from executor.records import CycleRecord, LoopEvent
 from executor.reference import ReferenceDocument, reference_at, referenced
 from executor.rest_pose import rest_pose
 from executor.run_folder import RunFolder
 from executor.standing_pose import standing_pose
+from executor.unreferenced import careful, counted_here, require_below
 from executor.winch_laws import CableStep, TakeUp, WinchLaw, wind_in_speed
-from executor.winch_motion import (
-    WinchesStand,
-    careful,
-    counted_here,
-    move_winches,
-    require_below,
-    require_held,
-)
+from executor.winch_motion import WinchesStand, move_winches, require_held
+from executor.winch_mover import LawMotion, WinchesHere
 from executor.wishes import OwnBoard
 from planner.check import verify
 from simulation.camera import SyntheticCamera
@@ -53,6 +49,25 @@ _CHANNELS = itertools.count()
 HOLDING = DriveState.QUICK_STOP_ACTIVE
 TARGET, LIMIT = 10.0, 60.0
 FINDINGS = {"over_tension", "went_slack"}
+
+
+@dataclass
+class Told:
+    """Hands on what happens."""
+
+    on_cycle: Callable[[CycleRecord], None]
+    take_event: Callable[[LoopEvent], None]
+
+    def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
+        self.on_cycle(record)
+
+
+def mover(as_set_up: Rig, law: WinchLaw, group: DriveGroup, board: OwnBoard) -> WinchesHere:
+    """A law in simulated time, on drives that are set up."""
+    drives = ReadyDrives(as_set_up, group, None, lambda _load: None, ())
+    limit, speed = as_set_up.max_tension, max(w.max_speed for w in as_set_up.winches)
+    motion = LawMotion(as_set_up.cable_count, 0.01, lambda _rig, _counts: law, limit, speed)
+    return WinchesHere(motion, drives, SimulatedClock(0.01), board)
 
 
 @dataclass
@@ -85,17 +100,13 @@ class Place:
             self.script(self, record.cycle)
 
         return move_winches(
-            self.as_set_up,
-            law,
-            self.group,
-            SimulatedClock(0.01),
-            self.board,
+            mover(self.as_set_up, law, self.group, self.board),
+            self.rig,
             self.custody or Custody(self.rig),
+            Told(on_cycle, self.events.append),
             record=Path("nowhere"),
             anew=True,
-            at_rest=self.at_rest,
-            on_cycle=on_cycle,
-            on_event=self.events.append,
+            at_rest=lambda stand, _true_pose: self.at_rest(stand),
         )
 
     @property
@@ -499,9 +510,9 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         group.configure()
         law = TakeUp(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
         stand = move_winches(
-            limited, law, group, SimulatedClock(0.01), OwnBoard(), Custody(rig),
-            record=Path("nowhere"), anew=True, at_rest=lambda _stand: None,
-            on_cycle=lambda _record: None, on_event=lambda _event: None,
+            mover(limited, law, group, OwnBoard()), rig, Custody(rig),
+            Told(lambda _record: None, lambda _event: None),
+            record=Path("nowhere"), anew=True, at_rest=lambda _stand, _true_pose: None,
         )  # fmt: skip
         assert stand.state is State.FINISHED, stand.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0

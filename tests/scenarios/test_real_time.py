@@ -17,9 +17,11 @@ from cdpr.rig import rig_from_document
 from drivers.bus import BusSettings, open_bus
 from drivers.cia402.states import DriveState
 from executor.command_client import ask_all
+from executor.latch import Latch
 from executor.prepare import PreparedRun
 from executor.run_folder import RunFolder
 from executor.running import reached_runs
+from simulation.power_loss import PowerLoss
 from simulation.rehearsal import Rehearsal
 from tests.cli.plans import RIG
 from tests.scenarios.test_processes import finished, program, waited_for
@@ -196,6 +198,32 @@ def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
     assert summary["verdict"] == "PASSED"
     codes = [event["code"] for event in summary["events"]]
     assert codes == ["enabled", "moving", "hold", "resume", "held"]
+
+
+def test_winches_without_a_path_are_moved_by_the_real_time_process_too(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its death is a fault that is told and latched, and the drives hold by themselves."""
+    channel = f"239.74.163.28:{20000 + (os.getpid() * 17) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
+    monkeypatch.chdir(tmp_path)
+    with drives_on(channel, prepared) as rehearsal:
+        loss = PowerLoss.drawn(prepared.rig, 4, 0.010, on_a_stand=True)
+        loss.happen_to(prepared.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+        with program("home", RIG, "--at-home", "--speed-mm-s", "0.05", *bus) as homing:
+            events = tmp_path / "runs/home/events.jsonl"
+            waited_for(events, "moving", homing)
+            child = real_time_process(homing.pid)
+            assert len(list(Path(f"/proc/{child}/task").iterdir())) == 1
+            os.kill(child, signal.SIGKILL)
+            out, err = homing.communicate()
+            assert homing.returncode == 1, (out, err)
+        assert all_hold(rehearsal)
+    assert "killed by signal 9" in err.replace("\n", " ")
+    assert json.loads(events.read_text().splitlines()[-1])["code"] == "real_time_lost"
+    latched = Latch(BusSettings("udp_multicast", channel)).read()
+    assert latched is not None
+    assert "killed by signal 9" in latched.cause
 
 
 def test_the_real_time_process_has_one_thread(short_plan: Path, tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ from cdpr.rig import rig_from_document
 from drivers.bus import BusSettings
 from executor.custody import Custody
 from executor.latch import Latch
+from executor.path_in_real_time import run_in_real_time
 from executor.prepare import PreparedRun, prepare
-from executor.real_time_process import run_in_real_time
 from simulation.power_loss import PowerLoss
 from tests.cli.plans import RIG
 from tests.cli.program import call

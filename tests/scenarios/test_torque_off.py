@@ -15,7 +15,7 @@ from drivers.cia402.states import DriveState
 from drivers.drive_group import CycleStatus, DriveGroup, GroupState, make_drive_group
 from executor.clock import SimulatedClock
 from executor.torque_off import take_torque_off
-from executor.winch_motion import set_up_here
+from executor.unreferenced import set_up_here
 from simulation.power_loss import PowerLoss
 from simulation.rehearsal import Rehearsal
 from tests.cli.plans import RIG
