@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 from calibration.board import Board, Seen, mirrored
 from calibration.data_hash import data_hash
 from calibration.interval import Interval
+from calibration.spread import Spread
 from calibration.uncertainty import NAMES, Uncertainty, uncertainty_of
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
@@ -20,6 +21,9 @@ LEAST_VIEWS = 4
 """Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
 _FAR_OFF, _OFF = 4.0, 0.5
 """A view is left out whose error is so many times the median, and so many pixels at least."""
+_LOOKED_AT = 5
+"""So many pictures without the board, spread over all, are looked at for what they show instead."""
+_MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
 _SAME = 0.01
 """Corners of two pictures that are nearer to each other, RMS, are of one: noise is larger, [px]."""
 
@@ -95,7 +99,7 @@ def calibrate_camera(
     views: dict[str, Seen] = {}
     left_out = dict(unused or {})
     size: tuple[int, int] | None = None
-    example: tuple[str, Image] | None = None
+    without = Spread[tuple[str, Image]](_LOOKED_AT)
     for name, image in pictures:
         own = (image.shape[1], image.shape[0])
         size = size or own
@@ -108,14 +112,14 @@ def calibrate_camera(
         seen = board.find(image)
         if seen is None:
             left_out[name] = "does not show the board"
-            example = example or (name, image)
+            without.add((name, image))
         elif first := next((n for n, before in views.items() if _same(seen, before)), None):
             left_out[name] = f"is the same picture as {first}"
         else:
             views[name] = seen
             left_out |= {f"{name}, {k}": "is seen more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
-        raise _too_few(views, left_out, board, example)
+        raise _too_few(views, left_out, board, without.chosen())
     return calibrate_from_views(views, size, left_out)
 
 
@@ -197,18 +201,30 @@ def _undetermined() -> BadInput:
     )
 
 
+def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
+    """What most of the pictures without the board show, if anything is known."""
+    shown: dict[str, list[str]] = {}
+    for name, image in without:
+        flipped = mirrored(board, image)
+        if what := _MIRRORED if flipped else board.instead(image):
+            shown.setdefault(what, []).append(name)
+    if not shown:
+        return ""
+    what, names = max(shown.items(), key=lambda item: len(item[1]))
+    verb = "shows"
+    if len(names) > 1:
+        verb = f"and {len(names) - 1} of {len(without) - 1} others that were looked at show"
+    return f"; {names[0]} {verb} {what}"
+
+
 def _too_few(
     views: Mapping[str, Seen],
     unused: Mapping[str, str],
     board: Board,
-    example: tuple[str, Image] | None,
+    without: Sequence[tuple[str, Image]],
 ) -> BadInput:
     count = len(views) + len(unused)
-    why = f"{board} was looked for"
-    if example is not None and mirrored(board, example[1]):
-        why += "; flipped over it is there, so the pictures are mirrored, or the board's print is"
-    elif example is not None and (instead := board.instead(example[1])):
-        why += f"; {example[0]} shows {instead}"
+    why = f"{board} was looked for{_instead(board, without)}"
     told = [f"{name} {reason}" for name, reason in unused.items()]
     if told:
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.extrinsics import ExtrinsicCalibration
 from calibration.extrinsics_result import ExtrinsicsResult
-from calibration.page import Section, interval_rows, page_of, table_of
+from calibration.page import Section, page_of, table_of
 from calibration.verdict import Verdict
 from cdpr.poses import Array, Pose, rotation_vector_from_matrix
 
@@ -35,7 +35,7 @@ def extrinsics_page(
                 "Where the camera stands, with 95 % intervals",
                 table_of(
                     [
-                        *interval_rows(document.stated),
+                        *document.in_words(),
                         ("rotation_wxyz", quaternion),
                         ("work space", f"seen within {verdict.error * 1e3:.2g} mm (95 %)"),
                         ("data", document.data_sha256[:23]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import date
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -35,6 +36,10 @@ class ExtrinsicsResult(ResultDocument):
     )
     tag_errors_px: dict[str, NonNegative] = Field(description="RMS corner error of each tag")
     pictures: int
+
+    def in_words(self) -> list[tuple[str, str]]:
+        """As of every result; turns are from the stated rotation, so that only doubt is told."""
+        return pose_rows(self.stated)
 
     def changes_to(self, other: Self) -> dict[str, float]:
         """How far the other camera stands off, and how it is turned about the world's axes."""
@@ -101,6 +106,14 @@ def pose_intervals(result: ExtrinsicCalibration) -> dict[str, Interval]:
         name: Interval(float(value), float(width))
         for name, value, width in zip(AXES, values, widths, strict=True)
     }
+
+
+def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
+    """Numbers of poses for people; turns from the stated rotation are 0 by their meaning."""
+    return [
+        (name, interval.doubt if "turn_" in name else str(interval))
+        for name, interval in stated.items()
+    ]
 
 
 def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """A camera's place from the rig's own motion: the platform's tags seen at poses the rig tells.
 
 With Z = world_from_camera, X = the tags' frame in the platform's, P the pose that the drives tell
-and M the tags' pose in the camera's frame, Z M = P X at every picture. X is known from the drawing
-up to a small error; motion without rotation cannot tell it from Z, and then the drawing holds.
+and M the tags' pose in the camera's frame, Z M = P X at every picture. X is known from the rig file
+up to a small error; motion without rotation cannot tell it from Z, and then the rig file holds.
 
 Source: Tsai & Lenz 1989; solved for both at once as in Zhuang & Shiu 1993, by least squares.
 """
@@ -30,7 +30,7 @@ LEAST_POSES = 8
 _LEAST_SPAN = 0.1
 """Along the axis of the largest, [m]."""
 DRAWING = (1e-3, np.radians(0.5))
-"""Deviation of the tags' frame from the drawing, [m] and [rad]."""
+"""Deviation of the tags' frame from the rig file, [m] and [rad]."""
 _FIRST = (1e-3, np.radians(0.2))
 """Of the poses that drives tell, to begin with; then as the residuals say."""
 _LEAST = (2e-5, np.radians(0.002))
@@ -122,6 +122,7 @@ def locate_by_motion(
     Raises:
         BadInput: Too few pictures have a pose.
     """
+    sights = sights.each_view_once()
     unknown = {name: "has no pose" for name in sights.squares if name not in poses}
     sights = sights.without(unknown)
     found = {name: _look(rig, camera, sights, name, poses[name]) for name in sights.squares}

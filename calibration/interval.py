@@ -34,6 +34,16 @@ class Interval:
     def __str__(self) -> str:
         """Value and half width, to two digits of the half width."""
         if not 0.0 < self.half_width < math.inf:
-            return f"{self.value:.6g} ± {self.half_width:g}"
-        decimals = max(0, 1 - math.floor(math.log10(self.half_width)))
-        return f"{self.value:.{decimals}f} ± {self.half_width:.{decimals}f}"
+            return f"{self.value:.6g} {self.doubt}"
+        return f"{self.value:.{self._decimals}f} {self.doubt}"
+
+    @property
+    def doubt(self) -> str:
+        """The half width alone, where the value is 0 by its meaning."""
+        if not 0.0 < self.half_width < math.inf:
+            return f"± {self.half_width:g}"
+        return f"± {self.half_width:.{self._decimals}f}"
+
+    @property
+    def _decimals(self) -> int:
+        return max(0, 1 - math.floor(math.log10(self.half_width)))

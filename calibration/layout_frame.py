@@ -1,4 +1,4 @@
-"""Where the platform's frame is in a layout: pictures cannot tell, the drawing does."""
+"""Where the platform's frame is in a layout: pictures cannot tell, the rig file does."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def corner_slopes(tags: Sequence[Tag]) -> Array:
 
 
 def to_drawing(tags: Sequence[Tag], drawn: Sequence[Tag], fixed: int | None) -> tuple[Pose, float]:
-    """The motion that puts tags where they were drawn, and their size by that of the drawing.
+    """The motion that puts tags where the rig file has them, and their size by that there.
 
     Source: Umeyama 1991.
     """

@@ -68,6 +68,10 @@ class ResultDocument(Document, ABC):
         """What was found, by name with unit."""
         return {name: Interval.between(*ends) for name, ends in self.intervals.items()}
 
+    def in_words(self) -> list[tuple[str, str]]:
+        """What was found, for people: names with unit, and values with their half widths."""
+        return [(name, str(interval)) for name, interval in self.stated.items()]
+
     def changes_to(self, other: Self) -> dict[str, float]:
         """By how much another result's numbers are larger, by name with unit."""
         mine, others = self.stated, other.stated

@@ -34,9 +34,9 @@ class RigCalibration:
     """A rig's numbers from measurements.
 
     Attributes:
-        parameters: The unknowns and the drawing.
+        parameters: The unknowns and the rig file.
         measured: What they are from, without places that contradict the others.
-        fit: The best fit that leaves what cannot be identified as in the drawing.
+        fit: The best fit that leaves what cannot be identified as in the rig file.
         observability: What the data tell.
         uncertainty: Of the unknowns.
         held_out: Places left out of fits.
@@ -53,7 +53,7 @@ class RigCalibration:
 
     @property
     def rig(self) -> Rig:
-        """The drawing."""
+        """As its file tells it."""
         return self.parameters.rig
 
     @cached_property
@@ -63,7 +63,7 @@ class RigCalibration:
 
     @cached_property
     def at_home_counts(self) -> Array:
-        """Unstrained cable at the drawing's home counts, shape (m,), [m]."""
+        """Unstrained cable at the rig file's home counts, shape (m,), [m]."""
         return RigModel(self.parameters, self.measured).counted.at_home(self.geometry)
 
     @cached_property
@@ -133,10 +133,10 @@ def calibrate_rig(
     """Finds the numbers of a rig.
 
     Args:
-        rig: The drawing.
+        rig: As its file tells it.
         measured: Places at rest.
-        deviations: How far off the drawing may be by group of numbers; groups left out are taken as
-            known.
+        deviations: How far off the rig file may be by group of numbers; groups left out are taken
+            as known.
         length_deviation: Of a cable's length as a drive tells it, [m].
 
     Raises:
@@ -199,7 +199,7 @@ def _mm(point: Array) -> str:
 
 
 def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:
-    """Places with the drive positions of poses, by the drawing and under the tensions of home."""
+    """Places with the drive positions of poses, by the rig file and under the tensions of home."""
     anchors = positions[:, None, :] + np.einsum("kij,mj->kmi", rotations, rig.anchors)
     winches, tensions = WinchMap(rig), working_tensions(rig, rig.home).tensions
     counts = winches.counts(winches.unstrained(cables_to(rig, anchors).lengths, tensions))

@@ -50,7 +50,7 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
         if (deviations <= 0.0).any():
             raise table.bad("a standard deviation is not positive", "leave out what is not known")
     return RigMeasurements(
-        names=tuple(f"{path.name}, line {k + 2}" for k in range(n)),
+        names=tuple(f"{path}, line {k + 2}" for k in range(n)),
         counts=read_only(counts),
         tensions=read_only(tensions),
         positions=read_only(positions),

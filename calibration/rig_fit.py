@@ -1,7 +1,7 @@
 """Fits a rig's numbers and the platform's poses together: damped least squares, robust.
 
 The poses are eliminated place by place (Schur complement), so that the effort grows with their
-number only in proportion. Unknowns are counted in standard deviations of the drawing, which is one
+number only in proportion. Unknowns are counted in standard deviations of the rig file, which is one
 more measurement of each.
 """
 
@@ -48,7 +48,7 @@ class RigFit:
         pose_misfits: Of the poses from the measured ones, in standard deviations, shape (n,); 0
             where there is none.
         informations: What each place alone says of the unknowns, its pose projected out, shape
-            (n, p, p), per variance of the drawing.
+            (n, p, p), per variance of the rig file.
         scores: Half the slope of each place's squares by the unknowns in the same units, (n, p).
     """
 
@@ -63,9 +63,9 @@ class RigFit:
 
     @property
     def information(self) -> Array:
-        """What the data alone say of the unknowns, shape (p, p), per variance of the drawing.
+        """What the data alone say of the unknowns, shape (p, p), per variance of the rig file.
 
-        Eigenvalues above 1 are known better from the data than from the drawing.
+        Eigenvalues above 1 are known better from the data than from the rig file.
         """
         total: Array = self.informations.sum(axis=0)
         return total
@@ -95,8 +95,8 @@ class RigFitter:
         """The most probable values and poses.
 
         Args:
-            basis: Directions in which the unknowns may leave the drawing, orthonormal columns in
-                standard deviations of the drawing, shape (p, r); all when left out.
+            basis: Directions in which the unknowns may leave the rig file, orthonormal columns in
+                standard deviations of the rig file, shape (p, r); all when left out.
 
         Raises:
             Fault: The search does not come to an end.
@@ -127,7 +127,7 @@ class RigFitter:
         )
 
     def _start(self) -> tuple[Array, Array]:
-        """Measured poses; the others from the drawing's forward kinematics, each near the last."""
+        """Measured poses; the others from the rig file's forward kinematics, each near the last."""
         rig, counted = self._parameters.rig, self._model.counted
         lengths = counted.by(self._parameters.geometry(np.zeros(len(self._parameters))))
         positions, rotations = self._measured.positions.copy(), self._measured.rotations.copy()

@@ -22,7 +22,7 @@ class HeldOut:
     """Places that a fit has not seen, each left out once.
 
     Attributes:
-        before: How far off they are by the drawing, shape (n,), [m].
+        before: How far off they are by the rig file, shape (n,), [m].
         after: By the fits that did not see them, shape (n,), [m].
         poses: Distances of positions; else of cables from any pose, for lengths alone.
     """

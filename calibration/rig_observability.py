@@ -1,7 +1,7 @@
 """Which directions of a rig's numbers the data tell, and words for those that they do not.
 
-The information of the data is compared with the drawing's: along an eigenvector with a value above
-1 the data know more. The others cannot be identified; they are left as the drawing says.
+The information of the data is compared with the rig file's: along an eigenvector with a value above
+1 the data know more. The others cannot be identified; they are left as the rig file says.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from calibration.rig_parameters import AXES, Parameters
 from cdpr.poses import Array, skew
 
 LEAST_INFORMATION = 1.0
-"""Of a direction, in units of what the drawing tells."""
+"""Of a direction, in units of what the rig file tells."""
 NAMED_SHARE = 0.85
 """A direction with a name is unknown when so much of its square lies among the unknown ones."""
 LARGEST_PARTS = 4
@@ -30,7 +30,7 @@ class Observability:
 
     Attributes:
         information: Eigenvalues, falling, shape (p,).
-        known: Orthonormal directions that the data tell, in standard deviations of the drawing,
+        known: Orthonormal directions that the data tell, in standard deviations of the rig file,
             shape (p, r).
         unknown: The others, shape (p, p − r).
     """

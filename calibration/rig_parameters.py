@@ -1,4 +1,4 @@
-"""The numbers of a rig that a calibration finds, in named groups, and what the drawing says."""
+"""The numbers of a rig that a calibration finds, in named groups, and what the rig file says."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RigGeometry:
         outlets: World frame, shape (m, 3), [m].
         anchors: Platform frame, shape (m, 3), [m].
         pulley_radius: [m]; 0 for point exits.
-        drum_scale: Cable paid out for a count, as a share of the drawing's, less 1, shape (m,).
+        drum_scale: Cable paid out for a count, as a share of the rig file's, less 1, shape (m,).
         offsets: Unstrained cable at the home counts beyond what reaches the home pose, shape (m,),
             [m]: by how much the reference was off.
         stiffness: Axial, of a cable, [N].
@@ -57,12 +57,12 @@ class RigGeometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """The layout of the vector of unknowns; each is a deviation from the drawing.
+    """The layout of the vector of unknowns; each is a deviation from the rig file.
 
     That of the stiffness is the logarithm of its share: near 0 the share less 1, never negative.
 
     Attributes:
-        rig: The drawing.
+        rig: As its file tells it.
         groups: Names of the groups that are looked for, in order.
         deviations: How far off each unknown may be, standard deviation, shape (p,), [m] or share.
         names: Of the unknowns, such as ``outlet_3_x``; p texts.
@@ -78,7 +78,7 @@ class Parameters:
         """The unknowns of a rig.
 
         Args:
-            rig: The drawing.
+            rig: As its file tells it.
             deviations: How far off it may be, by group; groups left out are taken as known.
         """
         groups = tuple(
@@ -128,7 +128,7 @@ def _names(group: str, m: int) -> list[str]:
 
 
 def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
-    """The drawing's rig with other outlets, anchors, pulleys and stiffness; its winches stay."""
+    """The rig file's rig with other outlets, anchors, pulleys and stiffness; its winches stay."""
     return replace(
         rig,
         outlets=read_only(geometry.outlets),
@@ -142,14 +142,14 @@ class CountedLengths:
     """Cable lengths that drive positions and tensions tell.
 
     Attributes:
-        paid_out: Unstrained cable since the home counts by the drawing's drums, shape (n, m), [m].
+        paid_out: Unstrained cable since the home counts by the rig file's drums, shape (n, m), [m].
     """
 
     def __init__(self, rig: Rig, counts: Array, tensions: Array) -> None:
-        """Takes the drawing's winches.
+        """Takes the rig file's winches.
 
         Args:
-            rig: The drawing.
+            rig: As its file tells it.
             counts: Shape (n, m), [counts].
             tensions: Shape (n, m), [N].
 

@@ -146,7 +146,7 @@ def _rows(rig: Rig, poses: Sequence[Pose], wish: Wish, parameters: Parameters) -
 
 def _most_telling(rows: Array, count: int) -> list[int]:
     """The rows that make the determinant of the information largest, one after the other."""
-    known = np.eye(rows.shape[2])  # the inverse information; at first the drawing's
+    known = np.eye(rows.shape[2])  # the inverse information; at first the rig file's
     left = np.ones(len(rows), dtype=bool)
     chosen: list[int] = []
     unit = np.eye(rows.shape[1])

@@ -27,7 +27,7 @@ class RigQuality:
 
     Attributes:
         verdict: Of all of it.
-        before: How far off places are by the drawing, RMS, [m].
+        before: How far off places are by the rig file, RMS, [m].
         held_out: By fits that did not see them, RMS, [m].
         level: How far off the platform may be at the orientation of home, 95 %, [m].
         turned: Turned by `tilt`, 95 %, [m].
@@ -130,7 +130,7 @@ def judged_places(rig: Rig, tilt: float) -> tuple[Array, Array]:
     """Centre and corners of the workspace, turned about x and y both ways.
 
     Args:
-        rig: The drawing.
+        rig: As its file tells it.
         tilt: How far, [rad]; 0 for the orientation of home alone.
 
     Returns:

@@ -2,7 +2,7 @@
 
 Every picture may be taken from anywhere; its camera pose is an unknown as well (bundle adjustment).
 Pictures tell the layout only up to a rigid motion of the platform's frame; it is put where the
-layout fits the drawing best, or where one tag is as drawn. What a picture says of the layout, its
+layout fits the rig file best, or where one tag is as there. What a picture says of the layout, its
 camera pose projected out, is added up as in `calibration.uncertainty`.
 """
 
@@ -12,25 +12,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calibration.extrinsics import widths_of
+from calibration.layout_fit import HUBER, far_off, fitted, starts_of
 from calibration.layout_frame import corner_slopes, held_still, to_drawing
 from calibration.tag_graph import connected_tags
 from calibration.tag_sights import TagSights
-from calibration.tag_views import TagViews, moved_tags
+from calibration.tag_views import TagViews
 from cdpr.errors import BadInput
 from cdpr.poses import Array, Pose, read_only
 from cdpr.rig import Camera, Rig, Tag
-from tracking.bundle import TagView, moved, solve_bundle
 
 LEAST_PICTURES = 4
 """Of two tags or more; twenty are good."""
-HUBER = 3.0
-"""Errors of edges beyond so many deviations count linearly."""
-_NARROWING = (1e4, 1e2, 2e1, HUBER)
-_FAR_OFF_PX = 2.0
-"""A picture whose corners are farther off does not show this platform as it is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,12 +37,12 @@ class TagLayout:
         covariance: Of each tag's position [m] and rotation vector [rad] along the platform's axes,
             shape (6 t, 6 t).
         half_widths: Of the 95 % intervals of the same, shape (6 t,).
-        fixed: Number of the tag that is as drawn; None where all fit the drawing best.
+        fixed: Number of the tag that is as in the rig file; None where all fit the rig file best.
         errors: RMS corner error of each picture, by name, [px].
         seen: In how many pictures each tag was, by number.
-        unseen: Why each of the other tags is as drawn, by number.
+        unseen: Why each of the other tags is as in the rig file, by number.
         sides: Largest angle between directions from which pictures were taken, [rad].
-        scale: Size of the layout by that of the drawing.
+        scale: Size of the layout by that of the rig file.
         unused: Why pictures are not used, by name.
         data_hash: Of what was seen.
     """
@@ -85,7 +79,7 @@ def require_tags(rig: Rig, fixed: int | None) -> None:
     """Refuses a rig whose layout cannot be measured.
 
     Raises:
-        BadInput: Its platform has one tag or none, or not the one that is to be as drawn.
+        BadInput: Its platform has one tag or none, or not the one that is to be as in the rig file.
     """
     numbers = [tag.id for tag in rig.platform_tags]
     told = f"tags of the platform: {', '.join(map(str, numbers)) or 'none'}"
@@ -111,10 +105,10 @@ def measure_layout(
     """Finds the layout of the platform's tags.
 
     Args:
-        rig: Its platform tags as drawn; their sizes hold.
+        rig: Its platform tags as in the rig file; their sizes hold.
         camera: Its matrix and distortion hold.
         sights: Of platform tags, from anywhere.
-        fixed: Number of the tag that is as drawn; left out, all fit the drawing best.
+        fixed: Number of the tag that is as in the rig file; left out, all fit the rig file best.
 
     Raises:
         BadInput: Too few pictures show two tags or more, or none shows the fixed tag with others.
@@ -125,8 +119,8 @@ def measure_layout(
         for name, squares in sights.squares.items()
         if len(squares) < 2
     }
-    sights = sights.without(single)
-    starts, sights = _starts(camera, drawn, sights)
+    sights = sights.without(single).each_view_once()
+    starts, sights = starts_of(camera, drawn, sights)
     located = connected_tags([tuple(squares) for squares in sights.squares.values()], fixed)
     among = fixed if fixed is not None else next(iter(located), None)
     sights = sights.without(
@@ -140,72 +134,13 @@ def measure_layout(
         raise _too_few(sights, fixed)
     tags = tuple(drawn[number] for number in located)
     views = TagViews.of(camera, sights, tags)
-    fit = _fitted(views, [starts[name] for name in sights.squares], tags)
-    if strange := _far_off(sights, views.picture_errors(*fit)):
+    fit = fitted(views, [starts[name] for name in sights.squares], tags)
+    if strange := far_off(sights, views.picture_errors(*fit)):
         sights = sights.without(strange)
         if len(sights.squares) < LEAST_PICTURES:
             raise _too_few(sights, fixed)
         return measure_layout(rig, camera, sights, fixed)
     return _result(rig, views, *fit, fixed, sights)
-
-
-def _far_off(sights: TagSights, errors: Sequence[float]) -> dict[str, str]:
-    """The picture that fits the others least, and why, where it is far off: it smears the fit."""
-    name, error = max(zip(sights.squares, errors, strict=True), key=lambda item: item[1])
-    if error <= max(_FAR_OFF_PX, 4.0 * float(np.median(errors))):
-        return {}
-    return {name: f"has corners that are {error:.2f} px off, far more than the others"}
-
-
-def _starts(
-    camera: Camera, drawn: Mapping[int, Tag], sights: TagSights
-) -> tuple[dict[str, Pose], TagSights]:
-    """``camera_from_platform`` of each picture by the drawing; pictures without one are named."""
-    starts = {}
-    for name, squares in sights.squares.items():
-        found = solve_bundle(camera, [TagView(drawn[k], s) for k, s in squares.items()])
-        if found is not None:
-            starts[name] = found.camera_from_body
-    strange = {
-        name: "allows no pose of the platform as drawn"
-        for name in sights.squares
-        if name not in starts
-    }
-    return starts, sights.without(strange)
-
-
-def _fitted(
-    views: TagViews, cameras: Sequence[Pose], tags: tuple[Tag, ...]
-) -> tuple[list[Pose], tuple[Tag, ...]]:
-    """Poses of the cameras and tags that fit; the first tag holds still meanwhile."""
-    count = 6 * len(cameras)
-
-    def at(x: Array) -> tuple[list[Pose], tuple[Tag, ...]]:
-        steps = x[:count].reshape(-1, 6)
-        own = np.concatenate([np.zeros(6), x[count:]])
-        return (
-            [moved(pose, step) for pose, step in zip(cameras, steps, strict=True)],
-            moved_tags(tags, own),
-        )
-
-    def slopes(x: Array) -> Array:
-        whole = views.dense_slopes(*at(x))
-        return np.delete(whole, np.s_[count : count + 6], axis=1)
-
-    # The drawing may be many deviations off, where Huber's loss hardly pulls: it narrows by and by.
-    # Each round starts anew from what was found: steps are small turns about the present poses.
-    for scale in _NARROWING:
-        found = least_squares(
-            lambda x: views.errors(*at(x)).ravel(),
-            np.zeros(count + 6 * (len(tags) - 1)),
-            jac=slopes,
-            loss="huber",
-            f_scale=scale,
-            x_scale="jac",
-            max_nfev=40,
-        )
-        cameras, tags = at(found.x)
-    return list(cameras), tags
 
 
 def _result(

@@ -19,6 +19,9 @@ from tracking.marks import modules_across
 from tracking.other_tags import what_else_is_seen
 from tracking.picture import Image
 
+SAME_VIEW = 0.1
+"""Corners of tags that nothing moved are nearer than that in two pictures, RMS, [px]."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagSights:
@@ -41,6 +44,22 @@ class TagSights:
         """The sights without some more pictures, and why."""
         left = {name: squares for name, squares in self.squares.items() if name not in unused}
         return TagSights(left, {**self.unused, **unused})
+
+    def each_view_once(self) -> TagSights:
+        """Without pictures in which all tags are where an earlier one has them.
+
+        It is a copy of that, saved anew, or nothing moved in between: both err alike, and together
+        they tell no more than one.
+        """
+        kept: dict[str, Mapping[int, RefinedTag]] = {}
+        unused = {}
+        for name, squares in self.squares.items():
+            first = next((n for n, before in kept.items() if _alike(squares, before)), None)
+            if first is None:
+                kept[name] = squares
+            else:
+                unused[name] = f"shows the same as {first}: nothing moved in between"
+        return self.without(unused)
 
     def data_hash(self) -> str:
         """Hash of what was seen."""
@@ -97,6 +116,14 @@ def sights_of(
     if not found:
         raise _nothing_seen(camera, family, wanted, left_out, example)
     return TagSights(found, left_out)
+
+
+def _alike(squares: Mapping[int, RefinedTag], before: Mapping[int, RefinedTag]) -> bool:
+    both = squares.keys() & before.keys()
+    if not both:
+        return False
+    apart = [squares[number].corners - before[number].corners for number in both]
+    return bool(np.mean(np.sum(np.square(apart), axis=2)) < SAME_VIEW**2)
 
 
 def _whole(

@@ -55,7 +55,7 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: Verdict) -> str:
 
 
 def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
-    """What changed against the drawing, tag by tag."""
+    """What changed against the rig file, tag by tag."""
     rows = []
     for tag, drawn in zip(result.tags, result.drawn, strict=True):
         shift = (tag.pose.position - drawn.pose.position) * 1e3
@@ -72,8 +72,8 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
 
 
 def _places(document: TagsResult) -> list[tuple[str, ...]]:
-    stated = document.stated
+    told = dict(document.in_words())
     return [
-        (f"tag {tag.id}", *(str(stated[f"tag_{tag.id}_{axis}"]) for axis in AXES))
+        (f"tag {tag.id}", *(told[f"tag_{tag.id}_{axis}"] for axis in AXES))
         for tag in document.platform
     ]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from calibration.extrinsics_result import AXES, SCALES
+from calibration.extrinsics_result import AXES, SCALES, pose_rows
 from calibration.interval import Interval
 from calibration.result_file import ResultDocument, common_keys
 from calibration.tag_layout import TagLayout
@@ -34,6 +34,10 @@ class TagsResult(ResultDocument):
     rms_px: NonNegative
     picture_errors_px: dict[str, NonNegative]
     seen: dict[str, int] = Field(description="in how many pictures each tag was")
+
+    def in_words(self) -> list[tuple[str, str]]:
+        """As of every result; turns are from the stated rotation, so that only doubt is told."""
+        return pose_rows(self.stated)
 
     def changes_to(self, other: Self) -> dict[str, float]:
         """How far the other result's tags are off, and how turned about the platform's axes."""

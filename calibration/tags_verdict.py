@@ -11,9 +11,9 @@ GOOD_PICTURES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
 """Pictures in all, pictures of each tag, pixels."""
 GOOD_SIDES_DEG = 40.0
 GOOD_SCALE = 0.02
-"""Share by which a layout may be larger or smaller than drawn."""
+"""Share by which a layout may be larger or smaller than in the rig file."""
 FAR_MM, FAR_DEG = 10.0, 8.0
-"""A tag farther from its drawn place was glued elsewhere, or the drawing is of another platform."""
+"""A tag farther from its place in the rig file was glued elsewhere, or this is another platform."""
 
 
 def judge_layout(result: TagLayout, wanted: float) -> Verdict:
@@ -48,7 +48,7 @@ def _about_pictures(result: TagLayout) -> list[Lack]:
         lacks.append(Lack(what, step))
     if abs(result.scale - 1.0) > GOOD_SCALE:
         way = "larger" if result.scale > 1.0 else "smaller"
-        what = f"the layout is {abs(result.scale - 1.0):.1%} {way} than drawn"
+        what = f"the layout is {abs(result.scale - 1.0):.1%} {way} than in the rig file"
         lacks.append(Lack(what, "measure the black squares and correct size_mm in the rig file"))
     return lacks
 

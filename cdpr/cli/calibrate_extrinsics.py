@@ -12,6 +12,7 @@ from cdpr.cli.calibrations import CalibrationOption
 
 if TYPE_CHECKING:
     from calibration.extrinsics import ExtrinsicCalibration
+    from cdpr.cli.picture_sources import Pictures
     from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
 
@@ -66,17 +67,22 @@ def extrinsics(
     from calibration.extrinsics_page import extrinsics_page, moved_rows
     from calibration.extrinsics_result import extrinsics_result
     from calibration.result_file import require_file_name
+    from calibration.surveyed_tags import require_frame_tags
     from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.cameras import named_camera
+    from cdpr.cli.picture_sources import pictures_of
     from cdpr.rig import load_rig
 
     the_rig = calibrated_rig(load_rig(rig), calibration)
     the_camera = named_camera(the_rig, camera)
     require_file_name(the_camera.name, "cameras")
     known = None if poses is None else _known_poses(poses)
+    if known is None:
+        require_frame_tags(the_rig)
+    images = pictures_of(source, the_camera, pictures, usual=20)
     today = begin("extrinsics", the_camera.name, output, force)
-    found = _located(the_rig, the_camera, source, pictures, known, survey_mm / 1e3, not as_json)
+    found = _located(the_rig, the_camera, images, known, survey_mm / 1e3, not as_json)
     verdict = judge_extrinsics(found, wanted_mm / 1e3)
     document = extrinsics_result(found, verdict, the_rig.document, today)
     before = the_camera.world_from_camera
@@ -96,22 +102,18 @@ def extrinsics(
 def _located(
     rig: Rig,
     camera: Camera,
-    source: str,
-    wanted: int | None,
+    images: Pictures,
     poses: dict[str, Pose] | None,
     survey: float,
     shown: bool,
 ) -> ExtrinsicCalibration:
     from calibration.hand_eye import locate_by_motion
-    from calibration.surveyed_tags import locate_camera, require_frame_tags
+    from calibration.surveyed_tags import locate_camera
     from calibration.tag_sights import sights_of
     from cdpr.cli.output import progress_bar
-    from cdpr.cli.picture_sources import pictures_of, told
+    from cdpr.cli.picture_sources import told
 
-    if poses is None:
-        require_frame_tags(rig)
     tags = rig.frame_tags if poses is None else rig.platform_tags
-    images = pictures_of(source, camera, wanted, usual=20)
     with progress_bar("looking for tags", images.count, shown) as advance:
         sights = sights_of(
             told(images, advance), rig, camera, [tag.id for tag in tags], images.unused

@@ -204,7 +204,7 @@ def _places_of(run: Path) -> RigMeasurements:
     good = poses.ok
     turned = [matrix_from_quaternion(q) for q in poses.rotation[good]]
     return at_rest(
-        run.name,
+        str(run),
         Recording(
             time=cycles.time,
             asked=cycles.set_counts.astype(np.float64),

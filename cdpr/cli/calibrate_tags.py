@@ -18,7 +18,7 @@ def tags(
     camera: CameraOption = None,
     fixed_tag: Annotated[
         int | None,
-        typer.Option(min=0, help="this tag is as drawn (default: all fit the drawing best)"),
+        typer.Option(min=0, help="this tag is as in the rig file (default: all fit it best)"),
     ] = None,
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
@@ -66,7 +66,7 @@ def tags(
     facts = [
         ("pictures", f"{len(found.errors)} used, corners {found.reprojection:.3f} px off (RMS)"),
         *(
-            (name, f"moved {shift} mm, turned {turn}° against the drawing; {count}")
+            (name, f"moved {shift} mm, turned {turn}° against the rig file; {count}")
             for name, shift, turn, _, count in change_rows(found)
         ),
     ]

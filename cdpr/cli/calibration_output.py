@@ -83,8 +83,11 @@ def finish(
         show_json(result.sealed().model_dump(mode="json"))
     else:
         lines = [("verdict", result.verdict), *(("next", step) for step in result.next_steps)]
-        lines += [(name, str(interval)) for name, interval in result.stated.items()]
-        lines += [*facts, *(("not used", f"{k} {why}") for k, why in result.unused.items())]
+        lines += [
+            *result.in_words(),
+            *facts,
+            *(("not used", f"{k} {why}") for k, why in result.unused.items()),
+        ]
         show_facts(f"{result.kind} {result.name}", [*lines, *files])
     if not result.good_enough:
         raise typer.Exit(3)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from calibration.board import mirrored
 from calibration.camera import calibrate_camera
 from calibration.charuco import Charuco
 from calibration.chessboard import Chessboard
+from calibration.spread import Spread
 from calibration.tag_grid import TagGrid
 from cdpr.errors import BadInput
 from cdpr.poses import Pose
@@ -110,10 +114,39 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
 def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
     image = next(image for image, _ in pictures(board) if board.find(image) is not None)
     with pytest.raises(BadInput) as caught:
-        calibrate_camera([("a", image), ("b", image)], wrong)
+        calibrate_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
     assert "is to be seen in 0 of 2 pictures" in caught.value.what
     assert told in caught.value.why
     assert "; a shows " in caught.value.why
+
+
+def test_what_most_pictures_show_instead_is_told_not_what_the_first_one_does() -> None:
+    """One picture of another board lies among twelve."""
+    image, stray = (
+        next(image for image, _ in pictures(board) if board.find(image) is not None)
+        for board in (TAGS, CHARUCO)
+    )
+    named = [("0.png", stray), *((f"{k}.png", image) for k in range(1, 13))]
+    with pytest.raises(BadInput) as caught:
+        calibrate_camera(named, TagGrid(5, 4, 0.040, 0.012, "tag25h9"))
+    found = re.search(r"; (\d+).png and (\d) of 4 others .* show tag36h11", caught.value.why)
+    assert found is not None, caught.value.why
+    assert found[1] != "0"
+    assert found[2] == "3"
+
+
+@given(count=st.integers(0, 200), wanted=st.integers(1, 7))
+def test_a_few_of_many_are_spread_over_all(count: int, wanted: int) -> None:
+    spread = Spread[int](wanted)
+    for number in range(count):
+        spread.add(number)
+    chosen = spread.chosen()
+    assert len(chosen) == min(count, wanted)
+    assert chosen == sorted(set(chosen))
+    if count > wanted > 1:
+        assert chosen[0] == 0
+        assert chosen[-1] >= count / 2
+        assert np.diff(chosen).max() <= 4 * count / wanted
 
 
 @pytest.mark.parametrize(("board", "number"), [(CHARUCO, 8), (TAGS, 27)])

@@ -94,12 +94,37 @@ def test_a_pose_that_was_written_wrongly_counts_little(rig: Rig) -> None:
 
 
 def test_poses_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
-    sights, told = session(rig, 10, 0.1, 1e-4, seed=7)
-    first = next(iter(sights.squares))
-    alike = TagSights(dict.fromkeys(told, sights.squares[first]), {})
-    found = locate_by_motion(rig, rig.cameras[0], alike, dict.fromkeys(told, told[first]))
-    verdict = judge_extrinsics(found, 1.0)
-    assert any("all poses lie within 0 mm" in reason for reason in verdict.reasons)
+    rng, camera = np.random.default_rng(7), rig.cameras[0]
+    told = {
+        f"{k}.png": Pose.level(rig.home.position + 1e-3 * rng.uniform(-1.0, 1.0, 3))
+        for k in range(10)
+    }
+    world = camera.world_from_camera.inverse()
+    seen = {name: world.compose(pose) for name, pose in told.items()}
+    sights = sights_at(camera, rig.platform_tags, seen, 0.03, rng)
+    verdict = judge_extrinsics(locate_by_motion(rig, camera, sights, told), 1.0)
+    assert any("all poses lie within" in reason for reason in verdict.reasons)
+
+
+def test_the_same_view_counts_once(rig: Rig) -> None:
+    """As of one picture saved several times, or of a platform that stood still."""
+    sights, told = session(rig, 10, 0.3, 1e-4, seed=7)
+    rng = np.random.default_rng(1)
+    copies = {
+        f"again {name}": {
+            k: replace(square, corners=square.corners + 0.04 * rng.standard_normal((4, 2)))
+            for k, square in squares.items()
+        }
+        for name, squares in sights.squares.items()
+    }
+    both = TagSights({**sights.squares, **copies}, {})
+    named = {f"again {name}": pose for name, pose in told.items()}
+    once = locate_by_motion(rig, rig.cameras[0], sights, told)
+    found = locate_by_motion(rig, rig.cameras[0], both, {**told, **named})
+    assert found.pictures == once.pictures
+    assert found.half_widths == pytest.approx(once.half_widths)
+    assert set(found.unused) == set(copies)
+    assert found.unused["again 3.png"] == "shows the same as 3.png: nothing moved in between"
 
 
 def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> None:

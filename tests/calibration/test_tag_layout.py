@@ -156,7 +156,7 @@ def test_sizes_that_are_not_as_told_are_noticed(rig: Rig) -> None:
     found = measure_layout(rig, rig.cameras[0], session(rig, small, 24, seed=5))
     verdict = judge_layout(found, 1.0)
     assert not verdict.good
-    assert any("larger than drawn" in reason for reason in verdict.reasons)
+    assert any("larger than in the rig file" in reason for reason in verdict.reasons)
     assert any("size_mm" in step for step in verdict.next_steps)
 
 

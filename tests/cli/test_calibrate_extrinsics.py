@@ -127,6 +127,7 @@ def test_people_read_the_verdict_first(folder) -> None:
     ("options", "named"),
     [
         (("--camera", "side"), "no camera 'side'"),
+        (("--pictures", "2"), "--pictures is for a video or a camera"),
         (("--poses", "missing.csv"), "no such file"),
         (("--calibration", RIG), "no calibration result"),
     ],
@@ -138,8 +139,10 @@ def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: st
 
 
 def test_folders_that_cannot_be_used_are_told(folder, tmp_path) -> None:
-    answer = call("calibrate", "extrinsics", RIG, tmp_path / "nowhere")
+    out = tmp_path / "out"
+    answer = call("calibrate", "extrinsics", RIG, tmp_path / "nowhere", "-o", out)
     one_message(answer, 2, "neither a folder of pictures")
+    assert not out.exists()
     (tmp_path / "small").mkdir()
     (tmp_path / "small" / "a.png").write_bytes((folder / "small.png").read_bytes())
     answer = call("calibrate", "extrinsics", RIG, tmp_path / "small")

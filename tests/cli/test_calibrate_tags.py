@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -107,8 +108,21 @@ def test_the_tags_are_found_where_they_were_glued_and_the_result_used(folder, tm
         assert tag["position_mm"] == pytest.approx(other["position_mm"], abs=0.05)
 
 
-def test_people_read_what_changed_against_the_drawing(folder) -> None:
+def test_pictures_that_were_saved_anew_count_once(folder, tmp_path) -> None:
+    for k in range(18):
+        image = cv2.imread(str(folder / f"{k}.png"), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+        if k < 6:
+            cv2.imwrite(str(tmp_path / f"copy_{k}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    found = json.loads(call("calibrate", "tags", RIG, tmp_path, "--json").out)
+    copies = {name: why for name, why in found["unused"].items() if "shows the same as" in why}
+    assert len(copies) == sum(f"{k}.png" in found["picture_errors_px"] for k in range(6))
+
+
+def test_people_read_what_changed_against_the_rig_file(folder) -> None:
     answer = call("calibrate", "tags", RIG, folder, "--wanted-mm", "0.01")
+    (turn,) = (line for line in answer.out.splitlines() if "tag_301_turn_x_deg" in line)
+    assert re.fullmatch(r"\s*tag_301_turn_x_deg\s+± 0\.\d+\s*", turn)
     assert answer.code == 3
     assert answer.out.splitlines()[1].split()[:4] == ["verdict", "not", "good", "enough:"]
     assert "moved" in answer.out
