@@ -11,6 +11,7 @@ import numpy as np
 from calibration.board import Board, Seen, mirrored
 from calibration.data_hash import data_hash
 from calibration.interval import Interval
+from calibration.same_view import as_in, nothing_moved
 from calibration.spread import Spread
 from calibration.uncertainty import NAMES, Uncertainty, uncertainty_of
 from cdpr.errors import BadInput
@@ -24,8 +25,6 @@ _FAR_OFF, _OFF = 4.0, 0.5
 _LOOKED_AT = 5
 """So many pictures without the board, spread over all, are looked at for what they show instead."""
 _MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
-_SAME = 0.01
-"""Corners of two pictures that are nearer to each other, RMS, are of one: noise is larger, [px]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +113,7 @@ def calibrate_camera(
             left_out[name] = "does not show the board"
             without.add((name, image))
         elif first := next((n for n, before in views.items() if _same(seen, before)), None):
-            left_out[name] = f"is the same picture as {first}"
+            left_out[name] = as_in(first)
         else:
             views[name] = seen
             left_out |= {f"{name}, {k}": "is seen more than once" for k in seen.twice}
@@ -124,10 +123,8 @@ def calibrate_camera(
 
 
 def _same(seen: Seen, before: Seen) -> bool:
-    """Whether two pictures are copies, which together tell no more than one."""
-    if not np.array_equal(seen.points, before.points):
-        return False
-    return bool(np.mean(np.sum((seen.corners - before.corners) ** 2, axis=1)) < _SAME**2)
+    same_points = np.array_equal(seen.points, before.points)
+    return same_points and nothing_moved(seen.corners, before.corners)
 
 
 def calibrate_from_views(

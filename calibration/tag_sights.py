@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.data_hash import data_hash
+from calibration.same_view import as_in, nothing_moved
 from cdpr.errors import BadInput
 from cdpr.rig import Camera, Rig
 from tracking.detector import Detection
@@ -18,9 +19,6 @@ from tracking.edges import RefinedTag, refine
 from tracking.marks import modules_across
 from tracking.other_tags import what_else_is_seen
 from tracking.picture import Image
-
-SAME_VIEW = 0.1
-"""Corners of tags that nothing moved are nearer than that in two pictures, RMS, [px]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,11 +44,7 @@ class TagSights:
         return TagSights(left, {**self.unused, **unused})
 
     def each_view_once(self) -> TagSights:
-        """Without pictures in which all tags are where an earlier one has them.
-
-        It is a copy of that, saved anew, or nothing moved in between: both err alike, and together
-        they tell no more than one.
-        """
+        """Without pictures in which all tags are where an earlier one has them."""
         kept: dict[str, Mapping[int, RefinedTag]] = {}
         unused = {}
         for name, squares in self.squares.items():
@@ -58,7 +52,7 @@ class TagSights:
             if first is None:
                 kept[name] = squares
             else:
-                unused[name] = f"shows the same as {first}: nothing moved in between"
+                unused[name] = as_in(first)
         return self.without(unused)
 
     def data_hash(self) -> str:
@@ -122,8 +116,8 @@ def _alike(squares: Mapping[int, RefinedTag], before: Mapping[int, RefinedTag]) 
     both = squares.keys() & before.keys()
     if not both:
         return False
-    apart = [squares[number].corners - before[number].corners for number in both]
-    return bool(np.mean(np.sum(np.square(apart), axis=2)) < SAME_VIEW**2)
+    corners, earlier = (np.array([one[k].corners for k in both]) for one in (squares, before))
+    return nothing_moved(corners, earlier)
 
 
 def _whole(
