@@ -64,6 +64,7 @@ class OdriveRehearsal(SimulatedRig[SimulatedOdrive]):
         while (message := take(self._bus, 0.0)) is not None:
             self._handle(message)
         self._advance(self._cycle)
+        self._finish_feeling()
 
     def _advance(self, elapsed: float) -> None:
         """The drives feel their cables once a cycle: finding the platform's place takes longest."""

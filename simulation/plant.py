@@ -6,6 +6,8 @@ matter of millinewtons. Deterministic: the same lengths from the same start give
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterator
+
 import numpy as np
 
 from cdpr.cables import Cables, cables_at
@@ -88,7 +90,12 @@ class Plant:
 
     def settle_counts(self, counts: Array) -> None:
         """`settle` at drive positions, shape (m,), [counts]."""
-        self.settle(self.winch_map.unstrained_from_counts(counts - self.miscounted))
+        for _ in self.settling_counts(counts):
+            pass
+
+    def settling_counts(self, counts: Array) -> Iterator[None]:
+        """`settling` at drive positions, shape (m,), [counts]."""
+        return self.settling(self.winch_map.unstrained_from_counts(counts - self.miscounted))
 
     def settle(self, unstrained: Array) -> None:
         """Moves the platform to its equilibrium; the search starts where it is.
@@ -99,16 +106,27 @@ class Plant:
         Raises:
             Fault: No equilibrium is found: the platform hangs on nothing, or a length is absurd.
         """
+        for _ in self.settling(unstrained):
+            pass
+
+    def settling(self, unstrained: Array) -> Iterator[None]:
+        """`settle` step by step, for who has something else to do meanwhile; argument as there.
+
+        Pose and tensions are as before until the last step.
+
+        Raises:
+            Fault: See `settle`.
+        """
         if not (np.isfinite(unstrained).all() and (unstrained > 0.0).all()):
             raise self._lost("an unstrained length is not a positive number", unstrained)
         self._unstrained = np.array(unstrained)
         if self._on_a_stand:
             self.tensions = read_only(self._pulled(self.pose)[1])
             self._on_a_stand = bool(self.tensions.min() < self._rig.min_tension)
-        if not (self._on_a_stand or self._settle_quickly()):
-            self._settle_anyhow()
+        if not (self._on_a_stand or (yield from self._settling_quickly())):
+            yield from self._settling_anyhow()
 
-    def _settle_quickly(self) -> bool:
+    def _settling_quickly(self) -> Generator[None, None, bool]:
         """The quick way: from the cables that pulled before to those that pull in the end.
 
         Newton's method in which the cables that pull may push as well, and the others do neither:
@@ -118,6 +136,7 @@ class Plant:
         """
         pose, pull = self.pose, self.tensions > 0.0
         for _ in range(QUICK_STEPS):
+            yield
             try:
                 cables = cables_at(self._rig, pose)
             except ValueError:  # an anchor inside its pulley
@@ -149,11 +168,12 @@ class Plant:
         self.pose, self.tensions = pose, read_only(tensions)
         return True
 
-    def _settle_anyhow(self) -> None:
+    def _settling_anyhow(self) -> Iterator[None]:
         """Down the energy, step by step, with cables that only pull."""
         pose = self.pose
         cables, tensions = self._pulled(pose)
         for _ in range(MAX_STEPS):
+            yield
             gradient = self._gradient(pose, _columns(pose, cables), tensions)
             if self._small(gradient):
                 self.pose, self.tensions = pose, read_only(tensions)

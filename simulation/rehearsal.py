@@ -32,7 +32,8 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
 
     One cycle passes from one SYNC to the next, however they jitter, and more only while none comes.
     Positions that a SYNC asks for are those at that SYNC. Torques are those that the drives felt
-    when all stood as at the SYNC before, as in a drive that filters them: one cycle old.
+    when all stood as at the SYNC before, as in a drive that filters them: one cycle old, or more
+    where `serve` took longer to find the platform's place.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
                 self._begun = True
             self._begun = self._begun and message.arbitration_id != SYNC_ID
             self._handle(message)
+            self._finish_feeling()
 
     def _let_pass(self, waited: float, message: can.Message | None) -> None:
         self._waited += waited
@@ -102,7 +104,7 @@ class Rehearsal(SimulatedRig[SimulatedDrive]):
             handler(message.data)
 
     def _on_sync(self, data: Frame) -> None:
-        """The drives answer before the platform's place is found, which may take a cycle long."""
+        """The drives answer before the platform's place is looked for, which may take long."""
         self.cycles += 1
         for drive in self.drives:
             drive.on_sync()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
@@ -125,6 +125,7 @@ class SimulatedRig(ABC, Generic[Drive]):
         self._transmission = Transmission(play, winches.step_counts, self._counts)
         self.plant.settle_counts(self._transmission.drums(self._counts))
         self._tension_noise = winches.tension_noise_n
+        self._feeling: Iterator[None] | None = None
         self._random = np.random.default_rng([simulation_of(rig).seed, 0x7E45])
         self.drives: tuple[Drive, ...] = ()
         self.drives = tuple(
@@ -182,6 +183,7 @@ class SimulatedRig(ABC, Generic[Drive]):
         while seconds > 1e-12:
             step = min(seconds, self._cycle)
             self._advance(step)
+            self._finish_feeling()
             seconds -= step
 
     def serve(
@@ -194,9 +196,10 @@ class SimulatedRig(ABC, Generic[Drive]):
     ) -> None:
         """Answers in real time until told to stop or interrupted from the keyboard.
 
-        When this process is held up, the drives' time stands still: they do not blame the master
-        for it. While the interface is down they hear and reach nobody, as with their cable pulled,
-        and go on when it is up again.
+        Drives answer at once; the platform's place is found while nothing is to be answered, and
+        torques wait for it. When this process is held up, the drives' time stands still: they do
+        not blame the master for it. While the interface is down they hear and reach nobody, as with
+        their cable pulled, and go on when it is up again.
 
         Args:
             stop_requested: Asked every few milliseconds; true ends it.
@@ -216,7 +219,9 @@ class SimulatedRig(ABC, Generic[Drive]):
                 last = now
                 if message is not None:
                     self._handle(message)
-                elif on_status is not None and now - told >= status_period:
+                    continue
+                self._go_on_feeling()
+                if on_status is not None and now - told >= status_period:
                     told = now
                     on_status(self.status())
         except KeyboardInterrupt:
@@ -227,14 +232,14 @@ class SimulatedRig(ABC, Generic[Drive]):
         self._advance(min(waited, self._cycle))
 
     def status(self) -> RehearsalStatus:
-        """Where everything stands."""
+        """Where everything stands, the platform where the drives felt it last."""
         states = tuple(drive.state for drive in self.drives)
-        return RehearsalStatus(self.cycles, states, self.pose, self.tensions)
+        return RehearsalStatus(self.cycles, states, self.plant.pose, self.plant.tensions)
 
     def _heard(self) -> can.Message | None:
         """The next frame; none while the interface is down."""
         try:
-            return take(self._bus, IDLE_WAIT)
+            return take(self._bus, IDLE_WAIT if self._feeling is None else 0.0)
         except BusDown:
             time.sleep(IDLE_WAIT)  # the kernel tells it at once, and time must pass all the same
             return None
@@ -244,8 +249,29 @@ class SimulatedRig(ABC, Generic[Drive]):
             drive.advance(elapsed)
 
     def _feel(self) -> None:
-        """The drives feel the cables as they are now."""
-        self._settle()
+        """The drives begin to feel the cables as they are now, unless they are still about it."""
+        if self._feeling is None:
+            self._feeling = self._felt()
+
+    def _go_on_feeling(self) -> None:
+        """One step, if there is one to do."""
+        if self._feeling is None:
+            return
+        try:
+            next(self._feeling)
+        except StopIteration:
+            self._feeling = None
+
+    def _finish_feeling(self) -> None:
+        while self._feeling is not None:
+            self._go_on_feeling()
+
+    def _felt(self) -> Iterator[None]:
+        """The platform goes where the drums let it; then the drives feel its cables."""
+        counts = np.array([drive.motor.position for drive in self.drives])
+        if not np.array_equal(counts, self._counts):
+            yield from self.plant.settling_counts(self._transmission.drums(counts))
+            self._counts = counts
         told = self.plant.tensions
         if self._tension_noise > 0.0:
             told = told + self._tension_noise * self._random.standard_normal(len(told))

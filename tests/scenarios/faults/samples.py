@@ -84,8 +84,7 @@ class WatchedRehearsal(Rehearsal):
         self._keep(self.now)
 
     def _on_sync(self, data: Frame) -> None:
-        # Drives act when the SYNC comes; to compute what the platform does takes time of this
-        # computer alone.
+        # Drives act when the SYNC comes; how long it takes to compute that is not theirs.
         came = self.now
         self.on_cycle()
         heard = {i: self.drives[i] for i in self.deaf}
