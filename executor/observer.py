@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cdpr.poses import Pose
 from cdpr.rig import Camera, Rig
 from executor.run_folder import RunFolder
+from tracking.guidance import DrivesAhead
 from tracking.measured_clearance import MeasuredClearance
 from tracking.measurement import NoPose, Observation
 from tracking.tracker import Tracker
@@ -28,12 +29,14 @@ class Trigger:
         time: Since the start of the run, [s].
         asked: When, monotonic, [s].
         true_pose: Where the simulated platform is; None with a real camera.
+        by_drives: Where the drives' positions put the platform; None when they do not tell.
     """
 
     frame: int
     time: float
     asked: float
     true_pose: Pose | None
+    by_drives: Pose | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +100,7 @@ class Observer:
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._prefix = f"{camera.name}_" if named else ""
-        self._tracker = Tracker(rig, camera)
+        self._tracker, self._drives = Tracker(rig, camera), DrivesAhead()
 
     def __enter__(self) -> Observer:
         return self
@@ -116,8 +119,10 @@ class Observer:
         kept = ""
         if trigger.frame % self._keep_every == 0:
             kept = self._folder.write_picture(trigger.frame, image, self._prefix)
+        taken = trigger.time + delay
+        by_drives = self._drives.at(taken, trigger.time, trigger.by_drives)
         began = time.monotonic()
-        found = self._tracker.observe(image, trigger.time + delay)
+        found = self._tracker.observe(image, taken, by_drives)
         return Look(trigger.frame, found, kept, time.monotonic() - began)
 
 

@@ -14,8 +14,8 @@ from executor.run_log import RunLog
 from executor.status import RunStatus
 
 #: Asks for a picture: time since the start of the run [s], the same moment on the monotonic clock
-#: [s], and where the simulated platform is then.
-Trigger = Callable[[float, float, Pose | None], None]
+#: [s], where the simulated platform is then, and where the drives' positions put it.
+Trigger = Callable[[float, float, Pose | None, Pose | None], None]
 
 
 class Recorder:
@@ -80,7 +80,8 @@ class Recorder:
             return
         self._progress(record.index)
         if self._trigger is not None:
-            self._trigger(record.at - self._began, record.at, true_pose)
+            by_drives = self.log.pose_by_drives(record)
+            self._trigger(record.at - self._began, record.at, true_pose, by_drives)
 
     def take_event(self, event: LoopEvent) -> None:
         """Something happened; it is on disk when this returns.

@@ -83,13 +83,16 @@ class RunCameras:
         self._told: dict[str, str] = {}
         self._news: list[CameraNews] = []
 
-    def trigger(self, time: float, asked: float, true_pose: Pose | None) -> None:
+    def trigger(
+        self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
+    ) -> None:
         """Takes in what the cameras have seen, and asks for a picture of this moment.
 
         Args:
             time: Since the start of the run, [s].
             asked: The same moment on the monotonic clock, [s].
             true_pose: Where the simulated platform is; None with real cameras.
+            by_drives: Where the drives' positions put it; None when they do not tell.
 
         Raises:
             CdprError: All cameras failed, for the reason that the first one told.
@@ -99,7 +102,7 @@ class RunCameras:
             self._put(eye, eye.collect())
         self._judge()
         self._look_for_trouble()
-        trigger = Trigger(self._frame, time, asked, true_pose)
+        trigger = Trigger(self._frame, time, asked, true_pose, by_drives)
         whom = frozenset(eye.name for eye in self._eyes if eye.ask(trigger))
         if whom:
             self._open.append(_Moment(trigger, whom))

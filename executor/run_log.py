@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cdpr.kinematics import poses_near
-from cdpr.poses import Array
+from cdpr.errors import Fault
+from cdpr.kinematics import forward_kinematics, poses_near
+from cdpr.poses import Array, Pose
 from cdpr.rig import Rig
 from cdpr.scene import Scene
 from executor.cycle_table import CycleTable, quaternions_of
 from executor.records import CycleRecord
+from executor.run_csv import Integers
 from executor.setpoints import CheckedTable
 from executor.standing import legs_at
 
@@ -36,6 +38,16 @@ class RunLog:
         """Where the drives last said that they stand, [counts]; None before the first cycle."""
         return self._records[-1].actual if self._records else None
 
+    def pose_by_drives(self, record: CycleRecord) -> Pose | None:
+        """Where the drives' positions put the platform in a cycle; None when they fit no pose."""
+        planned, row = self._checked.table, round(record.index)
+        lengths, _ = self._lengths([record], np.array([row]))
+        try:
+            guess = Pose(planned.positions[row], planned.rotations[row])
+            return forward_kinematics(self._rig, lengths[0], guess).pose
+        except Fault:
+            return None
+
     def table(self) -> CycleTable:
         """Everything that is known of the run's cycles."""
         records, rig, planned = self._records, self._rig, self._checked.table
@@ -43,14 +55,7 @@ class RunLog:
         index = np.array([0.0, *(r.index for r in records[:-1])])[: len(records)]
         rows = np.rint(index).astype(np.int64)
         actual = _matrix([r.actual for r in records], rig.cable_count)
-        tensions = rig.tensions_by(_matrix([r.torques for r in records], rig.cable_count))
-        # Only drives that follow their set-points tell the cables' tensions by their torques.
-        taut = np.isfinite([r.following_error for r in records])
-        stretch = np.where(taut[:, None], tensions, planned.tensions[rows])
-        winches = self._checked.winches
-        lengths = winches.strained(
-            winches.unstrained_from_counts(actual.astype(np.float64)), stretch
-        )
+        lengths, tensions = self._lengths(records, rows)
         encoder, turned = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
         legs = legs_at(planned.stands, index)
         return CycleTable(
@@ -73,8 +78,28 @@ class RunLog:
             actual_counts=actual,
             lengths=lengths,
             planned_tensions=between(planned.tensions, index),
-            tensions=np.where(taut[:, None], tensions, np.nan),
+            tensions=tensions,
         )
+
+    def _lengths(self, records: list[CycleRecord], rows: Integers) -> tuple[Array, Array]:
+        """Cable lengths [m] by the drives' positions, and tensions [N] where torques tell them.
+
+        Args:
+            records: n cycles.
+            rows: The set-points that the drives were told, shape (n,).
+        """
+        actual = _matrix([r.actual for r in records], self._rig.cable_count)
+        tensions = self._rig.tensions_by(
+            _matrix([r.torques for r in records], self._rig.cable_count)
+        )
+        # Only drives that follow their set-points tell the cables' tensions by their torques.
+        taut = np.isfinite([r.following_error for r in records])[:, None]
+        stretch = np.where(taut, tensions, self._checked.table.tensions[rows])
+        winches = self._checked.winches
+        lengths = winches.strained(
+            winches.unstrained_from_counts(actual.astype(np.float64)), stretch
+        )
+        return lengths, np.where(taut, tensions, np.nan)
 
     def _stop_at(self, row: int) -> str:
         """Name of the stop at which the platform stands; nothing on the way."""

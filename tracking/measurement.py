@@ -20,7 +20,8 @@ class PoseMeasurement:
             It holds the scatter of the corners, not errors of the camera's place or of the tags'.
         tags: Numbers of the tags it rests on.
         reprojection: RMS error of their corners, [px].
-        status: ``found`` (searched in the whole picture) or ``tracked`` (where it was expected).
+        status: ``found`` (searched in the whole picture), ``tracked`` (where it was expected) or
+            ``guided`` (where the drives' positions put it).
     """
 
     time: float

@@ -15,12 +15,14 @@ from tracking.camera_check import CameraCheck, refuse_moved_camera
 from tracking.consensus import Consensus, agreeing
 from tracking.detector import Detection
 from tracking.detectors import make_detector
+from tracking.doubt import doubt
 from tracking.edges import refine
 from tracking.frame_tags import near_places, nearest_to, region_around
+from tracking.guidance import Guidance
 from tracking.marks import modules_across, tag_corners
 from tracking.measurement import NoPose, Observation, PoseMeasurement
 from tracking.outliers import without_outliers
-from tracking.picture import Image
+from tracking.picture import Image, refuse_wrong_picture
 from tracking.prediction import predicted
 from tracking.projection import pixels_from_ideal, pixels_of
 from tracking.settings import TrackerSettings
@@ -29,8 +31,9 @@ from tracking.settings import TrackerSettings
 class Tracker:
     """Measures the platform's pose in one camera's pictures, one after the other.
 
-    The last pose says where to look next; without it, or when that fails, the whole picture is
-    searched. Tags on the frame show whether the camera still stands where the rig file says.
+    The last pose says where to look next, then the drives' positions where they are known; without
+    these, or when that fails, the whole picture is searched. Tags on the frame show whether the
+    camera still stands where the rig file says.
 
     Args:
         rig: Its tags and platform.
@@ -61,6 +64,7 @@ class Tracker:
         self._camera_from_world = camera.world_from_camera.inverse()
         self._last: PoseMeasurement | None = None
         self._before: PoseMeasurement | None = None
+        self._guidance = Guidance()
         self._pictures = 0
 
     @property
@@ -72,51 +76,62 @@ class Tracker:
         """Searches the whole of the next picture."""
         self._last = None
 
-    def observe(self, image: Image, time: float) -> Observation:
+    def observe(self, image: Image, time: float, by_drives: Pose | None = None) -> Observation:
         """Measures the platform in a picture.
 
         Args:
             image: Grey picture of the camera's size.
             time: When it was taken, [s].
+            by_drives: Where the drives' positions put the platform then; it says where to look, and
+                has no part in the pose.
 
         Raises:
             BadInput: The picture is not a grey one of the camera's size.
             CameraMoved: The frame tags are not where they should be.
         """
-        self._refuse_wrong_size(image)
+        refuse_wrong_picture(image, self.camera, self.rig.name)
         self._pictures += 1
         result: Observation | None = None
         if self._last is not None:
             result = self._follow(image, time, self._last)
+        if result is None and by_drives is not None:
+            result = self._guided(image, time, self._guidance.expected(by_drives))
+        if result is None and self._last is not None:
+            result = self._seek_around(image, time, self._last)
         if result is None:
             result = self._search(image, time)
         elif self._pictures % self.settings.camera_check_period == 0:
             self._check_camera(image, near_places(self.camera, self._frame, self._detector, image))
-        self._before = self._last
-        self._last = result if isinstance(result, PoseMeasurement) else None
+        self._before, self._last = self._last, None
+        if isinstance(result, PoseMeasurement):
+            self._last = result
+            if by_drives is not None:
+                self._guidance.learn(result.pose, by_drives)
         return result
 
-    def _refuse_wrong_size(self, image: Image) -> None:
-        wanted = (self.camera.height, self.camera.width)
-        if image.shape != wanted or image.dtype != np.uint8:
-            size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))
-            raise BadInput(
-                f"a picture has {size} px ({image.dtype}, {image.ndim} dimensions); camera"
-                f" {self.camera.name!r} takes grey 8-bit pictures of {wanted[1]} x {wanted[0]} px",
-                where=f"rig {self.rig.name}",
-                next_step="use pictures of this camera in full size, or mend the rig file",
-            )
-
     def _follow(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
-        """The pose where it is expected, or None when it must be searched for.
+        """The pose where it is expected, or None when it is not there.
 
-        First the edges of all tags that should be seen are looked for where they should be, which
-        needs no detector and finds tags that are hidden in part; then tags around the platform.
+        The edges of all tags that should be seen are looked for where they should be, which needs
+        no detector and finds tags that are hidden in part.
         """
+        found = self._measure(image, time, [], predicted(last, self._before, time), "tracked")
+        return found if self._goes_on(found, last) else None
+
+    def _guided(self, image: Image, time: float, expected: Pose) -> Observation | None:
+        """As `_follow`, at a pose that nobody has seen.
+
+        So it tells no pose from its mirror pose, and a tag alone is not enough: where drives are
+        wrong, that may be another print of it.
+        """
+        views = self._looked_for(image, self._camera_from_world.compose(expected), set())
+        seen = tuple(view.tag.id for view in views)
+        found = self._measure_views(image, time, views, seen, None, "guided")
+        return found if isinstance(found, PoseMeasurement) and len(found.tags) > 1 else None
+
+    def _seek_around(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
+        """The pose by the tags around the platform, or None when there is none to go on with."""
         expected = predicted(last, self._before, time)
-        found = self._measure(image, time, [], expected, "tracked")
-        if self._goes_on(found, last):
-            return found
         region = region_around(self.camera, expected.apply(self.rig.platform_corners), slack=0.2)
         if region is None:
             return None
@@ -167,12 +182,24 @@ class Tracker:
         expected: Pose | None,
         status: str,
     ) -> Observation:
+        views = self._views(image, detections, self._platform)
         seen = tuple(d.id for d in detections)
-        agreed = self._agreed(self._views(image, detections, self._platform))
+        return self._measure_views(image, time, views, seen, expected, status)
+
+    def _measure_views(
+        self,
+        image: Image,
+        time: float,
+        views: Sequence[TagView],
+        seen: tuple[int, ...],
+        expected: Pose | None,
+        status: str,
+    ) -> Observation:
+        agreed = self._agreed(views)
         if agreed.ambiguous:
             twice = ", ".join(map(str, agreed.ambiguous))
             return NoPose(time, f"tags {twice} are seen in places that do not agree", seen)
-        views = agreed.views
+        views = list(agreed.views)
         prior = None if expected is None else self._camera_from_world.compose(expected)
         first = solve_bundle(self.camera, views, prior) if views else None
         start = prior if first is None else first.camera_from_body
@@ -183,7 +210,7 @@ class Tracker:
         if fitted is None:
             return NoPose(time, "no tag of the platform fits a pose", seen)
         views, bundle = fitted
-        reason = self._doubt(views, bundle, prior)
+        reason = doubt(self.settings, views, bundle, prior)
         if reason:
             return NoPose(time, reason, seen)
         return self._measurement(time, views, bundle, status)
@@ -241,26 +268,6 @@ class Tracker:
                 return views, bundle
             views, start = kept, bundle.camera_from_body
         return None
-
-    def _doubt(self, views: list[TagView], bundle: BundlePose, prior: Pose | None) -> str:
-        """Why a pose is not believed, empty when it is."""
-        limits = self.settings
-        if bundle.reprojection > limits.reprojection_px:
-            return (
-                f"the corners fit to {bundle.reprojection:.2f} px only,"
-                f" the limit is {limits.reprojection_px:g} px"
-            )
-        if len(views) == 1 and bundle.rival_cost - bundle.cost < limits.single_tag_margin:
-            near = prior is not None and prior.angle_to(bundle.camera_from_body) < 0.1
-            if not near:
-                return f"only tag {views[0].tag.id} is to be seen, and it allows two poses"
-        largest = float(np.sqrt(np.linalg.norm(bundle.covariance[:3, :3], 2)))
-        if not largest <= limits.position_deviation:
-            return (
-                f"the position is uncertain to {largest * 1e3:.1f} mm,"
-                f" the limit is {limits.position_deviation * 1e3:g} mm"
-            )
-        return ""
 
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str

@@ -46,9 +46,11 @@ class RunWatch:
         self._cameras, self._status, self._board = cameras, status, board
         self._tell, self._clearance_stop = tell, clearance_stop
 
-    def trigger(self, time: float, asked: float, true_pose: Pose | None) -> None:
+    def trigger(
+        self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
+    ) -> None:
         """A picture is due; arguments and errors as for `RunCameras.trigger`."""
-        self._cameras.trigger(time, asked, true_pose)
+        self._cameras.trigger(time, asked, true_pose, by_drives)
         each = self._cameras.as_dict()
         self._status.take_cameras(each)
         self.rates = "; ".join(

@@ -76,7 +76,7 @@ def run_of(moments: int, *cameras: Any) -> tuple[RunCameras, list[str]]:
     eyes = [CameraEye(camera, "here") for camera in cameras]
     run, told = RunCameras(eyes, MODEL, _SCENE.obstacle_clearance, RATE), []
     for k in range(moments):
-        run.trigger(k / RATE, 100.0 + k / RATE, None)
+        run.trigger(k / RATE, 100.0 + k / RATE, None, None)
         told += [news.text for news in run.news()]
     return run, told
 
@@ -106,7 +106,7 @@ def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     limit = 10.0  # everything is too near
     run = RunCameras([CameraEye(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(5):
-        run.trigger(k / RATE, k / RATE, None)
+        run.trigger(k / RATE, k / RATE, None, None)
     assert "the scene asks for 10000 mm" in run.near
 
 
@@ -198,7 +198,7 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
         while not told:
             now += 1.0 / RATE
             assert now < 60.0, "it is told soon"
-            run.trigger(now, now, None)
+            run.trigger(now, now, None, None)
             told += [news.text for news in run.news()]
             if how == "stopped" and len(eyes[1].looks) == 3:
                 os.kill(child("side"), signal.SIGSTOP)

@@ -1,0 +1,37 @@
+"""While a run goes on, cameras are told where the drives put the platform, at the right time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cdpr.poses import Pose
+from executor.prepare import PreparedRun
+from tests.scenarios.stage import staged
+
+
+def test_each_picture_comes_with_the_drives_pose_of_its_own_time(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """The table of the whole run is made otherwise: all cycles at once, each near its plan."""
+    told: list[tuple[float, Pose | None]] = []
+
+    def trigger(time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None) -> None:
+        told.append((time, by_drives))
+
+    with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
+        cycles = stage.run(trigger=trigger).log.table()
+    assert len(told) > 20
+    rows = np.searchsorted(cycles.time, [time - 1e-6 for time, _ in told])
+    following = np.isfinite(cycles.following_error[rows])
+    assert following.sum() > 20
+    for k in np.flatnonzero(following):
+        row, (time, pose) = rows[k], told[k]
+        assert abs(cycles.time[row] - time) < 1e-9
+        assert pose is not None
+        assert np.linalg.norm(pose.position - cycles.encoder[row]) < 1e-6
+        beside = np.linalg.norm(np.diff(cycles.encoder[row - 1 : row + 2], axis=0), axis=1)
+        if beside.min() > 1e-4:  # it moves: another cycle's pose would be seen
+            before = np.linalg.norm(pose.position - cycles.encoder[row - 1])
+            assert before > 5e-5
