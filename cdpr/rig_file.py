@@ -261,11 +261,13 @@ class RigDocument(Document):
         return _repeated("camera name", names)
 
     def _camera_names(self) -> list[Finding]:
-        what = "is part of file names and of NAME=SOURCE, so it must hold no / and no ="
+        what = (
+            "is part of file names and of NAME=SOURCE: it must hold no /, no = and no leading dot"
+        )
         return [
             (("cameras", i, "name"), what)
             for i, camera in enumerate(self.cameras)
-            if set(camera.name) & set("/=")
+            if set(camera.name) & set("/=") or camera.name.startswith(".")
         ]
 
     def _home_inside(self) -> list[Finding]:

@@ -85,9 +85,7 @@ class CameraEye:
         unanswered = self._process.unanswered
         if look is None and unanswered is not None:
             if self.failed is None:
-                self.failed = CdprError(
-                    f"camera {self.name} gave no answer any more from {unanswered.time:.2f} s on"
-                )
+                self.failed = CdprError(f"no answer any more from {unanswered.time:.2f} s on")
             look = unseen(unanswered.frame, unanswered.time, self.failed.what)
             self.looks.append(look)
         return look

@@ -96,10 +96,10 @@ class Observer:
             source: Where pictures come from.
             folder: Where some of them are kept.
             keep_every: Every how many pictures one is kept.
-            named: Kept pictures bear the camera's name: there are others.
+            named: Kept pictures are in a folder of the camera's name: there are others.
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
-        self._prefix = f"{camera.name}_" if named else ""
+        self._name = camera.name if named else ""
         self._tracker, self._drives = Tracker(rig, camera), DrivesAhead()
 
     def __enter__(self) -> Observer:
@@ -118,7 +118,7 @@ class Observer:
         image, delay = self._source.picture(trigger)
         kept = ""
         if trigger.frame % self._keep_every == 0:
-            kept = self._folder.write_picture(trigger.frame, image, self._prefix)
+            kept = self._folder.write_picture(trigger.frame, image, self._name)
         taken = trigger.time + delay
         by_drives = self._drives.at(taken, trigger.time, trigger.by_drives)
         began = time.monotonic()

@@ -275,27 +275,29 @@ class RunFolder:
                 raise BadInput("not an event", where=f"{self.path / EVENTS}:{number}") from None
         return events
 
-    def write_picture(self, frame: int, image: NDArray[np.uint8], prefix: str = "") -> str:
+    def write_picture(self, frame: int, image: NDArray[np.uint8], camera: str = "") -> str:
         """Keeps a camera picture, grey or BGR, as JPEG.
 
         Args:
             frame: Number of the moment at which it was taken.
             image: Shape (height, width) or (height, width, 3).
-            prefix: Which of several cameras took it.
+            camera: Which of several cameras took it; each has a folder of its own.
 
         Returns:
-            Its name inside the folder, ``pictures/<prefix>frame_<frame>.jpg``.
+            Its name inside the folder, ``pictures/frame_<frame>.jpg`` or
+            ``pictures/<camera>/frame_<frame>.jpg``.
 
         Raises:
             Fault: The disk is full or gone.
         """
         import cv2
 
-        name = f"{PICTURES}/{prefix}frame_{frame:06d}.jpg"
+        name = "/".join([PICTURES, *([camera] if camera else []), f"frame_{frame:06d}.jpg"])
         done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
             raise ValueError(f"no picture: shape {image.shape}, type {image.dtype}")
         try:
+            (self.path / name).parent.mkdir(exist_ok=True)
             (self.path / name).write_bytes(data.tobytes())
         except OSError as error:
             raise self._not_written(name, error) from None
@@ -305,10 +307,13 @@ class RunFolder:
         """The JPEG that `write_picture` named.
 
         Raises:
-            BadInput: It is gone.
+            BadInput: It is gone, or not in the folder of pictures.
         """
         try:
-            return (self.path / PICTURES / Path(name).name).read_bytes()
+            place = (self.path / name).resolve()
+            if not place.is_relative_to((self.path / PICTURES).resolve()):
+                raise FileNotFoundError(0, f"it is not in {PICTURES}")
+            return place.read_bytes()
         except OSError as error:
             raise BadInput(
                 "the picture cannot be read",

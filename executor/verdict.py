@@ -229,7 +229,8 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
     """A camera saw the platform, and not all failed; nothing for a run without a camera."""
     failed = [one for one in cameras if one.failed]
     if failed and len(failed) == len(cameras):
-        return [Check("camera", False, "; ".join(f"{one.failed}" for one in failed))]
+        text = " ".join(f"Camera {one.name} failed: {one.failed}." for one in failed)
+        return [Check("camera", False, text)]
     if not len(poses):
         return []
     seen = int(poses.ok.sum())

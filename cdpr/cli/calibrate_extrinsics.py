@@ -77,7 +77,7 @@ def extrinsics(
     the_rig = calibrated_rig(load_rig(rig), calibration)
     the_camera = named_camera(the_rig, camera)
     require_file_name(the_camera.name, "cameras")
-    known = None if poses is None else _known_poses(poses)
+    known = None if poses is None else _known_poses(poses, the_camera)
     if known is None:
         require_frame_tags(the_rig)
     images = pictures_of(source, the_camera, pictures, usual=20)
@@ -123,22 +123,30 @@ def _located(
     return locate_by_motion(rig, camera, sights, poses)
 
 
-def _known_poses(path: Path) -> dict[str, Pose]:
+def _known_poses(path: Path, camera: Camera) -> dict[str, Pose]:
     """The platform's poses by picture, from a file or from the encoders of a run."""
     from calibration.pose_file import read_poses
 
-    return _poses_of_run(path) if path.is_dir() else read_poses(path)
+    return _poses_of_run(path, camera.name) if path.is_dir() else read_poses(path)
 
 
-def _poses_of_run(folder: Path) -> dict[str, Pose]:
-    """Poses by the drives' positions when the kept pictures of a run were taken."""
+def _poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
+    """Poses by the drives' positions when a camera's kept pictures of a run were taken."""
     import numpy as np
 
+    from cdpr.errors import BadInput
     from cdpr.poses import Pose, interpolate
     from executor.run_folder import RunFolder
 
     run = RunFolder.open(folder)
-    cycles, looks = run.cycles(), run.poses()
+    cycles, alone = run.cycles(), run.poses_by_camera()
+    looks = alone.get(camera) if alone else run.poses()
+    if looks is None:
+        raise BadInput(
+            f"camera {camera!r} took no pictures in this run",
+            where=str(folder),
+            next_step=f"name one of its cameras with --camera: {', '.join(alone)}",
+        )
     times = cycles.time
     poses = {}
     for time, picture in zip(looks.time, looks.picture, strict=True):

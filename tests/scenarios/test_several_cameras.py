@@ -15,7 +15,9 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
+from cdpr.cli.calibrate_extrinsics import _poses_of_run
 from cdpr.cli.cameras import choose_cameras
+from cdpr.errors import BadInput
 from cdpr.plan import save_plan
 from cdpr.poses import Pose, matrix_from_rotation_vector
 from cdpr.rig import load_rig
@@ -82,7 +84,7 @@ def test_all_cameras_of_the_rig_file_look_and_each_is_on_record(
         assert poses.frame.tolist() == together.frame.tolist()
         assert poses.ok.all()
         assert (together.std[:, :3] < poses.std[:, :3]).all()
-        assert {p.split("/")[1].split("_")[0] for p in poses.picture if p} == {name}
+        assert {p.split("/")[1] for p in poses.picture if p} == {name}
     numbers = [
         {*a.split(), *b.split()} for a, b in zip(*(p.tags for p in alone.values()), strict=True)
     ]
@@ -108,6 +110,19 @@ def test_each_camera_has_its_own_channels(answer_and_folder: tuple[Answer, RunFo
     kept = {name: sum(map(bool, p.picture)) for name, p in folder.poses_by_camera().items()}
     assert counts["/pictures/front"] == kept["front"] > 0
     assert counts["/pictures/side"] == kept["side"] > 0
+
+
+def test_the_kept_pictures_of_each_camera_have_the_drives_poses(
+    answer_and_folder: tuple[Answer, RunFolder],
+) -> None:
+    """With these `cdpr calibrate extrinsics --camera side --poses RUNDIR` finds its place."""
+    _, folder = answer_and_folder
+    kept = [Path(name).name for name in folder.poses_by_camera()["side"].picture if name]
+    poses = _poses_of_run(folder.path, "side")
+    assert set(kept[1:-1]) <= poses.keys() <= set(kept)
+    with pytest.raises(BadInput, match="camera 'back' took no pictures") as told:
+        _poses_of_run(folder.path, "back")
+    assert "front, side" in told.value.next_step
 
 
 @pytest.mark.parametrize(
@@ -215,18 +230,18 @@ def test_a_camera_that_hangs_is_told_and_the_run_goes_on_with_the_other(
     assert [e["text"] for e in hangs] == [
         "camera side gave no answer for 2 s; clearance is measured by front"
     ]
-    assert "camera side gave no answer any more from 0." in end[0]["text"]
+    assert "camera side failed (no answer any more from 0." in end[0]["text"]
     moved = [e["time_s"] for e in folder.summary()["events"] if e["code"] == "held"]
     assert hangs[0]["time_s"] < moved[0], "told while it moves"
     assert folder.poses().ok.all()
     alone = folder.poses_by_camera()
     assert len(alone["front"]) == len(folder.poses()) > len(alone["side"]) > 1
-    assert alone["side"].status[-1].startswith("camera side gave no answer any more")
+    assert alone["side"].status[-1].startswith("no answer any more from 0.")
     (front, side) = folder.summary()["cameras"]
     assert side["dropped"] > 10
     assert side["failed"]
     assert not front["failed"]
-    assert "gave no answer" in answer.out, "told at the end"
+    assert "(no answer any more from" in answer.out, "told at the end"
 
 
 @pytest.mark.usefixtures("no_report")
@@ -242,7 +257,7 @@ def test_a_run_whose_only_camera_hangs_comes_to_its_end_and_does_not_pass(
     assert summary["final_state"] == "finished"
     (hangs,) = told_of(folder, "camera_sees_nothing")
     assert hangs["text"] == "camera front gave no answer for 2 s; clearance is not measured"
-    assert any("gave no answer any more" in reason for reason in summary["reasons"])
+    assert any("Camera front failed: no answer" in reason for reason in summary["reasons"])
     assert folder.poses().ok[:-1].all(), "what was measured before is on record"
     assert not folder.poses().ok[-1]
 
