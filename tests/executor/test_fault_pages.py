@@ -23,6 +23,7 @@ PLACES = {
     "_fault": 0,
     "_tell": 0,
     "_tell_cause": 0,
+    "tell": 0,
 }
 
 
