@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calibration.extrinsics import ExtrinsicCalibration, widths_of, workspace_corners
+from calibration.survey import Survey
 from calibration.tag_sights import TagSights
 from calibration.verdict import Lack
 from cdpr.errors import BadInput
@@ -63,7 +64,7 @@ def require_frame_tags(rig: Rig) -> None:
 
 
 def locate_camera(
-    rig: Rig, camera: Camera, sights: TagSights, survey: float
+    rig: Rig, camera: Camera, sights: TagSights, survey: Survey
 ) -> ExtrinsicCalibration:
     """Finds the camera's place from pictures taken while it stood still.
 
@@ -71,7 +72,7 @@ def locate_camera(
         rig: Its frame tags are the surveyed ones.
         camera: Its matrix and distortion hold; its place in the rig file does not matter.
         sights: Of frame tags.
-        survey: Deviation of the surveyed places of corners along any axis, [m].
+        survey: How well the tags were surveyed.
 
     Raises:
         BadInput: The tags allow no place.
@@ -140,14 +141,14 @@ def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
 
 
 def _seen_tags(
-    rig: Rig, camera: Camera, sights: TagSights, start: Pose, survey: float
+    rig: Rig, camera: Camera, sights: TagSights, start: Pose, survey: Survey
 ) -> list[_SeenTag]:
     tags = {tag.id: tag for tag in rig.frame_tags}
     found = []
     for number in sights.numbers:
         squares = [s[number] for s in sights.squares.values() if number in s]
         corners = tag_corners(tags[number])
-        covariance = _of_picture(squares) + survey**2 * _of_survey(camera, start, corners)
+        covariance = _of_picture(squares) + survey.of_pixels(camera, start, tags[number])
         pixels = np.mean([square.corners.reshape(8) for square in squares], axis=0)
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         found.append(_SeenTag(number, corners, pixels, whitening))
@@ -157,17 +158,6 @@ def _seen_tags(
 def _of_picture(squares: Sequence[RefinedTag]) -> Array:
     """Covariance of corners in one picture; more pictures of a still scene err alike."""
     return np.asarray(np.mean([square.covariance for square in squares], axis=0))
-
-
-def _of_survey(camera: Camera, camera_from_world: Pose, corners: Array) -> Array:
-    """Covariance of pixels for corners surveyed to a metre, shape (8, 8)."""
-    points = camera_from_world.apply(corners)
-    covariance = np.zeros((8, 8))
-    for k, (x, y, z) in enumerate(points):
-        fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-        slope = np.array([[fx / z, 0.0, -fx * x / z**2], [0.0, fy / z, -fy * y / z**2]])
-        covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = slope @ slope.T
-    return covariance
 
 
 def _errors(camera: Camera, tags: Sequence[_SeenTag], pose: Pose) -> Array:

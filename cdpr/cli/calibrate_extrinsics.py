@@ -12,6 +12,7 @@ from cdpr.cli.calibrations import CalibrationOption
 
 if TYPE_CHECKING:
     from calibration.extrinsics import ExtrinsicCalibration
+    from calibration.survey import Survey
     from cdpr.cli.picture_sources import Pictures
     from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
@@ -43,6 +44,14 @@ def extrinsics(
     survey_mm: Annotated[
         float, typer.Option(min=0.0, help="how well corners of frame tags were surveyed, deviation")
     ] = 0.5,
+    survey_deg: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="how well turns of frame tags are known, deviation; --survey-mm is then of whole"
+            " tags (default: each corner was surveyed by itself)",
+        ),
+    ] = None,
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 1.0,
@@ -63,10 +72,13 @@ def extrinsics(
 
       cdpr calibrate extrinsics rig.yaml runs/first/pictures --poses runs/first
     """
+    from math import radians
+
     from calibration.extrinsics import judge_extrinsics
     from calibration.extrinsics_page import extrinsics_page, moved_rows
     from calibration.extrinsics_result import extrinsics_result
     from calibration.result_file import require_file_name
+    from calibration.survey import Survey
     from calibration.surveyed_tags import require_frame_tags
     from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.calibrations import calibrated_rig
@@ -81,8 +93,10 @@ def extrinsics(
     if known is None:
         require_frame_tags(the_rig)
     images = pictures_of(source, the_camera, pictures, usual=20)
+    turn = None if survey_deg is None else radians(survey_deg)
+    survey = Survey(survey_mm / 1e3, turn)
     today = begin("extrinsics", the_camera.name, output, force)
-    found = _located(the_rig, the_camera, images, known, survey_mm / 1e3, not as_json)
+    found = _located(the_rig, the_camera, images, known, survey, not as_json)
     verdict = judge_extrinsics(found, wanted_mm / 1e3)
     document = extrinsics_result(found, verdict, the_rig.document, today)
     before = the_camera.world_from_camera
@@ -104,7 +118,7 @@ def _located(
     camera: Camera,
     images: Pictures,
     poses: dict[str, Pose] | None,
-    survey: float,
+    survey: Survey,
     shown: bool,
 ) -> ExtrinsicCalibration:
     from calibration.hand_eye import locate_by_motion

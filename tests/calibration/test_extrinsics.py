@@ -13,6 +13,7 @@ from calibration.extrinsics import judge_extrinsics
 from calibration.extrinsics_result import extrinsics_result
 from calibration.kinds import calibrated, load_result
 from calibration.result_file import write_result
+from calibration.survey import Survey
 from calibration.surveyed_tags import locate_camera, require_frame_tags
 from calibration.tag_sights import sights_of
 from cdpr.errors import BadInput
@@ -23,6 +24,8 @@ from simulation.camera import SyntheticCamera
 from tests.calibration.exact_sights import sights_at
 from tracking.bundle import moved
 from tracking.camera_check import change_of_inverse
+from tracking.marks import tag_corners
+from tracking.projection import ideal_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -53,7 +56,9 @@ def numbers(rig: Rig) -> list[int]:
 
 def test_a_camera_is_located_to_half_a_millimetre(rig: Rig, pictures) -> None:
     truth, camera = elsewhere(rig), rig.cameras[0]
-    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 0.1e-3)
+    found = locate_camera(
+        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(0.1e-3)
+    )
     pose = found.world_from_camera
     assert pose.distance_to(truth) < 0.5e-3
     assert np.degrees(pose.angle_to(truth)) < 0.02
@@ -89,7 +94,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         rng = np.random.default_rng(seed)
         tags = crooked(rig.frame_tags, survey, rng)
         poses = {str(k): truth.inverse() for k in range(3)}
-        found = locate_camera(rig, camera, sights_at(camera, tags, poses, 0.03, rng), survey)
+        found = locate_camera(
+            rig, camera, sights_at(camera, tags, poses, 0.03, rng), Survey(survey)
+        )
         pose = found.world_from_camera
         turn = rotation_vector_from_matrix(pose.rotation @ truth.rotation.T)
         off = np.concatenate([pose.position - truth.position, turn])
@@ -102,6 +109,53 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
     assert np.median(stated) < 8.0 * np.median(errors)  # and not by promising nothing
 
 
+def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(rig: Rig) -> None:
+    """Eight tags in the plane of the floor, each 1 mm off as a whole."""
+    truth, camera, errors = elsewhere(rig), rig.cameras[0], []
+    tags = [
+        Tag(401 + k, 0.12, Pose.level([0.45 * np.cos(a), 0.45 * np.sin(a), 0.0]))
+        for k, a in enumerate(np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False))
+    ]
+    rig = replace(rig, frame_tags=tuple(tags))
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        shifts = 1e-3 * rng.standard_normal((8, 3))
+        there = [
+            replace(tag, pose=Pose(tag.pose.position + shift, tag.pose.rotation))
+            for tag, shift in zip(tags, shifts, strict=True)
+        ]
+        sights = sights_at(camera, there, {"a": truth.inverse()}, 0.03, rng)
+        errors.append([])
+        for survey in (Survey(1e-3), Survey(1e-3, 0.0)):
+            found = locate_camera(rig, camera, sights, survey)
+            back = found.world_from_camera.apply(truth.inverse().apply(found.points))
+            off = np.sqrt(np.mean(np.sum((back - found.points) ** 2, axis=1)))
+            errors[-1].append(off)
+            assert off < found.error
+    unaware, aware = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert aware < 0.6 * unaware
+
+
+@pytest.mark.parametrize("turn", [None, 0.0, 0.01])
+def test_the_pixels_of_a_survey_scatter_as_told(rig: Rig, turn: float | None) -> None:
+    """Against pixels of tags that were drawn at random."""
+    rng, camera, tag = np.random.default_rng(5), rig.cameras[0], rig.frame_tags[0]
+    world, survey = elsewhere(rig).inverse(), Survey(1e-3, turn)
+    pixels = []
+    for _ in range(4000):
+        corners = tag_corners(tag)
+        if turn is None:
+            corners = corners + 1e-3 * rng.standard_normal((4, 3))
+        else:
+            off = matrix_from_rotation_vector(turn * rng.standard_normal(3))
+            middle = tag.pose.position
+            corners = (corners - middle) @ off.T + middle + 1e-3 * rng.standard_normal(3)
+        pixels.append(ideal_of(camera, world.apply(corners)).ravel())
+    told = survey.of_pixels(camera, world, tag)
+    found = np.cov(np.array(pixels).T)
+    np.testing.assert_allclose(found, told, atol=0.08 * np.diag(told).max())
+
+
 def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) -> None:
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
     places = [(0.42, 0), (0, 0.42), (-0.42, 0), (0, -0.42), (0.3, 0.3), (-0.3, 0.3)]
@@ -109,7 +163,7 @@ def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) 
     rig = replace(rig, frame_tags=tuple(tags))
     knocked = [replace(tags[0], pose=Pose.level([0.44, 0.0, 0.0])), *tags[1:]]
     sights = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
-    found = locate_camera(rig, camera, sights, 0.2e-3)
+    found = locate_camera(rig, camera, sights, Survey(0.2e-3))
     assert list(found.unused) == ["tag 401"]
     away = float(found.unused["tag 401"].split()[2])
     assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, seen aslant
@@ -120,7 +174,7 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
     tags = crooked(rig.frame_tags, 10e-3, rng)
     found = locate_camera(
-        rig, camera, sights_at(camera, tags, {"a": truth.inverse()}, 0.02, rng), 1e-4
+        rig, camera, sights_at(camera, tags, {"a": truth.inverse()}, 0.02, rng), Survey(1e-4)
     )
     verdict = judge_extrinsics(found, 1.0)
     assert not verdict.good
@@ -132,7 +186,7 @@ def test_a_single_tag_is_not_good_enough(rig: Rig) -> None:
     camera, truth = rig.cameras[0], elsewhere(rig)
     rng = np.random.default_rng(3)
     sights = sights_at(camera, rig.frame_tags[:1], {"a": truth.inverse()}, 0.02, rng)
-    found = locate_camera(rig, camera, sights, 0.5e-3)
+    found = locate_camera(rig, camera, sights, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
     assert "1 frame tag is seen, 3 are needed" in verdict.reasons
     assert "survey more tags, all around what the camera sees" in verdict.next_steps
@@ -142,7 +196,9 @@ def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> N
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
     poses = {f"{k}.png": truth.inverse() for k in range(4)}
     poses["3.png"] = moved(truth.inverse(), np.array([0.01, 0, 0, 0, 0, 0]))
-    found = locate_camera(rig, camera, sights_at(camera, rig.frame_tags, poses, 0.02, rng), 1e-4)
+    found = locate_camera(
+        rig, camera, sights_at(camera, rig.frame_tags, poses, 0.02, rng), Survey(1e-4)
+    )
     assert list(found.unused) == ["3.png"]
     assert "the camera moved" in found.unused["3.png"]
     assert found.pictures == 3
@@ -164,7 +220,7 @@ def test_the_inverse_of_a_pose_changes_as_told() -> None:
 
 def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_path: Path) -> None:
     camera = rig.cameras[0]
-    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 5e-4)
+    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4))
     verdict = judge_extrinsics(found, 1e-3)
     result = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
     path = write_result(tmp_path, result)
@@ -178,7 +234,7 @@ def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_pat
 
 def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
-    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 5e-4)
+    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4))
     result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
     other = rig.document.cameras[0].model_copy(update={"fx_px": 901.0})
     changed = replace(rig, document=rig.document.model_copy(update={"cameras": [other]}))
@@ -188,7 +244,7 @@ def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictur
 
 def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
-    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), 5e-4)
+    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4))
     verdict = judge_extrinsics(found, 1e-3)
     one = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
     pose = found.world_from_camera

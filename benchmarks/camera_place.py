@@ -1,0 +1,129 @@
+"""How far off the place of a camera by surveyed tags is, and how near to the best that can be.
+
+    python benchmarks/camera_place.py [--trials 200]
+
+Tags on the floor around a rig are surveyed with random errors and seen by a camera with known
+noise. Told are the errors of points of the work space that the camera then puts elsewhere, beside
+the Cramér-Rao bound of the same sights: no unbiased estimator that knows of the errors of survey
+and corners what is told here can do better.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from calibration.extrinsics import workspace_corners
+from calibration.survey import Survey
+from calibration.surveyed_tags import locate_camera
+from calibration.tag_sights import TagSights
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector, skew
+from cdpr.rig import Rig, Tag, load_rig
+from tracking.bundle import moved
+from tracking.edges import RefinedTag
+from tracking.marks import tag_corners
+from tracking.projection import ideal_of
+
+RIG = Path(__file__).parents[1] / "configs/gachon_8_6.yaml"
+NOISE, SIZE = 0.03, 0.12
+RING = [(0.5 * np.cos(a), 0.5 * np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi, 8, False)]
+INNER = [
+    (0.28 * np.cos(a), 0.28 * np.sin(a)) for a in np.linspace(0.2, 0.2 + 2.0 * np.pi, 8, False)
+]
+PLACES = {17: [(0.0, 0.0), *RING, *INNER], 4: RING[1::2], 1: [(0.0, 0.0)]}
+
+
+SURVEYS = ("each corner", "each tag, turned as told", "each tag, and its turns")
+
+
+def survey_called(name: str, size: float) -> Survey:
+    """A survey of that kind, of one size of errors, [m]."""
+    turns = {SURVEYS[0]: None, SURVEYS[1]: 0.0, SURVEYS[2]: 2.0 * size / SIZE}
+    return Survey(size, turns[name])
+
+
+def by_pose(rig: Rig, tags: tuple[Tag, ...], camera_from_world: Pose) -> Array:
+    """Slopes of all pixels by the camera's pose, shape (8 t, 6)."""
+    corners = np.concatenate([tag_corners(tag) for tag in tags])
+
+    def pixels(step: Array) -> Array:
+        pose = moved(camera_from_world, step)
+        return ideal_of(rig.cameras[0], pose.apply(corners)).ravel()
+
+    return np.column_stack([(pixels(d) - pixels(-d)) / 2e-6 for d in 1e-6 * np.eye(6)])
+
+
+def bound(rig: Rig, tags: tuple[Tag, ...], survey: Survey) -> float:
+    """Cramér-Rao bound of points of the work space, RMS, [mm]."""
+    truth = rig.cameras[0].world_from_camera.inverse()
+    poses = by_pose(rig, tags, truth)
+    covariance = NOISE**2 * np.eye(8 * len(tags))
+    for k, tag in enumerate(tags):
+        block = slice(8 * k, 8 * k + 8)
+        covariance[block, block] += survey.of_pixels(rig.cameras[0], truth, tag)
+    best = np.linalg.inv(poses.T @ np.linalg.solve(covariance, poses))
+    points = truth.apply(workspace_corners(rig))
+    slopes = [np.hstack([np.eye(3), -skew(p - truth.position)]) for p in points]
+    return 1e3 * float(np.sqrt(np.mean([np.trace(s @ best @ s.T) for s in slopes])))
+
+
+def error(
+    rig: Rig, tags: tuple[Tag, ...], survey: Survey, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Of one survey and one picture: mean square of points of the work space, and as stated."""
+    camera = rig.cameras[0]
+    there, squares = camera.world_from_camera.inverse(), {}
+    for tag in tags:
+        slopes = survey.slopes(tag)
+        off = (slopes @ rng.standard_normal(slopes.shape[1])).reshape(4, 3)
+        pixels = ideal_of(camera, there.apply(tag_corners(tag) + off))
+        pixels = pixels + NOISE * rng.standard_normal((4, 2))
+        whitening = np.eye(8) / NOISE
+        target = whitening @ pixels.ravel()
+        squares[tag.id] = RefinedTag(pixels, whitening, target, np.ones(4, bool), NOISE)
+    found = locate_camera(
+        replace(rig, frame_tags=tags), camera, TagSights({"picture": squares}, {}), survey
+    )
+    back = found.world_from_camera.apply(there.apply(found.points)) - found.points
+    return float(np.mean(np.sum(back**2, axis=1))), found.error
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--survey-mm", type=float, default=0.5)
+    options = parser.parse_args()
+    rig, size = load_rig(RIG), options.survey_mm / 1e3
+    away = float(np.linalg.norm(rig.cameras[0].world_from_camera.position))
+    print(
+        f"survey {options.survey_mm:g} mm, corners {NOISE:g} px, tags of {SIZE * 1e3:g} mm on the"
+    )
+    print(f"floor, camera {away:.2f} m from the origin; points of the work space, RMS")
+    print(
+        f"{'tags':>5s} {'surveyed was':28s}{'error':>9s}{'bound':>9s}{'ratio':>7s}{'in 95 %':>9s}"
+    )
+    for count, places in PLACES.items():
+        tags = tuple(
+            Tag(
+                401 + k, SIZE, Pose(np.array([x, y, 0.0]), matrix_from_rotation_vector(np.zeros(3)))
+            )
+            for k, (x, y) in enumerate(places)
+        )
+        for name in SURVEYS:
+            survey, rng = survey_called(name, size), np.random.default_rng(7)
+            found = np.array([error(rig, tags, survey, rng) for _ in range(options.trials)])
+            off, best = 1e3 * float(np.sqrt(found[:, 0].mean())), bound(rig, tags, survey)
+            held = float(np.mean(np.sqrt(found[:, 0]) <= found[:, 1]))
+            row = f"{off:6.2f} mm{best:6.2f} mm{off / best:7.2f}{held:9.0%}"
+            print(f"{count:5d} {name:28s}{row}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
