@@ -117,7 +117,7 @@ def main() -> None:
             for k, (x, y) in enumerate(places)
         )
         for name in SURVEYS:
-            survey, rng = survey_called(name, size), np.random.default_rng(7)
+            survey, rng = survey_called(name, size), np.random.default_rng([11, count])
             found = np.array([error(rig, tags, survey, rng) for _ in range(options.trials)])
             off, best = 1e3 * float(np.sqrt(found[:, 0].mean())), bound(rig, tags, survey)
             held = float(np.mean(np.sqrt(found[:, 0]) <= found[:, 1]))

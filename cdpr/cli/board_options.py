@@ -1,10 +1,13 @@
-"""Options that say which board was printed, and the board that they make."""
+"""Options that say which board was printed, defined once, and the board that they make."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from functools import wraps
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -22,77 +25,100 @@ class BoardName(StrEnum):
     tags = "tags"
 
 
-BoardOption = Annotated[BoardName, typer.Option(help="what was printed")]
-ColumnsOption = Annotated[
-    int,
-    typer.Option(min=1, help="inner corners (chessboard), squares (charuco) or tags in a row"),
-]
-RowsOption = Annotated[int, typer.Option(min=1, help="how many rows of them")]
-SquareOption = Annotated[float | None, typer.Option(help="side of a square (chessboard, charuco)")]
-MarkerOption = Annotated[float | None, typer.Option(help="side of a marker (charuco)")]
-DictionaryOption = Annotated[str, typer.Option(help="of the markers (charuco), as 5X5_100")]
-LegacyOption = Annotated[
-    bool, typer.Option("--legacy", help="charuco as OpenCV before 4.6 drew it")
-]
-TagOption = Annotated[float | None, typer.Option(help="side of a tag's black square (tags)")]
-GapOption = Annotated[float | None, typer.Option(help="between black squares (tags)")]
-FamilyOption = Annotated[str, typer.Option(help="of the tags (tags)")]
-FirstOption = Annotated[int, typer.Option(min=0, help="number of the top left tag (tags)")]
-
 _NEEDED = {
-    BoardName.chessboard: ("square",),
-    BoardName.charuco: ("square", "marker"),
-    BoardName.tags: ("tag", "gap"),
+    BoardName.chessboard: ("square_mm",),
+    BoardName.charuco: ("square_mm", "marker_mm"),
+    BoardName.tags: ("tag_mm", "gap_mm"),
 }
+_SIZES = ("square_mm", "marker_mm", "tag_mm", "gap_mm")
 
 
-def board_of(
-    kind: BoardName,
-    columns: int,
-    rows: int,
-    sizes_mm: Mapping[str, float | None],
-    dictionary: str,
-    legacy: bool,
-    family: str,
-    first: int,
-) -> Board:
-    """The board.
+@dataclass(frozen=True, slots=True)
+class BoardOptions:
+    """What was said about a board; every field is an option of the verbs that know boards."""
 
-    Args:
-        kind: What was printed.
-        columns: Of inner corners, squares or tags.
-        rows: Likewise.
-        sizes_mm: Of square, marker, tag and gap, as far as they were given.
-        dictionary: Of markers.
-        legacy: Whether the board is as OpenCV drew it before 4.6.
-        family: Of tags.
-        first: Number of the first tag.
+    board: Annotated[BoardName, typer.Option(help="what was printed")] = BoardName.chessboard
+    columns: Annotated[
+        int | None,
+        typer.Option(min=1, help="inner corners (chessboard), squares (charuco) or tags in a row"),
+    ] = None
+    rows: Annotated[int | None, typer.Option(min=1, help="how many rows of them")] = None
+    square_mm: Annotated[
+        float | None, typer.Option(help="side of a square (chessboard, charuco)")
+    ] = None
+    marker_mm: Annotated[float | None, typer.Option(help="side of a marker (charuco)")] = None
+    dictionary: Annotated[str, typer.Option(help="of the markers (charuco), as 5X5_100")] = "4X4_50"
+    legacy: Annotated[
+        bool, typer.Option("--legacy", help="charuco as OpenCV before 4.6 drew it")
+    ] = False
+    tag_mm: Annotated[float | None, typer.Option(help="side of a tag's black square (tags)")] = None
+    gap_mm: Annotated[float | None, typer.Option(help="between black squares (tags)")] = None
+    family: Annotated[str, typer.Option(help="of the tags (tags)")] = "tag36h11"
+    first: Annotated[int, typer.Option(min=0, help="number of the top left tag (tags)")] = 0
 
-    Raises:
-        BadInput: A size is missing or one too many is given, or there can be no such board.
-    """
-    from calibration.charuco import Charuco
-    from calibration.chessboard import Chessboard
-    from calibration.tag_grid import TagGrid
+    def made(self) -> Board:
+        """The board.
 
-    needed = _NEEDED[kind]
-    given = [name for name, size in sizes_mm.items() if size is not None]
-    if missing := [name for name in needed if name not in given]:
-        raise BadInput(
-            f"--board {kind.value} needs {_listed(missing)}",
-            next_step="measure it on the print, with a ruler over many squares",
-        )
-    if others := [name for name in given if name not in needed]:
-        raise BadInput(f"--board {kind.value} knows no {_listed(others)}", next_step="leave it out")
-    size = [(sizes_mm[name] or 0.0) / 1000.0 for name in needed]
-    match kind:
-        case BoardName.chessboard:
-            return Chessboard(columns, rows, size[0])
-        case BoardName.charuco:
-            return Charuco(columns, rows, size[0], size[1], dictionary, legacy)
-        case BoardName.tags:
-            return TagGrid(columns, rows, size[0], size[1], family, first)
+        Raises:
+            BadInput: A number or size is missing or one too many is given, or there can be no such
+                board.
+        """
+        from calibration.charuco import Charuco
+        from calibration.chessboard import Chessboard
+        from calibration.tag_grid import TagGrid
+
+        if self.columns is None or self.rows is None:
+            raise BadInput(
+                "a board needs --columns and --rows",
+                next_step="count inner corners (chessboard), squares (charuco) or tags on it",
+            )
+        count, sides = (self.columns, self.rows), self._sides()
+        match self.board:
+            case BoardName.chessboard:
+                return Chessboard(*count, sides[0])
+            case BoardName.charuco:
+                return Charuco(*count, sides[0], sides[1], self.dictionary, self.legacy)
+            case BoardName.tags:
+                return TagGrid(*count, sides[0], sides[1], self.family, self.first)
+
+    def _sides(self) -> list[float]:
+        """The sizes of this kind of board, [m]."""
+        needed = _NEEDED[self.board]
+        sizes: dict[str, float | None] = {name: getattr(self, name) for name in _SIZES}
+        if missing := [name for name in needed if sizes[name] is None]:
+            raise BadInput(
+                f"--board {self.board.value} needs {_listed(missing)}",
+                next_step="measure it on the print, with a ruler over many squares",
+            )
+        given = [name for name, size in sizes.items() if size is not None]
+        if others := [name for name in given if name not in needed]:
+            what = f"--board {self.board.value} knows no {_listed(others)}"
+            raise BadInput(what, next_step="leave it out")
+        return [(sizes[name] or 0.0) / 1e3 for name in needed]
+
+
+def with_board_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the options of a board in place of its parameter ``printed``."""
+    hints = get_type_hints(BoardOptions, include_extras=True)
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    options = [
+        inspect.Parameter(option.name, kind, default=option.default, annotation=hints[option.name])
+        for option in fields(BoardOptions)
+    ]
+
+    @wraps(command)
+    def with_options(**values: Any) -> None:
+        printed = BoardOptions(**{option.name: values.pop(option.name) for option in options})
+        command(printed=printed, **values)
+
+    whole = inspect.signature(command, eval_str=True)
+    own = whole.parameters.values()
+    parameters = [p for one in own for p in (options if one.name == "printed" else [one])]
+    as_seen: Any = with_options
+    as_seen.__signature__ = whole.replace(parameters=parameters)
+    as_seen.__annotations__ = {p.name: p.annotation for p in parameters}
+    return with_options
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(f"--{name}-mm" for name in names)
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names)

@@ -7,21 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cdpr.cli.board_options import (
-    BoardName,
-    BoardOption,
-    ColumnsOption,
-    DictionaryOption,
-    FamilyOption,
-    FirstOption,
-    GapOption,
-    LegacyOption,
-    MarkerOption,
-    RowsOption,
-    SquareOption,
-    TagOption,
-    board_of,
-)
+from cdpr.cli.board_options import BoardOptions, with_board_options
 from cdpr.cli.calibration_output import FolderOption, ForceOption, JsonOption, WantedOption
 
 if TYPE_CHECKING:
@@ -29,21 +15,12 @@ if TYPE_CHECKING:
     from calibration.camera_verdict import CameraQuality
 
 
+@with_board_options
 def camera(
     folder: Annotated[
         Path, typer.Argument(help="folder of pictures of the board, or for --live", metavar="DIR")
     ],
-    columns: ColumnsOption,
-    rows: RowsOption,
-    board: BoardOption = BoardName.chessboard,
-    square_mm: SquareOption = None,
-    marker_mm: MarkerOption = None,
-    dictionary: DictionaryOption = "4X4_50",
-    legacy: LegacyOption = False,
-    tag_mm: TagOption = None,
-    gap_mm: GapOption = None,
-    family: FamilyOption = "tag36h11",
-    first: FirstOption = 0,
+    printed: BoardOptions,
     live: Annotated[
         str | None,
         typer.Option(help="take the pictures with this camera (or of a video) into DIR first"),
@@ -92,8 +69,7 @@ def camera(
     from drivers.picture_folder import OneCamerasPictures
 
     require_file_name(name, "--name")
-    sizes = {"square": square_mm, "marker": marker_mm, "tag": tag_mm, "gap": gap_mm}
-    the_board = board_of(board, columns, rows, sizes, dictionary, legacy, family, first)
+    the_board = printed.made()
     if live is None and (pictures is not None or size_px is not None):
         raise BadInput(
             "--pictures and --size-px are for taking pictures",

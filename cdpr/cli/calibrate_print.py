@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cdpr.cli.board_options import (
-    BoardName,
-    BoardOption,
-    DictionaryOption,
-    FamilyOption,
-    FirstOption,
-    GapOption,
-    LegacyOption,
-    MarkerOption,
-    SquareOption,
-    TagOption,
-    board_of,
-)
+from cdpr.cli.board_options import BoardOptions, with_board_options
 from cdpr.cli.calibration_output import JsonOption
 
 if TYPE_CHECKING:
@@ -35,24 +23,13 @@ class PaperName(StrEnum):
     letter = "letter"
 
 
+@with_board_options
 def print_(
     output: Annotated[Path, typer.Argument(help="file to write (PDF)", metavar="PDF")],
+    printed: BoardOptions,
     rig: Annotated[
         Path | None, typer.Option("--rig", help="print this rig's tags, not a board", metavar="RIG")
     ] = None,
-    columns: Annotated[
-        int | None, typer.Option(min=1, help="inner corners, squares or tags in a row")
-    ] = None,
-    rows: Annotated[int | None, typer.Option(min=1, help="how many rows of them")] = None,
-    board: BoardOption = BoardName.chessboard,
-    square_mm: SquareOption = None,
-    marker_mm: MarkerOption = None,
-    dictionary: DictionaryOption = "4X4_50",
-    legacy: LegacyOption = False,
-    tag_mm: TagOption = None,
-    gap_mm: GapOption = None,
-    family: FamilyOption = "tag36h11",
-    first: FirstOption = 0,
     paper: Annotated[PaperName, typer.Option(help="to print on")] = PaperName.a4,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
     as_json: JsonOption = False,
@@ -83,23 +60,22 @@ def print_(
             next_step=f"name it {output.with_suffix('.pdf').name}",
         )
     check_output(output, force)
-    sizes = {"square": square_mm, "marker": marker_mm, "tag": tag_mm, "gap": gap_mm}
     if rig is not None:
-        if columns or rows or any(size is not None for size in sizes.values()):
+        if printed != BoardOptions():
             raise BadInput(
                 "--rig prints the rig's tags in the sizes of its file",
                 where="--rig",
-                next_step="leave the board's numbers out, or leave --rig out",
+                next_step="leave the board's options out, or leave --rig out",
             )
         prints = _tags_of(rig)
         pages, what = sheets_of(prints, paper.value), f"{len(prints)} tags"
-    elif columns is None or rows is None:
+    elif printed == BoardOptions():
         raise BadInput(
             "a board needs --columns and --rows",
             next_step="pass them, or --rig RIG for the tags of a rig",
         )
     else:
-        made = board_of(board, columns, rows, sizes, dictionary, legacy, family, first)
+        made = printed.made()
         pages, what = [sheet_of(board_print(made), paper.value)], str(made)
     write_bytes_atomic(output, pdf_of(pages, f"cdpr: {what}"))
     step = (

@@ -142,6 +142,7 @@ def test_a_wrong_size_of_squares_shows_in_the_distance_of_the_boards(folder) -> 
     ("options", "named"),
     [
         ((*BOARD, "--name", "front/left"), "--name"),
+        (("--square-mm", "25"), "needs --columns and --rows"),
         (("--columns", "9", "--rows", "6"), "needs --square-mm"),
         ((*BOARD, "--tag-mm", "30"), "knows no --tag-mm"),
         (("--columns", "2", "--rows", "5", "--square-mm", "25"), "3 inner corners"),

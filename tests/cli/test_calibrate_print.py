@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
+from cdpr.cli import calibrate
+from cdpr.cli.board_options import BoardOptions
+from cdpr.cli.calibrate_print import print_
 from tests.calibration.pages import pages_in
 from tests.cli.plans import RIG
 from tests.cli.program import call, nothing_written, one_message
@@ -37,7 +42,9 @@ def test_the_tags_of_a_rig_are_printed(tmp_path: Path) -> None:
     [
         ((*BOARD[:-1], "35"), "use --paper a3"),
         ((*BOARD, "--rig", RIG), "--rig prints the rig's tags"),
+        (("--family", "tag25h9", "--rig", RIG), "--rig prints the rig's tags"),
         ((), "needs --columns and --rows"),
+        (("--board", "charuco"), "needs --columns and --rows"),
         (("--columns", "9", "--rows", "6"), "needs --square-mm"),
         (
             ("--board", "tags", "--columns", "3", "--rows", "2", "--tag-mm", "40", "--gap-mm", "2"),
@@ -49,6 +56,15 @@ def test_prints_that_cannot_be_are_refused(tmp_path: Path, options, named: str) 
     with nothing_written(tmp_path):
         answer = call("calibrate", "print", tmp_path / "board.pdf", *options)
     one_message(answer, 2, named)
+
+
+def test_camera_and_print_know_boards_by_the_same_options() -> None:
+    commands = [inspect.signature(command).parameters for command in (calibrate.camera, print_)]
+    for option in fields(BoardOptions):
+        one, other = (command[option.name] for command in commands)
+        assert one.default == other.default == option.default
+        helps = [parameter.annotation.__metadata__[0].help for parameter in (one, other)]
+        assert helps[0] == helps[1]
 
 
 def test_a_print_is_named_as_what_it_is(tmp_path: Path) -> None:
