@@ -13,13 +13,24 @@ from executor.run_csv import TableFile, numbers, texts, write_table
 _MM = 1e3
 
 
+def source_of(camera: str) -> str:
+    """The source of what one of several cameras measured alone."""
+    return f"tag:{camera}"
+
+
+def camera_of(source: str) -> str:
+    """The camera that a source is of alone; nothing for all cameras and for the drives."""
+    return source.partition(":")[2]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ClearanceTable:
     """Distances at n poses to each of k obstacles; no rows for a scene without obstacles.
 
     Attributes:
         time: Since the start of the run, shape (n,), [s].
-        source: Where each pose came from, n texts: ``tag`` or ``encoder``.
+        source: Where each pose came from, n texts: ``tag`` (all cameras), ``encoder``, or one of
+            several cameras alone (`source_of`).
         distance: Smallest distance, shape (n,), [m].
         uncertainty: How much less than that the smallest true one may be, shape (n,), [m].
         at_most: The smallest true one is no more than this, shape (n,), [m].

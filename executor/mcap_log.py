@@ -13,7 +13,7 @@ from mcap.writer import Writer
 
 from cdpr.errors import Fault
 from cdpr.poses import Array
-from executor.clearance_table import ClearanceTable
+from executor.clearance_table import ClearanceTable, camera_of
 from executor.cycle_table import CycleTable
 from executor.fused_table import FusedTable
 from executor.mcap_scene import robot_messages, scene_messages
@@ -223,9 +223,10 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
     )
     values = zip(*(_column(column * 1e3) for column in columns), strict=True)
     for i, row in enumerate(values):
+        camera = camera_of(clearance.source[i])
         each = zip(clearance.obstacles, near[i], planned[i], strict=True)
         content: dict[str, Any] = {
-            "source": clearance.source[i],
+            "source": "tag" if camera else clearance.source[i],
             **dict(zip(keys, row, strict=True)),
             "body": clearance.body[i],
             "obstacle": clearance.obstacle[i],
@@ -233,7 +234,7 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
                 {"name": n, "distance_mm": d, "planned_distance_mm": p} for n, d, p in each
             ],
         }
-        yield "/clearance", float(clearance.time[i]), content
+        yield topic_of("/clearance", camera), float(clearance.time[i]), content
 
 
 def _events(context: RunContext, start: int) -> Iterator[Message]:

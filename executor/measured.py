@@ -22,7 +22,7 @@ class ClearanceRow:
 
     Attributes:
         time: [s].
-        source: ``tag`` or ``encoder``.
+        source: As `ClearanceTable` has it.
         measured: At the measured pose.
         uncertainty: How much less than the smallest of them the smallest true one may be, [m].
         at_most: The smallest true one is no more than this, [m].
@@ -38,11 +38,15 @@ class ClearanceRow:
 
     @classmethod
     def by_tags(
-        cls, time: float, clearance: MeasuredClearance, planned: tuple[Nearest, ...]
+        cls,
+        time: float,
+        clearance: MeasuredClearance,
+        planned: tuple[Nearest, ...],
+        source: str = "tag",
     ) -> ClearanceRow:
-        """The row of a pose that a camera measured."""
+        """The row of a pose that the cameras measured, or one of them alone."""
         measured, spread = clearance.nearest, clearance.uncertainty
-        return cls(time, "tag", measured, spread, clearance.at_most, planned)
+        return cls(time, source, measured, spread, clearance.at_most, planned)
 
     @classmethod
     def by_drives(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from cdpr.clearance import ClearanceModel
 from cdpr.poses import Array, Pose
-from executor.clearance_table import ClearanceTable
+from executor.clearance_table import ClearanceTable, source_of
 from executor.cycle_table import CycleTable
 from executor.execution import Outcome
 from executor.fused_table import fused_table
@@ -23,6 +24,7 @@ from executor.run_cameras import Seen
 from executor.run_folder import RunFolder
 from executor.summary import RunContext, summarize
 from executor.versions import versions
+from tracking.measured_clearance import MeasuredClearance, clearance_of
 from tracking.measurement import NoPose, PoseMeasurement
 
 #: Clearances from drive positions are computed this often along a run, [Hz].
@@ -56,7 +58,7 @@ def conclude(
     cycles = outcome.log.table()
     poses = _pose_table(seen.together, cycles)
     alone = {name: _pose_table(looks, cycles) for name, looks in seen.alone.items()}
-    clearance = _clearance(prepared, cycles, seen.together)
+    clearance = _clearance(prepared, cycles, seen)
     folder.write_cycles(cycles)
     folder.write_poses(poses)
     for name, table in alone.items():
@@ -130,13 +132,12 @@ def _poses(positions: Array, quaternions: Array) -> list[Pose]:
     return [Pose.from_quaternion(position, quaternion) for position, quaternion in pairs]
 
 
-def _clearance(prepared: PreparedRun, cycles: CycleTable, looks: Sequence[Look]) -> ClearanceTable:
+def _clearance(prepared: PreparedRun, cycles: CycleTable, seen: Seen) -> ClearanceTable:
     model = ClearanceModel(prepared.rig, prepared.scene)
-    rows = [
-        ClearanceRow.by_tags(look.found.time, look.clearance, model.obstacles(planned))
-        for look, planned in zip(looks, _planned(looks, cycles), strict=True)
-        if look.clearance is not None
-    ]
+    rows = _seen_rows(model, cycles, seen.together, "tag")
+    for name, looks in seen.alone.items():
+        measured = [replace(k, clearance=_clearance_at(model, k)) for k in looks]
+        rows += _seen_rows(model, cycles, measured, source_of(name))
     if model.obstacle_names:
         every = max(1, round(1.0 / (CLEARANCE_RATE * prepared.checked.table.cycle)))
         chosen = np.arange(0, len(cycles), every)
@@ -147,3 +148,18 @@ def _clearance(prepared: PreparedRun, cycles: CycleTable, looks: Sequence[Look])
             _poses(cycles.planned[chosen], cycles.planned_rotation[chosen]),
         )
     return clearance_table(model.obstacle_names, rows)
+
+
+def _seen_rows(
+    model: ClearanceModel, cycles: CycleTable, looks: Sequence[Look], source: str
+) -> list[ClearanceRow]:
+    """A row for each look with a clearance."""
+    return [
+        ClearanceRow.by_tags(look.found.time, look.clearance, model.obstacles(planned), source)
+        for look, planned in zip(looks, _planned(looks, cycles), strict=True)
+        if look.clearance is not None
+    ]
+
+
+def _clearance_at(model: ClearanceModel, look: Look) -> MeasuredClearance | None:
+    return clearance_of(model, look.found) if isinstance(look.found, PoseMeasurement) else None

@@ -130,7 +130,8 @@ def _mm(values: Array) -> list[list[float]]:
 
 def _motion(run: RunData, view: SceneView) -> list[dict[str, Any]]:
     cycles, rig = run.cycles, run.rig
-    clearance = run.clearance.of("tag") if len(run.clearance.of("tag")) else run.clearance
+    by_tags, by_drives = run.clearance.of("tag"), run.clearance.of("encoder")
+    clearance = by_tags if len(by_tags) else by_drives
     found = []
     for row in view.moments.tolist():
         time, position = float(cycles.time[row]), cycles.encoder[row]

@@ -107,6 +107,10 @@ def test_each_camera_has_its_own_channels(answer_and_folder: tuple[Answer, RunFo
     rows = len(folder.poses())
     for channel in ("/tag_pose", "/tag_status"):
         assert [counts[channel + name] for name in ("", "/front", "/side")] == [rows] * 3
+    clearance = folder.clearance()
+    assert counts["/clearance/front"] == len(clearance.of("tag:front")) == rows
+    assert counts["/clearance/side"] == len(clearance.of("tag:side")) == rows
+    assert counts["/clearance"] == len(clearance.of("tag")) + len(clearance.of("encoder"))
     kept = {name: sum(map(bool, p.picture)) for name, p in folder.poses_by_camera().items()}
     assert counts["/pictures/front"] == kept["front"] > 0
     assert counts["/pictures/side"] == kept["side"] > 0
