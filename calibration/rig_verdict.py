@@ -121,7 +121,8 @@ def _other_stiffness(result: RigCalibration) -> list[Lack]:
         Lack(
             f"the data tell a stiffness of the cables of {compliance}, the rig file"
             f" {result.rig.cable_stiffness:.6g} N",
-            "check cables: stiffness_n of the rig file, and the tensions that the drives tell",
+            "check cables: stiffness_n of the rig file, and the tensions that the drives tell;"
+            " where it is truly that far off, pass a larger --stiffness-percent",
         )
     ]
 

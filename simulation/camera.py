@@ -39,6 +39,8 @@ PLATFORM = 168.0
 NEAREST = 0.02
 #: A smear is drawn as so many poses that neighbours are this far apart, [px], but no more than:
 SMEAR_STEP, MOST_POSES = 0.5, 64
+#: A shorter smear is not to be seen, [px].
+LEAST_SMEAR = 0.02
 #: Slack of the precomputed noise, in which each picture takes another place, [px].
 NOISE_SLACK = 96
 
@@ -106,7 +108,7 @@ class SyntheticCamera:
             return [pose]
         first, last = (pixels_of(self.camera, corners) for corners in seen)
         smear = float(np.linalg.norm(last - first, axis=1).max())
-        count = min(MOST_POSES, max(1, math.ceil(smear / SMEAR_STEP)))
+        count = 1 if smear < LEAST_SMEAR else min(MOST_POSES, 1 + math.ceil(smear / SMEAR_STEP))
         return [motion.moved(pose, ((k + 0.5) / count - 0.5) * time) for k in range(count)]
 
     def _at(self, pose: Pose) -> Image8:

@@ -521,6 +521,16 @@ def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool)
     assert any("stiffness_n" in step for step in verdict.next_steps)
 
 
+def test_a_stiffness_that_is_hardly_known_is_found_from_afar(turned: Truth) -> None:
+    """As the next step of a contradiction advises: a hundred and forty times too stiff."""
+    drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
+    loose = {**DEFAULT_DEVIATIONS, "stiffness": 5.0}
+    result = calibrate_rig(drawn, turned.measured, loose, LENGTH_DEVIATION)
+    stiffness = result.intervals["stiffness_n"]
+    assert abs(stiffness.value - 6000.0) < stiffness.half_width < 1200.0
+    assert judge_rig(result, 1e-3, 0.0).verdict.good
+
+
 def test_the_true_stiffness_is_not_doubted(
     found: RigCalibration, found_level: RigCalibration
 ) -> None:
