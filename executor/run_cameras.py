@@ -12,7 +12,7 @@ from executor.camera_eye import CameraEye, CameraRecord
 from executor.camera_sight import BLIND_PICTURES
 from executor.near_watch import NearWatch
 from executor.observer import Look, Trigger, unseen
-from tracking.cameras_together import at_once
+from tracking.cameras_together import CommonPose
 from tracking.measured_clearance import clearance_of
 from tracking.measurement import NoPose, PoseMeasurement
 
@@ -75,7 +75,7 @@ class RunCameras:
         self.near = ""
         """Between what the measured clearance fell below the limit, with numbers; else nothing."""
         self._eyes, self._model = eyes, model
-        self._watch, self._within = NearWatch(limit), 0.5 / rate
+        self._watch, self._common = NearWatch(limit), CommonPose(0.5 / rate)
         self._frame, self._now = 0, 0.0
         self._open: list[_Moment] = []
         self._together: list[Look] = []
@@ -161,7 +161,7 @@ class RunCameras:
             found = looks[0].found
         else:
             names = (eye.name for eye in self._eyes if eye.name in moment.looks)
-            found = at_once(dict(zip(names, (k.found for k in looks), strict=True)), self._within)
+            found = self._common.of(dict(zip(names, (k.found for k in looks), strict=True)))
         if isinstance(found, NoPose):
             disagree = sum(isinstance(look.found, PoseMeasurement) for look in looks) > 1
             self._count_disagreement(found.reason if disagree else "")

@@ -15,6 +15,7 @@ from cdpr.poses import (
     rotation_vector_from_matrix,
 )
 from tracking.measurement import NoPose, Observation, PoseMeasurement
+from tracking.prediction import carried_on
 
 #: What a camera's place may be off by, beside the covariance of what it measures, [m] and [rad].
 PLACE = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
@@ -23,16 +24,39 @@ PLACE = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
 GATE = 27.9
 
 
-def at_once(seen: Mapping[str, Observation], within: float) -> Observation:
-    """As `together`, of pictures taken at about the same time as the first camera's.
+class CommonPose:
+    """The pose of all cameras, moment after moment.
 
-    Args:
-        seen: What each camera measured, by its name, in the order of the cameras; not empty.
-        within: Pictures taken farther apart in time than this are not taken together, [s].
+    Pictures of one moment are taken a little apart in time. Each pose is carried on to the newest
+    one's time, as the same camera saw the platform go.
     """
-    first = next(iter(seen.values())).time
-    near = {name: one for name, one in seen.items() if abs(one.time - first) <= within}
-    return together(near)
+
+    def __init__(self, within: float) -> None:
+        """Nothing was seen yet.
+
+        Args:
+            within: Pictures taken farther apart in time than this are not taken together, [s].
+        """
+        self._within = within
+        self._before: dict[str, PoseMeasurement] = {}
+
+    def of(self, seen: Mapping[str, Observation]) -> Observation:
+        """The pose of a moment, as `together` finds it.
+
+        Args:
+            seen: What each camera measured, by its name, in the order of the cameras; not empty.
+        """
+        first = next(iter(seen.values())).time
+        near = {name: one for name, one in seen.items() if abs(one.time - first) <= self._within}
+        newest = max(one.time for one in near.values())
+        at_newest: dict[str, Observation] = {
+            name: carried_on(one, self._before.get(name), newest)
+            if isinstance(one, PoseMeasurement)
+            else one
+            for name, one in near.items()
+        }
+        self._before |= {n: one for n, one in seen.items() if isinstance(one, PoseMeasurement)}
+        return together(at_newest)
 
 
 def together(seen: Mapping[str, Observation]) -> Observation:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from dataclasses import replace
+
+from cdpr.poses import Pose, matrix_from_rotation_vector, read_only, rotation_vector_from_matrix
 from tracking.measurement import PoseMeasurement
 
 #: Older motion says nothing about the present one, [s].
@@ -26,3 +28,24 @@ def predicted(last: PoseMeasurement, before: PoseMeasurement | None, time: float
     turn = rotation_vector_from_matrix(last.pose.rotation @ before.pose.rotation.T)
     position = last.pose.position + share * (last.pose.position - before.pose.position)
     return Pose(position, matrix_from_rotation_vector(share * turn) @ last.pose.rotation)
+
+
+def carried_on(
+    last: PoseMeasurement, before: PoseMeasurement | None, time: float
+) -> PoseMeasurement:
+    """A measurement as it would have been a little later, with what that adds to its covariance.
+
+    Args:
+        last: The measurement.
+        before: The one before it by the same camera, if there is one.
+        time: Of the later one, [s].
+
+    Returns:
+        The measurement as it is where `predicted` knows no speed.
+    """
+    pose = predicted(last, before, time)
+    if before is None or pose is last.pose:
+        return last
+    share = (time - last.time) / (last.time - before.time)
+    covariance = (1.0 + share) ** 2 * last.covariance + share**2 * before.covariance
+    return replace(last, time=time, pose=pose, covariance=read_only(covariance))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from cdpr.clearance import ClearanceModel
-from tracking.cameras_together import at_once
+from tracking.cameras_together import CommonPose
 from tracking.measured_clearance import clearance_of
 from tracking.measurement import PoseMeasurement
 from tracking.pose_log import LoggedPicture
@@ -32,11 +32,11 @@ def track_together(
         BadInput: A picture is not of its camera's size.
         CameraMoved: Frame tags are not where they should be.
     """
-    count, reason = 0, "the sources have no pictures"
+    count, reason, common = 0, "the sources have no pictures", CommonPose(within)
     running = {name: _without_end(stream) for name, stream in streams.items()}
     for group in zip(*running.values(), strict=False):
         alone = dict(zip(running, group, strict=True))
-        found = at_once({name: one.observation for name, one in alone.items()}, within)
+        found = common.of({name: one.observation for name, one in alone.items()})
         clearance = None
         if isinstance(found, PoseMeasurement):
             count += 1

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from cdpr.poses import Pose, matrix_from_rotation_vector
@@ -13,8 +15,9 @@ from cdpr.rig import Camera, Rig
 from cdpr.scene import Scene
 from simulation.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.cameras_together import together
+from tracking.cameras_together import CommonPose, together
 from tracking.measurement import NoPose, PoseMeasurement
+from tracking.prediction import carried_on
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.05, 0.05, 0.4])
@@ -86,6 +89,51 @@ def test_of_three_the_one_that_disagrees_is_left_out() -> None:
     found = together({"a": good[0], "wrong": wrong, "b": good[1]})
     assert isinstance(found, PoseMeasurement)
     assert found.pose.distance_to(Pose.level([5e-5, 0.0, 0.4])) < 1e-9
+
+
+@given(
+    speed=st.tuples(*[st.floats(-0.3, 0.3)] * 3),
+    late=st.floats(0.0, 0.049),
+    period=st.floats(0.06, 0.4),
+)
+def test_cameras_that_look_a_little_apart_in_time_agree_on_a_platform_that_moves(
+    speed: tuple[float, float, float], late: float, period: float
+) -> None:
+    def seen(time: float, deviation: float) -> PoseMeasurement:
+        covariance = np.diag([deviation**2] * 6)
+        pose = Pose.level(np.array([0.0, 0.0, 0.4]) + time * np.array(speed))
+        return PoseMeasurement(time, pose, covariance, (301,), 0.1, "tracked")
+
+    common = CommonPose(0.05)
+    for k in range(3):
+        now = k * period
+        found = common.of({"front": seen(now, 1e-4), "side": seen(now + late, 2e-4)})
+    assert isinstance(found, PoseMeasurement)
+    assert found.time == pytest.approx(now + late)
+    assert found.pose.distance_to(seen(now + late, 1e-4).pose) < 1e-9
+    assert (found.position_deviation <= 2e-4 + 1e-12).all()
+
+
+def test_what_carrying_on_costs_is_in_the_covariance() -> None:
+    """By many noisy pairs: the later pose scatters as its covariance says."""
+    rng, errors = np.random.default_rng(3), []
+    for _ in range(400):
+        noise = rng.normal(0.0, 1e-4, (2, 3))
+        one, two = (
+            replace(measured((np.array([0, 0, 0.4]) + n).tolist(), [1e-4] * 3), time=time)
+            for n, time in zip(noise, (0.0, 0.1), strict=True)
+        )
+        later = carried_on(two, one, 0.15)
+        error = later.pose.position - [0, 0, 0.4]
+        errors.append(error @ np.linalg.solve(later.covariance[:3, :3], error))
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * len(errors)) / len(errors)
+    assert low < np.mean(errors) < high
+
+
+def test_pictures_too_far_apart_in_time_are_not_taken_together() -> None:
+    front = measured([0.0, 0.0, 0.4], [1e-4] * 3)
+    side = replace(measured([0.02, 0.0, 0.4], [1e-4] * 3), time=0.06)
+    assert CommonPose(0.05).of({"front": front, "side": side}) is front
 
 
 def test_one_that_sees_nothing_leaves_it_to_the_others() -> None:
