@@ -211,10 +211,20 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
             os.fsync(handle)  # or a power cut could leave the new name on an empty file
         Path(temporary).chmod(0o644)
         Path(temporary).replace(path)
+        _keep_names(path.parent)
     except OSError as error:
         raise _not_written(path, error, "free some space or choose another folder") from None
     finally:
         Path(temporary).unlink(missing_ok=True)  # gone already when all went well
+
+
+def _keep_names(folder: Path) -> None:
+    """A new name outlives a power cut only once its folder is on disk."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _not_written(path: Path, error: OSError, next_step: str) -> BadInput:

@@ -43,7 +43,7 @@ class Custody:
             Refused: So it is; with the cause.
         """
         if self._is_kept:
-            self._latch.require_released()
+            self._latch.require_disengaged()
 
     def reference(self) -> ReferenceDocument | None:
         """The reference that counts for this rig file; None where it needs none and has none.
@@ -161,7 +161,7 @@ class Custody:
             if anew:
                 self._lose("the drives were being referenced again, which did not come to its end")
         except BaseException:
-            self._latch.release()
+            self._latch.disengage()
             raise
 
     def take(self, reference: ReferenceDocument) -> None:
@@ -176,7 +176,7 @@ class Custody:
     def prevented(self) -> None:
         """Nothing moved after all."""
         if self._is_kept:
-            self._latch.release()
+            self._latch.disengage()
 
     def end(
         self,
@@ -188,7 +188,7 @@ class Custody:
         stands_at: Sequence[int] | None,
         let_go: str = "",
     ) -> None:
-        """The motion is over: the bus is released when it ended well, else latched.
+        """The motion is over: the bus is free when it ended well, else latched.
 
         Args:
             state: Where it ended.

@@ -1,9 +1,9 @@
 """The latch of a bus: while it is engaged nothing moves the drives there, in no process.
 
 It is a file in this computer's state folder (`executor.state_folder`). It is engaged before
-anything moves and released when the motion ended well; a fault leaves it engaged with its cause,
+anything moves and disengaged when the motion ended well; a fault leaves it engaged with its cause,
 and a program that died or a computer that lost power leaves it engaged too. Only `cdpr reset`
-releases it then.
+disengages it then.
 
 Whoever moves the drives, or resets them, holds a lock on a file beside it. The system gives it
 back when that program ends, however it ends; so every user can tell a run from what a run left.
@@ -24,8 +24,12 @@ from pathlib import Path
 from cdpr.documents import write_atomic
 from cdpr.errors import CdprError, Refused
 from drivers.bus import BusSettings
+from executor.file_lock import locked_within
 from executor.machine import State
 from executor.state_folder import state_file
+
+#: Who looks at the lock lets it go within this, [s].
+LOOKS_WITHIN = 0.5
 
 _CUT_SHORT = "a run did not come to its end: its program was killed, or the computer stopped"
 
@@ -71,7 +75,7 @@ class Latch:
             cause = f"the latch file cannot be read: {error}"
             return Latched(self._bus, "unknown", cause, "unknown", "unknown", 0)
 
-    def require_released(self) -> None:
+    def require_disengaged(self) -> None:
         """Nothing may move while it is engaged.
 
         Raises:
@@ -93,7 +97,7 @@ class Latch:
 
     @contextmanager
     def held_for_reset(self, rig: str, shown: Latched | None) -> Iterator[None]:
-        """Keeps runs off the bus while the block resets its drives; then it is released.
+        """Keeps runs off the bus while the block resets its drives; then it is off.
 
         When the block fails, the latch is as it was.
 
@@ -119,10 +123,10 @@ class Latch:
             yield
         except BaseException:
             if shown is None:
-                self.release()
+                self.disengage()
             self._let_go()
             raise
-        self.release()
+        self.disengage()
 
     def engage(self, rig: str, folder: Path, cause: str = _CUT_SHORT) -> None:
         """A run is about to move; if it does not come to its end, this is what tells of it.
@@ -135,25 +139,28 @@ class Latch:
         Raises:
             Refused: It is engaged already, or cannot be.
         """
+        self.require_disengaged()
         try:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
-        except FileExistsError:
-            raise self._refusal(self.read()) from None
         except OSError as error:
             raise self._not_kept(error.strerror or str(error)) from None
         self._hold()
-        self._write(self._latched(rig, cause, folder))
+        try:
+            self.require_disengaged()  # nobody else engages it from here on
+            self._write(self._latched(rig, cause, folder))
+        except BaseException:
+            self._let_go()
+            raise
 
     def settle(self, rig: str, state: State, cause: str, folder: Path) -> None:
-        """The motion is over: released when it ended well, else engaged with its cause."""
+        """The motion is over: disengaged when it ended well, else engaged with its cause."""
         if state in (State.FINISHED, State.STOPPED):
-            self.release()
+            self.disengage()
         else:
             self._write(self._latched(rig, cause, folder))
             self._let_go()
 
-    def release(self) -> None:
+    def disengage(self) -> None:
         """Drives may be moved again."""
         try:
             self.path.unlink(missing_ok=True)
@@ -162,15 +169,21 @@ class Latch:
         self._let_go()
 
     def _hold(self) -> None:
-        """Until it is let go, or this program ends; waits for those who only look."""
+        """Until it is let go, or this program ends; waits for those who only look.
+
+        Raises:
+            Refused: Somebody moves or resets the drives, or the lock cannot be made.
+        """
         if self._held is not None:
             return
         try:
             lock = os.open(self._lock, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise self._not_kept(error.strerror or str(error)) from None
+        if not locked_within(lock, LOOKS_WITHIN):
+            os.close(lock)
+            raise self._refusal(self.read())
         self._held = weakref.finalize(self, os.close, lock)
-        fcntl.flock(lock, fcntl.LOCK_EX)
 
     def _let_go(self) -> None:
         if self._held is not None:
@@ -202,30 +215,22 @@ class Latch:
     def _write(self, latched: Latched) -> None:
         try:
             write_atomic(self.path, json.dumps(asdict(latched), indent=1) + "\n")
-            folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
         except CdprError as error:
             raise self._not_kept(error.why) from None
-        except OSError as error:
-            raise self._not_kept(error.strerror or str(error)) from None
 
     def _refusal(self, latched: Latched | None) -> Refused:
-        if latched is not None and self.held_by_another():
+        if latched is None or self.held_by_another():
+            who = "" if latched is None else f" (process {latched.process})"
             return Refused(
-                f"a motion or a reset (process {latched.process}) is under way on this bus",
+                f"a motion or a reset{who} is under way on this bus",
                 where=f"bus {self._bus}",
                 next_step="wait for its end, or stop it with `cdpr stop` (`sudo cdpr stop` where it"
                 " is another user's)",
             )
-        cause = latched.cause if latched else "another run is about to move it"
-        since = f" since {latched.since}" if latched else ""
         return Refused(
-            f"a fault is latched{since}: {cause}",
+            f"a fault is latched since {latched.since}: {latched.cause}",
             where=f"bus {self._bus}",
-            why=f"on record in {latched.folder}" if latched else "",
+            why=f"on record in {latched.folder}",
             next_step="find the cause and look at the platform, then `cdpr reset RIG`;"
             " nothing was moved",
         )

@@ -9,9 +9,10 @@ the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``l
 (what keeps it from measuring, or nothing)}], ``drives`` [{``node``, ``state``,
 ``position_counts``, ``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``,
 ``text``}], the newest last. A number that is not known is null; before the first cycle ``state``
-is ``preparing`` and ``drives`` is empty; at the end ``cause`` says why it did not end well. Winches
-that move without a path (`cdpr home`, `cdpr jog --cable`) have no ``path_mm`` and
-``path_length_mm``; their ``row`` of 100 ``rows`` is a percentage.
+is ``preparing`` (while `cdpr release` takes the torque off ``releasing``) and ``drives`` is empty;
+at the end ``cause`` says why it did not end well. Winches that move without a path (`cdpr home`,
+`cdpr jog --cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a
+percentage.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ class CyclesSoFar:
         self._worst_lateness = 0.0
         self._lost = 0
         self._end: tuple[State, str] | None = None
+        self.before = "preparing"
+        """What is told as state as long as there is no cycle."""
 
     def take(self, record: CycleRecord) -> None:
         """One more is over."""
@@ -66,7 +69,7 @@ class CyclesSoFar:
         """State, times, replies and drives; see the head of this file."""
         state, cause = self._end or (self.last.state if self.last else None, None)
         told = {
-            "state": state.value if state else "preparing",
+            "state": state.value if state else self.before,
             "cause": cause or None,
             "simulated_time": self._simulated_time,
             "lost_replies": self._lost,
@@ -143,6 +146,10 @@ class MotionStatus(ABC):
         self._cameras: list[dict[str, Any]] = []
         self.folder: Path | None = None
         """Where it is on record, if anywhere."""
+
+    def take_release(self) -> None:
+        """The torque is being taken off; nothing moves, and no cycle is told."""
+        self._cycles.before = "releasing"
 
     def take_end(self, state: State, cause: str) -> None:
         """The motion is over."""

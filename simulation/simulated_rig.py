@@ -196,8 +196,8 @@ class SimulatedRig(ABC, Generic[Drive]):
     ) -> None:
         """Answers in real time until told to stop or interrupted from the keyboard.
 
-        Drives answer at once; the platform's place is found while nothing is to be answered, and
-        torques wait for it. When this process is held up, the drives' time stands still: they do
+        Drives answer at once; the platform's place is found while nothing is to be answered, in
+        half of that time at most, and torques wait for it. When this process is held up, the drives' time stands still: they do
         not blame the master for it. While the interface is down they hear and reach nobody, as with
         their cable pulled, and go on when it is up again.
 
@@ -212,15 +212,20 @@ class SimulatedRig(ABC, Generic[Drive]):
         """
         try:
             last = told = clock()
+            wait = IDLE_WAIT
             while not stop_requested():
-                message = self._heard()
+                message = self._heard(wait)
                 now = clock()
                 self._let_pass(now - last, message)
                 last = now
                 if message is not None:
                     self._handle(message)
+                    wait = 0.0
                     continue
-                self._go_on_feeling()
+                wait = IDLE_WAIT
+                if self._feeling is not None:
+                    self._go_on_feeling()
+                    wait = clock() - now  # a master on the same processor has its turn, too
                 if on_status is not None and now - told >= status_period:
                     told = now
                     on_status(self.status())
@@ -236,10 +241,10 @@ class SimulatedRig(ABC, Generic[Drive]):
         states = tuple(drive.state for drive in self.drives)
         return RehearsalStatus(self.cycles, states, self.plant.pose, self.plant.tensions)
 
-    def _heard(self) -> can.Message | None:
-        """The next frame; none while the interface is down."""
+    def _heard(self, wait: float) -> can.Message | None:
+        """The next frame, if one comes within a time [s]; none while the interface is down."""
         try:
-            return take(self._bus, IDLE_WAIT if self._feeling is None else 0.0)
+            return take(self._bus, wait)
         except BusDown:
             time.sleep(IDLE_WAIT)  # the kernel tells it at once, and time must pass all the same
             return None

@@ -42,13 +42,14 @@ def open_drives(
     Raises:
         BadInput: python-can has no such interface.
         HardwareMissing: The bus cannot be opened or a drive does not answer.
-        Refused: The bus is too slow, or a drive does not keep a setting.
+        Refused: The bus is too slow, a drive does not keep a setting, or somebody else sets it up.
     """
     from cdpr.cli.output import err
     from drivers.bus import IN_PROCESS, BusSettings, open_bus
     from drivers.drive_group import make_drive_group
     from executor.custody import Custody
     from executor.real_time_job import ReadyDrives
+    from executor.set_up_lock import SetUpLock
 
     custody, counted = Custody(rig), rig
     settings = BusSettings.of(rig)
@@ -59,6 +60,7 @@ def open_drives(
         custody.found_restarted(nodes)
 
     with ExitStack() as stack:
+        stack.enter_context(SetUpLock(settings).held())
         bus = open_bus(settings)
         stack.callback(bus.shutdown)
         pump, true_pose = None, None

@@ -97,28 +97,37 @@ def _released(rig: Rig, custody: Custody, without_real_time: bool) -> CycleStatu
     from functools import partial
 
     from cdpr.cli.drives import open_drives
-    from cdpr.errors import StoppedByOperator
+    from cdpr.errors import CdprError, StoppedByOperator
     from cdpr.scene import nothing_in_the_way
     from executor.arming import require_capabilities
     from executor.command_server import serving
+    from executor.machine import State
     from executor.running import announced, stop_requests
     from executor.status import WinchStatus
     from executor.unreferenced import set_up_here
     from executor.wishes import OwnBoard
 
     board = OwnBoard()
+    told = WinchStatus(rig, board, simulated_time=False)
     load = nothing_in_the_way(rig).load
     with (
         stop_requests(board),
         announced() as listeners,
-        serving(listeners, board, WinchStatus(rig, board, simulated_time=False)),
+        serving(listeners, board, told),
         open_drives(rig, rig.home, load, set_up_as=partial(set_up_here, rig)) as drives,
     ):
         require_capabilities(drives.group.capabilities, rig.document.bus.cycle_ms / 1000.0)
         stands = drives.group.read_positions().positions.tolist()
         if board.read().stop:
             raise StoppedByOperator("stopped before anything was released; the drives hold")
-        return _in_custody(rig, custody, drives, stands, board, without_real_time)
+        told.take_release()
+        try:
+            status = _in_custody(rig, custody, drives, stands, board, without_real_time)
+        except CdprError as error:
+            told.take_end(State.LATCHED, error.what)
+            raise
+        told.take_end(State.FINISHED, "")
+        return status
 
 
 def _in_custody(

@@ -25,7 +25,7 @@ def reset(
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
 ) -> None:
-    """Release a latched fault, after its cause is gone: resets drives in fault; moves nothing.
+    """Take a latched fault off, after its cause is gone: resets drives in fault; moves nothing.
 
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
     Afterwards a run starts only from where the platform stands.
@@ -60,15 +60,15 @@ def reset(
         told = _drives_reset(the_rig)
     if as_json:
         cause_before = latched.cause if latched else None
-        show_json({"released": latched is not None, "cause": cause_before, **told})
+        show_json({"was_latched": latched is not None, "cause": cause_before, **told})
         return
     out.print(f"drives: {', '.join(sorted(set(told['drives'])))}", soft_wrap=True)
     if told["restarted"]:
         names = ", ".join(the_rig.drive_names[node] for node in told["restarted"])
         out.print(f"switched on since they were last set up: {names}", soft_wrap=True)
     out.print(f"reference: {reference_text(told['reference'])}", soft_wrap=True, markup=False)
-    freed = "released" if latched else "nothing was latched"
-    out.print(f"{freed}; the next run starts only from where the platform stands now")
+    latch_now = "the latch is off" if latched else "nothing was latched"
+    out.print(f"{latch_now}; the next run starts only from where the platform stands now")
 
 
 def _drives_reset(rig: Rig) -> dict[str, Any]:

@@ -24,7 +24,8 @@ def status(
 ) -> None:
     """Tell how a rig stands: faults, reference, drives, tensions, pose. Moves and writes nothing.
 
-    While a run is under way the drives are not asked; `cdpr monitor` shows them.
+    While a run is under way, or being prepared, the drives are not asked; `cdpr monitor` shows
+    them.
 
     [dim]Example:[/dim]
 
@@ -38,6 +39,7 @@ def status(
     from drivers.bus import BusSettings
     from executor.custody import Custody
     from executor.latch import Latch
+    from executor.set_up_lock import SetUpLock
 
     the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     require_other_process(the_rig)
@@ -49,6 +51,7 @@ def status(
         "bus": str(settings),
         "run": latched.process if latched and under_way else None,
         "latched": latched.cause if latched and not under_way else None,
+        "being_set_up": False,
         "reference": reference_told(custody),
         "drives": None,
         "pose": None,
@@ -56,7 +59,8 @@ def status(
     missing: CdprError | None = None
     if not under_way:
         try:
-            told |= _seen(the_rig, custody)
+            with SetUpLock(settings).tried() as alone:
+                told |= _seen(the_rig, custody) if alone else {"being_set_up": True}
         except CdprError as error:  # what is on file is told all the same
             missing = error
     if as_json:
@@ -151,6 +155,8 @@ def _show(rig: Rig, told: dict[str, Any]) -> None:
         ("latched fault", latched),
         ("reference", reference_text(told["reference"])),
     ]
+    if told["being_set_up"]:
+        facts.append(("drives", "not asked: a motion is being prepared, or somebody else asks"))
     pose = told["pose"]
     if pose is not None:
         facts.append(("platform", pose.get("why_not") or _place(pose)))

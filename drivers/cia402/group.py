@@ -76,7 +76,7 @@ class Cia402Group(CyclicGroup):
         self._watch = DriveWatch(self._rig.drive_names, self._max_steps)
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
-        self._released = [False] * count
+        self._told_to_stop = [False] * count
         self._targets = [0] * count
         self._demands = [0] * count
         self._faults = []
@@ -169,7 +169,7 @@ class Cia402Group(CyclicGroup):
         self._online()
         self._discard_stale()
         following = self._state is GroupState.ENABLED
-        words = next_words(self._goal, self._watch.states, self._released)
+        words = next_words(self._goal, self._watch.states, self._told_to_stop)
         if ControlWord.ENABLE_OPERATION in words:
             self._left_stop = True
         self._demands = self._targets if self._known else list(self._watch.positions)
@@ -205,16 +205,16 @@ class Cia402Group(CyclicGroup):
     def _send(self, words: tuple[ControlWord, ...]) -> None:
         """One cycle's frames; what was asked for is remembered even if the bus fails."""
         self._words = words
-        self._note_released()
+        self._note_told_to_stop()
         self._watch.begin_cycle()
         self._cyclic.send(self._frames.of_cycle(words, self._targets))
 
-    def _note_released(self) -> None:
+    def _note_told_to_stop(self) -> None:
         for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):
             if state is not DriveState.QUICK_STOP_ACTIVE:
-                self._released[drive] = False
+                self._told_to_stop[drive] = False
             elif word is ControlWord.QUICK_STOP:
-                self._released[drive] = True
+                self._told_to_stop[drive] = True
 
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)

@@ -45,21 +45,22 @@ _NEXT_WORD = (
 
 
 def next_words(
-    goal: Goal, states: Sequence[DriveState], released: Sequence[bool]
+    goal: Goal, states: Sequence[DriveState], told_to_stop: Sequence[bool]
 ) -> tuple[ControlWord, ...]:
     """The control words of the next cycle, one a drive.
 
     Args:
         goal: Where the group is going.
         states: As last reported.
-        released: True for drives that were sent a quick stop since they reported QUICK STOP ACTIVE.
+        told_to_stop: True for drives that were sent a quick stop since they reported QUICK STOP
+            ACTIVE.
     """
     if goal is Goal.STOP:
         return (ControlWord.QUICK_STOP,) * len(states)
     if goal is Goal.ENABLE:
-        return _enable(states, released)
+        return _enable(states, told_to_stop)
     if goal is Goal.RELEASE:
-        return _release(states, released)
+        return _release(states, told_to_stop)
     if goal is Goal.RESET_FAULT:
         return tuple(
             ControlWord.RESET_FAULT if state is DriveState.FAULT else _idle(state)
@@ -72,7 +73,7 @@ def _idle(state: DriveState) -> ControlWord:
     return ControlWord.QUICK_STOP if state in _MAY_HOLD else ControlWord.SHUTDOWN
 
 
-def _enable(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[ControlWord, ...]:
+def _enable(states: Sequence[DriveState], told_to_stop: Sequence[bool]) -> tuple[ControlWord, ...]:
     """One step towards OPERATION ENABLED; the last step is one step of all drives."""
     if any(state in FAULTED for state in states):
         return (ControlWord.QUICK_STOP,) * len(states)
@@ -81,7 +82,7 @@ def _enable(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[Con
     # run must first be told to stop.
     fresh = all(
         state is not DriveState.QUICK_STOP_ACTIVE or told
-        for state, told in zip(states, released, strict=True)
+        for state, told in zip(states, told_to_stop, strict=True)
     )
     if lowest >= 2 and fresh:
         return (ControlWord.ENABLE_OPERATION,) * len(states)
@@ -89,7 +90,7 @@ def _enable(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[Con
     return tuple(ControlWord.QUICK_STOP if s in _MAY_HOLD else word for s in states)
 
 
-def _release(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[ControlWord, ...]:
+def _release(states: Sequence[DriveState], told_to_stop: Sequence[bool]) -> tuple[ControlWord, ...]:
     """Operation disabled on all, which closes brakes; shut down once none is under torque.
 
     The only way out of QUICK STOP ACTIVE without "disable voltage" leads through OPERATION
@@ -98,7 +99,7 @@ def _release(states: Sequence[DriveState], released: Sequence[bool]) -> tuple[Co
     if any(state in FAULTED for state in states):
         return (ControlWord.QUICK_STOP,) * len(states)
     if DriveState.QUICK_STOP_ACTIVE in states:
-        return _enable(states, released)
+        return _enable(states, told_to_stop)
     if DriveState.OPERATION_ENABLED in states:
         return (ControlWord.SWITCH_ON,) * len(states)
     return (ControlWord.SHUTDOWN,) * len(states)

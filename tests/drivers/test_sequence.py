@@ -43,7 +43,7 @@ def test_words_never_free_a_cable_and_enable_all_or_none(
     goal: Goal, drives: list[tuple[DriveState, bool]]
 ) -> None:
     states = [state for state, _ in drives]
-    words = next_words(goal, states, [released for _, released in drives])
+    words = next_words(goal, states, [told for _, told in drives])
     assert len(words) == len(states)
     assert all(word & 0x02 for word in words)
     if ControlWord.ENABLE_OPERATION in words:
@@ -77,12 +77,12 @@ def test_any_mixture_without_fault_is_enabled_and_released(
     states: list[DriveState],
 ) -> None:
     def run(goal: Goal, states: list[DriveState]) -> list[DriveState]:
-        released = [False] * len(states)
+        told_to_stop = [False] * len(states)
         for _ in range(8):
-            words = next_words(goal, states, released)
-            released = [
+            words = next_words(goal, states, told_to_stop)
+            told_to_stop = [
                 s is DriveState.QUICK_STOP_ACTIVE and (r or w is ControlWord.QUICK_STOP)
-                for s, r, w in zip(states, released, words, strict=True)
+                for s, r, w in zip(states, told_to_stop, words, strict=True)
             ]
             states = [after(s, w) for s, w in zip(states, words, strict=True)]
         return states

@@ -37,42 +37,69 @@ def wait_until_beyond(path_mm: float) -> None:
         signal.sigtimedwait([], 0.01)
 
 
-def test_a_run_engages_it_and_only_a_good_end_releases_it(tmp_path: Path) -> None:
+def test_a_run_engages_it_and_only_a_good_end_disengages_it(tmp_path: Path) -> None:
     latch = Latch(BUS)
-    latch.require_released()
+    latch.require_disengaged()
     for state in (State.FINISHED, State.STOPPED):
         latch.engage("rig", tmp_path)
         assert Latch(BUS).read() is not None
         latch.settle("rig", state, "", tmp_path)
-        latch.require_released()
+        latch.require_disengaged()
     latch.engage("rig", tmp_path)
     latch.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
     with pytest.raises(Refused, match="cable 6 is slack") as caught:
-        Latch(BUS).require_released()
+        Latch(BUS).require_disengaged()
     assert "cdpr reset" in caught.value.next_step
     with pytest.raises(Refused, match="cable 6 is slack"):
         Latch(BUS).engage("rig", tmp_path)
-    Latch(BUS).release()
-    latch.require_released()
+    Latch(BUS).disengage()
+    latch.require_disengaged()
 
 
 def test_a_run_that_never_came_to_its_end_is_a_fault(tmp_path: Path) -> None:
     Latch(BUS).engage("rig", tmp_path)
     with pytest.raises(Refused, match="did not come to its end"):
-        Latch(BUS).require_released()
+        Latch(BUS).require_disengaged()
 
 
 def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
     """To every user of the folder, who may not reach the other's run; and only until it ends."""
     running = Latch(BUS)
     running.engage("rig", tmp_path)
-    for ask in (Latch(BUS).require_released, Latch(BUS).require_no_run):
+    for ask in (Latch(BUS).require_disengaged, Latch(BUS).require_no_run):
         with pytest.raises(Refused, match=f"process {os.getpid()}.*under way"):
             ask()
     running.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
     Latch(BUS).require_no_run()
     with pytest.raises(Refused, match="cable 6 is slack"):
-        Latch(BUS).require_released()
+        Latch(BUS).require_disengaged()
+
+
+def test_nobody_sees_a_latch_that_does_not_say_its_cause_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, hold = [], Latch._hold
+
+    def looked_at(latch: Latch) -> None:
+        hold(latch)
+        seen.append(Latch(BUS).read())
+
+    monkeypatch.setattr(Latch, "_hold", looked_at)
+    Latch(BUS).engage("rig", tmp_path)
+    assert seen == [None]
+
+
+def test_of_two_that_begin_at_once_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("executor.latch.LOOKS_WITHIN", 0.05)
+    first = Latch(BUS)
+    first.path.parent.mkdir(parents=True)
+    first._hold()  # it is about to write why
+    with pytest.raises(Refused, match="under way"):
+        Latch(BUS).engage("rig", tmp_path)
+    assert first.read() is None
+    first.engage("rig", tmp_path)
 
 
 def test_a_program_that_was_killed_runs_no_more(tmp_path: Path) -> None:
@@ -84,7 +111,7 @@ def test_a_program_that_was_killed_runs_no_more(tmp_path: Path) -> None:
     assert killed.exitcode == -signal.SIGKILL
     Latch(BUS).require_no_run()
     with pytest.raises(Refused, match="did not come to its end"):
-        Latch(BUS).require_released()
+        Latch(BUS).require_disengaged()
 
 
 def _engaged_and_killed(folder: Path) -> None:
@@ -95,7 +122,7 @@ def _engaged_and_killed(folder: Path) -> None:
 
 def test_each_bus_has_its_own(tmp_path: Path) -> None:
     Latch(BUS).engage("rig", tmp_path)
-    Latch(BusSettings("socketcan", "can1")).require_released()
+    Latch(BusSettings("socketcan", "can1")).require_disengaged()
 
 
 def test_all_users_share_it_where_an_administrator_made_a_folder_for_it(
@@ -107,7 +134,7 @@ def test_all_users_share_it_where_an_administrator_made_a_folder_for_it(
     Latch(BUS).engage("rig", tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
     with pytest.raises(Refused, match="did not come to its end"):
-        Latch(BUS).require_released()
+        Latch(BUS).require_disengaged()
     assert Latch(BUS).path.parent == shared
 
 
@@ -117,7 +144,7 @@ def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
     latch = Latch(BUS)
     with pytest.raises(Refused, match=r"reset .*under way"), latch.held_for_reset("rig", None):
         Latch(BUS).engage("rig", tmp_path)
-    latch.require_released()
+    latch.require_disengaged()
     latch.engage("rig", tmp_path, "cable 3 is slack")
     shown = latch.read()
     with pytest.raises(KeyError), latch.held_for_reset("rig", shown):
@@ -125,9 +152,9 @@ def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
     assert latch.read() == shown
     with latch.held_for_reset("rig", shown):
         pass
-    latch.require_released()
+    latch.require_disengaged()
     with pytest.raises(Refused, match="changed since"), latch.held_for_reset("rig", shown):
-        pytest.fail("somebody else released it: the operator said yes to something else")
+        pytest.fail("somebody else disengaged it: the operator said yes to something else")
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"bus": 1}', "\x00"])
@@ -136,7 +163,7 @@ def test_a_latch_file_that_cannot_be_read_counts_as_engaged(tmp_path: Path, cont
     latch.engage("rig", tmp_path)
     latch.path.write_text(content)
     with pytest.raises(Refused, match="cannot be read"):
-        latch.require_released()
+        latch.require_disengaged()
 
 
 def test_without_a_place_for_the_latch_nothing_moves(
@@ -191,11 +218,11 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
         answer = call("reset", RIG, *bus, "--yes", "--json")
         assert answer.code == 0, answer
         told = json.loads(answer.out)
-        assert told["released"] is True
+        assert told["was_latched"] is True
         assert "fault" not in told["drives"]
         assert DriveState.FAULT not in {drive.state for drive in rehearsal.drives}
         assert [drive.motor.position for drive in rehearsal.drives] == stood
-    latch.require_released()
+    latch.require_disengaged()
 
 
 @pytest.mark.slow

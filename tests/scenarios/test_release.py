@@ -76,7 +76,7 @@ def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
         assert told["reference"]["counts"] is braked
         if not braked:
             assert "released by the operator" in told["reference"]["why_not"]
-    Latch(BusSettings("udp_multicast", channel)).require_released()
+    Latch(BusSettings("udp_multicast", channel)).require_disengaged()
 
 
 @pytest.mark.slow

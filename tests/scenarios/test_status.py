@@ -10,10 +10,13 @@ from typing import Any
 
 import pytest
 
+from cdpr.errors import Refused
 from drivers.bus import BusSettings
+from executor import set_up_lock
 from executor.latch import Latch
 from executor.machine import State
 from executor.prepare import PreparedRun
+from executor.set_up_lock import SetUpLock
 from executor.state_folder import state_file
 from simulation.drive import SimulatedDrive
 from tests.cli.plans import RIG
@@ -71,6 +74,45 @@ def test_what_is_on_file_is_told_although_no_drive_answers(tmp_path: Path) -> No
     assert answer.code == 4
     assert "cable 4 is slack" in answer.out
     assert "does not answer" in answer.err
+
+
+@pytest.mark.slow
+def test_drives_that_somebody_sets_up_are_not_asked(prepared: PreparedRun) -> None:
+    channel = f"239.74.163.27:{20000 + (os.getpid() * 23) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    with (
+        drives_on(channel, prepared) as rehearsal,
+        SetUpLock(BusSettings("udp_multicast", channel)).held(),
+    ):
+        answer = call("status", RIG, *bus, "--json")
+        assert answer.code == 0, answer
+        told = json.loads(answer.out)
+        assert (told["being_set_up"], told["drives"], told["run"]) == (True, None, None)
+        assert "a motion is being prepared" in call("status", RIG, *bus).out.replace("\n", " ")
+        assert rehearsal.cycles == 0
+
+
+def test_who_sets_drives_up_waits_for_who_asks_and_does_so_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = BusSettings("socketcan", "can6")
+    monkeypatch.setattr(set_up_lock, "ASKED_WITHIN", 0.05)
+    with SetUpLock(settings).tried() as alone:
+        assert alone
+        assert not state_file("set-up", settings).parent.exists(), "who looks makes no file"
+    with SetUpLock(settings).held():
+        with SetUpLock(settings).tried() as alone:
+            assert not alone
+        with pytest.raises(Refused, match="sets these drives up"), SetUpLock(settings).held():
+            pytest.fail("two programs set the same drives up")
+        with SetUpLock(BusSettings("socketcan", "can7")).held():
+            pass
+    with SetUpLock(settings).tried() as alone:
+        assert alone
+        with pytest.raises(Refused), SetUpLock(settings).held():
+            pytest.fail("drives were set up while somebody asked them")
+    with SetUpLock(settings).held():
+        pass
 
 
 def test_a_bus_of_one_process_has_nothing_to_tell() -> None:

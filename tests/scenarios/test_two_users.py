@@ -66,7 +66,7 @@ def moves(latch: Latch) -> None:
 
 
 def would_move(latch: Latch) -> None:
-    latch.require_released()
+    latch.require_disengaged()
 
 
 def would_reset(latch: Latch) -> None:
