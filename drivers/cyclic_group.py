@@ -12,6 +12,7 @@ from cdpr.rig import Rig
 from drivers.bus_faults import BusFault
 from drivers.cyclic_bus import CyclicBus, Listener
 from drivers.drive_group import WHOLE_BUS, CycleStatus, GroupState, Pump
+from drivers.set_up_refusals import SETTING_UP
 
 
 class GroupWatch(Listener, Protocol):
@@ -117,7 +118,7 @@ class CyclicGroup(ABC):
         if self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping:
             raise Refused(
                 "the drives are enabled; they cannot be set up now",
-                where="configuring the drives",
+                where=SETTING_UP,
                 next_step="stop them first",
             )
 

@@ -197,9 +197,9 @@ class SimulatedRig(ABC, Generic[Drive]):
         """Answers in real time until told to stop or interrupted from the keyboard.
 
         Drives answer at once; the platform's place is found while nothing is to be answered, in
-        half of that time at most, and torques wait for it. When this process is held up, the drives' time stands still: they do
-        not blame the master for it. While the interface is down they hear and reach nobody, as with
-        their cable pulled, and go on when it is up again.
+        half of that time at most, and torques wait for it. When this process is held up, the
+        drives' time stands still: they do not blame the master for it. While the interface is down
+        they hear and reach nobody, as with their cable pulled, and go on when it is up again.
 
         Args:
             stop_requested: Asked every few milliseconds; true ends it.

@@ -26,6 +26,13 @@ from drivers.cia402.objects import (
 from drivers.cia402.sdo import OBJECT_DOES_NOT_EXIST, SetupNetwork
 from drivers.cia402.states import FAULTED, DriveState, state_of
 from drivers.drive_group import OnRestarted, Pump
+from drivers.set_up_refusals import (
+    SETTING_UP,
+    answers_twice,
+    in_fault,
+    keeps_another,
+    moved_by_another,
+)
 
 #: Communication parameters that are 0 in a drive that was just switched on. Source: CiA 301, 7.5.2.
 FORGOTTEN = (0x1006, 0x1017)
@@ -100,13 +107,7 @@ def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting
 
 def _refuse_duplicates(network: SetupNetwork) -> None:
     for node in network.nodes_answering_twice():
-        raise Refused(
-            f"drive {node} answers twice",
-            where="configuring the drives",
-            why="two devices have this node id, or `cdpr sim` was started twice",
-            next_step="give every device on the bus its own node id",
-            values={"node": node},
-        )
+        raise answers_twice(node)
 
 
 def _absent(absent: dict[Setting, list[int]]) -> Iterator[str]:
@@ -143,7 +144,7 @@ def _find_all(
         first = silent[0]
         raise HardwareMissing(
             f"drives {names} do not answer",
-            where="configuring the drives",
+            where=SETTING_UP,
             why=first.why,
             next_step=first.next_step,
             values={"nodes": names},
@@ -162,26 +163,18 @@ def _expect(network: SetupNetwork, node: int, expectations: Sequence[Expectation
             )
 
 
+_STATUS_WORD = "object 6041h:00 status word"
+
+
 def _check_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
     """A drive that is enabled belongs to somebody; one that holds in quick stop may be taken."""
     data = network.client(node).read(0x6041, 0, "status word")
     state = state_of(int.from_bytes(data, "little"))
     if state in FAULTED and not to_reset:
-        raise Refused(
-            f"drive {node} is in fault",
-            where=f"drive {node}, object 6041h:00 status word",
-            why="it stopped itself; its own display or tool tells the cause",
-            next_step="remove the cause, then `cdpr reset RIG`",
-            values={"node": node},
-        )
+        why = "it stopped itself; its own display or tool tells the cause"
+        raise in_fault(node, "", _STATUS_WORD, why)
     if state is DriveState.OPERATION_ENABLED:
-        raise Refused(
-            f"drive {node} is enabled already",
-            where=f"drive {node}, object 6041h:00 status word",
-            why="another program moves it, or it did not stop when its master went away",
-            next_step="end the other program; otherwise press the emergency stop",
-            values={"node": node},
-        )
+        raise moved_by_another(node, "enabled already", _STATUS_WORD)
 
 
 def _write_all(
@@ -238,10 +231,4 @@ def _number(data: bytes, form: str) -> str:
 
 
 def _wrong(node: int, place: str, found: str, wanted: str, why: str) -> Refused:
-    return Refused(
-        f"the drive holds {found}, it must hold {wanted}",
-        where=f"drive {node}, object {place}",
-        why=f"needed because: {why}",
-        next_step="look the object up in the drive's manual; the drives stay as they are",
-        values={"node": node, "object": place, "found": found, "wanted": wanted},
-    )
+    return keeps_another(node, f"object {place}", found, wanted, why, "the drive's manual")

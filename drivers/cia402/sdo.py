@@ -30,6 +30,7 @@ from drivers.cia402.texts import abort_text
 from drivers.drive_group import Pump
 from drivers.error_frames import error_frame_fault
 from drivers.own_frames import OwnFrames
+from drivers.set_up_refusals import SETTING_UP
 
 RESPONSE_TIMEOUT = 0.5
 """For the answer to one request, [s]."""
@@ -121,7 +122,7 @@ class SetupNetwork:
         if self._own.is_foreign(can_id):
             raise Refused(
                 foreign_text(can_id),
-                where="configuring the drives",
+                where=SETTING_UP,
                 why=ForeignMaster.cause,
                 next_step=ForeignMaster.remedy,
             )

@@ -16,6 +16,13 @@ from drivers.odrive.dbc import Layout, Layouts
 from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
 from drivers.odrive.link import ECHO_WAIT, RESPONSE_TIMEOUT, SetupLink
 from drivers.odrive.messages import AxisError, AxisState, ControlMode, InputMode, error_text
+from drivers.set_up_refusals import (
+    SETTING_UP,
+    answers_twice,
+    in_fault,
+    keeps_another,
+    moved_by_another,
+)
 from drivers.travel import position_limits
 
 HEARTBEATS_WAITED = 3.2
@@ -35,7 +42,6 @@ NO_SUPPLY = 1.0
 CONFIRMATION_WAIT = 0.01
 """For the confirmation of a write, [s]."""
 
-WHERE = "configuring the drives"
 
 Told = dict[int, tuple[float, ...]]
 
@@ -113,7 +119,7 @@ def _answers(
     told: Told = {}
     for node, values in link.answers(layout, timeout):
         if node in told and asked:
-            raise _twice(node)
+            raise answers_twice(node)
         if node in nodes:
             told[node] = values
         if len(told) == len(nodes):
@@ -121,20 +127,11 @@ def _answers(
     silent = ", ".join(str(node) for node in nodes if node not in told)
     raise HardwareMissing(
         f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",
-        where=WHERE,
+        where=SETTING_UP,
         why="no power, a broken cable, a wrong bit rate or node id, or the message is switched off",
         next_step="check power and wiring, and node id, bit rate and message periods with"
         " odrivetool",
         values={"nodes": silent},
-    )
-
-
-def _twice(node: int) -> Refused:
-    return Refused(
-        f"drive {node} answers twice: two devices have this node id",
-        where=WHERE,
-        next_step="give every drive a node id of its own",
-        values={"node": node},
     )
 
 
@@ -147,7 +144,7 @@ def _check_versions(
     told = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
-            raise _twice(node)
+            raise answers_twice(node)
     for node, (_, *version) in told.items():
         firmware = tuple(int(part) for part in version)
         text = ".".join(map(str, firmware))
@@ -179,22 +176,12 @@ def _check_idle(
     for node, (_, state, _) in told.items():
         if state != AxisState.IDLE:
             enabled = state == AxisState.CLOSED_LOOP_CONTROL
-            raise Refused(
-                f"drive {node} is {'enabled already' if enabled else f'in axis state {state}'}",
-                where=f"drive {node}, Heartbeat",
-                why="another program moves it, or it did not stop when its master went away",
-                next_step="end the other program; otherwise press the emergency stop",
-                values={"node": node},
-            )
+            what = "enabled already" if enabled else f"in axis state {state}"
+            raise moved_by_another(node, what, "Heartbeat")
     for node, (errors, _, _) in told.items():
         if int(errors) & ~AxisError.WATCHDOG_TIMER_EXPIRED and not reset:
-            raise Refused(
-                f"drive {node} is in fault: {error_text(int(errors))}",
-                where=f"drive {node}, Heartbeat",
-                why="it disarmed itself; its brake holds the cable",
-                next_step="remove the cause, then `cdpr reset RIG`",
-                values={"node": node},
-            )
+            why = "it disarmed itself; its brake holds the cable"
+            raise in_fault(node, f": {error_text(int(errors))}", "Heartbeat", why)
     if any(errors == AxisError.WATCHDOG_TIMER_EXPIRED for errors, _, _ in told.values()):
         for node in nodes:
             link.tell(node, layouts.clear_errors, 0)
@@ -233,17 +220,17 @@ def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wante
             continue
         if int(told) == raw:
             return
-        found = endpoint.from_raw(int(told))
-        raise Refused(
-            f"the drive holds {found:g}, it must hold {wanted.value:g}",
-            where=f"drive {node}, endpoint {endpoint.name}",
-            why=f"needed because: {wanted.why}",
-            next_step="look the endpoint up in ODrive's API reference; the drives stay as they are",
-            values={"node": node, "endpoint": endpoint.name},
+        raise keeps_another(
+            node,
+            f"endpoint {endpoint.name}",
+            f"{endpoint.from_raw(int(told)):g}",
+            f"{wanted.value:g}",
+            wanted.why,
+            "ODrive's API reference",
         )
     raise HardwareMissing(
         f"drive {node} does not tell {endpoint.name}",
-        where=WHERE,
+        where=SETTING_UP,
         next_step="check that drives.endpoints is of the drive's firmware and board",
         values={"node": node, "endpoint": endpoint.name},
     )
