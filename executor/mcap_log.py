@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mcap.writer import Writer
 
 from cdpr.errors import Fault
-from cdpr.poses import Array
 from executor.clearance_table import ClearanceTable, camera_of
 from executor.cycle_table import CycleTable
 from executor.fused_table import FusedTable
+from executor.mcap_cameras import camera_messages
 from executor.mcap_scene import robot_messages, scene_messages
 from executor.mcap_schemas import CHANNELS
 from executor.mcap_values import (
-    WORLD,
     Message,
     channel_of,
+    column_of,
     nanoseconds,
-    pose_value,
+    poses_of,
+    rows_of,
     stamp_of,
     topic_of,
 )
@@ -62,12 +61,10 @@ def write_mcap(
         *scene_messages(context, start),
         *robot_messages(context.rig, cycles, start),
         *_cycles(cycles, start),
-        *_tags(poses, start),
-        *(message for name in alone for message in _tags(alone[name], start, name)),
+        *camera_messages(folder, poses, alone, start),
         *_clearance(clearance),
-        *_poses_of("/fused_pose", fused.time, fused.position, fused.rotation, start),
+        *poses_of("/fused_pose", fused.time, fused.position, fused.rotation, start),
         *_events(context, start),
-        *_all_pictures(folder, poses, alone, start),
     ]
     write_messages(folder.mcap, messages, start)
     return folder.mcap
@@ -118,39 +115,11 @@ def _write(path: Path, messages: Sequence[Message], start: int) -> None:
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _rows(values: Array) -> list[list[float | None]]:
-    """Rows as JSON can say them: null for what is not known."""
-    if np.isfinite(values).all():
-        rows: list[list[float | None]] = values.tolist()
-        return rows
-    return [[v if np.isfinite(v) else None for v in row] for row in values.tolist()]
-
-
-def _column(values: Array) -> list[float | None]:
-    return [v if np.isfinite(v) else None for v in values.tolist()]
-
-
-def _poses_of(
-    topic: str, times: Array, positions: Array, quaternions: Array, start: int
-) -> Iterator[Message]:
-    known = np.isfinite(positions).all(axis=1) & np.isfinite(quaternions).all(axis=1)
-    rows = zip(
-        times[known].tolist(), positions[known].tolist(), quaternions[known].tolist(), strict=True
-    )
-    for time, position, quaternion in rows:
-        stamp = stamp_of(start, time)
-        yield (
-            topic,
-            time,
-            {"timestamp": stamp, "frame_id": WORLD, "pose": pose_value(position, quaternion)},
-        )
-
-
 def _cycles(cycles: CycleTable, start: int) -> Iterator[Message]:
-    yield from _poses_of(
+    yield from poses_of(
         "/planned_pose", cycles.time, cycles.planned, cycles.planned_rotation, start
     )
-    yield from _poses_of(
+    yield from poses_of(
         "/encoder_pose", cycles.time, cycles.encoder, cycles.encoder_rotation, start
     )
     yield from _drives(cycles)
@@ -163,18 +132,18 @@ def _drives(cycles: CycleTable) -> Iterator[Message]:
         cycles.path_index.tolist(),
         cycles.leg.tolist(),
         cycles.stop,
-        _column(cycles.travelled * 1e3),
-        _column(cycles.lateness * 1e3),
+        column_of(cycles.travelled * 1e3),
+        column_of(cycles.lateness * 1e3),
         cycles.missing.tolist(),
-        _column(cycles.following_error * 1e3),
+        column_of(cycles.following_error * 1e3),
         strict=True,
     )
     drives = zip(
         cycles.set_counts.tolist(),
         cycles.actual_counts.tolist(),
-        _rows(cycles.lengths * 1e3),
-        _rows(cycles.planned_tensions),
-        _rows(cycles.tensions),
+        rows_of(cycles.lengths * 1e3),
+        rows_of(cycles.planned_tensions),
+        rows_of(cycles.tensions),
         strict=True,
     )
     where, how = ("state", "path_index", "leg", "stop", "path_mm"), ("lateness_ms", "missing")
@@ -188,32 +157,8 @@ def _drives(cycles: CycleTable) -> Iterator[Message]:
         yield "/drives", time, content
 
 
-def _tags(poses: PoseTable, start: int, camera: str = "") -> Iterator[Message]:
-    topic = topic_of("/tag_pose", camera)
-    yield from _poses_of(topic, poses.time, poses.position, poses.rotation, start)
-    covariances = _rows(poses.covariance.reshape(-1, 36))
-    rows = zip(
-        poses.time.tolist(),
-        poses.frame.tolist(),
-        poses.status,
-        poses.tags,
-        _column(poses.reprojection),
-        covariances,
-        strict=True,
-    )
-    for time, frame, status, tags, reprojection, covariance in rows:
-        content = {
-            "frame": frame,
-            "status": status,
-            "tags": tags,
-            "reprojection_px": reprojection,
-            "covariance": covariance,
-        }
-        yield topic_of("/tag_status", camera), time, content
-
-
 def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
-    near, planned = _rows(clearance.distances * 1e3), _rows(clearance.planned_distances * 1e3)
+    near, planned = rows_of(clearance.distances * 1e3), rows_of(clearance.planned_distances * 1e3)
     keys = ("distance_mm", "uncertainty_mm", "at_most_mm", "planned_distance_mm")
     columns = (
         clearance.distance,
@@ -221,7 +166,7 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
         clearance.at_most,
         clearance.planned_distance,
     )
-    values = zip(*(_column(column * 1e3) for column in columns), strict=True)
+    values = zip(*(column_of(column * 1e3) for column in columns), strict=True)
     for i, row in enumerate(values):
         camera = camera_of(clearance.source[i])
         each = zip(clearance.obstacles, near[i], planned[i], strict=True)
@@ -248,26 +193,3 @@ def _events(context: RunContext, start: int) -> Iterator[Message]:
             "line": 0,
         }
         yield "/events", event.time_s, content
-
-
-def _all_pictures(
-    folder: RunFolder, poses: PoseTable, alone: Mapping[str, PoseTable], start: int
-) -> Iterator[Message]:
-    if not alone:
-        yield from _pictures(folder, poses, start)
-    for name, table in alone.items():
-        yield from _pictures(folder, table, start, name)
-
-
-def _pictures(
-    folder: RunFolder, poses: PoseTable, start: int, camera: str = ""
-) -> Iterator[Message]:
-    for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
-        if name:
-            content = {
-                "timestamp": stamp_of(start, time),
-                "frame_id": camera or "camera",
-                "data": base64.b64encode(folder.picture(name)).decode(),
-                "format": "jpeg",
-            }
-            yield topic_of("/pictures", camera), time, content

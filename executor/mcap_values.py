@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
+
+import numpy as np
+
+from cdpr.poses import Array
 
 #: One message: topic, time since the start of the run [s], content.
 Message = tuple[str, float, dict[str, Any]]
@@ -45,3 +49,41 @@ def pose_value(
 
 
 STILL = pose_value((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+def rows_of(values: Array) -> list[list[float | None]]:
+    """Rows as JSON can say them: null for what is not known."""
+    if np.isfinite(values).all():
+        rows: list[list[float | None]] = values.tolist()
+        return rows
+    return [[v if np.isfinite(v) else None for v in row] for row in values.tolist()]
+
+
+def column_of(values: Array) -> list[float | None]:
+    """A column as JSON can say it."""
+    return [v if np.isfinite(v) else None for v in values.tolist()]
+
+
+def poses_of(
+    topic: str, times: Array, positions: Array, quaternions: Array, start: int
+) -> Iterator[Message]:
+    """A message a pose that is known.
+
+    Args:
+        topic: Of the messages.
+        times: Since the start of the run, shape (n,), [s].
+        positions: Shape (n, 3), [m].
+        quaternions: (w, x, y, z), shape (n, 4).
+        start: [ns since 1970].
+    """
+    known = np.isfinite(positions).all(axis=1) & np.isfinite(quaternions).all(axis=1)
+    rows = zip(
+        times[known].tolist(), positions[known].tolist(), quaternions[known].tolist(), strict=True
+    )
+    for time, position, quaternion in rows:
+        stamp = stamp_of(start, time)
+        yield (
+            topic,
+            time,
+            {"timestamp": stamp, "frame_id": WORLD, "pose": pose_value(position, quaternion)},
+        )
