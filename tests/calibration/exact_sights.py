@@ -28,7 +28,7 @@ def seen_tag(
         return None
     corners = pixels + noise * rng.standard_normal((4, 2))
     whitening = np.eye(8) / max(noise, 1e-4)
-    return RefinedTag(corners, whitening, whitening @ corners.ravel(), np.ones(4, bool), noise)
+    return RefinedTag(corners, whitening, whitening @ corners.ravel(), np.ones(4, bool))
 
 
 def sights_at(

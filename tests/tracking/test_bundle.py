@@ -35,7 +35,7 @@ def view_of(
     if rng is not None:
         target = target + rng.standard_normal(8)
     seen = np.linalg.solve(whitening, target).reshape(4, 2)
-    return TagView(tag, RefinedTag(seen, whitening, target, np.ones(4, dtype=bool), 0.02))
+    return TagView(tag, RefinedTag(seen, whitening, target, np.ones(4, dtype=bool)))
 
 
 def visible(rig: Rig, camera_from_body: Pose) -> list[Tag]:
@@ -102,9 +102,7 @@ def test_a_tag_with_a_wrong_edge_hardly_moves_the_pose(rig: Rig) -> None:
     clean = solve_bundle(camera, views)
     target = views[0].seen.target.copy()
     target[0] += 100.0  # two pixels
-    bad = RefinedTag(
-        views[0].seen.corners, views[0].seen.whitening, target, views[0].seen.edges, 0.02
-    )
+    bad = RefinedTag(views[0].seen.corners, views[0].seen.whitening, target, views[0].seen.edges)
     spoilt = solve_bundle(camera, [TagView(views[0].tag, bad), *views[1:]])
     assert clean is not None
     assert spoilt is not None

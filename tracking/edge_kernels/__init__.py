@@ -1,0 +1,1 @@
+"""Compiled passes over the pixels beside the edges of tags."""
