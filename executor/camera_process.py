@@ -15,8 +15,9 @@ from cdpr.errors import CdprError, Fault
 from executor.observer import Look, MakeObserver, Trigger
 from executor.spawning import interrupts_blocked
 
-#: How long the process may take to import its libraries and open its camera, [s].
-START_TIMEOUT = 60.0
+#: How long the process may take to import its libraries, to compile what finds tags' edges (once on
+#: a machine) and to open its camera, [s].
+START_TIMEOUT = 180.0
 #: In simulated time, and at the end of a run, an answer is waited for no longer than this, [s].
 PATIENCE = 20.0
 #: How long a process may take to end, [s].

@@ -48,6 +48,7 @@ class BundlePose:
         edge_errors: Of each tag's edges in deviations, 0 where hidden, shape (t, 4).
         corner_errors: Of each tag's corners, RMS, shape (t,), [px]; of whole tags their corners,
             else of the edges that were measured.
+        certainties: How much each tag's edges tell, shape (t,), [1/px²].
     """
 
     camera_from_body: Pose
@@ -56,11 +57,12 @@ class BundlePose:
     rival_cost: float
     edge_errors: Array
     corner_errors: Array
+    certainties: Array
 
     @property
     def reprojection(self) -> float:
-        """RMS error of all tags' corners, [px]."""
-        return float(np.sqrt(np.mean(self.corner_errors**2)))
+        """RMS error of all tags' corners, each tag counted for what its edges tell, [px]."""
+        return float(np.sqrt(np.average(self.corner_errors**2, weights=self.certainties)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,7 +260,14 @@ def _result(
         rival,
         read_only(_edge_sizes(errors)),
         read_only(_corner_errors(squares, views, pose)),
+        read_only(np.array([_certainty(view.seen) for view in views])),
     )
+
+
+def _certainty(seen: RefinedTag) -> float:
+    """One over the variance that offsets and tilts of a tag's edges leave its corners, [1/px²]."""
+    rows = np.sum(seen.whitening**2, axis=1)[np.repeat(seen.edges, 2)]
+    return float(1.0 / np.mean(1.0 / rows))
 
 
 def _corner_errors(squares: _Squares, views: Sequence[TagView], pose: Pose) -> Array:

@@ -72,12 +72,12 @@ class EdgeCurves:
         opposite = np.roll(middle, -2, axis=1) - middle
         return np.asarray(np.abs(np.sum(opposite * self.outward, axis=2)) / modules)
 
-    def lines(self, found: Array, floor: float) -> Lines:
+    def lines(self, found: Array, doubt: Array) -> Lines:
         """Straight lines in ideal pixels.
 
         Args:
             found: What is known of each edge, shape (t, 4, `COLUMNS`).
-            floor: What every edge may be off beside that, [px].
+            doubt: What each edge may be off beside that, shape (t, 4), [px].
         """
         # Where offset and tilt err independently.
         tilt_variance = np.maximum(found[..., TILT_VARIANCE], 1e-12)
@@ -93,7 +93,7 @@ class EdgeCurves:
         good = (found[..., SHARE] >= LEAST_SHARE) & (
             deviation * np.sqrt(2.0 * found[..., HALF]) < MOST_SCATTER
         )
-        more = np.hypot(deviation, floor) / np.maximum(deviation, 1e-9)
+        more = np.hypot(deviation, doubt) / np.maximum(deviation, 1e-9)
         tilt = np.sqrt(tilt_variance) * ideal_pixel / (length / 2.0)
         return Lines(
             points=points[2].reshape(-1, 2),

@@ -22,8 +22,12 @@ from tracking.edge_lines import Lines, meet
 from tracking.picture import Image
 from tracking.projection import pixels_from_ideal
 
-#: What pixels do to an edge beside noise, so that no edge claims to be exact, [px].
-FLOOR = 0.0035
+#: What an edge may be off beside noise, so that none claims to be exact: pixels are no mixture of a
+#: bell and a box, nor is paper flat, [px].
+FLOOR = 0.0015
+#: The second row of modules inside an edge is not modelled: this many times the share of it that
+#: the blur brings to the first row's middle, in deviations of the blur.
+SECOND_ROW = 1.0
 #: Where the blur is wider than this share of a module, corners are fitted again as long as they
 #: move by more than `NEAR`: what the modules beside an edge add hangs on where they lie.
 CROWDED = 0.2
@@ -86,8 +90,9 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     inside = _inside(rough, image.shape)
     curves = EdgeCurves.between(camera, np.where(inside, rough, _somewhere(image.shape)))
     found = np.zeros((len(rough), 4, COLUMNS))
-    find_edges(pixels, curves.pixels, curves.bows, curves.module_widths(modules), found)
-    lines = curves.lines(found, FLOOR)
+    widths = curves.module_widths(modules)
+    find_edges(pixels, curves.pixels, curves.bows, widths, found)
+    lines = curves.lines(found, _doubt(found, widths))
     for _ in range(MOST_FITS):
         better = pixels_from_ideal(camera, meet(lines, curves.ideal))
         inside &= _inside(better, image.shape)
@@ -95,13 +100,23 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
         before, widths = found, curves.module_widths(modules)
         found = np.zeros_like(before)
         fit_edges(pixels, curves.pixels, curves.bows, widths, modules, before, found)
-        lines = curves.lines(found, FLOOR)
+        lines = curves.lines(found, _doubt(found, widths))
         final = meet(lines, curves.ideal)
         moved = np.abs(final - curves.ideal).max(axis=(1, 2))
         crowded = np.max(found[..., SPREAD] * (found[..., SHARE] > 0) / widths, axis=1) > CROWDED
         if not np.any(inside[:, 0, 0] & (moved > np.where(crowded, NEAR, FAR))):
             break
     return [_refined(final, lines, t) if inside[t, 0, 0] else None for t in range(len(final))]
+
+
+def load_kernels() -> None:
+    """Loads the machine code of `refine`, or compiles it, so that no picture waits for it."""
+    grey = np.zeros((16, 16), dtype=np.uint8)
+    grey.flags.writeable = False
+    square, bows = _somewhere(grey.shape)[None], np.zeros((1, 4, 2))
+    widths, found = np.ones((1, 4)), np.zeros((1, 4, COLUMNS))
+    find_edges(grey, square, bows, widths, found)
+    fit_edges(grey, square, bows, widths, 8, found, np.zeros_like(found))
 
 
 def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -115,6 +130,14 @@ def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 def _somewhere(shape: tuple[int, ...]) -> Array:
     """A square in the picture that stands in for unusable tags, so that arrays stay whole."""
     return np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
+
+
+def _doubt(found: Array, widths: Array) -> Array:
+    """What the edges may be off beside noise, shape (t, 4), [px]."""
+    spread = np.maximum(found[..., SPREAD], 1e-6)
+    away = np.clip(widths / spread, 1.0, 20.0)
+    tail = np.exp(-0.5 * away**2) / (np.sqrt(2.0 * np.pi) * away)  # of a bell, beyond a module
+    return np.asarray(np.hypot(FLOOR, SECOND_ROW * spread * tail))
 
 
 def _refined(corners: Array, lines: Lines, tag: int) -> RefinedTag | None:

@@ -124,10 +124,12 @@ def _located(
     from calibration.hand_eye import locate_by_motion
     from calibration.surveyed_tags import locate_camera
     from calibration.tag_sights import sights_of
+    from cdpr.cli.compiling import ready_to_measure
     from cdpr.cli.output import progress_bar
     from cdpr.cli.picture_sources import told
 
     tags = rig.frame_tags if poses is None else rig.platform_tags
+    ready_to_measure(shown)
     with progress_bar("looking for tags", images.count, shown) as advance:
         sights = sights_of(
             told(images, advance), rig, camera, [tag.id for tag in tags], images.unused

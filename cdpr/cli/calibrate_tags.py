@@ -47,6 +47,7 @@ def tags(
     from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.cameras import named_camera
+    from cdpr.cli.compiling import ready_to_measure
     from cdpr.cli.output import progress_bar
     from cdpr.cli.picture_sources import pictures_of, told
     from cdpr.rig import load_rig
@@ -58,6 +59,7 @@ def tags(
     images = pictures_of(source, the_camera, pictures, usual=40)
     today = begin("tags", the_rig.name, output, force)
     numbers = [tag.id for tag in the_rig.platform_tags]
+    ready_to_measure(not as_json)
     with progress_bar("looking for tags", images.count, not as_json) as advance:
         sights = sights_of(told(images, advance), the_rig, the_camera, numbers, images.unused)
     found = measure_layout(the_rig, the_camera, sights, fixed_tag)

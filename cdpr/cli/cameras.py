@@ -193,10 +193,12 @@ def look_at_rest(
     """
     import time
 
+    from cdpr.cli.compiling import ready_to_measure
     from cdpr.scene import nothing_in_the_way
     from executor.observer import Trigger
     from tracking.tracker import Tracker
 
+    ready_to_measure(shown=True)
     camera = rig.cameras[0]
     source, tracker = _source(rig, nothing_in_the_way(rig), camera, name), Tracker(rig, camera)
     try:
@@ -222,6 +224,7 @@ def make_observer(
     named: bool,
 ) -> Observer:
     """Builds the observer inside its camera's process."""
+    from cdpr.cli.compiling import ready_to_measure
     from cdpr.rig import rig_from_document
     from cdpr.scene import scene_from_document
     from executor.observer import Observer
@@ -229,6 +232,7 @@ def make_observer(
 
     rig, scene = rig_from_document(rig_document), scene_from_document(scene_document)
     camera = named_camera(rig, camera_name)
+    ready_to_measure(shown=False)
     pictures = _source(rig, scene, camera, source)
     return Observer(rig, camera, pictures, RunFolder(folder), keep_every, named=named)
 

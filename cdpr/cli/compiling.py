@@ -1,34 +1,63 @@
-"""Telling that machine code is made, which takes minutes and happens once."""
+"""Telling that machine code is made, which takes a while and happens once."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from planner.machine_code import Task
+    from cdpr.machine_code import Task
+
+Work = Literal["optimal", "turning", "paper", "maps", "edges"]
+"""A plan of one of three searches, a map, or the edges of tags in a picture."""
 
 
 @contextmanager
-def told_when_compiling(task: Task, shown: bool) -> Iterator[bool]:
-    """Around what compiles a task's code when it is done for the first time.
+def told_when_compiling(work: Work, shown: bool) -> Iterator[bool]:
+    """Around what compiles the code of some work when it is done for the first time.
 
     Args:
-        task: Which.
+        work: Which.
         shown: Whether a spinner may turn meanwhile.
 
     Yields:
         Whether the code was there.
     """
     from cdpr.cli.output import err, spinner
-    from planner.machine_code import is_compiled, note_compiled
+    from cdpr.machine_code import is_compiled, note_compiled
 
+    task = _task(work)
     compiled = is_compiled(task)
     if compiled:
         yield True
     else:
-        err.print("compiling the planner for this machine, once; one to three minutes …")
+        what, duration = "the planner", "one to three minutes"
+        if work == "edges":
+            what, duration = "the tags' edge finder", "up to a minute"
+        err.print(f"compiling {what} for this machine, once; {duration} …")
         with spinner("compiling", shown):
             yield False
         note_compiled(task)
+
+
+def ready_to_measure(shown: bool) -> None:
+    """Loads what finds tags' edges in pictures, so that no picture waits for it."""
+    from tracking.edges import load_kernels
+
+    with told_when_compiling("edges", shown):
+        load_kernels()
+
+
+def _task(work: Work) -> Task:
+    from cdpr.machine_code import Task
+
+    if work == "edges":
+        import tracking
+
+        return Task(work, (Path(tracking.__path__[0]) / "edge_kernels",))
+    import planner
+
+    here = Path(planner.__path__[0])
+    return Task(work, tuple(here / name for name in ("exact", "optimal", "paper", "turning")))

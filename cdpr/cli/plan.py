@@ -34,11 +34,11 @@ from cdpr.cli.readings import (
 )
 
 if TYPE_CHECKING:
+    from cdpr.cli.compiling import Work
     from cdpr.plan_file import PlanDocument
     from cdpr.rig import Rig
     from cdpr.scene import Scene
     from cdpr.scene_stops import StopDocument
-    from planner.machine_code import Task
     from planner.way import Settings
 
 _LONG = 1000.0
@@ -165,7 +165,7 @@ def planned(
     from planner.settings import PlannerSettings
 
     make = partial(make_plan, rig, scene, settings, rounds=rounds, done=visited)
-    with told_when_compiling(_task(settings), shown) as compiled:
+    with told_when_compiling(_work(settings), shown) as compiled:
         if not compiled:
             return make()
         if isinstance(settings, PlannerSettings):
@@ -180,7 +180,7 @@ def planned(
             return make(progress=lambda done, _most, _cost: advance(scale * done))
 
 
-def _task(settings: Settings) -> Task:
+def _work(settings: Settings) -> Work:
     from planner.settings import PlannerSettings
     from planner.turning.settings import TurningSettings
 

@@ -84,6 +84,7 @@ def track(
     from cdpr.clearance import ClearanceModel
     from cdpr.cli.calibrations import calibrated_rig
     from cdpr.cli.camera_line import Pace
+    from cdpr.cli.compiling import ready_to_measure
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
     from cdpr.cli.track_sources import eyes_of, picture_source
@@ -108,6 +109,7 @@ def track(
     for path in logs.values():
         check_output(path, force)
     the_scene = _scene(scene, plan)
+    ready_to_measure(not as_json)
     unused: dict[str, dict[str, str]] = {eye.name: {} for eye in eyes}
     opened = [
         picture_source(the_rig, the_scene, eye, name, plan, unused[eye.name])

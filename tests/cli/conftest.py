@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from planner import machine_code
+from cdpr import machine_code
 from tests.cli.plans import RIG, write_short_plan
 from tests.cli.program import Answer, call
 

@@ -14,8 +14,8 @@ from typing import Any, NoReturn
 
 import pytest
 
+from cdpr import machine_code
 from cdpr.cli.verbs import VERBS
-from planner import machine_code
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import Answer, call
 
@@ -85,7 +85,7 @@ def test_compiling_is_told_where_it_does_not_disturb_json(
 ) -> None:
     noted: list[str] = []
     monkeypatch.setattr(machine_code, "is_compiled", lambda task: False)
-    monkeypatch.setattr(machine_code, "note_compiled", noted.append)
+    monkeypatch.setattr(machine_code, "note_compiled", lambda task: noted.append(task.name))
     scene = CONFIGS / "environment_1.yaml"
     planned = call("plan", RIG, scene, "-o", tmp_path / "plan.json", "--json")
     assert document(planned)["plan"] == str(tmp_path / "plan.json")

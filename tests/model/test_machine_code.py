@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from planner import machine_code
+from cdpr import machine_code
+from cdpr.machine_code import Task
 
 
 @pytest.fixture
@@ -18,22 +19,25 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     kernels.mkdir()
     (kernels / "edge.py").write_text("a kernel")
     (kernels / "hull.py").write_text("another")
-    monkeypatch.setattr(machine_code, "_KERNELS", (kernels,))
     return tmp_path
 
 
+def task(kernels: Path, name: str) -> Task:
+    return Task(name, (kernels,))
+
+
 def test_a_task_is_compiled_once_it_was_done_and_the_others_are_not(cache: Path) -> None:
-    assert not machine_code.is_compiled("optimal")
-    machine_code.note_compiled("optimal")
-    assert machine_code.is_compiled("optimal")
-    assert not machine_code.is_compiled("turning")
+    assert not machine_code.is_compiled(task(cache / "kernels", "optimal"))
+    machine_code.note_compiled(task(cache / "kernels", "optimal"))
+    assert machine_code.is_compiled(task(cache / "kernels", "optimal"))
+    assert not machine_code.is_compiled(task(cache / "kernels", "turning"))
 
 
 @pytest.mark.parametrize("change", ["touched", "edited", "added", "elsewhere"])
 def test_code_that_numba_would_not_find_again_is_not_said_to_be_there(
-    cache: Path, change: str, monkeypatch: pytest.MonkeyPatch
+    cache: Path, change: str
 ) -> None:
-    machine_code.note_compiled("optimal")
+    machine_code.note_compiled(task(cache / "kernels", "optimal"))
     kernels = cache / "kernels"
     match change:
         case "touched":
@@ -46,19 +50,19 @@ def test_code_that_numba_would_not_find_again_is_not_said_to_be_there(
             (kernels / "ball.py").write_text("a third")
         case "elsewhere":
             kernels.rename(cache / "moved")
-            monkeypatch.setattr(machine_code, "_KERNELS", (cache / "moved",))
-    assert not machine_code.is_compiled("optimal")
+            kernels = cache / "moved"
+    assert not machine_code.is_compiled(task(kernels, "optimal"))
 
 
 def test_without_a_folder_nothing_is_said_to_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_code, "cache_folder", lambda _: None)
-    machine_code.note_compiled("maps")
-    assert not machine_code.is_compiled("maps")
+    machine_code.note_compiled(task(Path("kernels"), "maps"))
+    assert not machine_code.is_compiled(task(Path("kernels"), "maps"))
 
 
 def test_a_stamp_that_cannot_be_written_is_done_without(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(machine_code, "cache_folder", lambda _: cache / "gone")
-    machine_code.note_compiled("maps")
-    assert not machine_code.is_compiled("maps")
+    machine_code.note_compiled(task(Path("kernels"), "maps"))
+    assert not machine_code.is_compiled(task(Path("kernels"), "maps"))

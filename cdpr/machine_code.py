@@ -8,16 +8,23 @@ compiles anew; hence the stamp of a task is named after path, date and size of e
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from cdpr.compiled import cache_folder
 
-Task = Literal["optimal", "turning", "paper", "maps"]
-"""What was done once when its code is there: a plan of one of three searches, or a map."""
 
-_HERE = Path(__file__).parent
-_KERNELS = tuple(_HERE / name for name in ("exact", "optimal", "paper", "turning"))
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What runs kernels.
+
+    Attributes:
+        name: Of what was done once when its code is there.
+        kernels: Folders of the kernels; the code's stamp lies in the first one's cache.
+    """
+
+    name: str
+    kernels: tuple[Path, ...]
 
 
 def is_compiled(task: Task) -> bool:
@@ -41,12 +48,12 @@ def note_compiled(task: Task) -> None:
 
 
 def _stamp(task: Task) -> Path | None:
-    folder = cache_folder(_KERNELS[0])
+    folder = cache_folder(task.kernels[0])
     if folder is None:
         return None
     digest = hashlib.sha256()
-    for kernels in _KERNELS:
+    for kernels in task.kernels:
         for source in sorted(kernels.glob("*.py")):
             state = source.stat()
             digest.update(f"{source} {state.st_mtime_ns} {state.st_size}\n".encode())
-    return folder / f"compiled-{task}-{digest.hexdigest()[:16]}"
+    return folder / f"compiled-{task.name}-{digest.hexdigest()[:16]}"
