@@ -30,11 +30,13 @@ class RigUncertainty:
     Attributes:
         by_scatter: Covariance, shape (p, p); what is not identified has that of the rig file.
         by_places: The same by what leaving each place out changes.
+        scatter: By how much the residuals' variance is larger than stated; 1 where it is not.
         quantile: Half the width of a 95 % interval in standard deviations.
     """
 
     by_scatter: Array
     by_places: Array
+    scatter: float
     quantile: float
 
     @property
@@ -82,14 +84,17 @@ def uncertainty_of_rig(
     whole = informations.sum(axis=0) + np.eye(known.shape[1])
     squares = float(np.sum(fit.weights * (fit.residuals / length_deviation) ** 2))
     freedom = fit.residuals.size - known.shape[1] - 6 * int((~measured.posed).sum())
-    scatter = max(1.0, squares / max(freedom, 1)) * np.linalg.inv(whole)
+    scatter = max(1.0, squares / max(freedom, 1))
     count = len(measured)
     without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]
     apart = without - without.mean(axis=0)
     by_drawing = np.linalg.inv(whole @ whole)
     places = (count - 1) / count * apart.T @ apart + by_drawing
     spread = parameters.deviations
-    of_all = (known @ inner @ known.T + unknown @ unknown.T for inner in (scatter, places))
+    of_all = (
+        known @ inner @ known.T + unknown @ unknown.T
+        for inner in (scatter * np.linalg.inv(whole), places)
+    )
     by_scatter, by_places = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
     quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
-    return RigUncertainty(by_scatter, by_places, quantile)
+    return RigUncertainty(by_scatter, by_places, scatter, quantile)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.interval import CONFIDENCE
 from calibration.rig_calibration import RigCalibration
-from calibration.rig_stiffness import compliance_told
+from calibration.rig_stiffness import compliance_told, differences_told
 from calibration.verdict import Lack, Verdict
 from cdpr.poses import Array, matrix_from_rotation_vector
 from cdpr.rig import Rig
@@ -115,14 +115,30 @@ def _far_numbers(result: RigCalibration) -> list[Lack]:
 
 def _other_stiffness(result: RigCalibration) -> list[Lack]:
     compliance = compliance_told(result)
-    if compliance is None or not compliance.contradicts:
+    if compliance is None:
         return []
+    if not compliance.contradicts:
+        return _cables_that_differ(result)
     return [
         Lack(
             f"the data tell a stiffness of the cables of {compliance}, the rig file"
             f" {result.rig.cable_stiffness:.6g} N",
             "check cables: stiffness_n of the rig file, and the tensions that the drives tell;"
             " where it is truly that far off, pass a larger --stiffness-percent",
+        )
+    ]
+
+
+def _cables_that_differ(result: RigCalibration) -> list[Lack]:
+    differences = differences_told(result)
+    if differences is None or not differences.contradict:
+        return []
+    return [
+        Lack(
+            f"the cables differ: the data tell stiffnesses of {differences}; the result has"
+            f" {result.geometry.stiffness:.4g} N for all",
+            "look for a cable that is worn, loose on its drum or of another kind, and check the"
+            " tensions that its drive tells",
         )
     ]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from cdpr.rig import Rig, rig_from_document
 from cdpr.statics.tension_solution import TensionInfeasible
 from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
-from simulation.as_built import rig_as_built
+from simulation.as_built import rig_as_built, stiffness_as_built
 from simulation.plant import Plant
 
 POSITION_NOISE, TURN_NOISE = 0.2e-3, 0.5e-3
@@ -34,7 +34,7 @@ class Truth:
 def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) -> Truth:
     """Where a simulated rig comes to rest when its drives are told to go to random poses."""
     random = np.random.default_rng(seed)
-    winches, plant = WinchMap(rig), Plant(rig_as_built(rig), rig.home)
+    winches, plant = WinchMap(rig), _plant(rig)
     span = rig.workspace_upper - rig.workspace_lower
     rows: list[tuple[Array, Array, Pose]] = []
     while len(rows) < count:
@@ -75,8 +75,14 @@ def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) 
     )
 
 
-def built_otherwise(rig: Rig, seed: int) -> Rig:
-    """The same rig file, but built with other random errors, as large as are usually stated."""
+def built_otherwise(rig: Rig, seed: int, stiffness: Sequence[float] | None = None) -> Rig:
+    """The same rig file, but built with other random errors, as large as are usually stated.
+
+    Args:
+        rig: Of the rehearsal.
+        seed: Of the errors.
+        stiffness: Of each cable, [N]; left out, as the rig file tells.
+    """
     random, document = np.random.default_rng(seed), rig.document
     assert document.simulation is not None
     assert document.simulation.as_built is not None
@@ -88,6 +94,7 @@ def built_otherwise(rig: Rig, seed: int) -> Rig:
             "outlets_mm": (1e3 * rig.outlets + 4.0 * random.standard_normal((m, 3))).tolist(),
             "anchors_mm": (1e3 * rig.anchors + random.standard_normal((m, 3))).tolist(),
             "drums_mm_per_rev": (drums * (1.0 + 0.005 * random.standard_normal(m))).tolist(),
+            "stiffness_n": None if stiffness is None else list(stiffness),
             "home_counts": (homes + slips * random.standard_normal(m)).tolist(),
         }
     )
@@ -122,6 +129,10 @@ def share_inside(intervals: Mapping[str, Interval], true: Mapping[str, float]) -
         for name, value in true.items()
     ]
     return sum(found) / len(found)
+
+
+def _plant(rig: Rig) -> Plant:
+    return Plant(rig_as_built(rig), rig.home, None, stiffness_as_built(rig))
 
 
 def write_places(path: Path, measured: RigMeasurements, *, poses: bool = True) -> None:

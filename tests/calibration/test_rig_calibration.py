@@ -24,7 +24,7 @@ from calibration.rig_observability import Observability, identified, sentences
 from calibration.rig_page import rig_page
 from calibration.rig_parameters import DEFAULT_DEVIATIONS, CountedLengths, Parameters
 from calibration.rig_result import RigResult, require_one_drawing, rig_result
-from calibration.rig_stiffness import compliance_told
+from calibration.rig_stiffness import compliance_told, differences_told
 from calibration.rig_uncertainty import uncertainty_of_rig
 from calibration.rig_verdict import judge_rig, judged_places
 from cdpr.errors import BadInput, InvalidFile
@@ -529,6 +529,23 @@ def test_a_stiffness_that_is_hardly_known_is_found_from_afar(turned: Truth) -> N
     stiffness = result.intervals["stiffness_n"]
     assert abs(stiffness.value - 6000.0) < stiffness.half_width < 1200.0
     assert judge_rig(result, 1e-3, 0.0).verdict.good
+
+
+def test_cables_that_differ_are_told_and_others_are_not(rig: Rig) -> None:
+    """Cable 3 is of half the stiffness; the tensions of all were measured."""
+    for weak in (6000.0, 3000.0):
+        built = built_otherwise(rig, 5, [6000.0] * 2 + [weak] + [6000.0] * 5)
+        data = places(built, 60, tilt=np.radians(8.0), seed=6).measured
+        result = calibrate_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+        differences = differences_told(result)
+        assert differences is not None
+        reasons = judge_rig(result, 1e-3, 0.0).verdict.reasons
+        assert any("the cables differ" in reason for reason in reasons) == (weak < 6000.0)
+    assert np.argmax(differences.told) == 2
+    assert 1.0 / differences.told[2] == pytest.approx(3000.0, rel=0.25)
+    blind = replace(data, tensions=np.full_like(data.tensions, np.nan))
+    told = calibrate_rig(built, blind, {"offsets": 2e-3}, LENGTH_DEVIATION)
+    assert differences_told(told) is None
 
 
 def test_the_true_stiffness_is_not_doubted(
