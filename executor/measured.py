@@ -9,11 +9,14 @@ import numpy as np
 
 from cdpr.clearance import ClearanceModel, Nearest
 from cdpr.poses import Array, Pose
+from cdpr.winches import WinchMap
 from executor.clearance_table import ClearanceTable, no_clearance
-from tracking.measured_clearance import MeasuredClearance
+from executor.drives_covariance import covariance_by_drives
+from tracking.measured_clearance import MeasuredClearance, clearance_at
 
-#: What a clearance from drive positions may be off by: counts, torque resolution, one cycle, [m].
-ENCODER_UNCERTAINTY = 1e-4
+#: What the covariance of a pose by the drives does not know, [m]: forward kinematics takes cables
+#: for straight and weightless, and the rig for as it was calibrated.
+ALLOWANCE = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,34 +40,39 @@ class ClearanceRow:
     planned: tuple[Nearest, ...]
 
     @classmethod
-    def by_tags(
-        cls,
-        time: float,
-        clearance: MeasuredClearance,
-        planned: tuple[Nearest, ...],
-        source: str = "tag",
+    def at(
+        cls, time: float, source: str, clearance: MeasuredClearance, planned: tuple[Nearest, ...]
     ) -> ClearanceRow:
-        """The row of a pose that the cameras measured, or one of them alone."""
+        """The row of a measured pose."""
         measured, spread = clearance.nearest, clearance.uncertainty
         return cls(time, source, measured, spread, clearance.at_most, planned)
 
-    @classmethod
-    def by_drives(
-        cls, time: float, measured: tuple[Nearest, ...], planned: tuple[Nearest, ...]
-    ) -> ClearanceRow:
-        """The row of a pose that follows from the drives' positions."""
-        at_most = min((n.distance for n in measured), default=np.inf) + ENCODER_UNCERTAINTY
-        return cls(time, "encoder", measured, ENCODER_UNCERTAINTY, at_most, planned)
-
 
 def encoder_rows(
-    model: ClearanceModel, times: Array, measured: Sequence[Pose], planned: Sequence[Pose]
+    model: ClearanceModel,
+    winches: WinchMap,
+    times: Array,
+    measured: Sequence[Pose],
+    planned: Sequence[Pose],
+    noise: Array,
 ) -> list[ClearanceRow]:
-    """A row for each pose that follows from the drives' positions."""
-    return [
-        ClearanceRow.by_drives(float(time), model.obstacles(at), model.obstacles(due))
-        for time, at, due in zip(times, measured, planned, strict=True)
-    ]
+    """A row for each pose that follows from the drives' positions; none without an obstacle.
+
+    Args:
+        model: Robot and scene.
+        winches: Of the robot.
+        times: Of n poses, shape (n,), [s].
+        measured: By the drives, ``world_from_platform``.
+        planned: At the same times.
+        noise: Of the tensions that the drives tell, shape (m,), [N].
+    """
+    rows = []
+    for time, at, due in zip(times.tolist(), measured, planned, strict=True):
+        covariance = covariance_by_drives(winches, model.rig, at, noise)
+        clearance = clearance_at(model, at, covariance, ALLOWANCE)
+        if clearance is not None:
+            rows.append(ClearanceRow.at(time, "encoder", clearance, model.obstacles(due)))
+    return rows
 
 
 def clearance_table(names: tuple[str, ...], rows: Sequence[ClearanceRow]) -> ClearanceTable:

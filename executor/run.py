@@ -12,6 +12,7 @@ from cdpr.clearance import ClearanceModel
 from cdpr.poses import Array, Pose
 from executor.clearance_table import ClearanceTable, source_of
 from executor.cycle_table import CycleTable
+from executor.drives_covariance import tension_noise
 from executor.execution import Outcome
 from executor.fused_table import fused_table
 from executor.mcap_log import write_mcap
@@ -143,9 +144,11 @@ def _clearance(prepared: PreparedRun, cycles: CycleTable, seen: Seen) -> Clearan
         chosen = np.arange(0, len(cycles), every)
         rows += encoder_rows(
             model,
+            prepared.checked.winches,
             cycles.time[chosen],
             _poses(cycles.encoder[chosen], cycles.encoder_rotation[chosen]),
             _poses(cycles.planned[chosen], cycles.planned_rotation[chosen]),
+            tension_noise(prepared.rig, cycles.tensions),
         )
     return clearance_table(model.obstacle_names, rows)
 
@@ -155,7 +158,7 @@ def _seen_rows(
 ) -> list[ClearanceRow]:
     """A row for each look with a clearance."""
     return [
-        ClearanceRow.by_tags(look.found.time, look.clearance, model.obstacles(planned), source)
+        ClearanceRow.at(look.found.time, source, look.clearance, model.obstacles(planned))
         for look, planned in zip(looks, _planned(looks, cycles), strict=True)
         if look.clearance is not None
     ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from cdpr.cables import Cables, cables_at
 from cdpr.clearance import ClearanceModel, Nearest, cable_name
-from cdpr.poses import Array, read_only, skew
+from cdpr.poses import Array, Pose, read_only, skew
 from tracking.measurement import PoseMeasurement
 
 #: How many standard deviations of the pose an uncertainty holds.
@@ -24,7 +24,7 @@ class MeasuredClearance:
     Attributes:
         nearest: In the order of the scene's obstacles.
         uncertainties: Of each distance: `DEVIATIONS` standard deviations of the measured pose and
-            `ALLOWANCE`; shape (k,), [m].
+            what they do not know; shape (k,), [m].
     """
 
     nearest: tuple[Nearest, ...]
@@ -64,24 +64,37 @@ class MeasuredClearance:
 
 
 def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
+    """Clearance to every obstacle as a camera sees it; None in a scene without obstacles."""
+    return clearance_at(model, measurement.pose, measurement.covariance, ALLOWANCE)
+
+
+def clearance_at(
+    model: ClearanceModel, pose: Pose, covariance: Array, allowance: float
+) -> MeasuredClearance | None:
     """Clearance to every obstacle at a measured pose; None in a scene without obstacles.
 
     The pose's covariance is carried to the distance by its gradient: the nearest point of the robot
     moves with the platform (wholly on it, in proportion along a cable), and the distance changes by
     that motion along the line to the obstacle; that both nearest points slide changes nothing to
     first order.
+
+    Args:
+        model: Robot and scene.
+        pose: ``world_from_platform``.
+        covariance: Of position and rotation vector about world axes, shape (6, 6), [m, rad].
+        allowance: What the covariance does not know, [m].
     """
-    nearest = model.obstacles(measurement.pose)
+    nearest = model.obstacles(pose)
     if not nearest:
         return None
-    cables = cables_at(model.rig, measurement.pose)
+    cables = cables_at(model.rig, pose)
     names = {cable_name(i): i for i in range(model.rig.cable_count)}
-    deviations = [_deviation(n, names.get(n.first), cables, measurement) for n in nearest]
-    return MeasuredClearance(nearest, read_only(DEVIATIONS * np.array(deviations) + ALLOWANCE))
+    deviations = [_deviation(n, names.get(n.first), cables, pose, covariance) for n in nearest]
+    return MeasuredClearance(nearest, read_only(DEVIATIONS * np.array(deviations) + allowance))
 
 
 def _deviation(
-    nearest: Nearest, cable: int | None, cables: Cables, measurement: PoseMeasurement
+    nearest: Nearest, cable: int | None, cables: Cables, pose: Pose, spread: Array
 ) -> float:
     """Standard deviation of one distance, [m]."""
     share, point = 1.0, nearest.first_point
@@ -90,9 +103,9 @@ def _deviation(
         length = float(np.linalg.norm(end - start))
         share = float(np.clip((point - start) @ (end - start) / length**2, 0.0, 1.0))
         point = end
-    arm = point - measurement.pose.position
+    arm = point - pose.position
     by_pose = share * np.hstack([np.eye(3), -skew(arm)])
-    covariance = by_pose @ measurement.covariance @ by_pose.T
+    covariance = by_pose @ spread @ by_pose.T
     line = nearest.first_point - nearest.second_point
     length = float(np.linalg.norm(line))
     if length < 1e-9:  # they touch, so the line is unknown: any direction may be the worst

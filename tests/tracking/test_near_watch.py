@@ -61,7 +61,7 @@ def test_the_run_stops_exactly_when_one_obstacle_is_surely_too_near(
 def test_the_verdict_is_that_of_the_obstacle_that_is_surely_too_near(
     obstacles_mm: list[tuple[float, float]],
 ) -> None:
-    row = ClearanceRow.by_tags(1.0, measured(obstacles_mm), nearest([d for d, _ in obstacles_mm]))
+    row = ClearanceRow.at(1.0, "tag", measured(obstacles_mm), nearest([d for d, _ in obstacles_mm]))
     names = tuple(f"post {i}" for i in range(len(obstacles_mm)))
     required, against_plan = distances(clearance_table(names, [row]), LIMIT_MM / 1e3)
     assert required.passed is not surely_too_near(obstacles_mm)
@@ -70,7 +70,7 @@ def test_the_verdict_is_that_of_the_obstacle_that_is_surely_too_near(
 
 def test_nearer_than_planned_counts_the_upper_side_too() -> None:
     found = measured([(30.0, 1.0), (50.0, 40.0)])  # planned at 35 mm, at most 31 mm truly
-    row = ClearanceRow.by_tags(1.0, found, nearest([35.0, 50.0]))
+    row = ClearanceRow.at(1.0, "tag", found, nearest([35.0, 50.0]))
     _, against_plan = distances(clearance_table(("post 0", "post 1"), [row]), LIMIT_MM / 1e3)
     assert not against_plan.passed
     assert "at most 31.00 mm" in against_plan.text
