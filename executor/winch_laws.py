@@ -23,7 +23,8 @@ STAYS_TAUT = 0.8
 #: Cycles in which all cables must be taut, and in which one that was taut must not be slack.
 TAUT_CYCLES, SLACK_CYCLES = 20, 5
 #: A step may raise a tension by this share of what is left to the limit: its effect is seen only
-#: two cycles later, and the cables opposite may be wound in meanwhile, too.
+#: two cycles later, three where a torque is told a cycle late, and the cables opposite may be wound
+#: in meanwhile, too.
 SHARE_OF_ROOM = 0.125
 
 Targets = tuple[int, ...]

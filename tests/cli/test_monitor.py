@@ -105,6 +105,8 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     told.folder = Path("runs/[first]")
     assert before.keys() == status().keys()
     assert "preparing" in shown(before)
+    told.take_release()
+    assert "releasing" in shown(told.as_dict()).lower()
     for cycle in range(3):
         told.take_cycle(replace(_record(cycle), index=25.0))
     told.take_event(LoopEvent(1, 50.01, "moving", "winding in"))
