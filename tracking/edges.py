@@ -30,9 +30,9 @@ FLOOR = 0.0015
 SECOND_ROW = 1.0
 #: Where the blur is wider than this share of a module, corners are fitted again as long as they
 #: move by more than `NEAR`: what the modules beside an edge add hangs on where they lie.
-CROWDED = 0.2
+CROWDED = 0.22
 #: Elsewhere they are fitted again only if they move by more than `FAR`, [px].
-NEAR, FAR = 0.02, 0.3
+NEAR, FAR = 0.03, 0.3
 #: At most so many fits.
 MOST_FITS = 4
 
@@ -92,19 +92,22 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     found = np.zeros((len(rough), 4, COLUMNS))
     widths = curves.module_widths(modules)
     find_edges(pixels, curves.pixels, curves.bows, widths, found)
-    lines = curves.lines(found, _doubt(found, widths))
+    final = meet(curves.lines(found, _doubt(found, widths)), curves.ideal)
+    again = inside.copy()
     for _ in range(MOST_FITS):
-        better = pixels_from_ideal(camera, meet(lines, curves.ideal))
+        better = pixels_from_ideal(camera, final)
         inside &= _inside(better, image.shape)
-        curves = EdgeCurves.between(camera, np.where(inside, better, curves.pixels))
-        before, widths = found, curves.module_widths(modules)
-        found = np.zeros_like(before)
-        fit_edges(pixels, curves.pixels, curves.bows, widths, modules, before, found)
+        again &= inside
+        curves = EdgeCurves.between(camera, np.where(again, better, curves.pixels))
+        widths, which = curves.module_widths(modules), np.flatnonzero(again)
+        fit = np.empty((len(which), 4, COLUMNS))
+        places = curves.pixels[which], curves.bows[which], widths[which]
+        fit_edges(pixels, *places, modules, found[which], fit)
+        found[which] = fit
         lines = curves.lines(found, _doubt(found, widths))
         final = meet(lines, curves.ideal)
-        moved = np.abs(final - curves.ideal).max(axis=(1, 2))
-        crowded = np.max(found[..., SPREAD] * (found[..., SHARE] > 0) / widths, axis=1) > CROWDED
-        if not np.any(inside[:, 0, 0] & (moved > np.where(crowded, NEAR, FAR))):
+        again = inside & _unsettled(final - curves.ideal, found, widths)[:, None, None]
+        if not again.any():
             break
     return [_refined(final, lines, t) if inside[t, 0, 0] else None for t in range(len(final))]
 
@@ -130,6 +133,13 @@ def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 def _somewhere(shape: tuple[int, ...]) -> Array:
     """A square in the picture that stands in for unusable tags, so that arrays stay whole."""
     return np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
+
+
+def _unsettled(moved: Array, found: Array, widths: Array) -> NDArray[np.bool_]:
+    """Which tags' corners moved so far that they are fitted again, shape (t,)."""
+    blurred = np.where(found[..., SHARE] > 0.0, found[..., SPREAD] / widths, 0.0).max(axis=1)
+    limit = np.where(blurred > CROWDED, NEAR, FAR)
+    return np.asarray(np.abs(moved).max(axis=(1, 2)) > limit, dtype=np.bool_)
 
 
 def _doubt(found: Array, widths: Array) -> Array:
