@@ -29,7 +29,8 @@ FLOOR = 0.0015
 #: the blur brings to the first row's middle, in deviations of the blur.
 SECOND_ROW = 1.0
 #: Where the blur is wider than this share of a module, corners are fitted again as long as they
-#: move by more than `NEAR`: what the modules beside an edge add hangs on where they lie.
+#: move by more than `NEAR` and half of what an edge may be off: what the modules beside an edge add
+#: hangs on where they lie.
 CROWDED = 0.22
 #: Elsewhere they are fitted again only if they move by more than `FAR`, [px].
 NEAR, FAR = 0.03, 0.3
@@ -106,7 +107,7 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
         found[which] = fit
         lines = curves.lines(found, _doubt(found, widths))
         final = meet(lines, curves.ideal)
-        again = inside & _unsettled(final - curves.ideal, found, widths)[:, None, None]
+        again = inside & _unsettled(final - curves.ideal, found, widths, lines)[:, None, None]
         if not again.any():
             break
     return [_refined(final, lines, t) if inside[t, 0, 0] else None for t in range(len(final))]
@@ -135,10 +136,11 @@ def _somewhere(shape: tuple[int, ...]) -> Array:
     return np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
 
 
-def _unsettled(moved: Array, found: Array, widths: Array) -> NDArray[np.bool_]:
+def _unsettled(moved: Array, found: Array, widths: Array, lines: Lines) -> NDArray[np.bool_]:
     """Which tags' corners moved so far that they are fitted again, shape (t,)."""
     blurred = np.where(found[..., SHARE] > 0.0, found[..., SPREAD] / widths, 0.0).max(axis=1)
-    limit = np.where(blurred > CROWDED, NEAR, FAR)
+    unsure = lines.offset_deviation.reshape(-1, 4).max(axis=1)
+    limit = np.where(blurred > CROWDED, np.maximum(NEAR, 0.5 * unsure), FAR)
     return np.asarray(np.abs(moved).max(axis=(1, 2)) > limit, dtype=np.bool_)
 
 
