@@ -10,7 +10,7 @@ import pytest
 from cdpr.plan import load_plan
 from cdpr.rig import load_rig
 from executor.run_folder import RunFolder
-from tests.cli.plans import CONFIGS, RIG
+from tests.cli.plans import CONFIGS, rig_with_two_pictures_a_second
 from tests.cli.program import call
 
 SCENE = CONFIGS / "pick_and_place.yaml"
@@ -21,17 +21,18 @@ CARRIED = [0.0, 1.2, 1.2, 0.0, 0.5, 0.0]
 @pytest.mark.slow
 def test_the_ready_scene_is_planned_checked_and_run_with_the_camera(tmp_path: Path) -> None:
     plan, run = tmp_path / "plan.json", tmp_path / "run"
-    planned = call("plan", RIG, SCENE, "-o", plan, "--rounds", "20")
+    rig_file = rig_with_two_pictures_a_second(tmp_path)
+    planned = call("plan", rig_file, SCENE, "-o", plan, "--rounds", "20")
     assert planned.code == 0, planned
     assert "tray (pick 2 s, then 1.2 kg), over the wall (pass), shelf" in planned.said
     checked = call("check", plan)
     assert checked.code == 0, checked
-    ran = call("run", plan, "--rig", RIG, "-o", run, "--fast")
+    ran = call("run", plan, "--rig", rig_file, "-o", run, "--fast")
     assert ran.code == 0, ran.out
     assert "at stop 'tray', standing still for 2 s while 1.2 kg is picked up" in ran.err
 
     folder = RunFolder.open(run)
-    cycles, summary, rig = folder.cycles(), folder.summary(), load_rig(RIG)
+    cycles, summary, rig = folder.cycles(), folder.summary(), load_rig(rig_file)
     assert summary["verdict"] == "PASSED"
     assert list(dict.fromkeys(cycles.leg.tolist())) == [1, 2, 3, 4, 5, 6]
     scene = load_plan(plan).scene

@@ -9,7 +9,7 @@ import pytest
 
 from cdpr.plan import load_plan
 from executor.run_folder import RunFolder
-from tests.cli.plans import CONFIGS, RIG
+from tests.cli.plans import CONFIGS, rig_with_two_pictures_a_second
 from tests.cli.program import Answer, call
 
 
@@ -22,11 +22,12 @@ def done(*words: str | Path) -> Answer:
 @pytest.mark.slow
 def test_the_platform_is_put_down_on_the_ramp(tmp_path: Path) -> None:
     plan, folder = tmp_path / "plan.json", tmp_path / "run"
-    done("plan", RIG, CONFIGS / "turn.yaml", "-o", plan, "--free-rotation", "--rounds", "60")
+    rig_file = rig_with_two_pictures_a_second(tmp_path)
+    done("plan", rig_file, CONFIGS / "turn.yaml", "-o", plan, "--free-rotation", "--rounds", "60")
     waypoints = load_plan(plan).waypoints
     assert np.degrees(waypoints[0].angle_to(waypoints[-1])) == pytest.approx(6.0)
     assert "passed" in done("check", plan).out
-    assert "PASSED" in done("run", plan, "--rig", RIG, "--fast", "-o", folder).out
+    assert "PASSED" in done("run", plan, "--rig", rig_file, "--fast", "-o", folder).out
     run = RunFolder.open(folder)
     assert run.summary()["verdict"] == "PASSED"
     assert run.poses().rotation[-1] == pytest.approx(waypoints[-1].quaternion, abs=0.002)
