@@ -1,6 +1,6 @@
 """How exactly the platform's pose is tracked, beside plain OpenCV and pyapriltags.
 
-    python benchmarks/tracking.py [--frames 1000] [--peer-every 5]
+    python benchmarks/tag_tracking.py [--frames 1000] [--peer-every 5]
 
 The ready rig's cube (96 mm tags on 130 mm faces) flies a smooth curve with turns of up to 10°,
 about 1.6 m before the camera, which sees three faces, at 1280 x 720 and at 1920 x 1080 px. Peers
