@@ -7,6 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 PIP := install --quiet --disable-pip-version-check
 PACKAGES := cdpr planner executor drivers tracking calibration simulation
+COMPILE_EDGES := from cdpr.cli.compiling import ready_to_measure; ready_to_measure(shown=False)
 
 # A sourced ROS or Conda shell puts its own packages in front of ours.
 unexport PYTHONPATH PYTHONHOME
@@ -40,8 +41,9 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: --no-build-isolation -c constraints.txt -e ".[dev]" && \
 	"$(BIN)/python" -m pip check --disable-pip-version-check && \
-	echo "Compiling the planner (once; a minute or two) ..." && \
+	echo "Compiling the planner and the tags' edge finder (once; a minute or two) ..." && \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml -o "$(VENV)/first-plan.json" --force --json >/dev/null && \
+	"$(BIN)/python" -c '$(COMPILE_EDGES)' && \
 	echo "$$place, $$pins" > "$(STAMP)"
 
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
@@ -54,7 +56,7 @@ test: install  ## Run the whole test suite on two cores
 	  -o "$(VENV)/paper-plan.json" --force --json >/dev/null & paper=$$!; \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/turn.yaml --free-rotation --rounds 1 \
 	  -o "$(VENV)/turning-plan.json" --force --json >/dev/null && \
-	"$(BIN)/python" -c 'from tracking.edges import load_kernels; load_kernels()' && \
+	"$(BIN)/python" -c '$(COMPILE_EDGES)' && \
 	wait $$paper
 	"$(BIN)/python" -m pytest -n 2
 
