@@ -44,4 +44,6 @@ def make_synthetic_camera(rig: Rig, scene: Scene, camera: Camera) -> SyntheticCa
     from simulation.camera import SyntheticCamera
 
     truth, optics = camera_as_built(rig, camera)
-    return SyntheticCamera(rig_as_built(rig), scene, truth, simulation_of(rig).seed, optics)
+    number = [one.name for one in rig.cameras].index(camera.name)
+    seed = simulation_of(rig).seed + number  # no two cameras have the same noise
+    return SyntheticCamera(rig_as_built(rig), scene, truth, seed, optics)

@@ -186,6 +186,19 @@ def test_less_light_and_no_cables_show_in_the_picture(rig: Rig, scene: Scene) ->
     assert 100 < np.count_nonzero(shown() != full) < full.size / 20  # thin cables
 
 
+def test_two_cameras_in_one_place_differ_by_their_noise_alone(rig: Rig, scene: Scene) -> None:
+    first = rig.document.cameras[0]
+    second = first.model_copy(update={"name": "second"})
+    two = rig_from_document(rig.document.model_copy(update={"cameras": [first, second]}))
+    pictures = [
+        make_synthetic_camera(two, scene, camera).render(rig.home).astype(float)
+        for camera in two.cameras
+    ]
+    apart = pictures[0] - pictures[1]
+    assert abs(apart.mean()) < 0.01
+    assert 1.0 < apart.std() < 3.0  # of 1.5 grey levels each
+
+
 @pytest.mark.parametrize(
     ("simulation", "key", "what"),
     [
