@@ -120,7 +120,7 @@ def test_pictures_that_were_saved_anew_count_once(folder, tmp_path) -> None:
 
 
 def test_people_read_what_changed_against_the_rig_file(folder) -> None:
-    answer = call("calibrate", "tags", RIG, folder, "--wanted-mm", "0.01")
+    answer = call("calibrate", "tags", RIG, folder, "--wanted-mm", "0.001")
     (turn,) = (line for line in answer.out.splitlines() if "tag_301_turn_x_deg" in line)
     assert re.fullmatch(r"\s*tag_301_turn_x_deg\s+± 0\.\d+\s*", turn)
     assert answer.code == 3
