@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,9 @@ from numpy.typing import NDArray
 
 from cdpr.errors import BadInput, Fault, HardwareMissing
 from cdpr.rig import Camera
+from drivers.newest_picture import LOST_PICTURES, PictureReader
 
 Image = NDArray[np.uint8]
-
-#: Pictures a camera may fail to give in a row before it counts as gone.
-LOST_PICTURES = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +91,7 @@ class VideoFile:
 
 
 class LiveCamera:
-    """A camera on this machine or on the network.
+    """A camera on this machine or on the network; it answers with its newest picture.
 
     Args:
         source: Its index, such as ``0``, its device file or its address.
@@ -107,24 +106,26 @@ class LiveCamera:
     def __init__(
         self, source: int | str, camera: Camera, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.name = str(source)
-        self._camera, self._clock, self._number = camera, clock, 0
-        numbered = isinstance(source, int) or source.isdigit()
-        self._capture = _opened(int(source) if numbered else str(source))
-        if not self._capture.isOpened():
-            self._capture.release()
+        self.name = f"camera {live_name(camera.name, str(source))}"
+        self._seen = False
+        numbered = isinstance(source, int) or source.isdecimal()
+        capture = _opened(int(source) if numbered else str(source))
+        if not capture.isOpened():
+            capture.release()
             raise HardwareMissing(
                 "the camera cannot be opened",
-                where=f"camera {self.name}",
+                where=self.name,
                 why="it is not connected, another program uses it, or you may not read it",
                 next_step="check the cable and `ls -l /dev/video*`, close other programs, or pass"
                 " another camera",
             )
-        self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
-        self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
-        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # or pictures wait in the queue
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
+        self._reader = PictureReader(capture, clock)
+        # Whoever only iterates over it closes nothing, and its thread must not outlive it.
+        self._let_go = weakref.finalize(self, self._reader.close)
         try:
-            refuse_wrong_size(self.read().image, camera, f"camera {self.name}")
+            refuse_wrong_size(self.read().image, camera, self.name)
         except BaseException:
             self.close()
             raise
@@ -136,7 +137,7 @@ class LiveCamera:
         self.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Pictures without end.
+        """Pictures without end; those that came while one was looked at are left out.
 
         Raises:
             Fault: The camera stopped giving pictures.
@@ -145,29 +146,34 @@ class LiveCamera:
             yield self.read()
 
     def read(self) -> Frame:
-        """The next picture, with the time at which it arrived.
+        """The newest picture that was not read before, with the time at which it arrived.
+
+        It may have arrived before this was called.
 
         Raises:
             HardwareMissing: It never gave a picture.
             Fault: It stopped giving pictures.
         """
-        for _ in range(LOST_PICTURES):
-            good, picture = self._capture.read()
-            now = self._clock()
-            if good:
-                self._number += 1
-                return Frame(now, _grey(np.asarray(picture)), f"picture {self._number - 1}")
-        kind = Fault if self._number else HardwareMissing
+        arrived = self._reader.newest()
+        if arrived is not None:
+            self._seen = True
+            return Frame(arrived.time, _grey(arrived.picture), f"picture {arrived.number}")
+        kind = Fault if self._seen else HardwareMissing
         raise kind(
             f"the camera gave no picture {LOST_PICTURES} times in a row",
-            where=f"camera {self.name}",
+            where=self.name,
             why="it was unplugged, or the bus it hangs on is too slow for its pictures",
             next_step="check the cable, then start again",
         )
 
     def close(self) -> None:
         """Lets go of the camera."""
-        self._capture.release()
+        self._let_go()
+
+
+def live_name(camera: str, source: str) -> str:
+    """A camera of the rig file and where its pictures come from, such as ``side (0)``."""
+    return source if camera == source else f"{camera} ({source})"
 
 
 def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:

@@ -43,14 +43,14 @@ class Guidance:
 
 
 class DrivesAhead:
-    """The drives' pose at the time of a picture, which is a little after they were heard."""
+    """The drives' pose at the time of a picture, a little after they were heard or before."""
 
     def __init__(self) -> None:
         """They were not heard yet."""
         self._last: tuple[float, Pose] | None = None
 
     def at(self, picture: float, heard: float, pose: Pose | None) -> Pose | None:
-        """The pose when the picture was taken, if the drives go on as they went.
+        """The pose when the picture was taken, if the drives go as they went.
 
         Args:
             picture: When it was taken, [s].
@@ -61,6 +61,6 @@ class DrivesAhead:
         if before is None or pose is None:
             return pose
         between, ahead = heard - before[0], picture - heard
-        if not (0.0 < between <= MEMORY and 0.0 < ahead <= MEMORY):
+        if not (0.0 < between <= MEMORY and 0.0 < abs(ahead) <= MEMORY):
             return pose
         return interpolate(before[1], pose, 1.0 + ahead / between)

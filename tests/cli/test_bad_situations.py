@@ -242,7 +242,7 @@ def test_a_real_bus_moves_only_after_a_yes(folder: Path, answers: str) -> None:
 
 
 def test_a_camera_that_is_not_there_is_told_before_anything_moves(folder: Path) -> None:
-    refused(folder, 4, "camera 77", "/dev/video", rig=RIG, fast=True, camera=77)
+    refused(folder, 4, "camera front (77)", "/dev/video", rig=RIG, fast=True, camera=77)
 
 
 def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
@@ -274,7 +274,7 @@ def test_wishes_that_contradict_each_other_are_told(
     ("source", "code", "part"),
     [
         ("no such thing", 2, "neither a folder of pictures"),
-        ("77", 4, "camera 77"),
+        ("77", 4, "camera front (77)"),
         ("empty", 2, "empty"),
         ("text.mp4", 2, "text.mp4"),
         ("synthetic", 2, "--plan"),

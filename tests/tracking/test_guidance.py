@@ -72,7 +72,7 @@ def test_the_drives_motion_leads_on_from_where_the_camera_saw_the_platform(
 @given(
     speed=st.tuples(NUMBERS, NUMBERS, NUMBERS),
     period=st.floats(0.01, MEMORY),
-    delay=st.floats(0.001, MEMORY),
+    delay=st.floats(0.001, MEMORY) | st.floats(-MEMORY, -0.001),
 )
 def test_the_drives_pose_is_that_of_the_pictures_own_time(
     speed: tuple[float, float, float], period: float, delay: float

@@ -127,7 +127,7 @@ def test_a_camera_that_is_not_there_is_hardware_missing(camera: Camera) -> None:
     with pytest.raises(HardwareMissing, match="cannot be opened") as told:
         LiveCamera("97", camera)
     assert told.value.exit_code == 4
-    assert "camera 97" in told.value.where
+    assert told.value.where == "camera front (97)"
 
 
 def test_pictures_without_tags_say_what_was_expected(rig: Rig, camera: Camera) -> None:

@@ -1,0 +1,138 @@
+"""A camera that takes pictures faster than they are asked for: none grows old in a queue."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import drivers.cameras
+from cdpr.errors import BadInput, Fault, HardwareMissing
+from cdpr.rig import Camera
+from drivers.cameras import LiveCamera
+from drivers.newest_picture import LOST_PICTURES
+
+
+class Queue:
+    """Pictures of a camera, waiting for whoever reads them.
+
+    A picture's brightness is its number. Reading one takes no time; when none waits, reading waits,
+    as with a camera, for the next.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._shape = (camera.height, camera.width, 3)
+        self._changed = threading.Condition()
+        self._taken = self._come = self._wanting = 0
+        self._gone = self.released = False
+
+    def take(self, pictures: int) -> None:
+        """So many more were taken."""
+        with self._changed:
+            self._come += pictures
+            self._changed.notify_all()
+
+    def wait_until_read(self) -> None:
+        """Returns when all were read, and the next one is waited for."""
+        with self._changed:
+            assert self._changed.wait_for(
+                lambda: self._wanting and self._taken == self._come, timeout=20.0
+            )
+
+    def unplug(self) -> None:
+        with self._changed:
+            self._gone = True
+            self._changed.notify_all()
+
+    def isOpened(self) -> bool:  # noqa: N802  # as OpenCV has it
+        return True
+
+    def set(self, _what: int, _value: float) -> bool:
+        return True
+
+    def read(self) -> tuple[bool, Any]:
+        with self._changed:
+            self._wanting += 1
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._gone or self._taken < self._come)
+            self._wanting -= 1
+            if self._taken == self._come:
+                return False, None
+            self._taken += 1
+            return True, np.full(self._shape, self._taken - 1, np.uint8)
+
+    def release(self) -> None:
+        self.released = True
+
+    def clock(self) -> float:
+        """Each picture arrives when it is read, a hundred a second."""
+        return (self._taken - 1) / 100.0
+
+
+@pytest.fixture
+def queue(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
+    made = Queue(camera)
+    monkeypatch.setattr(drivers.cameras, "_opened", lambda _: made)
+    yield made
+    made.unplug()
+
+
+def test_the_newest_picture_is_answered_with_the_time_at_which_it_came(
+    queue: Queue, camera: Camera
+) -> None:
+    queue.take(1)
+    with LiveCamera("0", camera, queue.clock) as live:
+        for number in (30, 60, 90):  # it takes thirty while one is asked for
+            queue.take(30)
+            queue.wait_until_read()
+            frame = live.read()
+            assert (int(frame.image[0, 0]), frame.name) == (number, f"picture {number}")
+            assert frame.time == pytest.approx(number / 100.0)
+        queue.unplug()
+    assert queue.released
+
+
+def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
+    queue.take(1)
+    with LiveCamera("0", camera, queue.clock) as live:
+        later = threading.Timer(0.0, queue.take, [1])
+        later.start()
+        assert live.read().name == "picture 1"
+        later.join()
+        queue.unplug()
+
+
+def test_a_camera_that_goes_is_told_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
+    queue.take(1)
+    with LiveCamera("7", camera, queue.clock) as live:
+        queue.unplug()
+        with pytest.raises(Fault, match=f"{LOST_PICTURES} times in a row") as told:
+            live.read()
+    assert told.value.where == f"camera {camera.name} (7)"
+
+
+def test_a_camera_that_never_gave_a_picture_or_another_size_is_let_go_of(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue.unplug()
+    with pytest.raises(HardwareMissing, match="gave no picture"):
+        LiveCamera("0", camera, queue.clock)
+    assert queue.released
+    monkeypatch.setattr(queue, "released", False)
+    monkeypatch.setattr(queue, "_shape", (4, 5, 3))
+    queue.take(1)
+    with pytest.raises(BadInput, match="5 x 4 px"):
+        LiveCamera("0", camera, queue.clock)
+    assert queue.released
+
+
+def test_who_closes_nothing_leaves_no_thread(queue: Queue, camera: Camera) -> None:
+    queue.take(2)
+    live = LiveCamera("0", camera, queue.clock)
+    assert int(next(iter(live)).image[0, 0]) <= 1
+    queue.unplug()
+    del live
+    assert queue.released
