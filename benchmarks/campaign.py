@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from cdpr.cli.cameras import choose_cameras
+from cdpr.cli.camera_choice import choose_cameras
 from cdpr.cli.carry_out import prepared_run
 from cdpr.cli.demo import RIG, configs
 from cdpr.cli.run_motion import run_prepared

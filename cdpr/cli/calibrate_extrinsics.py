@@ -82,7 +82,7 @@ def extrinsics(
     from calibration.surveyed_tags import require_frame_tags
     from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.cameras import named_camera
+    from cdpr.cli.camera_choice import named_camera
     from cdpr.cli.picture_sources import pictures_of
     from cdpr.rig import load_rig
 

@@ -46,7 +46,7 @@ def tags(
     from calibration.tags_verdict import judge_layout
     from cdpr.cli.calibration_output import begin, finish
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.cameras import named_camera
+    from cdpr.cli.camera_choice import named_camera
     from cdpr.cli.compiling import ready_to_measure
     from cdpr.cli.output import progress_bar
     from cdpr.cli.picture_sources import pictures_of, told

@@ -25,7 +25,7 @@ def demo(
 
       cdpr demo --environment 3
     """
-    from cdpr.cli.cameras import choose_cameras
+    from cdpr.cli.camera_choice import choose_cameras
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.output import out, show_facts
     from cdpr.cli.plan import planned, sentences_of

@@ -180,7 +180,7 @@ def _known_pose(
     Raises:
         BadInput: It is not said how the pose is known, or in several ways.
     """
-    from cdpr.cli.cameras import choose_camera
+    from cdpr.cli.camera_choice import choose_camera
     from cdpr.document_types import millimetres
     from cdpr.errors import BadInput
     from cdpr.poses import Pose

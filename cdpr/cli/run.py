@@ -66,7 +66,7 @@ def run(
       cdpr run plan.json --rig rig.yaml -o runs/third --camera front=0 --camera side=1
     """
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.cameras import choose_cameras
+    from cdpr.cli.camera_choice import choose_cameras
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.plan_for_rig import require_same_rig

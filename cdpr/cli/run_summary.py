@@ -98,7 +98,7 @@ def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
 
 def _cameras(rig: Rig, eyes: Mapping[Camera, str]) -> str:
     """Which cameras look, and which of the rig file's do not."""
-    from cdpr.cli.cameras import looked_with
+    from cdpr.cli.camera_choice import looked_with
 
     used = {camera.name for camera in eyes}
     unused = [camera.name for camera in rig.cameras if camera.name not in used]

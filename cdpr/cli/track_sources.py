@@ -27,7 +27,7 @@ def eyes_of(
     Raises:
         BadInput: A camera is not the rig's, is named twice, or not at all.
     """
-    from cdpr.cli.cameras import named_camera
+    from cdpr.cli.camera_choice import named_camera
     from cdpr.errors import BadInput
 
     named = [source.partition("=") for source in sources]
@@ -75,7 +75,7 @@ def picture_source(
         plan: The path that rendered ones show.
         unused: Becomes why files of a folder are not used, by name, as they are met.
     """
-    from cdpr.cli.cameras import SYNTHETIC
+    from cdpr.cli.camera_choice import SYNTHETIC
     from cdpr.cli.output import err
     from cdpr.cli.picture_sources import require_camera_source
     from cdpr.errors import BadInput

@@ -16,7 +16,7 @@ import yaml
 from mcap.reader import make_reader
 
 from cdpr.cli.calibrate_extrinsics import _poses_of_run
-from cdpr.cli.cameras import choose_cameras
+from cdpr.cli.camera_choice import choose_cameras
 from cdpr.errors import BadInput
 from cdpr.plan import save_plan
 from cdpr.poses import Pose, matrix_from_rotation_vector
