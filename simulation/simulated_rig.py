@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import can
 import numpy as np
@@ -21,15 +21,10 @@ from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
 from drivers.bus import SentFrame, take, transmit
 from drivers.bus_faults import BusDown
-from simulation.as_built import (
-    rig_as_built,
-    simulation_of,
-    stiffness_as_built,
-    winches_as_built,
-)
-from simulation.drive_motion import Motor
+from simulation.as_built import rig_as_built, stiffness_as_built
+from simulation.drive_train import DriveTrain
 from simulation.plant import Plant
-from simulation.transmission import Transmission
+from simulation.winch_drive import WinchDrive
 
 Frame = bytes | bytearray
 
@@ -38,32 +33,6 @@ TOP_SPEED_RESERVE = 1.5
 
 IDLE_WAIT = 0.005
 """Longest wait for a frame before time-outs of the drives are looked at, [s]."""
-
-
-class WinchDrive(Protocol):
-    """What a rig needs of a simulated drive.
-
-    Attributes:
-        motor: What it moves.
-        torque: Actual torque, set by the rig, in the unit of its protocol.
-    """
-
-    motor: Motor
-    torque: float
-
-    @property
-    def state(self) -> Enum:
-        """Its state in the words of its protocol."""
-        ...
-
-    @property
-    def torque_on(self) -> bool:
-        """The motor holds or moves the cable; otherwise the brake does."""
-        ...
-
-    def advance(self, elapsed: float) -> None:
-        """Lets time pass, [s]."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,20 +86,13 @@ class SimulatedRig(ABC, Generic[Drive]):
         self._cycle = rig.document.bus.cycle_ms / 1000.0
         self.plant = Plant(rig_as_built(rig), start_pose, load, stiffness_as_built(rig))
         self.cycles = 0
-        self._per_newton = self._torque_per_newton()
-        self._counts = _counts_as_told(rig, start_pose, load)
-        winches = winches_as_built(rig)
-        per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
-        play = per_metre * winches.backlash_mm / 1000.0
-        self._transmission = Transmission(play, winches.step_counts, self._counts)
-        self.plant.settle_counts(self._transmission.drums(self._counts))
-        self._tension_noise = winches.tension_noise_n
-        self._feeling: Iterator[None] | None = None
-        self._random = np.random.default_rng([simulation_of(rig).seed, 0x7E45])
+        per_newton = self._torque_per_newton()
+        start = _counts_as_told(rig, start_pose, load)
+        self._drive_train = DriveTrain(rig, self.plant, start, per_newton)
         self.drives: tuple[Drive, ...] = ()
         self.drives = tuple(
             self._make_drive(number, float(counts), self._top_speed(number))
-            for number, counts in enumerate(self._counts)
+            for number, counts in enumerate(start)
         )
 
     @abstractmethod
@@ -223,8 +185,8 @@ class SimulatedRig(ABC, Generic[Drive]):
                     wait = 0.0
                     continue
                 wait = IDLE_WAIT
-                if self._feeling is not None:
-                    self._go_on_feeling()
+                if self._drive_train.feeling:
+                    self._drive_train.go_on_feeling()
                     wait = clock() - now  # a master on the same processor has its turn, too
                 if on_status is not None and now - told >= status_period:
                     told = now
@@ -255,41 +217,13 @@ class SimulatedRig(ABC, Generic[Drive]):
 
     def _feel(self) -> None:
         """The drives begin to feel the cables as they are now, unless they are still about it."""
-        if self._feeling is None:
-            self._feeling = self._felt()
-
-    def _go_on_feeling(self) -> None:
-        """One step, if there is one to do."""
-        if self._feeling is None:
-            return
-        try:
-            next(self._feeling)
-        except StopIteration:
-            self._feeling = None
+        self._drive_train.begin_feeling(self.drives)
 
     def _finish_feeling(self) -> None:
-        while self._feeling is not None:
-            self._go_on_feeling()
-
-    def _felt(self) -> Iterator[None]:
-        """The platform goes where the drums let it; then the drives feel its cables."""
-        counts = np.array([drive.motor.position for drive in self.drives])
-        if not np.array_equal(counts, self._counts):
-            yield from self.plant.settling_counts(self._transmission.drums(counts))
-            self._counts = counts
-        told = self.plant.tensions
-        if self._tension_noise > 0.0:
-            told = told + self._tension_noise * self._random.standard_normal(len(told))
-        torques = told * self._per_newton
-        for drive, torque in zip(self.drives, torques.tolist(), strict=True):
-            drive.torque = torque if drive.torque_on else 0.0
+        self._drive_train.finish_feeling()
 
     def _settle(self) -> None:
-        """The platform goes where the drums let it; nothing to do while none has turned."""
-        counts = np.array([drive.motor.position for drive in self.drives])
-        if not np.array_equal(counts, self._counts):
-            self.plant.settle_counts(self._transmission.drums(counts))
-            self._counts = counts
+        self._drive_train.settle(self.drives)
 
     def _send(self, can_id: int, data: Frame) -> None:
         with suppress(BusDown):  # nobody is reached
