@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from cdpr.errors import BadInput
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from cdpr.rig import Camera, Rig
 
@@ -67,7 +67,22 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
             where="--camera",
             next_step="use the interface 'virtual', a real camera, or --no-camera",
         )
+    if wanted != SYNTHETIC:
+        _require_live(wanted)
     return wanted
+
+
+def _require_live(source: str) -> None:
+    """What was recorded shows nothing of a platform that moves now."""
+    from cdpr.cli.picture_sources import is_camera
+
+    if not is_camera(source):
+        raise BadInput(
+            f"{source!r} is no camera",
+            where="--camera",
+            why="pictures must be taken while the platform moves; a file or a folder has others",
+            next_step="name an index such as 0, a device such as /dev/video0, or an address",
+        )
 
 
 def choose_cameras(
@@ -100,6 +115,46 @@ def choose_cameras(
         return eyes
     choose_camera(rig, wanted[0], without, in_process)
     return {}
+
+
+def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:
+    """The one camera that measures a platform at rest, and where its pictures come from.
+
+    Args:
+        rig: Its cameras.
+        wanted: One source, or ``NAME=SOURCE``.
+        in_process: The drives are simulated in this process.
+
+    Raises:
+        BadInput: There are several, or the wish cannot be met.
+    """
+    from cdpr.cli.track_sources import eyes_of
+
+    if len(wanted) != 1:
+        raise BadInput(
+            f"{len(wanted)} cameras are named, and one measures",
+            where="--camera",
+            next_step="name the one that sees the most tags, from the nearest",
+        )
+    ((camera, source),) = eyes_of(rig, wanted, None, "--camera").items()
+    choose_camera(rig, source, False, in_process)
+    return camera, source
+
+
+def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
+    """In simulated time a real camera's pictures would be stamped with times that mean nothing.
+
+    Raises:
+        BadInput: ``--fast`` is given, and a source is a real camera.
+    """
+    real = [source for source in sources if source != SYNTHETIC]
+    if fast and real:
+        raise BadInput(
+            "--fast needs synthetic cameras",
+            where=f"--camera {real[0]}",
+            why="a real camera takes its pictures in real time, and the run would be over before",
+            next_step="leave --fast out, or pass --camera synthetic",
+        )
 
 
 def looked_with(eyes: Mapping[Camera, str]) -> str:

@@ -79,12 +79,19 @@ def require_camera_source(source: str) -> None:
     Raises:
         BadInput: It is neither a number nor a device nor an address.
     """
-    if not source.isdigit() and "://" not in source and not source.startswith("/dev/"):
+    if not is_camera(source):
         raise BadInput(
             "neither a folder of pictures, nor a video file, nor a camera",
             where=source,
             next_step="check the path; a camera is an index such as 0, /dev/video0 or an address",
         )
+
+
+def is_camera(source: str) -> bool:
+    """Whether it can be a camera: a number, a device or an address, and no file."""
+    if source.startswith("/dev/"):
+        return not (Path(source).is_file() or Path(source).is_dir())
+    return source.isdecimal() or ("://" in source and not source.startswith("file:"))
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:

@@ -66,7 +66,7 @@ def run(
       cdpr run plan.json --rig rig.yaml -o runs/third --camera front=0 --camera side=1
     """
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.camera_choice import choose_cameras
+    from cdpr.cli.camera_choice import choose_cameras, require_simulated_pictures
     from cdpr.cli.carry_out import carry_out, prepared_run
     from cdpr.cli.named_bus import rig_on_bus
     from cdpr.cli.plan_for_rig import require_same_rig
@@ -78,6 +78,7 @@ def run(
     the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     in_process = the_rig.document.bus.interface == IN_PROCESS
     eyes = choose_cameras(the_rig, camera or [], no_camera, in_process)
+    require_simulated_pictures(eyes.values(), fast)
     if not eyes:
         why = "without a camera no clearance is measured, and nothing stops the run for it"
         require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)

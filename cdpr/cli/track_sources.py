@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,9 +30,8 @@ def eyes_of(
     from cdpr.cli.camera_choice import named_camera
     from cdpr.errors import BadInput
 
-    named = [source.partition("=") for source in sources]
     names = [camera.name for camera in rig.cameras]
-    if len(sources) == 1 and named[0][0] not in names:
+    if len(sources) == 1 and _is_unnamed(sources[0], names):
         return {named_camera(rig, wanted): sources[0]}
     if wanted is not None:
         raise BadInput(
@@ -41,20 +40,55 @@ def eyes_of(
             next_step="leave it out, or name the camera in the source: NAME=SOURCE",
         )
     eyes: dict[Camera, str] = {}
-    for name, sign, place in named:
-        if not sign or not place:
+    for source in sources:
+        name, sign, place = source.partition("=")
+        if name in names and not place:
             raise BadInput(
-                f"the source {name!r} does not say which camera it is of",
+                f"camera {name!r} has no source",
                 where=where,
-                next_step=f"write NAME={name}, NAME one of: {', '.join(names)}",
+                next_step=f"write {name}=0, or what its pictures come from",
+            )
+        if not sign or "://" in name:
+            raise BadInput(
+                f"the source {source!r} does not say which camera it is of",
+                where=where,
+                next_step=f"write NAME={source}, NAME one of: {', '.join(names)}",
             )
         camera = named_camera(rig, name)
         if camera in eyes:
             raise BadInput(
                 f"camera {name!r} has two sources", where=where, next_step="name each camera once"
             )
+        _require_own(place, eyes, name, where)
         eyes[camera] = place
     return eyes
+
+
+def _is_unnamed(source: str, names: list[str]) -> bool:
+    """Whether a source names no camera: ``0``, an address or a path, and not ``WORD=0``."""
+    word, sign, _ = source.partition("=")
+    if not sign:
+        return word not in names or Path(source).exists()
+    return "://" in word or (word not in names and Path(source).exists())
+
+
+def _require_own(place: str, eyes: Mapping[Camera, str], name: str, where: str) -> None:
+    """Two cameras cannot take the same pictures."""
+    from cdpr.cli.camera_choice import SYNTHETIC
+    from cdpr.errors import BadInput
+
+    for camera, other in eyes.items():
+        if place != SYNTHETIC and _device(place) == _device(other):
+            raise BadInput(
+                f"cameras {camera.name!r} and {name!r} have the same source {place!r}",
+                where=where,
+                next_step="give each camera its own",
+            )
+
+
+def _device(source: str) -> str:
+    """A source, the same for both names of a camera of this machine: ``0`` and ``/dev/video0``."""
+    return source.removeprefix("/dev/video")
 
 
 def picture_source(

@@ -242,7 +242,7 @@ def test_a_real_bus_moves_only_after_a_yes(folder: Path, answers: str) -> None:
 
 
 def test_a_camera_that_is_not_there_is_told_before_anything_moves(folder: Path) -> None:
-    refused(folder, 4, "camera front (77)", "/dev/video", rig=RIG, fast=True, camera=77)
+    refused(folder, 4, "camera front (77)", "/dev/video", rig=RIG, camera=77)
 
 
 def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
@@ -258,6 +258,13 @@ def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
         ({"fast": True, "interface": "udp_multicast", "no_camera": True}, ["--fast", "virtual"]),
         ({"interface": "udp_multicast"}, ["no camera was named"]),
         ({"interface": "udp_multicast", "camera": "synthetic"}, ["synthetic"]),
+        ({"camera": "0", "fast": True}, ["--camera 0", "--fast needs synthetic cameras"]),
+        ({"camera": "plan.json"}, ["'plan.json' is no camera", "while the platform moves"]),
+        ({"camera": "/nowhere/run.avi"}, ["'/nowhere/run.avi' is no camera", "/dev/video0"]),
+        ({"camera": "file:///tmp/run.avi"}, ["is no camera"]),
+        ({"camera": "frnt=0"}, ["no camera 'frnt'", "name one of: front"]),
+        ({"camera": "front"}, ["camera 'front' has no source", "write front=0"]),
+        ({"camera": "front="}, ["camera 'front' has no source", "write front=0"]),
         (
             {"interface": "udp_multicast", "no_camera": True, "simulated_start_mm": "0 0 445"},
             ["--simulated-start-mm"],

@@ -81,6 +81,9 @@ def test_two_cameras_are_logged_together_and_alone(
     [
         (["front=synthetic", "back=synthetic"], ["no camera 'back'", "front, side"]),
         (["front=synthetic", "synthetic"], ["'synthetic' does not say which camera"]),
+        (["frnt=synthetic"], ["no camera 'frnt'", "front, side"]),
+        (["side="], ["camera 'side' has no source", "write side=0"]),
+        (["front=somewhere", "side=somewhere"], ["'front' and 'side' have the same source"]),
         (["front=synthetic", "front=synthetic"], ["'front' has two sources"]),
         (["front=synthetic", "side=synthetic", "--camera", "side"], ["--camera is for a single"]),
     ],

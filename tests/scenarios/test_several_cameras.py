@@ -152,6 +152,10 @@ def test_cameras_are_chosen_as_they_are_named(
         (["front=0", "back=1"], ["no camera 'back'", "front, side"]),
         (["0", "side=1"], ["'0' does not say which camera it is of"]),
         (["side=0", "side=1"], ["'side' has two sources"]),
+        (["side=0", "front=0"], ["cameras 'side' and 'front' have the same source '0'"]),
+        (["side=0", "front=/dev/video0"], ["have the same source"]),
+        (["side=0", "front"], ["camera 'front' has no source", "write front=0"]),
+        (["side=0", "http://x/?a=b"], ["'http://x/?a=b' does not say which camera it is of"]),
         (["front=0", "--no-camera"], ["--camera and --no-camera contradict"]),
     ],
 )
