@@ -248,9 +248,9 @@ class Loop:
         """Does what the operator wants, as far as the state allows it."""
         state = self.machine.state
         if wishes.stop and state in _STOPPABLE:
-            if wishes.too_near:
-                near = f"{_TOO_NEAR}: {wishes.too_near}"
-                self._tell_cause("clearance_low", f"{near}; slowing down {self.way}")
+            if wishes.for_what is not None:
+                text = f"{wishes.for_what.text}; slowing down {self.way}"
+                self._tell_cause(wishes.for_what.code, text)
             else:
                 self._tell_cause("stop", f"stop requested; slowing down {self.way}")
             self._feed.stop()
@@ -332,7 +332,6 @@ _ACTIVE = ON_PATH | {State.ENABLING, State.APPROACHING, State.SECURING}
 _WITHOUT_QUICK_STOP = ON_PATH | {State.SECURING}
 _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.HOLDING})
 
-_TOO_NEAR = "the camera measured less clearance than the scene asks for"
 _HELD = "at rest; the drives hold by themselves under torque"
 _BRAKED = "at rest; the brakes of the winches hold"
 _NEVER_ENABLED = "stopped before all drives were enabled; none of them follows set-points"

@@ -9,12 +9,8 @@ from typing import Any
 from cdpr.clearance import ClearanceModel
 from cdpr.poses import Pose
 from executor.camera_eye import CameraEye, CameraRecord
-from executor.camera_sight import BLIND_PICTURES
-from executor.near_watch import NearWatch
+from executor.common_look import CameraNews, CommonLook
 from executor.observer import Look, Trigger, unseen
-from tracking.cameras_together import CommonPose
-from tracking.measured_clearance import clearance_of
-from tracking.measurement import NoPose, PoseMeasurement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,19 +26,6 @@ class Seen:
     together: Sequence[Look] = ()
     alone: Mapping[str, Sequence[Look]] = field(default_factory=dict)
     cameras: tuple[CameraRecord, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class CameraNews:
-    """Something about a camera that the operator must know.
-
-    Attributes:
-        code: Of the event, ``camera`` or ``camera_sees_nothing``.
-        text: One sentence.
-    """
-
-    code: str
-    text: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,16 +55,26 @@ class RunCameras:
             limit: Clearance that the scene asks for, [m].
             rate: Moments a second, [Hz].
         """
-        self.near = ""
-        """Between what the measured clearance fell below the limit, with numbers; else nothing."""
-        self._eyes, self._model = eyes, model
-        self._watch, self._common = NearWatch(limit), CommonPose(0.5 / rate)
+        self._eyes = eyes
+        self._common = CommonLook([eye.name for eye in eyes], model, limit, rate)
         self._frame, self._now = 0, 0.0
         self._open: list[_Moment] = []
         self._together: list[Look] = []
-        self._disagree = 0
         self._told: dict[str, str] = {}
         self._news: list[CameraNews] = []
+
+    @property
+    def near(self) -> str:
+        """Between what the measured clearance fell below the limit, with numbers; else nothing."""
+        return self._common.near
+
+    @property
+    def all_failed(self) -> str:
+        """Why there is no camera any more, as a clause; nothing while there is one."""
+        failed = {eye.name: eye.failed.what for eye in self._eyes if eye.failed is not None}
+        if len(failed) < len(self._eyes):
+            return ""
+        return "all cameras failed: " + "; ".join(f"{name}: {why}" for name, why in failed.items())
 
     def trigger(
         self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
@@ -93,27 +86,23 @@ class RunCameras:
             asked: The same moment on the monotonic clock, [s].
             true_pose: Where the simulated platform is; None with real cameras.
             by_drives: Where the drives' positions put it; None when they do not tell.
-
-        Raises:
-            CdprError: All cameras failed, for the reason that the first one told.
         """
         self._now = asked
         for eye in self._eyes:
             self._put(eye, eye.collect())
         self._judge()
-        self._look_for_trouble()
         trigger = Trigger(self._frame, time, asked, true_pose, by_drives)
         whom = frozenset(eye.name for eye in self._eyes if eye.ask(trigger))
         if whom:
             self._open.append(_Moment(trigger, whom))
         self._frame += 1
-        failures = [eye.failed for eye in self._eyes if eye.failed is not None]
-        if len(failures) == len(self._eyes):
-            raise failures[0]
+        self._look_for_trouble()
 
     def news(self) -> list[CameraNews]:
         """What began since this was asked last."""
-        news, self._news = self._news, []
+        news = [*self._news, *self._common.news]
+        self._news.clear()
+        self._common.news.clear()
         return news
 
     def as_dict(self) -> list[dict[str, Any]]:
@@ -125,6 +114,7 @@ class RunCameras:
         for eye in self._eyes:
             self._put(eye, eye.finish())
         self._judge(last=True)
+        self._common.finish()
         self._look_for_trouble()
         several = len(self._eyes) > 1
         return Seen(
@@ -151,32 +141,11 @@ class RunCameras:
 
     def _joined(self, moment: _Moment) -> Look:
         """What all cameras say of a moment together."""
-        looks = [moment.looks[eye.name] for eye in self._eyes if eye.name in moment.looks]
-        frame = moment.trigger.frame
-        if not looks:
-            reason = next((e.failed.what for e in self._eyes if e.failed), "no camera answered")
-            return unseen(frame, moment.trigger.time, reason)
-        picture = next((look.picture for look in looks if look.picture), "")
-        if len(self._eyes) == 1:
-            found = looks[0].found
-        else:
-            names = (eye.name for eye in self._eyes if eye.name in moment.looks)
-            found = self._common.of(dict(zip(names, (k.found for k in looks), strict=True)))
-        if isinstance(found, NoPose):
-            disagree = sum(isinstance(look.found, PoseMeasurement) for look in looks) > 1
-            self._count_disagreement(found.reason if disagree else "")
-            return Look(frame, found, picture)
-        self._count_disagreement("")
-        clearance = clearance_of(self._model, found)
-        self.near = self.near or self._watch.take(clearance)
-        return Look(frame, found, picture, clearance=clearance)
-
-    def _count_disagreement(self, reason: str) -> None:
-        self._disagree = self._disagree + 1 if reason else 0
-        if self._disagree == BLIND_PICTURES:
-            times = f"{BLIND_PICTURES} times in a row"
-            text = f"{reason}, {times}; clearance is not measured"
-            self._news.append(CameraNews("camera_sees_nothing", text))
+        looks = {eye.name: moment.looks[eye.name] for eye in self._eyes if eye.name in moment.looks}
+        if looks:
+            return self._common.of(looks)
+        reason = next((e.failed.what for e in self._eyes if e.failed), "no camera answered")
+        return unseen(moment.trigger.frame, moment.trigger.time, reason)
 
     def _look_for_trouble(self) -> None:
         troubles = {eye.name: eye.trouble(self._now) for eye in self._eyes}

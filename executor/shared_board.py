@@ -8,7 +8,7 @@ import time
 from dataclasses import replace
 
 from executor.shared_memory import SharedMemory
-from executor.wishes import Wishes
+from executor.wishes import StopReason, Wishes
 
 #: The supervisor has hung if nothing is heard of it for so long, [s].
 SILENCE = 2.0
@@ -16,8 +16,8 @@ SILENCE = 2.0
 _BEATS, _LENGTH = struct.Struct("<Q"), struct.Struct("<H")
 _LONGEST_TEXT = 400
 _STOP, _HOLD, _PERCENT, _BEAT, _TROUBLE = 0, 1, 2, 8, 16
-_NEAR = _TROUBLE + _LENGTH.size + _LONGEST_TEXT
-_SIZE = _NEAR + _LENGTH.size + _LONGEST_TEXT
+_REASON = _TROUBLE + _LENGTH.size + _LONGEST_TEXT
+_SIZE = _REASON + _LENGTH.size + _LONGEST_TEXT
 
 
 class SharedBoard:
@@ -29,10 +29,11 @@ class SharedBoard:
         self.memory.view[_PERCENT] = 100
         self._beats = 0
 
-    def ask_stop(self, too_near: str = "") -> None:
+    def ask_stop(self, for_what: StopReason | None = None) -> None:
         """See `WishBoard`."""
-        if not self.memory.view[_STOP]:
-            _write(self.memory, _NEAR, too_near)  # before the stop: whoever reads that knows why
+        if for_what is not None and not self.memory.view[_STOP]:
+            # Before the stop: whoever reads that knows why.
+            _write(self.memory, _REASON, f"{for_what.code} {for_what.text}")
         self.memory.view[_STOP] = 1
 
     def ask_hold(self, hold: bool) -> None:
@@ -95,8 +96,9 @@ class Supervised:
 def _read(memory: SharedMemory) -> Wishes:
     view = memory.view
     stop, hold = bool(view[_STOP]), bool(view[_HOLD])
-    near = _text(memory, _NEAR) if stop else ""
-    return Wishes(stop, hold, view[_PERCENT] / 100.0, too_near=near)
+    code, _, text = (_text(memory, _REASON) if stop else "").partition(" ")
+    for_what = StopReason(code, text) if code else None
+    return Wishes(stop, hold, view[_PERCENT] / 100.0, for_what=for_what)
 
 
 def _write(memory: SharedMemory, place: int, text: str) -> None:

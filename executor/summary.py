@@ -86,6 +86,7 @@ def summarize(
         poses,
         clearance,
         context.cameras,
+        too_near=any(event.code == "clearance_low" for event in context.events),
     )
     return {
         "schema_version": 1,

@@ -72,6 +72,8 @@ def judge(
     poses: PoseTable,
     clearance: ClearanceTable,
     cameras: Sequence[CameraRecord] = (),
+    *,
+    too_near: bool = False,
 ) -> Verdict:
     """The verdict over a run.
 
@@ -85,12 +87,13 @@ def judge(
         poses: What the cameras saw together.
         clearance: How near it came.
         cameras: What became of each camera's pictures.
+        too_near: It was stopped for what the cameras measured, and not by the operator.
     """
     measured = [
         following(cycles, rig.motion.following_error),
         replies(cycles, simulated),
         *tensions(cycles, rig),
-        *distances(clearance, scene.obstacle_clearance),
+        *distances(clearance, scene.obstacle_clearance, cameras),
         *camera(poses, cameras),
     ]
     failures = [check for check in measured if not check.passed]
@@ -105,7 +108,7 @@ def judge(
         return Verdict(PASSED, sentence, (end, *measured))
     told = cause.rstrip(".") or f"the final state is {final_state!r}"
     end = Check("finished", False, f"The run ended {at}, before the goal: {told}.")
-    if final_state == "stopped" and not failures:
+    if final_state == "stopped" and not failures and not too_near:
         return Verdict(STOPPED, "The run was stopped before the goal.", (end, *measured))
     word = "was stopped" if final_state == "stopped" else "ended with a fault"
     return Verdict(FAILED, f"The run {word} before the goal.", (end, *measured))
@@ -179,13 +182,15 @@ def _where(
     return int(row), int(column) + 1
 
 
-def distances(clearance: ClearanceTable, required: float) -> list[Check]:
+def distances(
+    clearance: ClearanceTable, required: float, cameras: Sequence[CameraRecord] = ()
+) -> list[Check]:
     """Nowhere nearer than the scene allows, and nowhere nearer than planned by the camera.
 
     A distance is too small only when it is so by more than its own uncertainty.
     """
     checks = []
-    for source, teller in (("tag", "the camera"), ("encoder", "the drives")):
+    for source, teller in (("tag", _who(cameras)), ("encoder", "the drives")):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
             checks.append(_against_required(rows, required, teller))
@@ -240,8 +245,8 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
     error = poses.error[poses.ok] * 1e3
     rms = float(np.sqrt(np.mean(error**2)))
     text = (
-        f"{_who(cameras)} measured {seen} of {len(poses)} pictures, {rms:.2f} mm RMS from the plan"
-        f" (largest {error.max():.2f} mm)."
+        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} pictures,"
+        f" {rms:.2f} mm RMS from the plan (largest {error.max():.2f} mm)."
     )
     if len(cameras) > 1:
         text += f" Alone: {', '.join(map(_of_one, cameras))}."
@@ -249,7 +254,7 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
 
 
 def _who(cameras: Sequence[CameraRecord]) -> str:
-    return f"{len(cameras)} cameras together" if len(cameras) > 1 else "The camera"
+    return f"{len(cameras)} cameras together" if len(cameras) > 1 else "the camera"
 
 
 def _of_one(record: CameraRecord) -> str:

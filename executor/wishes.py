@@ -7,13 +7,26 @@ from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
+class StopReason:
+    """Why a run is to end that nobody stopped.
+
+    Attributes:
+        code: Of the event that tells it.
+        text: A clause, with numbers.
+    """
+
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Wishes:
     """All of it at one moment; each stays until it is changed.
 
     Attributes:
         stop: End the run along the path.
-        too_near: The stop is wished because the camera saw this: what was too near to what, with
-            numbers; else nothing.
+        for_what: The stop is wished for this, which the cameras saw, and with which code; None when
+            the operator wishes it.
         hold: Come to rest on the path and wait there.
         speed: Share of the planned speed along the path, from 0.01 to 1.
         lost: Why nobody supervises the run any more; nothing while somebody does.
@@ -23,7 +36,7 @@ class Wishes:
     hold: bool = False
     speed: float = 1.0
     lost: str = ""
-    too_near: str = ""
+    for_what: StopReason | None = None
 
 
 #: Slowest and fastest feed that may be asked for, [% of the planned speed].
@@ -33,11 +46,11 @@ SLOWEST, FASTEST = 1, 100
 class WishBoard(Protocol):
     """Where wishes are put up. A stop cannot be taken back."""
 
-    def ask_stop(self, too_near: str = "") -> None:
+    def ask_stop(self, for_what: StopReason | None = None) -> None:
         """The run is to end along the path.
 
         Args:
-            too_near: What the camera saw too near to what, with numbers, if it is for that.
+            for_what: What the cameras saw; None when the operator wishes it.
         """
 
     def ask_hold(self, hold: bool) -> None:
@@ -57,12 +70,12 @@ class OwnBoard:
         """Nothing is wished yet."""
         # One attribute each: a signal that interrupts one wish cannot undo another.
         self._stop, self._hold, self._speed = False, False, 1.0
-        self._too_near = ""
+        self._for_what: StopReason | None = None
 
-    def ask_stop(self, too_near: str = "") -> None:
+    def ask_stop(self, for_what: StopReason | None = None) -> None:
         """See `WishBoard`."""
         if not self._stop:
-            self._too_near = too_near
+            self._for_what = for_what
         self._stop = True
 
     def ask_hold(self, hold: bool) -> None:
@@ -75,4 +88,4 @@ class OwnBoard:
 
     def read(self) -> Wishes:
         """See `WishBoard`."""
-        return Wishes(self._stop, self._hold, self._speed, too_near=self._too_near)
+        return Wishes(self._stop, self._hold, self._speed, for_what=self._for_what)

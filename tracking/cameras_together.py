@@ -35,8 +35,11 @@ class CommonPose:
         """Nothing was seen yet.
 
         Args:
-            within: Pictures taken farther apart in time than this are not taken together, [s].
+            within: A picture that was taken farther than this from the median time of a moment's
+                pictures is not taken together with the others, [s].
         """
+        self.apart = 0
+        """In how many moments a pose was left out for that."""
         self._within = within
         self._before: dict[str, PoseMeasurement] = {}
 
@@ -46,17 +49,24 @@ class CommonPose:
         Args:
             seen: What each camera measured, by its name, in the order of the cameras; not empty.
         """
-        first = next(iter(seen.values())).time
-        near = {name: one for name, one in seen.items() if abs(one.time - first) <= self._within}
+        poses = {name: one for name, one in seen.items() if isinstance(one, PoseMeasurement)}
+        if not poses:
+            return together(seen)
+        near = self._near(poses)
         newest = max(one.time for one in near.values())
-        at_newest: dict[str, Observation] = {
-            name: carried_on(one, self._before.get(name), newest)
-            if isinstance(one, PoseMeasurement)
-            else one
-            for name, one in near.items()
+        at_newest = {
+            name: carried_on(one, self._before.get(name), newest) for name, one in near.items()
         }
-        self._before |= {n: one for n, one in seen.items() if isinstance(one, PoseMeasurement)}
+        self._before |= poses
+        self.apart += len(near) < len(poses)
         return together(at_newest)
+
+    def _near(self, poses: Mapping[str, PoseMeasurement]) -> Mapping[str, PoseMeasurement]:
+        """Those taken about the median time; the newest where none was: no camera comes first."""
+        middle = float(np.median([one.time for one in poses.values()]))
+        near = {n: one for n, one in poses.items() if abs(one.time - middle) <= self._within}
+        newest = max(poses, key=lambda name: poses[name].time)
+        return near or {newest: poses[newest]}
 
 
 def together(seen: Mapping[str, Observation]) -> Observation:

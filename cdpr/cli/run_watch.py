@@ -49,19 +49,22 @@ class RunWatch:
     def trigger(
         self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
     ) -> None:
-        """A picture is due; arguments and errors as for `RunCameras.trigger`."""
+        """A picture is due; arguments as for `RunCameras.trigger`."""
         self._cameras.trigger(time, asked, true_pose, by_drives)
+        self._tell_news(asked)
         each = self._cameras.as_dict()
         self._status.take_cameras(each)
         self.rates = "; ".join(
             f"{c['name']} {rates(c['pictures_per_second'], c['measuring_ms'], len(c['tags']))}"
             for c in each
         )
-        near = self._cameras.near
-        if near and self._clearance_stop and not self._board.read().stop:
-            self._board.ask_stop(too_near=near)
-            err.print(f"[red]too near[/] {escape(near)}", soft_wrap=True)
-        self._tell_news(asked)
+        near, all_failed = self._cameras.near, self._cameras.all_failed
+        if near and self._clearance_stop:
+            who = "the cameras" if len(each) > 1 else "the camera"
+            less = f"{who} measured less clearance than the scene asks for: {near}"
+            self._stop("too near", near, "clearance_low", less)
+        if all_failed:
+            self._stop("stopping", all_failed, "camera", all_failed)
 
     def finish(self, at: float, quiet: bool) -> Seen:
         """Waits for the last pictures.
@@ -79,6 +82,15 @@ class RunWatch:
                 text = f"camera {camera.name}: {what}, the one before was not done"
                 self._tell("pictures_dropped", text, at)
         return seen
+
+    def _stop(self, label: str, told: str, code: str, why: str) -> None:
+        """Asks for a stop, unless one is under way."""
+        from executor.wishes import StopReason
+
+        if self._board.read().stop:
+            return
+        self._board.ask_stop(StopReason(code, why))
+        err.print(f"[red]{label}[/] {escape(told)}", soft_wrap=True)
 
     def _tell_news(self, at: float) -> None:
         for news in self._cameras.news():

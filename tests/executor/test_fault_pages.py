@@ -20,6 +20,8 @@ PLACES = {
     "Finding": 1,
     "LoopEvent": 2,
     "RunEvent": 1,
+    "StopReason": 0,
+    "_stop": 2,
     "_fault": 0,
     "_tell": 0,
     "_tell_cause": 0,

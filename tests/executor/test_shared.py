@@ -21,7 +21,7 @@ from executor.ring import Ring
 from executor.shared_board import SILENCE, SharedBoard, Supervised
 from executor.shared_memory import SharedMemory
 from executor.wire import RecordWire, pack_event, unpack_event
-from executor.wishes import Wishes
+from executor.wishes import StopReason, Wishes
 
 SLOTS, CONTENT = 8, 40
 
@@ -183,19 +183,21 @@ def test_wishes_reach_the_other_side_and_stay(board, clock):
 
 
 @pytest.mark.parametrize("text", ["platform to post: 6.0 ± 1.0 mm", "ü" * 1000])
-def test_what_was_too_near_reaches_the_other_side(board, clock, text):
+def test_what_a_stop_is_for_reaches_the_other_side(board, clock, text):
     other = Supervised(board.memory, os.getppid())
-    board.ask_stop(too_near=text)
+    board.ask_stop(StopReason("clearance_low", text))
     board.ask_stop()
-    near = other.read().too_near
-    assert near == board.read().too_near
-    assert near
-    assert text.startswith(near.rstrip("�"))
+    reason = other.read().for_what
+    assert reason == board.read().for_what
+    assert reason is not None
+    assert reason.code == "clearance_low"
+    assert reason.text
+    assert text.startswith(reason.text.rstrip("�"))
 
 
-def test_a_stop_that_was_wished_before_was_not_for_being_too_near(board, clock):
+def test_a_stop_that_was_wished_before_was_for_nothing_else(board, clock):
     board.ask_stop()
-    board.ask_stop(too_near="platform to post")
+    board.ask_stop(StopReason("camera", "all cameras failed"))
     assert board.read() == Wishes(stop=True)
 
 

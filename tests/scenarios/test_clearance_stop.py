@@ -23,6 +23,7 @@ from executor.near_watch import NearWatch
 from executor.observer import Observer, Trigger
 from executor.prepare import PreparedRun
 from executor.run_folder import RunFolder
+from executor.wishes import StopReason
 from simulation.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, straight_plan
 from tests.cli.program import call
@@ -33,7 +34,7 @@ from tracking.measurement import PoseMeasurement
 #: The platform truly stands so far towards the block, [m].
 OFF = np.array([-0.005, 0.0, 0.0])
 #: What a camera may have seen.
-NEAR = "platform to block: 6.0 ± 1.0 mm; the scene asks for 10 mm"
+NEAR = "less clearance than the scene asks for: platform to block: 6.0 ± 1.0 mm"
 
 
 @pytest.fixture(scope="module")
@@ -131,15 +132,18 @@ def test_to_leave_out_a_stop_that_no_camera_could_make_is_refused(
     assert not run.exists()
 
 
-def test_the_loop_tells_who_wanted_the_stop(prepared: PreparedRun, tmp_path: Path) -> None:
-    with staged(
-        prepared, tmp_path / "run", at(150, lambda s: s.board.ask_stop(too_near=NEAR))
-    ) as stage:
+@pytest.mark.parametrize("code", ["clearance_low", "camera"])
+def test_the_loop_tells_what_the_stop_was_for(
+    prepared: PreparedRun, tmp_path: Path, code: str
+) -> None:
+    reason = StopReason(code, NEAR)
+    script = at(150, lambda s: s.board.ask_stop(reason))
+    with staged(prepared, tmp_path / "run", script) as stage:
         outcome = stage.run()
     assert outcome.state is State.STOPPED
-    assert f"less clearance than the scene asks for: {NEAR}; slowing down" in outcome.cause
+    assert outcome.cause.startswith(f"{NEAR}; slowing down")
     events = {event.code: event.text for event in stage.events()}
-    assert events["clearance_low"] == outcome.cause
+    assert events[code] == outcome.cause
     assert "stop" not in events
 
 

@@ -345,7 +345,12 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
     summary = folder.summary()
     assert summary["verdict"] == "FAILED"
     assert any("camera front ended" in reason for reason in summary["reasons"])
-    assert summary["final_state"] == ("latched" if cycle == CRUISING else "finished")
+    assert summary["final_state"] == ("stopped" if cycle == CRUISING else "finished")
+    codes = [event["code"] for event in summary["events"]]
+    assert codes.count("camera") == (2 if cycle == CRUISING else 1), "told, then stopped for it"
+    assert not {"recorder", "supervisor_lost"} & set(codes)
+    if cycle == CRUISING:
+        assert any("all cameras failed: front: the process" in r for r in summary["reasons"])
     assert folder.report.is_file()
 
 

@@ -132,8 +132,35 @@ def test_what_carrying_on_costs_is_in_the_covariance() -> None:
 
 def test_pictures_too_far_apart_in_time_are_not_taken_together() -> None:
     front = measured([0.0, 0.0, 0.4], [1e-4] * 3)
-    side = replace(measured([0.02, 0.0, 0.4], [1e-4] * 3), time=0.06)
-    assert CommonPose(0.05).of({"front": front, "side": side}) is front
+    side = replace(measured([0.02, 0.0, 0.4], [1e-4] * 3), time=0.11)
+    common = CommonPose(0.05)
+    assert common.of({"front": front, "side": side}) is side
+    assert common.of({"side": side, "front": front}) is side
+    assert common.apart == 2
+
+
+@pytest.mark.parametrize("first", ["late", "a"])
+def test_the_camera_that_is_named_first_does_not_decide_which_pictures_count(first: str) -> None:
+    good = [measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([1e-4, 0.0, 0.4], [1e-4] * 3)]
+    late = replace(measured([0.02, 0.0, 0.4], [1e-4] * 3), time=0.09)
+    seen = {"late": late, "a": good[0], "b": good[1]}
+    common = CommonPose(0.05)
+    found = common.of({first: seen[first], **seen})
+    assert isinstance(found, PoseMeasurement)
+    assert found.pose.distance_to(Pose.level([5e-5, 0.0, 0.4])) < 1e-9
+    assert common.apart == 1
+
+
+@pytest.mark.parametrize("late", [0.0, 0.07, 0.099])
+def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) -> None:
+    """Asked every 0.1 s, each answers with a picture of its own time: up to a period apart."""
+    front = measured([0.0, 0.0, 0.4], [1e-4] * 3)
+    side = replace(front, time=late)
+    common = CommonPose(0.05)
+    found = common.of({"front": front, "side": side, "dark": NoPose(5.0, "dark")})
+    assert isinstance(found, PoseMeasurement)
+    assert found.position_deviation == pytest.approx(np.full(3, 1e-4 / np.sqrt(2)))
+    assert common.apart == 0
 
 
 def test_one_that_sees_nothing_leaves_it_to_the_others() -> None:

@@ -1,0 +1,56 @@
+"""What the cameras of a run tell while it goes on, and what the run is stopped for."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from cdpr.cli.run_watch import RunWatch
+from executor.camera_eye import CameraEye
+from executor.run_cameras import RunCameras
+from executor.wishes import OwnBoard, StopReason
+from tests.executor.test_run_cameras import MODEL, RATE, Scripted
+
+
+def watched(
+    moments: int, limit: float, *cameras: Any, clearance_stop: bool = True
+) -> tuple[OwnBoard, list[tuple[str, str]]]:
+    """The board after so many moments, and what was told."""
+    board, told = OwnBoard(), list[tuple[str, str]]()
+    status: Any = SimpleNamespace(take_cameras=lambda _cameras: None)
+    watch = RunWatch(
+        RunCameras([CameraEye(camera, "here") for camera in cameras], MODEL, limit, RATE),
+        status,
+        board,
+        lambda code, text, _at: told.append((code, text)),
+        clearance_stop=clearance_stop,
+    )
+    for k in range(moments):
+        watch.trigger(k / RATE, k / RATE, None, None)
+    return board, told
+
+
+def test_when_the_last_camera_fails_that_is_told_and_the_run_is_stopped_for_it() -> None:
+    board, told = watched(5, 0.0, Scripted("front", [0, -2]))
+    why = "the process of camera front ended without an answer"
+    assert told == [("camera", f"camera front failed ({why}); clearance is not measured")]
+    assert board.read().for_what == StopReason("camera", f"all cameras failed: front: {why}")
+
+
+def test_while_one_camera_is_left_nothing_is_stopped() -> None:
+    board, told = watched(5, 0.0, Scripted("front", [0, -2]), Scripted("side", [0]))
+    assert [code for code, _ in told] == ["camera"]
+    assert not board.read().stop
+
+
+@pytest.mark.parametrize(("names", "who"), [(["a"], "the camera"), (["a", "b"], "the cameras")])
+def test_too_little_clearance_stops_the_run(names: list[str], who: str) -> None:
+    board, _ = watched(4, 10.0, *(Scripted(name, [0]) for name in names))
+    reason = board.read().for_what
+    assert reason is not None
+    assert reason.code == "clearance_low"
+    assert reason.text.startswith(f"{who} measured less clearance than the scene asks for: ")
+    board, _ = watched(4, 10.0, *(Scripted(name, [0]) for name in names), clearance_stop=False)
+    assert not board.read().stop
