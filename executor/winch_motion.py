@@ -73,7 +73,7 @@ def require_held(rig: Rig, stand: WinchesStand, told: CycleStatus) -> None:
         what,
         where="winches",
         why="a drive let go, slipped or was moved by hand; counts and pose do not belong together",
-        next_step="look at the platform and the drives, then begin anew",
+        next_step="look at the platform and the drives, then `cdpr reset RIG`",
     )
 
 
@@ -92,6 +92,11 @@ class _LastCycles:
 
     def take_event(self, event: LoopEvent) -> None:
         self._records.take_event(event)
+
+    def tell(self, code: str, text: str) -> None:
+        """Records an event that happened after the last cycle."""
+        cycle, at = (self.cycles[-1].cycle, self.cycles[-1].at) if self.cycles else (0, 0.0)
+        self._records.take_event(LoopEvent(cycle, at, code, text))
 
 
 def move_winches(
@@ -122,7 +127,7 @@ def move_winches(
             enabled.
         HardwareMissing: A drive does not answer.
         StoppedByOperator: The operator wanted to stop before anything moved.
-        Fault: The drives did not hold after the motion.
+        CdprError: The drives did not hold after the motion, or did not tell; it is latched.
     """
     custody.require_free()
     last = _LastCycles(records)
@@ -130,20 +135,25 @@ def move_winches(
     if armed.denied:
         last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
     custody.begin(record, custody.still_counts(armed.stands_at), anew=anew)
-    ended = _CUT_SHORT
+    ended, told = _CUT_SHORT, None
     try:
         ended = mover.run()
         stand = _stand(rig, armed.stands_at, ended, last.cycles)
         if stand.state is State.FINISHED:
             reference = at_rest(stand, ended.true_pose)
-            require_held(rig, stand, mover.stands_now())
+            try:
+                told = mover.stands_now()
+                require_held(rig, stand, told)
+            except CdprError as error:
+                ended = _not_held(ended, told, error.what)
+                last.tell("not_held", error.what)
+                raise
             if reference is not None:
                 custody.take(reference)
     finally:
-        not_kept = _kept(custody, ended, record, last.cycles)
+        not_kept = _kept(custody, ended, record, _stands_at(last.cycles, told))
     if not_kept:
-        cycle, at = (last.cycles[-1].cycle, last.cycles[-1].at) if last.cycles else (0, 0.0)
-        last.take_event(LoopEvent(cycle, at, "recorder", not_kept))
+        last.tell("recorder", not_kept)
         stand = replace(stand, state=State.LATCHED, cause=stand.cause or not_kept)
     return stand
 
@@ -159,9 +169,22 @@ def _stand(
     return WinchesStand(ended.state, ended.cause, before, counts.mean(axis=0), tensions)
 
 
-def _kept(custody: Custody, ended: Ended, record: Path, last: Sequence[CycleRecord]) -> str:
+def _not_held(ended: Ended, told: CycleStatus | None, cause: str) -> Ended:
+    """A motion that came to its end, with what was found wrong with the drives afterwards."""
+    # Drives that tell nothing held when they were last heard.
+    holding = ended.holding if told is None else told.holding
+    return replace(ended, state=State.LATCHED, cause=cause, holding=holding)
+
+
+def _stands_at(last: Sequence[CycleRecord], told: CycleStatus | None) -> Sequence[int] | None:
+    """Where the drives stood when they were last heard, [counts]; None when nobody heard them."""
+    if told is not None:
+        return [int(position) for position in told.positions]
+    return last[-1].actual if last else None
+
+
+def _kept(custody: Custody, ended: Ended, record: Path, stands_at: Sequence[int] | None) -> str:
     """Keeps how it ended; why it could not, if so: the motion is over, and is told all the same."""
-    stands_at = last[-1].actual if last else None
     try:
         custody.end(ended.state, ended.cause, record, holding=ended.holding, stands_at=stands_at)
     except CdprError as error:

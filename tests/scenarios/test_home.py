@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cdpr.cli.jog_way import straight_way
-from cdpr.errors import Fault, Refused, StoppedByOperator
+from cdpr.errors import CdprError, Fault, Refused, StoppedByOperator
 from cdpr.plan import plan_from_document
 from cdpr.poses import Array, Pose
 from cdpr.rig import Rig, load_rig, rig_from_document
@@ -82,6 +82,7 @@ class Place:
     script: Callable[[Place, int], None] = lambda _place, _cycle: None
     at_rest: Callable[[WinchesStand], ReferenceDocument | None] = lambda _stand: None
     custody: Custody | None = None
+    anew: bool = True
     board: OwnBoard = field(default_factory=OwnBoard)
     records: list[CycleRecord] = field(default_factory=list)
     events: list[LoopEvent] = field(default_factory=list)
@@ -105,7 +106,7 @@ class Place:
             self.custody or Custody(self.rig),
             Told(on_cycle, self.events.append),
             record=Path("nowhere"),
-            anew=True,
+            anew=self.anew,
             at_rest=lambda stand, _true_pose: self.at_rest(stand),
         )
 
@@ -472,6 +473,53 @@ def test_what_happens_while_the_camera_looks_is_noticed(
             return
         with pytest.raises(Fault, match=told):
             require_held(place.rig, stand, place.group.read_positions())
+
+
+def no_more_heard(place: Place) -> None:
+    place.rehearsal.drives[5].silent = True
+
+
+@pytest.mark.parametrize("anew", [True, False])
+@pytest.mark.parametrize(
+    ("happens", "told", "counts"),
+    [
+        (moved_by_hand, "moved by 0.20 mm", True),
+        (loses_all_torque, "not all drives hold", False),
+        (no_more_heard, "no position from drive 6", True),
+    ],
+)
+def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
+    anew: bool, happens: Callable[[Place], None], told: str, counts: bool
+) -> None:
+    """The reference of before counts only where every cable was held, and none is made."""
+    rig = load_rig(RIG)
+    bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can7"})
+    kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
+    custody = Custody(kept)
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+        tensions = np.full(rig.cable_count, TARGET)
+        begin = np.array(place.counts)
+        custody.take(reference_at(kept, kept.home, begin, tensions, "stated pose", 0.0))
+
+        def at_rest(stand: WinchesStand) -> ReferenceDocument:
+            happens(place)
+            return reference_at(kept, kept.home, stand.counts, tensions, "new", 0.0)
+
+        place.custody, place.at_rest, place.anew = custody, at_rest, anew
+        with pytest.raises(CdprError, match=told):
+            place.take_up()
+        assert place.events[-1].code == "not_held"
+        assert told in place.events[-1].text
+        moved = [drive.motor.position for drive in place.rehearsal.drives]
+    with pytest.raises(Refused, match=told):
+        custody.require_free()
+    reference = custody.kept_reference()
+    assert reference is not None
+    assert reference.how == "stated pose"
+    assert bool(reference.lost) is (anew or not counts)
+    if not reference.lost:
+        assert reference.stands_at == pytest.approx(moved, abs=1.0)
+        assert reference.stands_at != list(begin)
 
 
 def test_a_stop_before_anything_is_enabled_leaves_all_as_it_was() -> None:
