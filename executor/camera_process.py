@@ -15,9 +15,6 @@ from cdpr.errors import CdprError, Fault
 from executor.observer import Look, MakeObserver, Trigger
 from executor.spawning import interrupts_blocked
 
-#: How long the process may take to import its libraries, to compile what finds tags' edges (once on
-#: a machine) and to open its camera, [s].
-START_TIMEOUT = 180.0
 #: In simulated time, and at the end of a run, an answer is waited for no longer than this, [s].
 PATIENCE = 20.0
 #: How long a process may take to end, [s].
@@ -40,7 +37,7 @@ class CameraProcess:
     """Takes pictures with one camera when told to, and measures the platform in them."""
 
     def __init__(self, name: str, make_observer: MakeObserver, *, may_wait: bool) -> None:
-        """Starts the process; `require_ready` waits until its camera is.
+        """Starts the process; `is_ready` tells when its camera is.
 
         Args:
             name: Of the camera.
@@ -61,17 +58,19 @@ class CameraProcess:
             self._process.start()
         far_end.close()
 
-    def require_ready(self) -> None:
-        """Waits until the camera is open.
+    def is_ready(self, within: float) -> bool:
+        """Whether the camera is open; asked until it is, and then no more.
+
+        Args:
+            within: How long it is waited for, [s].
 
         Raises:
             CdprError: It cannot be used, for the reason told.
         """
-        if not self._link.poll(START_TIMEOUT):
-            raise Fault(
-                f"the process of camera {self.name} was not ready within {START_TIMEOUT:.0f} s"
-            )
+        if not self._link.poll(within):
+            return False
         self._receive()
+        return True
 
     @property
     def unanswered(self) -> Trigger | None:
@@ -101,11 +100,26 @@ class CameraProcess:
         Raises:
             CdprError: The process failed, for the reason told.
         """
-        return self._answer_within(PATIENCE if self._waits else 0.0)
+        return self.answer_within(PATIENCE if self._waits else 0.0)
 
     def last_answer(self) -> Look | None:
         """As `answer`, at the end of the run: it is waited for in real time too."""
-        return self._answer_within(PATIENCE)
+        return self.answer_within(PATIENCE)
+
+    def answer_within(self, patience: float) -> Look | None:
+        """The answer to what was asked, if it comes within so long, [s].
+
+        Raises:
+            CdprError: The process failed, for the reason told.
+        """
+        if not self._link.poll(patience if self._asked is not None else 0.0):
+            self._waits = self._waits and self._asked is None
+            return None
+        look = self._receive()
+        if not isinstance(look, Look):
+            raise TypeError(f"camera {self.name} answered {look!r}")
+        self._asked, self._waits = None, self._may_wait
+        return look
 
     def close(self) -> None:
         """Ends the process, whatever it does; further calls change nothing."""
@@ -121,16 +135,6 @@ class CameraProcess:
             self._process.kill()
             self._process.join()
         self._process.close()
-
-    def _answer_within(self, patience: float) -> Look | None:
-        if not self._link.poll(patience if self._asked is not None else 0.0):
-            self._waits = self._waits and self._asked is None
-            return None
-        look = self._receive()
-        if not isinstance(look, Look):
-            raise TypeError(f"camera {self.name} answered {look!r}")
-        self._asked, self._waits = None, self._may_wait
-        return look
 
     def _receive(self) -> Look | _Ready:
         try:

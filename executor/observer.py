@@ -83,7 +83,7 @@ class Observer:
         rig: Rig,
         camera: Camera,
         source: PictureSource,
-        folder: RunFolder,
+        folder: RunFolder | None,
         keep_every: int,
         *,
         named: bool,
@@ -94,7 +94,7 @@ class Observer:
             rig: The robot with its tags.
             camera: The camera that the source is.
             source: Where pictures come from.
-            folder: Where some of them are kept.
+            folder: Where some of them are kept; None to keep none.
             keep_every: Every how many pictures one is kept.
             named: Kept pictures are in a folder of the camera's name: there are others.
         """
@@ -117,7 +117,7 @@ class Observer:
         """Takes a picture and measures the platform in it."""
         image, delay = self._source.picture(trigger)
         kept = ""
-        if trigger.frame % self._keep_every == 0:
+        if self._folder is not None and trigger.frame % self._keep_every == 0:
             kept = self._folder.write_picture(trigger.frame, image, self._name)
         taken = trigger.time + delay
         by_drives = self._drives.at(taken, trigger.time, trigger.by_drives)

@@ -7,16 +7,15 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from cdpr.cli.camera_choice import SYNTHETIC, named_camera
-from cdpr.errors import Fault
+from cdpr.errors import Fault, StoppedByOperator
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
 
-    from cdpr.poses import Pose
     from cdpr.rig import Camera, Rig
     from cdpr.rig_file import RigDocument
     from cdpr.scene import Scene
@@ -24,8 +23,8 @@ if TYPE_CHECKING:
     from drivers.cameras import LiveCamera
     from executor.observer import Observer, PictureSource, Trigger
     from executor.run_cameras import RunCameras
+    from executor.wishes import WishBoard
     from simulation.motion import Film
-    from tracking.measurement import Observation
 
 #: About so many pictures of a run are kept for its report.
 KEPT_PICTURES = 12
@@ -38,7 +37,10 @@ def open_cameras(
     eyes: Mapping[Camera, str],
     folder: Path,
     pictures: int,
+    board: WishBoard,
+    *,
     simulated_time: bool,
+    quiet: bool,
 ) -> Iterator[RunCameras | None]:
     """Starts a process for each camera; None without one.
 
@@ -48,14 +50,22 @@ def open_cameras(
         eyes: From `choose_cameras`.
         folder: The run folder.
         pictures: How many are expected of each; some of them are kept.
+        board: A stop that is wished here ends the opening.
         simulated_time: A late picture holds the run up instead of being dropped.
+        quiet: Nothing shows that it waits.
+
+    Raises:
+        StoppedByOperator: A stop was wished before all were open.
+        CdprError: A camera cannot be used, for the reason told.
     """
     if not eyes:
         yield None
         return
     from cdpr.clearance import ClearanceModel
+    from cdpr.cli.output import spinner
     from executor.camera_eye import CameraEye
     from executor.camera_process import CameraProcess
+    from executor.camera_start import wait_until_ready
     from executor.run_cameras import RunCameras
 
     keep_every = max(1, pictures // KEPT_PICTURES)
@@ -67,8 +77,9 @@ def open_cameras(
             process = CameraProcess(camera.name, make, may_wait=simulated_time)
             stack.callback(process.close)
             processes[camera] = process
-        for process in processes.values():
-            process.require_ready()
+        names = ", ".join(camera.name for camera in eyes)
+        with spinner(f"opening camera {names}", not quiet):
+            wait_until_ready(list(processes.values()), partial(require_no_stop, board))
         yield RunCameras(
             [CameraEye(process, eyes[camera]) for camera, process in processes.items()],
             ClearanceModel(rig, scene),
@@ -82,42 +93,16 @@ def asked_rate(eyes: Mapping[Camera, str]) -> float:
     return min(camera.rate for camera in eyes)
 
 
-def look_at_rest(
-    rig: Rig,
-    name: str,
-    pictures: int,
-    true_pose: Pose | None,
-    before_each: Callable[[], None],
-) -> list[Observation]:
-    """Pictures of a platform that stands still, each measured.
+def require_no_stop(board: WishBoard) -> None:
+    """The last look at the board before something is begun.
 
-    Args:
-        rig: The robot; its first camera is used.
-        name: From `choose_camera`.
-        pictures: How many.
-        true_pose: Where the simulated platform is.
-        before_each: Called before each picture; what it raises ends the looking.
+    Raises:
+        StoppedByOperator: A stop is wished.
     """
-    import time
-
-    from cdpr.cli.compiling import ready_to_measure
-    from cdpr.scene import nothing_in_the_way
-    from executor.observer import Trigger
-    from tracking.tracker import Tracker
-
-    ready_to_measure(shown=True)
-    camera = rig.cameras[0]
-    source, tracker = _source(rig, nothing_in_the_way(rig), camera, name), Tracker(rig, camera)
-    try:
-        looks = []
-        for frame in range(pictures):
-            before_each()
-            asked = time.monotonic()
-            image, _ = source.picture(Trigger(frame, frame / camera.rate, asked, true_pose))
-            looks.append(tracker.observe(image, frame / camera.rate))
-        return looks
-    finally:
-        source.close()
+    if board.read().stop:
+        raise StoppedByOperator(
+            "stopped before anything moved", next_step="run it again when all is well"
+        )
 
 
 def make_observer(
@@ -125,7 +110,7 @@ def make_observer(
     scene_document: SceneDocument,
     camera_name: str,
     source: str,
-    folder: Path,
+    folder: Path | None,
     keep_every: int,
     *,
     named: bool,
@@ -141,7 +126,8 @@ def make_observer(
     camera = named_camera(rig, camera_name)
     ready_to_measure(shown=False)
     pictures = _source(rig, scene, camera, source)
-    return Observer(rig, camera, pictures, RunFolder(folder), keep_every, named=named)
+    kept = None if folder is None else RunFolder(folder)
+    return Observer(rig, camera, pictures, kept, keep_every, named=named)
 
 
 def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:

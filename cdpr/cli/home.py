@@ -19,7 +19,7 @@ from cdpr.cli.motion_options import (
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
-    from cdpr.rig import Rig
+    from cdpr.rig import Camera, Rig
     from executor.custody import Custody
     from executor.reference import ReferenceDocument
     from executor.winch_motion import WinchesStand
@@ -41,8 +41,12 @@ def home(
         typer.Option("--pose-mm", help="a jig holds it level at x y z"),
     ] = None,
     camera: Annotated[
-        str | None,
-        typer.Option(help="it hangs free, and this camera measures it ('synthetic', or an index)"),
+        list[str] | None,
+        typer.Option(
+            help="it hangs free, and this camera measures it: 'synthetic', an index, or of another"
+            " camera than the rig file's first NAME=SOURCE",
+            metavar="SOURCE",
+        ),
     ] = None,
     calibration: CalibrationOption = None,
     as_rig_file: Annotated[
@@ -91,6 +95,7 @@ def home(
     from functools import partial
 
     from cdpr.cli.calibrations import calibrated_rig
+    from cdpr.cli.camera_choice import choose_one_camera, require_simulated_pictures
     from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.home_facts import show_reference, show_wish
     from cdpr.cli.named_bus import require_own_time, rig_on_bus
@@ -121,16 +126,20 @@ def home(
         )
         _go_by_the_rig_file(Custody(the_rig), yes or in_process, as_json)
         return
-    known = _known_pose(the_rig, at_home, pose_mm, camera, in_process, as_rig_file)
+    _require_one_way(at_home, pose_mm, camera, as_rig_file)
+    eye = choose_one_camera(the_rig, camera, in_process) if camera else None
+    if eye is not None:
+        require_simulated_pictures(eye[1:], fast)
+    known = _stated_pose(the_rig, pose_mm) if eye is None else None
     limit = limit_of(the_rig, limit_n)
     target = _target(the_rig, tension_n, limit)
     speed, reach = speed_of(the_rig, speed_mm_s), reach_mm / 1000.0
     custody = Custody(the_rig)
     custody.require_free()
-    if camera is not None:
-        _require_picture(the_rig, camera)
+    if eye is not None:
+        _require_picture(the_rig, eye, shown=not as_json)
     show_and_ask(
-        partial(show_wish, the_rig, target, limit, reach, speed, camera),
+        partial(show_wish, the_rig, target, limit, reach, speed, eye),
         "Wind the cables in now?",
         "nothing was moved",
         asks=not (in_process or yes),
@@ -139,13 +148,13 @@ def home(
     made: list[ReferenceDocument] = []
 
     def at_rest(stand: WinchesStand, true_pose: Pose | None, board: WishBoard) -> ReferenceDocument:
-        made.append(_referenced(the_rig, stand, true_pose, board, known, camera, pictures))
+        made.append(_referenced(the_rig, stand, true_pose, board, known, eye, pictures))
         return made[0]
 
     take_up = partial(TakeUp, target=target, limit=limit, reach=reach, speed=speed)
 
     lost = PowerLoss.drawn(
-        the_rig, 0, simulated_slack_mm / 1000.0, on_a_stand=camera is None
+        the_rig, 0, simulated_slack_mm / 1000.0, on_a_stand=eye is None
     ) if in_process else None  # fmt: skip
     motion = WinchMotion(
         the_rig, known or the_rig.home, limit, speed, take_up, lost, fast, without_real_time,
@@ -160,32 +169,23 @@ def home(
         show_reference(reference, where)
 
 
-def _require_picture(rig: Rig, camera: str) -> None:
+def _require_picture(rig: Rig, eye: tuple[Camera, str], shown: bool) -> None:
     """The camera is there and gives pictures, before anything is moved for it."""
-    from cdpr.cli.cameras import look_at_rest
+    from cdpr.cli.rest_camera import look_at_rest
 
-    look_at_rest(rig, camera, 1, rig.home, lambda: None)
+    look_at_rest(rig, eye, 1, rig.home, lambda: None, shown=shown)
 
 
-def _known_pose(
-    rig: Rig,
+def _require_one_way(
     at_home: bool,
     pose_mm: tuple[float, float, float] | None,
-    camera: str | None,
-    in_process: bool,
+    camera: list[str] | None,
     as_rig_file: bool,
-) -> Pose | None:
-    """The pose that is stated; None when the camera measures it.
-
-    Raises:
-        BadInput: It is not said how the pose is known, or in several ways.
-    """
-    from cdpr.cli.camera_choice import choose_camera
-    from cdpr.document_types import millimetres
+) -> None:
+    """Refuses when it is not said how the pose is known, or in several ways."""
     from cdpr.errors import BadInput
-    from cdpr.poses import Pose
 
-    if (at_home, pose_mm is not None, camera is not None).count(True) != 1 or as_rig_file:
+    if (at_home, pose_mm is not None, bool(camera)).count(True) != 1 or as_rig_file:
         raise BadInput(
             "say how the platform's pose is known: --at-home, --pose-mm or --camera alone",
             where="cdpr home",
@@ -193,9 +193,18 @@ def _known_pose(
             next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z; or let it"
             " hang in view of a calibrated camera and pass --camera INDEX",
         )
-    if camera is not None:
-        choose_camera(rig, camera, False, in_process)
-        return None
+
+
+def _stated_pose(rig: Rig, pose_mm: tuple[float, float, float] | None) -> Pose:
+    """The pose in which a jig holds the platform; the rig's home without a place.
+
+    Raises:
+        BadInput: It is outside the workspace.
+    """
+    from cdpr.document_types import millimetres
+    from cdpr.errors import BadInput
+    from cdpr.poses import Pose
+
     if pose_mm is None:
         return rig.home
     pose = Pose.level(millimetres(list(pose_mm)))
@@ -251,7 +260,7 @@ def _referenced(
     true_pose: Pose | None,
     board: WishBoard,
     known: Pose | None,
-    camera: str | None,
+    eye: tuple[Camera, str] | None,
     pictures: int,
 ) -> ReferenceDocument:
     """The reference at the pose where the platform is held now.
@@ -260,14 +269,14 @@ def _referenced(
         StoppedByOperator: The operator stopped it while the camera looked.
         Refused: The pose is not known well enough.
     """
-    from cdpr.cli.cameras import look_at_rest
+    from cdpr.cli.rest_camera import look_at_rest
     from cdpr.errors import StoppedByOperator
     from executor.reference import reference_at
     from executor.rest_pose import rest_pose
 
     if known is not None:
         return reference_at(rig, known, stand.counts, stand.tensions, "stated pose", 0.0)
-    assert camera is not None
+    assert eye is not None
 
     def unless_stopped() -> None:
         if board.read().stop:
@@ -276,7 +285,7 @@ def _referenced(
                 next_step="home again when all is well",
             )
 
-    looks = look_at_rest(rig, camera, pictures, true_pose, unless_stopped)
+    looks = look_at_rest(rig, eye, pictures, true_pose, unless_stopped, shown=False)
     found = rest_pose(rig, looks)
-    how = f"tags in {found.pictures} of {pictures} pictures, camera {rig.cameras[0].name!r}"
+    how = f"tags in {found.pictures} of {pictures} pictures, camera {eye[0].name!r}"
     return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cdpr.rig import Rig
+    from cdpr.rig import Camera, Rig
     from executor.reference import ReferenceDocument
 
 
@@ -17,7 +17,7 @@ def show_wish(
     limit: float,
     reach: float,
     speed: float,
-    camera: str | None,
+    eye: tuple[Camera, str] | None,
     on: Console,
 ) -> None:
     """What is going to happen; tensions in N, lengths in m."""
@@ -32,7 +32,12 @@ def show_wish(
             ("rig", rig.name),
             ("pretension", f"{target:g} N a cable, at most {limit:g} N"),
             ("winches", f"all together, at most {fastest:.2f} mm/s and {reach * 1000:g} mm each"),
-            ("pose", "stated, held by a jig" if camera is None else f"measured, camera {camera}"),
+            (
+                "pose",
+                "stated, held by a jig"
+                if eye is None
+                else f"measured, camera {eye[0].name} ({eye[1]})",
+            ),
             ("bus", f"{bus.interface} {bus.channel}".strip()),
         ],
         on,

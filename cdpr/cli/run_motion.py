@@ -100,6 +100,7 @@ def run_prepared(
 def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcome, Seen]:
     """The motion and its pictures; `cdpr stop` and its like reach the run all the time."""
     from contextlib import ExitStack
+    from functools import partial
 
     from cdpr.cli.cameras import asked_rate, open_cameras
     from cdpr.cli.output import err, progress_bar
@@ -119,13 +120,15 @@ def _move_and_look(job: _Job, before_motion: Callable[[], None]) -> tuple[Outcom
     pictures = int(prepared.duration * rate)
     board: OwnBoard | SharedBoard = OwnBoard() if job.fast else SharedBoard()
     status = RunStatus(prepared, job.folder.path, board, simulated_time=job.fast)
-    cameras_at = (prepared.rig, prepared.scene, job.eyes, job.folder.path)
+    opening = partial(
+        open_cameras, prepared.rig, prepared.scene, job.eyes, job.folder.path, pictures, board
+    )
     with (
         ExitStack() as stack,
         stop_requests(board),
         announced() as listeners,
         serving(listeners, board, status),
-        open_cameras(*cameras_at, pictures, job.fast) as cameras,
+        opening(simulated_time=job.fast, quiet=job.quiet) as cameras,
     ):
         if isinstance(board, SharedBoard):
             stack.callback(board.close)
@@ -163,14 +166,13 @@ def _move(
 
     if isinstance(board, SharedBoard):
         return _move_in_real_time(job, board, recorder, before_motion)
+    from cdpr.cli.cameras import require_no_stop
     from cdpr.cli.drives import open_drives
-    from cdpr.errors import StoppedByOperator
     from executor.clock import SimulatedClock
     from executor.execution import run_here
 
     def last_chance() -> None:
-        if board.read().stop:
-            raise StoppedByOperator("stopped before anything moved")
+        require_no_stop(board)
         before_motion()
 
     prepared = job.prepared

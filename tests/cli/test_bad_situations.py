@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -13,6 +16,8 @@ from pathlib import Path
 import pytest
 
 from drivers.cia402 import sdo
+from executor import camera_process
+from executor.camera_process import CameraProcess
 from simulation.rehearsal import Rehearsal
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import Answer, call, nothing_written, one_message
@@ -243,6 +248,26 @@ def test_a_real_bus_moves_only_after_a_yes(folder: Path, answers: str) -> None:
 
 def test_a_camera_that_is_not_there_is_told_before_anything_moves(folder: Path) -> None:
     refused(folder, 4, "camera front (77)", "/dev/video", rig=RIG, camera=77)
+
+
+def test_ctrl_c_is_heard_while_a_camera_that_hangs_is_opened(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its server takes the connection and says nothing more."""
+    is_ready, asked = CameraProcess.is_ready, []
+
+    def stop_at_first(process: CameraProcess, within: float) -> bool:
+        if not asked:
+            os.kill(os.getpid(), signal.SIGINT)
+        asked.append(process.name)
+        return is_ready(process, within)
+
+    monkeypatch.setattr(camera_process, "END_TIMEOUT", 0.1)
+    monkeypatch.setattr(CameraProcess, "is_ready", stop_at_first)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        source = f"http://127.0.0.1:{server.getsockname()[1]}/stream"
+        refused(folder, 130, "stopped before anything moved", rig=RIG, camera=source)
+    assert asked == ["front"]
 
 
 def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:

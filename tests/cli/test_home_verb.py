@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 from pathlib import Path
@@ -11,10 +12,11 @@ import pytest
 
 from cdpr.cli.named_bus import rig_on_bus
 from cdpr.errors import Refused
-from cdpr.poses import Pose
+from executor import camera_process
+from executor.camera_process import CameraProcess
 from executor.custody import Custody
+from executor.observer import Trigger
 from executor.reference import as_in_the_file
-from simulation.camera import SyntheticCamera
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
 
@@ -30,6 +32,10 @@ def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ((), 2, "how the platform's pose is known"),
         (("--at-home", "--camera", "synthetic"), 2, "how the platform's pose is known"),
+        (("--camera", "0"), 2, "--fast needs synthetic cameras"),
+        (("--camera", "run.avi"), 2, "'run.avi' is no camera"),
+        (("--camera", "side=0"), 2, "no camera 'side'"),
+        (("--camera", "front=0", "--camera", "front=1"), 2, "2 cameras are named, and one"),
         (("--at-home", "--pose-mm", "0", "0", "445"), 2, "how the platform's pose is known"),
         (("--at-home", "--as-rig-file"), 2, "how the platform's pose is known"),
         (("--as-rig-file", "--tension-n", "7"), 2, "no effect here: --tension-n"),
@@ -95,19 +101,28 @@ def test_a_camera_that_is_not_there_is_found_out_before_anything_moves(
     assert "none" in answer.err.replace("\n", "")
 
 
-def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    render, shown = SyntheticCamera.render, []
+@pytest.mark.parametrize("hangs", [False, True])
+def test_a_stop_while_the_camera_looks_ends_it(
+    monkeypatch: pytest.MonkeyPatch, hangs: bool
+) -> None:
+    """Ctrl-C is heard too when the camera does not answer any more."""
+    ask, asked = CameraProcess.ask, []
 
-    def looked_at(camera: SyntheticCamera, pose: Pose, frame: int, *moving: object) -> object:
-        shown.append(frame)
-        if shown == [0, 0, 1]:  # the first before anything moved
+    def stop_at_second(process: CameraProcess, trigger: Trigger) -> None:
+        asked.append(trigger.frame)
+        if asked == [0, 0, 1]:  # the first before anything moved
+            (camera,) = multiprocessing.active_children()
+            assert camera.pid is not None
+            if hangs:
+                os.kill(camera.pid, signal.SIGSTOP)
             os.kill(os.getpid(), signal.SIGINT)
-        return render(camera, pose, frame, *moving)
+        ask(process, trigger)
 
-    monkeypatch.setattr(SyntheticCamera, "render", looked_at)
+    monkeypatch.setattr(camera_process, "END_TIMEOUT", 0.1)
+    monkeypatch.setattr(CameraProcess, "ask", stop_at_second)
     answer = call("home", RIG, "--camera", "synthetic", "--pictures", "20", "--fast")
     assert answer.code == 130, answer
-    assert shown == [0, 0, 1]
+    assert asked == [0, 0, 1]
 
 
 def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:

@@ -23,6 +23,7 @@ from executor import camera_process
 from executor.camera_eye import CameraEye
 from executor.camera_process import CameraProcess
 from executor.camera_sight import BLIND_PICTURES
+from executor.camera_start import wait_until_ready
 from executor.observer import Look, Trigger
 from executor.run_cameras import RunCameras
 from tests.cli.plans import RIG, free_scene
@@ -238,8 +239,7 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
     make = {"front": quick, "side": silent if how == "silent" else quick}
     processes = [CameraProcess(name, make[name], may_wait=False) for name in make]  # type: ignore[arg-type]
     try:
-        for process in processes:
-            process.require_ready()
+        wait_until_ready(processes, lambda: None)
         eyes = [CameraEye(process, "here") for process in processes]
         run, told, now = RunCameras(eyes, MODEL, 0.01, RATE), [], 0.0
         while not told:

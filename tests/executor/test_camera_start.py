@@ -1,0 +1,69 @@
+"""Cameras open all at once, and a stop is heard while they do."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import pytest
+
+from cdpr.errors import Fault, HardwareMissing, StoppedByOperator
+from executor import camera_start
+from executor.camera_process import CameraProcess
+from executor.camera_start import HEARING, wait_until_ready
+
+
+class Opening:
+    """A camera that is open, or fails, when it was asked so often."""
+
+    def __init__(self, name: str, after: float, fails: bool = False) -> None:
+        self.name, self.asked = name, 0
+        self._after, self._fails = after, fails
+
+    def is_ready(self, within: float) -> bool:
+        assert within <= HEARING
+        self.asked += 1
+        if self.asked < self._after:
+            return False
+        if self._fails:
+            raise HardwareMissing("the camera cannot be opened", where=f"camera {self.name}")
+        return True
+
+
+def wait(*cameras: Opening, stop_after: float = float("inf")) -> None:
+    looks = 0
+
+    def unless_stopped() -> None:
+        nonlocal looks
+        looks += 1
+        if looks > stop_after:
+            raise StoppedByOperator("stopped before anything moved")
+
+    wait_until_ready([cast(CameraProcess, camera) for camera in cameras], unless_stopped)
+
+
+def test_each_is_asked_until_it_is_open() -> None:
+    slow, fast = Opening("slow", 5), Opening("fast", 2)
+    wait(slow, fast)
+    assert (slow.asked, fast.asked) == (5, 2)
+
+
+def test_one_that_fails_is_told_though_another_one_hangs() -> None:
+    hung, broken = Opening("hung", float("inf")), Opening("broken", 3, fails=True)
+    with pytest.raises(HardwareMissing, match="cannot be opened"):
+        wait(hung, broken)
+    assert hung.asked == 3
+
+
+def test_a_stop_is_heard_while_a_camera_hangs() -> None:
+    hung = Opening("hung", float("inf"))
+    with pytest.raises(StoppedByOperator):
+        wait(hung, stop_after=4)
+    assert hung.asked == 4
+
+
+def test_all_cameras_together_have_one_time_to_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera_start, "START_TIMEOUT", -1.0)
+    cameras = [Opening("front", float("inf")), Opening("open", 1), Opening("side", float("inf"))]
+    with pytest.raises(Fault, match="camera front, side did not open"):
+        wait(*cameras)
+    assert [camera.asked for camera in cameras] == [1, 1, 1]
