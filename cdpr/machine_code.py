@@ -27,6 +27,11 @@ class Task:
     kernels: tuple[Path, ...]
 
 
+def can_be_kept(task: Task) -> bool:
+    """Whether there is a folder in which a task's code outlives the process."""
+    return cache_folder(task.kernels[0]) is not None
+
+
 def is_compiled(task: Task) -> bool:
     """Whether a task was done before with the very files that lie here.
 

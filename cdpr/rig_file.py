@@ -290,8 +290,8 @@ class RigDocument(Document):
     def _simulation_fits(self) -> list[Finding]:
         if self.simulation is None:
             return []
-        names = [camera.name for camera in self.cameras]
-        return self.simulation.misfits(len(self.outlets_mm), self.pulleys is not None, names)
+        rates = {camera.name: camera.rate_hz for camera in self.cameras}
+        return self.simulation.misfits(len(self.outlets_mm), self.pulleys is not None, rates)
 
 
 def _repeated(

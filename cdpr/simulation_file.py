@@ -6,7 +6,7 @@ of a simulated rig what they know of a real one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Annotated
 
 from pydantic import Field
@@ -87,13 +87,13 @@ class SimulationDocument(Document):
     winches: SimulatedWinchesDocument = SimulatedWinchesDocument()
     cameras: list[SimulatedCameraDocument] = []
 
-    def misfits(self, cables: int, pulleys: bool, cameras: Sequence[str]) -> list[Finding]:
+    def misfits(self, cables: int, pulleys: bool, cameras: Mapping[str, float]) -> list[Finding]:
         """What does not agree with the rest of the rig file.
 
         Args:
             cables: Number of outlets.
             pulleys: The rig has pulleys.
-            cameras: Names of its cameras.
+            cameras: Names of its cameras and how many pictures they take, [1/s].
         """
         found: list[Finding] = []
         if self.as_built is not None:
@@ -112,4 +112,7 @@ class SimulationDocument(Document):
                 found.append((place_of_name, f"no camera is called {name!r}"))
             elif name in names[:i]:
                 found.append((place_of_name, f"camera {name!r} stands twice"))
+            elif self.cameras[i].exposure_ms > 1000.0 / cameras[name]:
+                what = f"at {cameras[name]:g} pictures/s there is no time to expose one so long"
+                found.append((("simulation", "cameras", i, "exposure_ms"), what))
         return found

@@ -26,7 +26,7 @@ def told_when_compiling(work: Work, shown: bool) -> Iterator[bool]:
         Whether the code was there.
     """
     from cdpr.cli.output import err, spinner
-    from cdpr.machine_code import is_compiled, note_compiled
+    from cdpr.machine_code import can_be_kept, is_compiled, note_compiled
 
     task = _task(work)
     compiled = is_compiled(task)
@@ -36,7 +36,14 @@ def told_when_compiling(work: Work, shown: bool) -> Iterator[bool]:
         what, duration = "the planner", "one to three minutes"
         if work == "edges":
             what, duration = "the tags' edge finder", "up to a minute"
-        err.print(f"compiling {what} for this machine, once; {duration} …")
+        if can_be_kept(task):
+            err.print(f"compiling {what} for this machine, once; {duration} …")
+        else:
+            err.print(
+                f"compiling {what}, {duration}, and every time anew: no folder for it can be"
+                " written; name one by the variable NUMBA_CACHE_DIR",
+                soft_wrap=True,
+            )
         with spinner("compiling", shown):
             yield False
         note_compiled(task)

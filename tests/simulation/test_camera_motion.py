@@ -117,3 +117,21 @@ def test_the_exposure_comes_from_the_rig_file(rig: Rig) -> None:
     )
     robot = replace(rig, document=document)
     assert camera_as_built(robot, rig.cameras[0])[1].exposure == pytest.approx(0.008)
+
+
+def test_a_short_smear_is_as_bright_as_what_it_is_the_mean_of(
+    rig: Rig, scene: Scene, facing: Camera
+) -> None:
+    """The mean of two pictures lies between two grey levels half the time."""
+    exposure = 0.005
+    camera = SyntheticCamera(rig, scene, facing, optics=Optics(noise=0.0, exposure=exposure))
+    motion = Motion(np.array([0.02, 0.0, 0.0]), np.zeros(3))
+    parts = [
+        camera.render(motion.moved(rig.home, share * exposure)).astype(float)
+        for share in (-0.25, 0.25)
+    ]
+    mean = (parts[0] + parts[1]) / 2.0
+    between = mean % 1.0 != 0.0
+    assert between.sum() > 200
+    smeared = camera.render(rig.home, 0, motion).astype(float)
+    assert abs((smeared - mean)[between].mean()) < 0.05

@@ -206,6 +206,11 @@ def test_two_cameras_in_one_place_differ_by_their_noise_alone(rig: Rig, scene: S
         ({"as_built": "pulleys"}, "pulley_radius_mm", "the rig has no pulleys"),
         ({"cameras": [{"name": "rear"}]}, "simulation.cameras[0].name", "no camera is called"),
         ({"cameras": [{"name": "front"}] * 2}, "simulation.cameras[1].name", "stands twice"),
+        (
+            {"cameras": [{"name": "front", "exposure_ms": 101}]},
+            "simulation.cameras[0].exposure_ms",
+            "at 10 pictures/s there is no time",
+        ),
     ],
 )
 def test_a_simulation_that_does_not_fit_the_rig_is_refused_by_key(
