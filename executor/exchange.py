@@ -10,10 +10,10 @@ from cdpr.poses import Array
 from drivers.drive_group import CycleStatus, DriveGroup, GroupState
 from executor.clock import Clock
 from executor.course import Course
-from executor.safety.gate import Purpose, Request, Verdict, examine
+from executor.safety.gate import ALLOWED, Purpose, Request, Verdict, examine
 from executor.safety.limits import gate_limits, least_steps, watch_limits
 from executor.safety.stuck import StuckWatch
-from executor.safety.watch import Finding, Observation, Watch
+from executor.safety.watch import Finding, Observation, Reaction, Watch
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Exchanged:
 
     Attributes:
         verdict: Of the gate; when it denied, nothing was sent and there is nothing else.
-        status: What the drives told.
+        status: What the drives told; None also when it was too late to send anything.
         following_error: Largest over the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
         findings: What the watch saw.
@@ -59,6 +59,7 @@ class Exchange:
         self._stuck = StuckWatch.fresh(least_steps(rig), names)
         self.armed = False
         self.latched = False
+        self._unsent = 0.0
         self.targets: tuple[int, ...] | None = None
         self.actual: tuple[int, ...] = ()
 
@@ -101,7 +102,12 @@ class Exchange:
             targets: One position a drive, [counts].
             at_rest: Nothing moves, so that nothing can be late.
         """
-        lateness = self._clock.next_cycle()
+        # The cycle that was not sent has no record: the one in its place tells how late it is.
+        lateness, self._unsent = max(self._clock.next_cycle(), self._unsent), 0.0
+        too_late = () if at_rest else self._too_late(lateness)
+        if too_late:
+            self._unsent = lateness
+            return Exchanged(ALLOWED, lateness, findings=too_late)
         verdict = self.allows(purpose, targets)
         if not verdict.allowed:
             return Exchanged(verdict, lateness)
@@ -112,6 +118,11 @@ class Exchange:
         errors = self._following_errors(status)
         findings = self._look(status, errors, 0.0 if at_rest else lateness)
         return Exchanged(verdict, lateness, status, _largest(errors), findings)
+
+    def _too_late(self, lateness: float) -> tuple[Finding, ...]:
+        """Why nothing is sent any more: the drives have stopped by themselves meanwhile."""
+        found = self._watch.lateness(lateness)
+        return tuple(each for each in found if each.reaction is Reaction.QUICK_STOP)
 
     def _following_errors(self, status: CycleStatus) -> Array:
         """Signed, in cable length, shape (m,), [m]; NaN while drives do not follow or answer."""

@@ -306,6 +306,8 @@ class Loop:
                     return
                 targets = self._exchange.resting_targets
                 done = self._exchange.cycle(Purpose.HOLD, targets, at_rest=True)
+                if not done.verdict.allowed:  # now and in every later cycle
+                    return
                 self._record(done)
                 self._tell_reasons(done.findings)
         except Exception as error:  # the drives have been told to stop; nothing more is owed

@@ -34,6 +34,10 @@ from executor.wire import RecordWire, unpack_event
 
 #: The rings are looked into, and a sign of life is given, this often, [s].
 LOOK = 0.01
+#: Looks in a row without a record, about 1 s, after which a process that moves drives hangs: it
+#: tells every cycle. Looks are counted, not time, so that a supervisor that was suspended itself
+#: first reads what it missed.
+SILENT_LOOKS = 100
 #: A process that was not told to move ends within this, [s]; drives may still be asked for a time.
 END_TIMEOUT = 10.0
 
@@ -112,16 +116,17 @@ class RealTimeProcess:
         with suppress(OSError):  # it died since it was armed, which is told below
             self._link.send(Go())
         said: object = None
-        over = False
-        while not over:
+        over, silent = False, 0
+        while not over and silent < SILENT_LOOKS:
             over = bool(wait([self._link, self._process.sentinel], LOOK))
             self._board.beat()
             if over:
                 said = self._heard()
-            self._take_in(self._records)
+            silent = 0 if self._take_in(self._records) else silent + 1
         if isinstance(said, Ended):
             return said
-        error = said.error if isinstance(said, Failed) else self._died()
+        error = said.error if isinstance(said, Failed) else self._died() if over else self._hung()
+        self._take_in(self._records)
         self.tell("real_time_lost", error.what)
         # They hold by themselves, as SYNC stays away.
         return Ended(State.LATCHED, error.what, holding=True, true_pose=None)
@@ -134,6 +139,8 @@ class RealTimeProcess:
         """
         with suppress(OSError):  # told below
             self._link.send(Look())
+        if not self._link.poll(END_TIMEOUT):
+            raise self._hung()
         said = self._heard()
         if isinstance(said, CycleStatus):
             return said
@@ -174,16 +181,32 @@ class RealTimeProcess:
             next_step="look at the platform first; then start again from where it is",
         )
 
-    def _take_in(self, records: Records) -> None:
-        """Everything that was told since the last time; cycles first, they tell the time."""
+    def _hung(self) -> Fault:
+        """Ends a process that hangs: nothing of it may reach the drives any more."""
+        self._process.kill()  # a process that is suspended hears no milder signal
+        self._process.join()
+        return Fault(
+            "the real-time process hung and was ended; the drives stop and hold by themselves as"
+            " set-points stay away",
+            where="real-time process",
+            why="it was suspended, or waits for a device that does not answer",
+            next_step="look at the platform first; then start again from where it is",
+        )
+
+    def _take_in(self, records: Records) -> bool:
+        """Everything told since the last time; cycles first, they tell the time. False if none."""
+        told = False
         for content in self._cycles.take():
+            told = True
             self._last, true_pose = self._wire.unpack(content)
             self._record(partial(records.take_cycle, self._last, true_pose))
         for content in self._events.take():
+            told = True
             self._record(partial(records.take_event, unpack_event(content)))
         lost = self._cycles.lost + self._events.lost
         if lost:
             self._board.complain(f"{lost} records of the run were lost: they came too fast")
+        return told
 
     def _record(self, take: Callable[[], None]) -> None:
         """A record that cannot be kept leads to a stop along the path, not to an end of care."""

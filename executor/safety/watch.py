@@ -48,6 +48,8 @@ class WatchLimits:
         loose_cycles: Cycles without tension that are one too many.
         missing_cycles: Missing replies in a row that are one too many.
         late_periods: Lateness, in cycles, from which on the path stops.
+        gone_periods: Lateness, in cycles, from which on the drives have stopped by themselves, as
+            SYNC stayed away: no set-point may follow.
     """
 
     following_error: float
@@ -58,6 +60,7 @@ class WatchLimits:
     loose_cycles: int = 3
     missing_cycles: int = MISSING_CYCLES
     late_periods: float = 2.0
+    gone_periods: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +130,7 @@ class Watch:
             *watch._replies(seen),
             *watch._following(seen),
             *watch._tensions(seen),
-            *watch._lateness(seen),
+            *watch.lateness(seen.lateness),
         )
 
     def _replies(self, seen: Observation) -> list[Finding]:
@@ -173,11 +176,14 @@ class Watch:
                 found.append(Finding(Reaction.PATH_STOP, "over_tension", over, drive + 1))
         return found
 
-    def _lateness(self, seen: Observation) -> list[Finding]:
-        text = f"a cycle began {seen.lateness:.1f} cycles late"
-        if not seen.lateness < self.limits.late_periods:  # also when it is no number
+    def lateness(self, cycles: float) -> list[Finding]:
+        """What a cycle that begins so late asks for, before anything is sent in it."""
+        text = f"a cycle began {cycles:.1f} cycles late"
+        if not cycles < self.limits.gone_periods:  # also when it is no number
+            return [Finding(Reaction.QUICK_STOP, "late", text)]
+        if cycles >= self.limits.late_periods:
             return [Finding(Reaction.PATH_STOP, "late", text)]
-        if seen.lateness >= 1.0:
+        if cycles >= 1.0:
             return [Finding(Reaction.NOTE, "late", text)]
         return []
 

@@ -75,7 +75,11 @@ def overload(stage: Stage) -> None:
 
 
 def late(stage: Stage) -> None:
-    stage.lateness = 3.0
+    stage.lateness = 2.9
+
+
+def far_too_late(stage: Stage) -> None:
+    stage.lateness = 1371.9
 
 
 def jump_in_table(stage: Stage) -> None:
@@ -108,7 +112,8 @@ CASES = {
     "a winch slips": Case(slip, "following_error", ("cable 2", "allowed 2.00 mm"), lost=(1,)),
     "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "torn"), within=5),
     "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "102.0 N"), within=60),
-    "the loop is late": Case(late, "late", ("3.0 cycles late",), within=40),
+    "the loop is late": Case(late, "late", ("2.9 cycles late; stopped along",), within=40),
+    "the loop hung": Case(far_too_late, "late", ("1371.9 cycles late; quick stop",)),
     "the table was changed": Case(jump_in_table, "gate_denied", ("cable 4", "step"), within=30),
     "a drive is silent while enabling": Case(
         silence(6), "drive_silent", ("(drive 7) did not answer",), cycle=1, lost=(6,)
@@ -267,6 +272,34 @@ def test_the_first_of_several_causes_is_the_one_that_is_told(
     assert outcome.state is State.LATCHED
     assert "late" in outcome.cause
     assert codes.index("late") < codes.index("drive_silent")
+
+
+@pytest.mark.parametrize("lateness", [3.0, 1371.9])
+@pytest.mark.usefixtures("no_pictures")
+def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lateness: float
+) -> None:
+    """Targets stay those of the cycle before the silence; the first of the stop tells how late."""
+    with staged(
+        prepared, tmp_path / "run", at(CRUISING, lambda s: setattr(s, "lateness", lateness))
+    ) as stage:
+        sent: list[tuple[int, tuple[int, ...]]] = []
+        send = stage.group.send_cycle
+
+        def noted(targets: tuple[int, ...]) -> None:
+            sent.append((stage.cycle, tuple(targets)))
+            send(targets)
+
+        monkeypatch.setattr(stage.group, "send_cycle", noted)
+        outcome = stage.run()
+        assert outcome.state is State.LATCHED
+        concluded(stage, outcome)
+    before = [targets for cycle, targets in sent if cycle in (CRUISING - 2, CRUISING - 1)]
+    after = {targets for cycle, targets in sent if cycle >= CRUISING}
+    assert before[0] != before[1], "it moved"
+    assert after == {before[1]}
+    assert CRUISING not in {cycle for cycle, _ in sent}
+    assert stage.folder.cycles().lateness.max() == pytest.approx(lateness * 0.01)
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -140,6 +140,24 @@ def test_the_death_of_the_real_time_process_is_told_and_the_drives_stop_by_thems
     assert len(folder.cycles()) == summary["cycles"] > 10
 
 
+def test_a_real_time_process_that_hangs_is_ended_and_told(
+    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+) -> None:
+    """Suspended for good, it would otherwise be waited for without end."""
+    run = tmp_path / "run"
+    with moving_over_udp(prepared, short_plan, run, 4) as (process, rehearsal):
+        child = real_time_process(process.pid)
+        os.kill(child, signal.SIGSTOP)
+        out, err = process.communicate()
+        assert process.returncode == 1, (out, err)
+        assert gone(child)
+        assert all_hold(rehearsal)
+    summary = RunFolder.open(run).summary()
+    assert summary["final_state"] == "latched"
+    assert any("hung and was ended" in reason for reason in summary["reasons"])
+    assert summary["events"][-1]["code"] == "real_time_lost"
+
+
 def test_a_supervisor_that_hangs_is_noticed(
     prepared: PreparedRun, short_plan: Path, tmp_path: Path
 ) -> None:

@@ -233,8 +233,10 @@ def test_slack_before_the_drives_follow_does_not_count():
         (1.0, Reaction.NOTE),
         (1.999, Reaction.NOTE),
         (2.0, Reaction.PATH_STOP),
-        (1e9, Reaction.PATH_STOP),
-        (NAN, Reaction.PATH_STOP),
+        (2.999, Reaction.PATH_STOP),
+        (3.0, Reaction.QUICK_STOP),
+        (1e9, Reaction.QUICK_STOP),
+        (NAN, Reaction.QUICK_STOP),
     ],
 )
 def test_a_late_cycle_is_noted_and_a_very_late_one_stops(lateness, reaction):
