@@ -54,6 +54,7 @@ def test_the_larger_reaction_has_the_larger_number():
 
 def test_limits_have_the_values_of_the_stop_rules():
     assert (LIMITS.slack_cycles, LIMITS.missing_cycles, LIMITS.late_periods) == (5, 2, 2.0)
+    assert LIMITS.gone_periods == 3.0
     assert LIMITS.loose_cycles == 3
 
 
