@@ -19,7 +19,7 @@ from cdpr.cli.motion_options import (
 
 if TYPE_CHECKING:
     from cdpr.poses import Pose
-    from cdpr.rig import Camera, Rig
+    from cdpr.rig import Rig
     from executor.custody import Custody
     from executor.reference import ReferenceDocument
     from executor.winch_motion import WinchesStand
@@ -98,6 +98,7 @@ def home(
     from cdpr.cli.camera_choice import choose_one_camera, require_simulated_pictures
     from cdpr.cli.carry_out import show_and_ask
     from cdpr.cli.home_facts import show_reference, show_wish
+    from cdpr.cli.home_pose import referenced, require_one_way, require_picture, stated_pose
     from cdpr.cli.named_bus import require_own_time, rig_on_bus
     from cdpr.cli.output import show_json
     from cdpr.cli.winches import WinchMotion, carry_out_by_law, limit_of, speed_of
@@ -126,18 +127,18 @@ def home(
         )
         _go_by_the_rig_file(Custody(the_rig), yes or in_process, as_json)
         return
-    _require_one_way(at_home, pose_mm, camera, as_rig_file)
+    require_one_way(at_home, pose_mm, camera, as_rig_file)
     eye = choose_one_camera(the_rig, camera, in_process) if camera else None
     if eye is not None:
         require_simulated_pictures(eye[1:], fast)
-    known = _stated_pose(the_rig, pose_mm) if eye is None else None
+    known = stated_pose(the_rig, pose_mm) if eye is None else None
     limit = limit_of(the_rig, limit_n)
     target = _target(the_rig, tension_n, limit)
     speed, reach = speed_of(the_rig, speed_mm_s), reach_mm / 1000.0
     custody = Custody(the_rig)
     custody.require_free()
     if eye is not None:
-        _require_picture(the_rig, eye, shown=not as_json)
+        require_picture(the_rig, eye, shown=not as_json)
     show_and_ask(
         partial(show_wish, the_rig, target, limit, reach, speed, eye),
         "Wind the cables in now?",
@@ -148,7 +149,7 @@ def home(
     made: list[ReferenceDocument] = []
 
     def at_rest(stand: WinchesStand, true_pose: Pose | None, board: WishBoard) -> ReferenceDocument:
-        made.append(_referenced(the_rig, stand, true_pose, board, known, eye, pictures))
+        made.append(referenced(the_rig, stand, true_pose, board, known, eye, pictures))
         return made[0]
 
     take_up = partial(TakeUp, target=target, limit=limit, reach=reach, speed=speed)
@@ -167,55 +168,6 @@ def home(
         show_json({"file": where, **reference.model_dump(mode="json")})
     else:
         show_reference(reference, where)
-
-
-def _require_picture(rig: Rig, eye: tuple[Camera, str], shown: bool) -> None:
-    """The camera is there and gives pictures, before anything is moved for it."""
-    from cdpr.cli.rest_camera import look_at_rest
-
-    look_at_rest(rig, eye, 1, rig.home, lambda: None, shown=shown)
-
-
-def _require_one_way(
-    at_home: bool,
-    pose_mm: tuple[float, float, float] | None,
-    camera: list[str] | None,
-    as_rig_file: bool,
-) -> None:
-    """Refuses when it is not said how the pose is known, or in several ways."""
-    from cdpr.errors import BadInput
-
-    if (at_home, pose_mm is not None, bool(camera)).count(True) != 1 or as_rig_file:
-        raise BadInput(
-            "say how the platform's pose is known: --at-home, --pose-mm or --camera alone",
-            where="cdpr home",
-            why="counts are referenced at a pose that is known, and at no guess",
-            next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z; or let it"
-            " hang in view of a calibrated camera and pass --camera INDEX",
-        )
-
-
-def _stated_pose(rig: Rig, pose_mm: tuple[float, float, float] | None) -> Pose:
-    """The pose in which a jig holds the platform; the rig's home without a place.
-
-    Raises:
-        BadInput: It is outside the workspace.
-    """
-    from cdpr.document_types import millimetres
-    from cdpr.errors import BadInput
-    from cdpr.poses import Pose
-
-    if pose_mm is None:
-        return rig.home
-    pose = Pose.level(millimetres(list(pose_mm)))
-    inside = (rig.workspace_lower <= pose.position) & (pose.position <= rig.workspace_upper)
-    if not inside.all():
-        raise BadInput(
-            "this pose is outside the workspace",
-            where="--pose-mm",
-            next_step="name the position of the platform's origin in the world frame, in mm",
-        )
-    return pose
 
 
 def _go_by_the_rig_file(custody: Custody, yes: bool, as_json: bool) -> None:
@@ -252,40 +204,3 @@ def _target(rig: Rig, tension_n: float | None, limit: float) -> float:
             next_step="name another pretension or limit",
         )
     return target
-
-
-def _referenced(
-    rig: Rig,
-    stand: WinchesStand,
-    true_pose: Pose | None,
-    board: WishBoard,
-    known: Pose | None,
-    eye: tuple[Camera, str] | None,
-    pictures: int,
-) -> ReferenceDocument:
-    """The reference at the pose where the platform is held now.
-
-    Raises:
-        StoppedByOperator: The operator stopped it while the camera looked.
-        Refused: The pose is not known well enough.
-    """
-    from cdpr.cli.rest_camera import look_at_rest
-    from cdpr.errors import StoppedByOperator
-    from executor.reference import reference_at
-    from executor.rest_pose import rest_pose
-
-    if known is not None:
-        return reference_at(rig, known, stand.counts, stand.tensions, "stated pose", 0.0)
-    assert eye is not None
-
-    def unless_stopped() -> None:
-        if board.read().stop:
-            raise StoppedByOperator(
-                "stopped before the pose was measured; the cables are taut and held",
-                next_step="home again when all is well",
-            )
-
-    looks = look_at_rest(rig, eye, pictures, true_pose, unless_stopped, shown=False)
-    found = rest_pose(rig, looks)
-    how = f"tags in {found.pictures} of {pictures} pictures, camera {eye[0].name!r}"
-    return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)
