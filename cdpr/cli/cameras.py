@@ -62,6 +62,7 @@ def open_cameras(
         yield None
         return
     from cdpr.clearance import ClearanceModel
+    from cdpr.cli.compiling import ready_for_processes
     from cdpr.cli.output import spinner
     from executor.camera_eye import CameraEye
     from executor.camera_process import CameraProcess
@@ -69,6 +70,7 @@ def open_cameras(
     from executor.run_cameras import RunCameras
 
     keep_every = max(1, pictures // KEPT_PICTURES)
+    ready_for_processes(not quiet)
     with ExitStack() as stack:
         processes = {}
         for camera, source in eyes.items():

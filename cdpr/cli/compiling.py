@@ -57,6 +57,14 @@ def ready_to_measure(shown: bool) -> None:
         load_kernels()
 
 
+def ready_for_processes(shown: bool) -> None:
+    """Compiles what finds tags' edges once, for processes that then only load it."""
+    from cdpr.machine_code import is_compiled
+
+    if not is_compiled(_task("edges")):
+        ready_to_measure(shown)
+
+
 def _task(work: Work) -> Task:
     from cdpr.machine_code import Task
 
