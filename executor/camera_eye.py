@@ -79,15 +79,24 @@ class CameraEye:
         """Its newest answer, if it is there."""
         return self._taken(self._process.answer)
 
+    @property
+    def busy(self) -> bool:
+        """It was asked, and may still answer."""
+        return self.failed is None and self._process.unanswered is not None
+
+    def wait(self, patience: float) -> Look | None:
+        """Its answer, waited for so long, [s]."""
+        return self._taken(lambda: self._process.answer_within(patience))
+
     def finish(self) -> Look | None:
-        """Its last answer, and what is said in place of one that never came."""
-        look = self._taken(self._process.last_answer)
+        """What is said in place of an answer that never came; None when there is nothing to say."""
         unanswered = self._process.unanswered
-        if look is None and unanswered is not None:
-            if self.failed is None:
-                self.failed = CdprError(f"no answer any more from {unanswered.time:.2f} s on")
-            look = unseen(unanswered.frame, unanswered.time, self.failed.what)
-            self.looks.append(look)
+        if unanswered is None:
+            return None
+        if self.failed is None:
+            self.failed = CdprError(f"no answer any more from {unanswered.time:.2f} s on")
+        look = unseen(unanswered.frame, unanswered.time, self.failed.what)
+        self.looks.append(look)
         return look
 
     def trouble(self, now: float) -> str:

@@ -15,7 +15,7 @@ from cdpr.errors import CdprError, Fault
 from executor.observer import Look, MakeObserver, Trigger
 from executor.spawning import interrupts_blocked
 
-#: In simulated time, and at the end of a run, an answer is waited for no longer than this, [s].
+#: In simulated time an answer is waited for no longer than this, [s].
 PATIENCE = 20.0
 #: How long a process may take to end, [s].
 END_TIMEOUT = 2.0
@@ -101,10 +101,6 @@ class CameraProcess:
             CdprError: The process failed, for the reason told.
         """
         return self.answer_within(PATIENCE if self._waits else 0.0)
-
-    def last_answer(self) -> Look | None:
-        """As `answer`, at the end of the run: it is waited for in real time too."""
-        return self.answer_within(PATIENCE)
 
     def answer_within(self, patience: float) -> Look | None:
         """The answer to what was asked, if it comes within so long, [s].

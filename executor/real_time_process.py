@@ -75,6 +75,7 @@ class RealTimeProcess:
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
         self._records: Records | None = None
         self._last: CycleRecord | None = None
+        self._ended = False
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
         self._process = context.Process(
@@ -124,6 +125,7 @@ class RealTimeProcess:
                 said = self._heard()
             silent = 0 if self._take_in(self._records) else silent + 1
         if isinstance(said, Ended):
+            self._ended = True
             return said
         error = said.error if isinstance(said, Failed) else self._died() if over else self._hung()
         self._take_in(self._records)
@@ -154,7 +156,8 @@ class RealTimeProcess:
 
     def close(self) -> None:
         """Waits for the process; whatever it does, it comes to rest and ends."""
-        self._board.ask_stop()
+        if not self._ended:  # a stop that is wished from now on is the operator's
+            self._board.ask_stop()
         self._link.close()
         self._process.join(END_TIMEOUT)
         if self._process.is_alive():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,11 @@ from cdpr.poses import Pose
 from executor.camera_eye import CameraEye, CameraRecord
 from executor.common_look import CameraNews, CommonLook
 from executor.observer import Look, Trigger, unseen
+
+#: At the end of a run the last pictures are waited for no longer than this, [s],
+PATIENCE = 20.0
+#: and after a stop no longer than this, [s]; whether there is one is asked every so often, [s].
+HURRY, ROUND = 2.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,8 +114,13 @@ class RunCameras:
         """How each camera does; see `executor.status`."""
         return [eye.as_dict(self._now) for eye in self._eyes]
 
-    def finish(self) -> Seen:
-        """Waits for the last pictures; what is missing then is told."""
+    def finish(self, stopped: Callable[[], bool]) -> Seen:
+        """Waits for the last pictures of all cameras; what is missing then is told.
+
+        Args:
+            stopped: Whether a stop is wished; the wait is a short one then.
+        """
+        self._wait_for_all(stopped)
         for eye in self._eyes:
             self._put(eye, eye.finish())
         self._judge(last=True)
@@ -122,6 +132,16 @@ class RunCameras:
             {eye.name: tuple(eye.looks) for eye in self._eyes} if several else {},
             tuple(eye.record() for eye in self._eyes),
         )
+
+    def _wait_for_all(self, stopped: Callable[[], bool]) -> None:
+        """In rounds that share one patience, however many cameras hang."""
+        rounds = 0
+        while waiting := [eye for eye in self._eyes if eye.busy]:
+            if rounds * ROUND >= (HURRY if stopped() else PATIENCE):
+                return
+            for eye in waiting:
+                self._put(eye, eye.wait(ROUND / len(waiting)))
+            rounds += 1
 
     def _put(self, eye: CameraEye, look: Look | None) -> None:
         for moment in self._open:

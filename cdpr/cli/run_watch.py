@@ -74,7 +74,7 @@ class RunWatch:
             quiet: Nothing shows that it waits.
         """
         with spinner("waiting for the last pictures", not quiet):
-            seen = self._cameras.finish()
+            seen = self._cameras.finish(lambda: self._board.read().stop)
         self._tell_news(at)
         for camera in seen.cameras:
             if camera.dropped:

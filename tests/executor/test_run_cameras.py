@@ -19,13 +19,13 @@ from cdpr.cli.camera_line import Pace, camera_line
 from cdpr.errors import BadInput, Fault
 from cdpr.poses import Pose
 from cdpr.rig import load_rig
-from executor import camera_process
+from executor import camera_process, run_cameras
 from executor.camera_eye import CameraEye
 from executor.camera_process import CameraProcess
 from executor.camera_sight import BLIND_PICTURES
 from executor.camera_start import wait_until_ready
 from executor.observer import Look, Trigger
-from executor.run_cameras import RunCameras
+from executor.run_cameras import HURRY, PATIENCE, ROUND, RunCameras
 from tests.cli.plans import RIG, free_scene
 from tracking.measured_clearance import MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
@@ -55,6 +55,7 @@ class Scripted:
     ) -> None:
         self.name, self.unanswered, self._off = name, None, {"shift": shift, "late": late}
         self._delays, self._left = list(delays), 0
+        self.waited = 0.0
 
     unanswered: Trigger | None
 
@@ -68,13 +69,19 @@ class Scripted:
         if self.unanswered is None or self._left:
             self._left -= self._left > 0
             return None
-        return self.last_answer()
+        return self.answer_within(0.0)
 
-    def last_answer(self) -> Look | None:
+    def answer_within(self, patience: float) -> Look | None:
+        self.waited += patience
         if self.unanswered is None or self._left < 0:
             return None
         look, self.unanswered = seen_at(self.unanswered, **self._off), None
         return look
+
+
+def never() -> bool:
+    """Nobody wishes a stop."""
+    return False
 
 
 def run_of(moments: int, *cameras: Any) -> tuple[RunCameras, list[str]]:
@@ -95,7 +102,7 @@ def test_however_late_cameras_answer_every_moment_is_told_once_and_nothing_is_lo
     front: list[int], side: list[int], moments: int
 ) -> None:
     run, _ = run_of(moments, Scripted("front", front), Scripted("side", side))
-    seen = run.finish()
+    seen = run.finish(never)
     frames = [look.frame for look in seen.together]
     alone = {name: [look.frame for look in looks] for name, looks in seen.alone.items()}
     assert frames == sorted(set(alone["front"]) | set(alone["side"]))
@@ -118,7 +125,7 @@ def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
 
 def test_pictures_of_both_make_a_better_pose() -> None:
     run, told = run_of(5, Scripted("front", [0]), Scripted("side", [0]))
-    seen = run.finish()
+    seen = run.finish(never)
     for look in seen.together:
         assert isinstance(look.found, PoseMeasurement)
         assert look.found.position_deviation == pytest.approx(np.full(3, 1e-4 / np.sqrt(2)))
@@ -132,7 +139,7 @@ def test_cameras_that_disagree_are_told_once_and_clearance_is_not_measured() -> 
         f"cameras front and side disagree by 20.0 mm, {BLIND_PICTURES} times in a row;"
         " clearance is not measured together, only watched by each alone"
     ]
-    assert all(look.clearance is None for look in run.finish().together)
+    assert all(look.clearance is None for look in run.finish(never).together)
 
 
 def nearest_at(shift: float) -> MeasuredClearance:
@@ -158,7 +165,7 @@ def test_of_cameras_that_disagree_one_that_sees_too_little_clearance_is_enough(w
         told.append(run.near)
     assert not any(told[:2])
     assert f"as camera {sees} alone sees it" in run.near
-    assert all(look.clearance is None for look in run.finish().together)
+    assert all(look.clearance is None for look in run.finish(never).together)
 
 
 def test_one_that_dies_is_told_and_after_the_last_one_none_is_left() -> None:
@@ -178,12 +185,33 @@ def test_one_that_dies_is_told_and_after_the_last_one_none_is_left() -> None:
 
 def test_moments_in_which_cameras_were_not_taken_together_are_counted_and_told() -> None:
     run, told = run_of(10, Scripted("front", [0]), Scripted("side", [0], late=0.12))
-    run.finish()
+    run.finish(never)
     told += [news.text for news in run.news()]
     assert told == [
         "in 10 of 10 moments not all cameras were taken together: pictures were taken more than"
         " 50 ms apart from the others"
     ]
+
+
+@pytest.mark.parametrize("stops", [None, 0, 100])
+def test_at_the_end_all_that_hang_are_waited_for_together_and_a_stop_cuts_it_short(
+    stops: int | None,
+) -> None:
+    """The operator stops before the end, in the hundredth round of waiting, or never."""
+    hanging = [Scripted(name, [-1]) for name in ("front", "side", "back")]
+    run, _ = run_of(3, *hanging, Scripted("well", [0]))
+    rounds = 0
+
+    def stopped() -> bool:
+        nonlocal rounds
+        rounds += 1
+        return stops is not None and rounds > stops
+
+    seen = run.finish(stopped)
+    longest = {None: PATIENCE, 0: HURRY, 100: 100 * ROUND}[stops]
+    assert sum(camera.waited for camera in hanging) == pytest.approx(longest, abs=2 * ROUND)
+    assert [c.failed for c in seen.cameras] == ["no answer any more from 0.00 s on"] * 3 + [""]
+    assert seen.cameras[-1].poses == 3
 
 
 def test_live_figures_are_those_of_the_newest_pictures() -> None:
@@ -234,7 +262,7 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
     monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     """Real processes; the loop's clock is ours, so nobody has to wait for 2 s."""
-    monkeypatch.setattr(camera_process, "PATIENCE", 1.0)
+    monkeypatch.setattr(run_cameras, "PATIENCE", 1.0)
     monkeypatch.setattr(camera_process, "END_TIMEOUT", 0.2)
     make = {"front": quick, "side": silent if how == "silent" else quick}
     processes = [CameraProcess(name, make[name], may_wait=False) for name in make]  # type: ignore[arg-type]
@@ -251,7 +279,7 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
                 os.kill(child("side"), signal.SIGSTOP)
             front_only = len(eyes[1].looks) >= 3
             wait_for_answers(processes[:1] if front_only else processes)
-        seen = run.finish()
+        seen = run.finish(never)
     finally:
         for process in processes:
             process.close()

@@ -351,9 +351,10 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
 ) -> None:
     """Through the real program with its real camera process, killed as the system would."""
     from executor.camera_process import CameraProcess
+    from executor.run_cameras import ROUND
 
     cycles, real = 0, SimulatedClock.next_cycle
-    last_answer = CameraProcess.last_answer
+    answer_within = CameraProcess.answer_within
 
     def next_cycle(clock: SimulatedClock) -> float:
         nonlocal cycles
@@ -362,13 +363,13 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
             die("killed")()
         return real(clock)
 
-    def die_or_answer(process: CameraProcess) -> Any:
-        if cycles < cycle:
+    def die_or_answer(process: CameraProcess, patience: float) -> Any:
+        if cycles < cycle and patience == ROUND:
             die("killed")()
-        return last_answer(process)
+        return answer_within(process, patience)
 
     monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
-    monkeypatch.setattr(CameraProcess, "last_answer", die_or_answer)
+    monkeypatch.setattr(CameraProcess, "answer_within", die_or_answer)
     run = tmp_path / "run"
     answer = call("run", short_plan, "--rig", RIG, "-o", run, "--fast")
     assert answer.code == 1, answer

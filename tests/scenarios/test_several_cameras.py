@@ -21,7 +21,7 @@ from cdpr.errors import BadInput
 from cdpr.plan import save_plan
 from cdpr.poses import Pose, matrix_from_rotation_vector
 from cdpr.rig import load_rig
-from executor import camera_process, camera_sight
+from executor import camera_process, camera_sight, run_cameras
 from executor import run as run_module
 from executor.clock import SimulatedClock
 from executor.run_folder import RunFolder
@@ -204,6 +204,7 @@ def camera_of(name: str) -> int:
 def stop_in_motion(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Stops (SIGSTOP) a camera's process once the platform moves."""
     monkeypatch.setattr(camera_process, "PATIENCE", 3.0)
+    monkeypatch.setattr(run_cameras, "PATIENCE", 3.0)
     monkeypatch.setattr(camera_process, "END_TIMEOUT", 0.2)
 
     def stop(name: str) -> None:
