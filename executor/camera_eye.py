@@ -13,9 +13,7 @@ from executor.camera_process import CameraProcess
 from executor.camera_sight import CameraSight
 from executor.observer import Look, Trigger, unseen
 from tracking.measurement import PoseMeasurement
-
-#: Live figures are those of so many of the newest pictures.
-NEWEST = 10
+from tracking.pace import Pace
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +58,7 @@ class CameraEye:
         """Pictures that were due while it was busy."""
         self._poses = 0
         self._process = process
-        self._sight = CameraSight()
+        self._sight, self._pace = CameraSight(), Pace()
 
     def ask(self, trigger: Trigger) -> bool:
         """Asks for a picture unless it is busy or gone; returns whether it did."""
@@ -119,16 +117,15 @@ class CameraEye:
 
     def as_dict(self, now: float) -> dict[str, Any]:
         """How it does at the moment; see `executor.status`."""
-        newest = self.looks[-NEWEST:]
-        found = newest[-1].found if newest else None
+        found = self.looks[-1].found if self.looks else None
         return {
             "name": self.name,
             "source": self.source,
             "pictures": len(self.looks),
             "poses": self._poses,
             "dropped": self.dropped,
-            "pictures_per_second": _rate(newest),
-            "measuring_ms": _median_ms(newest),
+            "pictures_per_second": self._pace.pictures_per_second,
+            "measuring_ms": self._pace.measuring_ms,
             "tags": list(found.tags) if isinstance(found, PoseMeasurement) else [],
             "trouble": self.trouble(now),
         }
@@ -145,6 +142,7 @@ class CameraEye:
         if look is not None:
             seen = isinstance(look.found, PoseMeasurement)
             self.looks.append(look)
+            self._pace.take(look.found.time, look.seconds)
             self._sight.answer(seen)
             self._poses += seen
         return look
@@ -159,11 +157,3 @@ class CameraEye:
 def _median_ms(looks: list[Look]) -> float | None:
     seconds = [look.seconds for look in looks if np.isfinite(look.seconds)]
     return round(float(np.median(seconds)) * 1e3, 2) if seconds else None
-
-
-def _rate(looks: list[Look]) -> float | None:
-    """Pictures in a second of the run's time."""
-    if len(looks) < 2:
-        return None
-    took = looks[-1].found.time - looks[0].found.time
-    return round((len(looks) - 1) / took, 1) if took > 0.0 else None

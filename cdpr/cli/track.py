@@ -83,7 +83,7 @@ def track(
 
     from cdpr.clearance import ClearanceModel
     from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.camera_line import Pace
+    from cdpr.cli.camera_line import rates
     from cdpr.cli.compiling import ready_to_measure
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
@@ -92,6 +92,8 @@ def track(
     from executor.running import stop_requests
     from executor.track_mcap import write_track_mcap
     from executor.wishes import OwnBoard
+    from tracking.measurement import PoseMeasurement
+    from tracking.pace import Pace
     from tracking.pose_log import write_pose_log
     from tracking.track import TrackCount
     from tracking.track import track as tracked
@@ -141,7 +143,10 @@ def track(
             logged.append(found)
             for name, one in alone.items():
                 each[name].append(one)
-            show(len(logged), pace.after(time.monotonic(), count.seconds, found.observation))
+            pace.take(time.monotonic(), count.seconds[-1])
+            seen = found.observation
+            tags = len(seen.tags) if isinstance(seen, PoseMeasurement) else 0
+            show(len(logged), rates(pace.pictures_per_second, pace.measuring_ms, tags))
             if board.read().stop:
                 break
     for name, path in logs.items():

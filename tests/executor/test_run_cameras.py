@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cdpr.clearance import ClearanceModel
-from cdpr.cli.camera_line import Pace, camera_line
+from cdpr.cli.camera_line import camera_line
 from cdpr.errors import BadInput, Fault
 from cdpr.poses import Pose
 from cdpr.rig import load_rig
@@ -29,6 +29,7 @@ from executor.run_cameras import HURRY, PATIENCE, ROUND, RunCameras
 from tests.cli.plans import RIG, free_scene
 from tracking.measured_clearance import MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
+from tracking.pace import Pace
 
 RATE = 10.0
 HERE = Pose.level([0.0, 0.0, 0.445])
@@ -225,10 +226,13 @@ def test_live_figures_are_those_of_the_newest_pictures() -> None:
 
 
 def test_the_pace_of_a_source_is_that_of_its_newest_pictures() -> None:
-    pace, look = Pace(), seen_at(Trigger(0, 0.0, 0.0, None))
-    lines = [pace.after(5.0 + k / 20, [0.004] * (k + 1), look.found) for k in range(30)]
-    assert lines[0] == "– pictures/s, 4.0 ms, 2 tags"
-    assert lines[-1] == "20.0 pictures/s, 4.0 ms, 2 tags"
+    pace = Pace()
+    assert (pace.pictures_per_second, pace.measuring_ms) == (None, None)
+    for k in range(30):
+        pace.take(5.0 + k / 20, 1.0 if k < 20 else 0.004)
+        assert (pace.pictures_per_second is None) is (k == 0)
+    pace.take(6.5, float("nan"))
+    assert (pace.pictures_per_second, pace.measuring_ms) == (20.0, 4.0)
 
 
 class Quick:
