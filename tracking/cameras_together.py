@@ -28,7 +28,8 @@ class CommonPose:
     """The pose of all cameras, moment after moment.
 
     Pictures of one moment are taken a little apart in time. Each pose is carried on to the newest
-    one's time, as the same camera saw the platform go.
+    one's time, as the same camera saw the platform go. One whose camera saw nothing shortly before is
+    left out, as nobody knows how fast the platform went: the newest pose always counts.
     """
 
     def __init__(self, within: float) -> None:
@@ -40,6 +41,8 @@ class CommonPose:
         """
         self.apart = 0
         """In how many moments a pose was left out for that."""
+        self.without_speed = 0
+        """In how many a pose was left out as its camera could not carry it on."""
         self._within = within
         self._before: dict[str, PoseMeasurement] = {}
 
@@ -54,11 +57,11 @@ class CommonPose:
             return together(seen)
         near = self._near(poses)
         newest = max(one.time for one in near.values())
-        at_newest = {
-            name: carried_on(one, self._before.get(name), newest) for name, one in near.items()
-        }
+        carried = {n: carried_on(one, self._before.get(n), newest) for n, one in near.items()}
+        at_newest = {name: one for name, one in carried.items() if one is not None}
         self._before |= poses
         self.apart += len(near) < len(poses)
+        self.without_speed += len(at_newest) < len(near)
         return together(at_newest)
 
     def _near(self, poses: Mapping[str, PoseMeasurement]) -> Mapping[str, PoseMeasurement]:
@@ -76,7 +79,7 @@ def together(seen: Mapping[str, Observation]) -> Observation:
     nobody knows which is wrong.
 
     Args:
-        seen: What each camera measured, by its name, at about the same time.
+        seen: What each camera measured, by its name; all poses are of one time.
     """
     poses = {name: one for name, one in seen.items() if isinstance(one, PoseMeasurement)}
     if not poses:
@@ -128,7 +131,6 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
     turned = matrix_from_rotation_vector(step[3:]) @ first.pose.rotation
     return replace(
         first,
-        time=float(np.mean([one.time for one in poses])),
         pose=Pose(first.pose.position + step[:3], turned),
         covariance=read_only((covariance + covariance.T) / 2.0),
         tags=tuple(sorted({number for one in poses for number in one.tags})),

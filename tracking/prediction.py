@@ -32,20 +32,22 @@ def predicted(last: PoseMeasurement, before: PoseMeasurement | None, time: float
 
 def carried_on(
     last: PoseMeasurement, before: PoseMeasurement | None, time: float
-) -> PoseMeasurement:
+) -> PoseMeasurement | None:
     """A measurement as it would have been a little later, with what that adds to its covariance.
 
     Args:
         last: The measurement.
         before: The one before it by the same camera, if there is one.
-        time: Of the later one, [s].
+        time: Of the later one, [s]; not before the measurement's own.
 
     Returns:
-        The measurement as it is where `predicted` knows no speed.
+        None where `predicted` knows no speed: nobody can tell where the platform is then.
     """
+    if time == last.time:
+        return last
     pose = predicted(last, before, time)
     if before is None or pose is last.pose:
-        return last
+        return None
     share = (time - last.time) / (last.time - before.time)
     covariance = (1.0 + share) ** 2 * last.covariance + share**2 * before.covariance
     return replace(last, time=time, pose=pose, covariance=read_only(covariance))

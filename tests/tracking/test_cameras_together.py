@@ -124,6 +124,7 @@ def test_what_carrying_on_costs_is_in_the_covariance() -> None:
             for n, time in zip(noise, (0.0, 0.1), strict=True)
         )
         later = carried_on(two, one, 0.15)
+        assert later is not None
         error = later.pose.position - [0, 0, 0.4]
         errors.append(error @ np.linalg.solve(later.covariance[:3, :3], error))
     low, high = chi2.ppf([0.0005, 0.9995], 3 * len(errors)) / len(errors)
@@ -154,13 +155,36 @@ def test_the_camera_that_is_named_first_does_not_decide_which_pictures_count(fir
 @pytest.mark.parametrize("late", [0.0, 0.07, 0.099])
 def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) -> None:
     """Asked every 0.1 s, each answers with a picture of its own time: up to a period apart."""
-    front = measured([0.0, 0.0, 0.4], [1e-4] * 3)
-    side = replace(front, time=late)
-    common = CommonPose(0.05)
-    found = common.of({"front": front, "side": side, "dark": NoPose(5.0, "dark")})
+    front, common = measured([0.0, 0.0, 0.4], [1e-4] * 3), CommonPose(0.05)
+    for now in (0.0, 0.1):
+        seen = {"front": replace(front, time=now), "side": replace(front, time=now + late)}
+        found = common.of({**seen, "dark": NoPose(5.0, "dark")})
     assert isinstance(found, PoseMeasurement)
-    assert found.position_deviation == pytest.approx(np.full(3, 1e-4 / np.sqrt(2)))
+    assert found.time == 0.1 + late
+    share = late / 0.1
+    information = 1.0 + 1.0 / ((1.0 + share) ** 2 + share**2)
+    assert found.position_deviation == pytest.approx(np.full(3, 1e-4 / np.sqrt(information)))
     assert common.apart == 0
+
+
+@given(speed=st.floats(-0.3, 0.3), late=st.floats(0.001, 0.09), pause=st.floats(0.51, 5.0))
+def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
+    speed: float, late: float, pause: float
+) -> None:
+    """First pictures, and those after nothing was seen for long: the later camera, which is worse."""
+
+    def seen(time: float, deviation: float) -> PoseMeasurement:
+        one = measured([speed * time, 0.0, 0.4], [deviation] * 3)
+        return replace(one, time=time)
+
+    common = CommonPose(0.05)
+    for now in (0.0, pause):
+        found = common.of({"front": seen(now, 2e-5), "side": seen(now + late, 1e-4)})
+        assert isinstance(found, PoseMeasurement)
+        assert found.time == now + late
+        assert found.pose.distance_to(seen(found.time, 1.0).pose) < 1e-12
+        assert found.position_deviation == pytest.approx(np.full(3, 1e-4))
+    assert (common.without_speed, common.apart) == (2, 0)
 
 
 def test_one_that_sees_nothing_leaves_it_to_the_others() -> None:
