@@ -28,8 +28,8 @@ class CommonPose:
     """The pose of all cameras, moment after moment.
 
     Pictures of one moment are taken a little apart in time. Each pose is carried on to the newest
-    one's time, as the same camera saw the platform go. One whose camera saw nothing shortly before is
-    left out, as nobody knows how fast the platform went: the newest pose always counts.
+    one's time, as the same camera saw the platform go. One whose camera saw nothing shortly
+    before is left out, as nobody knows how fast the platform went: the newest pose always counts.
     """
 
     def __init__(self, within: float) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from cdpr.rig import Camera, Rig
     from cdpr.scene import Scene
     from tracking.pose_log import LoggedPicture
-    from tracking.track import Picture, TrackCount
+    from tracking.track import Picture
+    from tracking.track_together import TogetherCount
 
 #: A live camera that shows no tag for so many pictures is given up.
 PATIENCE = 50
@@ -79,7 +80,7 @@ def track(
     """
     import time
     from dataclasses import replace
-    from itertools import islice
+    from itertools import islice, takewhile
 
     from cdpr.clearance import ClearanceModel
     from cdpr.cli.calibrations import calibrated_rig
@@ -87,7 +88,8 @@ def track(
     from cdpr.cli.compiling import ready_to_measure
     from cdpr.cli.output import progress_bar, show_facts, show_json
     from cdpr.cli.plan import check_output
-    from cdpr.cli.track_sources import eyes_of, picture_source
+    from cdpr.cli.track_facts import track_facts
+    from cdpr.cli.track_sources import eyes_of, picture_source, refuse_unused_plan
     from cdpr.rig import load_rig
     from executor.running import stop_requests
     from executor.track_mcap import write_track_mcap
@@ -97,6 +99,7 @@ def track(
     from tracking.pose_log import write_pose_log
     from tracking.track import TrackCount
     from tracking.track import track as tracked
+    from tracking.track_together import TogetherCount
     from tracking.tracker import Tracker
 
     check_output(output, force)
@@ -110,6 +113,7 @@ def track(
     logs = {eye.name: _own_file(output, eye.name) for eye in eyes} if several else {}
     for path in logs.values():
         check_output(path, force)
+    refuse_unused_plan(eyes.values(), plan)
     the_scene = _scene(scene, plan)
     ready_to_measure(not as_json)
     unused: dict[str, dict[str, str]] = {eye.name: {} for eye in eyes}
@@ -118,11 +122,12 @@ def track(
         for eye, name in eyes.items()
     ]
     totals = [total for _, total in opened if total is not None]
-    total = min(totals) if len(totals) == len(opened) else None
+    total = max(totals) if len(totals) == len(opened) else None
     model = ClearanceModel(the_rig, the_scene) if the_scene and the_scene.obstacles else None
     logged: list[LoggedPicture] = []
     each: dict[str, list[LoggedPicture]] = {eye.name: [] for eye in eyes}
-    count, pace, board, began = TrackCount(), Pace(), OwnBoard(), time.time_ns()
+    count, shared, pace, board = TrackCount(), TogetherCount(), Pace(), OwnBoard()
+    began = time.time_ns()
     with (
         ExitStack() as drawing,
         stop_requests(board),
@@ -130,16 +135,18 @@ def track(
     ):
         streams: dict[str, Iterator[LoggedPicture]] = {}
         for eye, (frames, length) in zip(eyes, opened, strict=True):
-            place = overlay / eye.name if overlay is not None and several else overlay
+            place = _own_drawing(overlay, eye.name) if overlay and several else overlay
             streams[eye.name] = tracked(
-                islice(frames, pictures),
+                takewhile(lambda _: not board.read().stop, islice(frames, pictures)),
                 Tracker(the_rig, eye),
                 count,
                 give_up_after=PATIENCE if length is None and not several else None,
                 model=model,
                 on_picture=drawing.enter_context(_overlay(place, the_rig, eye, force)),
             )
-        for found, alone in _all_of(streams, 0.5 / next(iter(eyes)).rate, model):
+        # The fastest tells what one moment is, whichever is named first.
+        within = 0.5 / max(eye.rate for eye in eyes)
+        for found, alone in _all_of(streams, within, shared, model):
             logged.append(found)
             for name, one in alone.items():
                 each[name].append(one)
@@ -147,14 +154,13 @@ def track(
             seen = found.observation
             tags = len(seen.tags) if isinstance(seen, PoseMeasurement) else 0
             show(len(logged), rates(pace.pictures_per_second, pace.measuring_ms, tags))
-            if board.read().stop:
-                break
     for name, path in logs.items():
         write_pose_log(path, each[name], with_clearance=model is not None)
     write_pose_log(output, logged, with_clearance=model is not None)
     if mcap is not None:
         write_track_mcap(mcap, logged, each if several else {}, began)
-    facts = _facts(logged, output, count, (time.time_ns() - began) * 1e-9)
+    took = (time.time_ns() - began) * 1e-9
+    facts = track_facts(logged, output, count, shared if several else None, took)
     if as_json:
         show_json({**facts, "unused": _by_file(unused)})
     else:
@@ -164,6 +170,12 @@ def track(
 def _own_file(output: Path, name: str) -> Path:
     """Where one of several cameras is logged alone: ``poses-front.csv`` beside ``poses.csv``."""
     return output.with_name(f"{output.stem}-{name}{output.suffix}")
+
+
+def _own_drawing(overlay: Path, name: str) -> Path:
+    """Where one of several cameras' pictures are drawn: a video like a log, or a folder inside."""
+    is_folder = overlay.is_dir() or not overlay.suffix
+    return overlay / name if is_folder else _own_file(overlay, name)
 
 
 def _by_file(unused: dict[str, dict[str, str]]) -> dict[str, str]:
@@ -177,13 +189,16 @@ def _by_file(unused: dict[str, dict[str, str]]) -> dict[str, str]:
 
 
 def _all_of(
-    streams: dict[str, Iterator[LoggedPicture]], within: float, model: ClearanceModel | None
+    streams: dict[str, Iterator[LoggedPicture]],
+    within: float,
+    count: TogetherCount,
+    model: ClearanceModel | None,
 ) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
     """What is measured together and by each camera alone."""
     from tracking.track_together import track_together
 
     if len(streams) > 1:
-        yield from track_together(streams, within, model)
+        yield from track_together(streams, within, count, model)
         return
     for name, stream in streams.items():
         for found in stream:
@@ -217,38 +232,3 @@ def _overlay(
             out.write(drawn_over(picture.image, rig, camera, found, logged.clearance), picture.name)
 
         yield draw
-
-
-def _facts(
-    logged: list[LoggedPicture], output: Path, count: TrackCount, took: float
-) -> dict[str, Any]:
-    """What was measured, in numbers.
-
-    Args:
-        logged: What was measured.
-        output: Where it is written.
-        count: How many pictures were measured, and in which times.
-        took: How long all of it took, [s].
-    """
-    import numpy as np
-
-    from tracking.measurement import PoseMeasurement
-
-    poses = [p.observation for p in logged if isinstance(p.observation, PoseMeasurement)]
-    deviations = np.array([np.linalg.norm(p.position_deviation) for p in poses])
-    facts: dict[str, Any] = {
-        "poses_file": str(output),
-        "pictures": len(logged),
-        "poses": len(poses),
-        "position_deviation_mm": round(float(np.median(deviations)) * 1000, 4),
-        "reprojection_px": round(float(np.median([p.reprojection for p in poses])), 4),
-        "pictures_per_second": round(len(logged) / took, 1),
-        "measuring_ms": round(float(np.median(count.seconds)) * 1000, 2),
-    }
-    clearances = [p.clearance for p in logged if p.clearance is not None]
-    if clearances:
-        nearest = min(clearances, key=lambda c: c.distance)
-        facts["smallest_clearance_mm"] = round(nearest.distance * 1000, 3)
-        facts["clearance_uncertainty_mm"] = round(nearest.uncertainty * 1000, 3)
-        facts["clearance_at_most_mm"] = round(nearest.at_most * 1000, 3)
-    return facts

@@ -91,6 +91,25 @@ def _device(source: str) -> str:
     return source.removeprefix("/dev/video")
 
 
+def refuse_unused_plan(sources: Iterable[str], plan: Path | None) -> None:
+    """A path is for rendered pictures.
+
+    Raises:
+        BadInput: There is one, and no source is ``synthetic``.
+    """
+    from cdpr.cli.camera_choice import SYNTHETIC
+    from cdpr.errors import BadInput
+
+    named = list(sources)
+    if plan is not None and SYNTHETIC not in named:
+        raise BadInput(
+            "--plan is for the synthetic camera",
+            where="track",
+            why=f"pictures come from {', '.join(named)}",
+            next_step="name the obstacles with --scene, or the source 'synthetic'",
+        )
+
+
 def picture_source(
     rig: Rig,
     scene: Scene | None,
@@ -120,17 +139,11 @@ def picture_source(
         if plan is None or scene is None:
             raise BadInput(
                 "the synthetic camera needs a path to look at",
-                where="track",
+                where=f"track, camera {camera.name!r}",
                 next_step="pass --plan plan.json",
             )
         rendered = _rendered_times(rig, camera, plan)
         return _rendered(rig, scene, camera, rendered), len(rendered)
-    if plan is not None:
-        raise BadInput(
-            "--plan is for the synthetic camera",
-            where="track",
-            next_step="name the obstacles with --scene, or the source 'synthetic'",
-        )
     path = Path(source)
     if path.is_dir():
 

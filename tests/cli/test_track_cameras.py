@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -15,6 +16,7 @@ from mcap.reader import make_reader
 from cdpr.plan import load_plan, save_plan
 from cdpr.poses import Pose, matrix_from_rotation_vector
 from cdpr.rig import load_rig
+from simulation.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
 from tests.cli.program import call, nothing_written, one_message
 
@@ -74,6 +76,54 @@ def test_two_cameras_are_logged_together_and_alone(
         counted = Counter(channel.topic for _, channel, _ in make_reader(stream).iter_messages())
     for channel in ("/tag_pose", "/tag_status", "/clearance"):
         assert [counted[channel + name] for name in ("", "/front", "/side")] == [3, 3, 3]
+
+
+def test_cameras_of_different_rates_are_paired_by_time_to_the_end_of_the_longest(
+    rig_file: Path, plan: Path, tmp_path: Path
+) -> None:
+    data = yaml.safe_load(rig_file.read_text())
+    data["cameras"][0]["rate_hz"], data["cameras"][1]["rate_hz"] = 10.0, 5.0
+    uneven = tmp_path / "rig.yaml"
+    uneven.write_text(yaml.safe_dump(data))
+    rig, scene = load_rig(uneven), load_plan(plan).scene
+    for camera, count in zip(rig.cameras, (5, 2), strict=True):
+        picture = SyntheticCamera(rig, scene, camera, seed=1).render(scene.start, 0)
+        (tmp_path / camera.name).mkdir()
+        for number in range(count):
+            cv2.imwrite(str(tmp_path / camera.name / f"{number}.png"), picture)
+    log, drawn = tmp_path / "poses.csv", tmp_path / "drawn.avi"
+    sources = [f"{name}={tmp_path / name}" for name in ("front", "side")]
+    answer = call("track", uneven, *sources, "-o", log, "--overlay", drawn, "--json")
+    assert answer.code == 0, answer
+    facts = json.loads(answer.out)
+    assert (facts["pictures"], facts["poses"], facts["pictures_without_partner"]) == (5, 5, 3)
+    assert (facts["moments_apart"], facts["moments_without_speed"]) == (0, 0)
+    rows = {name: rows_of(tmp_path / f"poses{name}.csv") for name in ("", "-front", "-side")}
+    assert [len(rows[name]) for name in rows] == [5, 5, 2]
+    assert [float(row["time_s"]) for row in rows[""]] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    better = [
+        float(both["std_x_mm"]) < float(front["std_x_mm"])
+        for both, front in zip(rows[""], rows["-front"], strict=True)
+    ]
+    assert better == [True, False, True, False, False]
+    assert not drawn.exists()
+    assert all((tmp_path / f"drawn-{name}.avi").is_file() for name in ("front", "side"))
+
+
+def test_a_plan_is_for_those_cameras_that_are_synthetic(
+    rig_file: Path, plan: Path, tmp_path: Path
+) -> None:
+    blank = tmp_path / "blank"
+    blank.mkdir()
+    camera = load_rig(rig_file).cameras[1]
+    cv2.imwrite(str(blank / "0.png"), np.full((camera.height, camera.width), 99, dtype=np.uint8))
+    options = ("--plan", plan, "--pictures", "1", "-o", tmp_path / "poses.csv", "--json")
+    answer = call("track", rig_file, "front=synthetic", f"side={blank}", *options)
+    assert answer.code == 0, answer
+    assert json.loads(answer.out)["poses"] == 1
+    with nothing_written(tmp_path):
+        answer = call("track", rig_file, f"side={blank}", *options, "--force")
+    one_message(answer, 2, "--plan is for the synthetic camera", str(blank))
 
 
 @pytest.mark.parametrize(

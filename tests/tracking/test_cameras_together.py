@@ -171,7 +171,7 @@ def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) 
 def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
     speed: float, late: float, pause: float
 ) -> None:
-    """First pictures, and those after nothing was seen for long: the later camera, which is worse."""
+    """First pictures, and those after nothing was seen for long: the later, worse camera."""
 
     def seen(time: float, deviation: float) -> PoseMeasurement:
         one = measured([speed * time, 0.0, 0.4], [deviation] * 3)
