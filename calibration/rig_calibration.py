@@ -40,7 +40,7 @@ class RigCalibration:
         observability: What the data tell.
         uncertainty: Of the unknowns.
         held_out: Places left out of fits.
-        length_deviation: Of a cable's length as a drive tells it, [m].
+        length_deviation: Of a cable's length as a drive tells it, its tension measured, [m].
     """
 
     parameters: Parameters
@@ -137,7 +137,7 @@ def calibrate_rig(
         measured: Places at rest.
         deviations: How far off the rig file may be by group of numbers; groups left out are taken
             as known.
-        length_deviation: Of a cable's length as a drive tells it, [m].
+        length_deviation: Of a cable's length as a drive tells it, its tension measured, [m].
 
     Raises:
         BadInput: Too few places, a pose outside the rig, or nothing to look for.
@@ -159,7 +159,7 @@ def calibrate_rig(
             next_step="leave out --known for one of them",
         )
     fit, observability = identified(parameters, measured, length_deviation)
-    agreeing = without_outliers(measured, fit, length_deviation, FEWEST_PLACES)
+    agreeing = without_outliers(measured, fit, FEWEST_PLACES)
     if len(agreeing) < len(measured):
         measured = agreeing
         fit, observability = identified(parameters, measured, length_deviation)
@@ -168,7 +168,7 @@ def calibrate_rig(
         measured,
         fit,
         observability,
-        uncertainty_of_rig(parameters, measured, fit, observability, length_deviation),
+        uncertainty_of_rig(parameters, measured, fit, observability),
         held_out(parameters, measured, length_deviation),
         length_deviation,
     )

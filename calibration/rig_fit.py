@@ -20,7 +20,7 @@ from calibration.robust import huber, share_of
 from cdpr.cables import NoCable
 from cdpr.errors import Fault
 from cdpr.kinematics import ForwardSolution, forward_kinematics
-from cdpr.poses import Array, matrix_from_rotation_vector, rotation_vector_from_matrix
+from cdpr.poses import Array, matrix_from_rotation_vector, read_only, rotation_vector_from_matrix
 from cdpr.rig import Rig
 
 MOST_STEPS = 200
@@ -43,6 +43,7 @@ class RigFit:
         positions: World frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
         residuals: Of cable lengths, shape (n, m), [m].
+        deviations: How far off each length was taken to be, shape (n, m), [m].
         weights: How much of each residual's square counts, shape (n, m); less than 1 where it is
             far off.
         pose_misfits: Of the poses from the measured ones, in standard deviations, shape (n,); 0
@@ -56,6 +57,7 @@ class RigFit:
     positions: Array
     rotations: Array
     residuals: Array
+    deviations: Array
     weights: Array
     pose_misfits: Array
     informations: Array
@@ -86,7 +88,7 @@ class RigFitter:
         """
         self._parameters, self._measured = parameters, measured
         self._model = RigModel(parameters, measured)
-        self._length_weight = 1.0 / length_deviation**2
+        self._deviations = self._model.length_deviations(length_deviation)
         self._posed = measured.posed
         self._pose_weights = np.zeros((len(measured), 6, 6))
         self._pose_weights[self._posed] = np.linalg.inv(measured.covariances[self._posed])
@@ -157,7 +159,7 @@ class RigFitter:
             residuals = self._model.residuals(values, positions, rotations)
         except NoCable:
             return float("inf")
-        cables = np.sqrt(self._length_weight) * np.abs(residuals)
+        cables = np.abs(residuals) / self._deviations
         poses = self._distances(self._pose_errors(positions, rotations))
         return float(z @ z + huber(cables, CABLE_BEND).sum() + huber(poses, POSE_BEND).sum())
 
@@ -165,9 +167,7 @@ class RigFitter:
         self, values: Array, z: Array, spread: Array, positions: Array, rotations: Array
     ) -> System:
         line = self._model.linearised(values, positions, rotations)
-        weights = self._length_weight * share_of(
-            np.sqrt(self._length_weight) * np.abs(line.residuals), CABLE_BEND
-        )
+        weights = self._cable_share(line.residuals) / self._deviations**2
         errors = self._pose_errors(positions, rotations)
         share = share_of(self._distances(errors), POSE_BEND)
         pose_weights = share[:, None, None] * self._pose_weights
@@ -183,6 +183,10 @@ class RigFitter:
             + np.einsum("nij,nj->ni", pose_weights, errors),
         )
 
+    def _cable_share(self, residuals: Array) -> Array:
+        """How much of each cable's square counts, shape (n, m)."""
+        return share_of(np.abs(residuals) / self._deviations, CABLE_BEND)
+
     def _result(self, values: Array, positions: Array, rotations: Array) -> RigFit:
         spread = np.diag(self._parameters.deviations)
         zero = np.zeros(len(values))
@@ -193,7 +197,8 @@ class RigFitter:
             positions,
             rotations,
             residuals,
-            share_of(np.sqrt(self._length_weight) * np.abs(residuals), CABLE_BEND),
+            read_only(self._deviations),
+            self._cable_share(residuals),
             self._distances(self._pose_errors(positions, rotations)),
             *system.by_place(),
         )

@@ -12,10 +12,10 @@ import numpy as np
 
 from calibration.rig_measurements import RigMeasurements
 from calibration.rig_parameters import CountedLengths, Parameters, RigGeometry, rig_with
+from calibration.rig_tensions import likely_tensions, tension_doubt
 from cdpr.cables import Cables, cables_to
 from cdpr.poses import Array
 from cdpr.rig import Rig
-from cdpr.statics.working import working_tensions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class RigModel:
     """Lengths of cables of a rig with unknown numbers, at n poses."""
 
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
-        """Takes the measurements; unmeasured tensions are the working ones of home.
+        """Takes the measurements; tensions that were not measured are those of `likely_tensions`.
 
         Where some were not measured, nothing tells of the cables' stiffness.
 
@@ -45,12 +45,22 @@ class RigModel:
             TensionInfeasible: The rig cannot hold its platform at home.
         """
         self.parameters = parameters
-        rig = parameters.rig
-        working = working_tensions(rig, rig.home).tensions
-        told = np.isfinite(measured.tensions)
-        tensions = np.where(told, measured.tensions, working)
-        self._stretch_is_told = bool(told.all())
-        self.counted = CountedLengths(rig, measured.counts, tensions)
+        self._told = np.isfinite(measured.tensions)
+        self._stretch_is_told = bool(self._told.all())
+        tensions = likely_tensions(parameters.rig, measured)
+        self.counted = CountedLengths(parameters.rig, measured.counts, tensions)
+
+    def length_deviations(self, length_deviation: float) -> Array:
+        """How far off the lengths may be that drives tell, shape (n, m), [m].
+
+        Args:
+            length_deviation: With tensions that were measured, [m]; others add what they may
+                stretch a cable of the rig file's stiffness.
+        """
+        rig, drawn = self.parameters.rig, self.parameters.geometry(np.zeros(len(self.parameters)))
+        stretched = tension_doubt(rig) / rig.cable_stiffness * self.counted.by(drawn)
+        deviations: Array = np.hypot(length_deviation, np.where(self._told, 0.0, stretched))
+        return deviations
 
     def residuals(self, values: Array, positions: Array, rotations: Array) -> Array:
         """As in `Linearised`."""

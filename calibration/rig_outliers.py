@@ -16,18 +16,15 @@ OFF = 2.0
 """and farther off than so many of the standard deviations that were stated."""
 
 
-def without_outliers(
-    measured: RigMeasurements, fit: RigFit, length_deviation: float, fewest: int
-) -> RigMeasurements:
+def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> RigMeasurements:
     """The places that agree with each other; the others are named as unused.
 
     Args:
         measured: Places at rest.
         fit: Of all of them, robust.
-        length_deviation: Of a cable's length as a drive tells it, [m].
         fewest: Nothing is left out where fewer places than that would remain.
     """
-    cables = fit.residuals / length_deviation
+    cables = fit.residuals / fit.deviations
     misfits = _misfits(cables, fit.pose_misfits, measured)
     usual = float(np.median(misfits))
     bad = misfits > max(FAR_OFF * usual, OFF)

@@ -118,7 +118,7 @@ def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
     by_compliance = -model.counted.by_compliance(result.geometry)[..., None] * groups
     free = parameters.deviations[:, None] * result.observability.known
     by_all = np.concatenate([line.by_values @ free, by_compliance], axis=2)
-    weights = fit.weights / result.length_deviation**2
+    weights = fit.weights / fit.deviations**2
     weighted = weights[..., None] * line.by_pose
     poses = np.swapaxes(line.by_pose, 1, 2) @ weighted
     poses[data.posed] += np.linalg.inv(data.covariances[data.posed])

@@ -66,23 +66,21 @@ def uncertainty_of_rig(
     measured: RigMeasurements,
     fit: RigFit,
     observability: Observability,
-    length_deviation: float,
 ) -> RigUncertainty:
     """The uncertainty of a fit.
 
     Args:
         parameters: The unknowns.
         measured: Places at rest.
-        fit: Of them, in the directions that they tell.
+        fit: Of them, in the directions that they tell; where residuals tell of lengths farther off
+            than they were taken to be, that holds.
         observability: Which those are.
-        length_deviation: Of a cable's length as a drive tells it, [m]; where residuals tell of a
-            larger one, that holds.
     """
     known, unknown = observability.known, observability.unknown
     informations = known.T @ fit.informations @ known
     scores = fit.scores @ known
     whole = informations.sum(axis=0) + np.eye(known.shape[1])
-    squares = float(np.sum(fit.weights * (fit.residuals / length_deviation) ** 2))
+    squares = float(np.sum(fit.weights * (fit.residuals / fit.deviations) ** 2))
     freedom = fit.residuals.size - known.shape[1] - 6 * int((~measured.posed).sum())
     scatter = max(1.0, squares / max(freedom, 1))
     count = len(measured)

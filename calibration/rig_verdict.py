@@ -55,7 +55,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    lacks = _far_numbers(result) + _other_stiffness(result)
+    lacks = _far_numbers(result) + _other_stiffness(result) + _unknown_stretch(result)
     if missed > wanted:
         what = "places" if out.poses else "lengths of cables at places"
         lacks.append(
@@ -139,6 +139,22 @@ def _cables_that_differ(result: RigCalibration) -> list[Lack]:
             f" {result.geometry.stiffness:.4g} N for all",
             "look for a cable that is worn, loose on its drum or of another kind, and check the"
             " tensions that its drive tells",
+        )
+    ]
+
+
+def _unknown_stretch(result: RigCalibration) -> list[Lack]:
+    """Tensions that were not measured and matter: they err alike in many places."""
+    usual = result.length_deviation
+    stretch = float(np.sqrt(np.max(result.fit.deviations**2) - usual**2))
+    if stretch <= usual:
+        return []
+    places = int((~np.isfinite(result.measured.tensions)).any(axis=1).sum())
+    return [
+        Lack(
+            f"tensions were not measured in {places} places, which makes lengths of cables"
+            f" uncertain by {stretch * 1e3:.2g} mm, --length-mm is {usual * 1e3:.2g}",
+            "measure tensions too: use run folders, or tables with the columns tension_1_n …",
         )
     ]
 

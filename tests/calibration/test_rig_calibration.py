@@ -25,13 +25,15 @@ from calibration.rig_page import rig_page
 from calibration.rig_parameters import DEFAULT_DEVIATIONS, CountedLengths, Parameters
 from calibration.rig_result import RigResult, require_one_drawing, rig_result
 from calibration.rig_stiffness import compliance_told, differences_told
+from calibration.rig_tensions import likely_tensions, tension_doubt
 from calibration.rig_uncertainty import uncertainty_of_rig
 from calibration.rig_verdict import judge_rig, judged_places
 from cdpr.errors import BadInput, InvalidFile
 from cdpr.kinematics import poses_near
-from cdpr.poses import Array, matrix_from_rotation_vector, rotation_vector_from_matrix
+from cdpr.poses import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from cdpr.rig import Rig, load_rig, rig_from_document
 from cdpr.rig_file import RigDocument
+from cdpr.statics.working import working_tensions
 from cdpr.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
@@ -205,6 +207,44 @@ def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
     assert "the stiffness of the cables" in result.not_identified
     width = result.intervals["stiffness_n"].half_width
     assert width == pytest.approx(0.2 * 6000.0 * 2.0, rel=0.01)  # Student's factor of 59
+    assert share_inside(result.intervals, true_numbers(rig)) >= 0.9
+    verdict = judge_rig(result, 10e-3, 0.0).verdict
+    assert not verdict.good
+    assert verdict.reasons[0].startswith("tensions were not measured in 60 places")
+    assert any("tension_1_n" in step for step in verdict.next_steps)
+
+
+def test_without_tensions_cables_that_hardly_stretch_are_as_certain(
+    rig: Rig, turned: Truth
+) -> None:
+    stiff = drawn_with(rig, 1e6)
+    blind = replace(turned.measured, tensions=np.full_like(turned.measured.tensions, np.nan))
+    model = RigModel(Parameters.of(stiff, DEFAULT_DEVIATIONS), blind)
+    deviations = model.length_deviations(LENGTH_DEVIATION)
+    assert deviations == pytest.approx(LENGTH_DEVIATION, rel=0.01)
+    assert deviations.min() > LENGTH_DEVIATION
+    soft = RigModel(Parameters.of(rig, DEFAULT_DEVIATIONS), blind)
+    assert soft.length_deviations(LENGTH_DEVIATION).min() > 5.0 * LENGTH_DEVIATION
+    measured = RigModel(Parameters.of(rig, DEFAULT_DEVIATIONS), turned.measured)
+    assert np.all(measured.length_deviations(LENGTH_DEVIATION) == LENGTH_DEVIATION)
+
+
+def test_tensions_that_were_not_measured_are_the_working_ones_of_their_place(
+    rig: Rig, turned: Truth
+) -> None:
+    tensions = turned.measured.tensions.copy()
+    tensions[0, 2], tensions[1], tensions[2] = np.nan, np.nan, np.nan
+    positions = turned.measured.positions.copy()
+    positions[2] = np.nan
+    data = replace(turned.measured, tensions=tensions, positions=positions)
+    likely = likely_tensions(rig, data)
+    place = Pose(positions[1], data.rotations[1])
+    assert np.array_equal(likely[1], working_tensions(rig, place).tensions)
+    assert np.array_equal(likely[2], working_tensions(rig, rig.home).tensions)
+    assert np.isfinite(likely[0, 2])
+    assert np.array_equal(np.delete(likely[0], 2), np.delete(tensions[0], 2))
+    assert np.array_equal(likely[3:], tensions[3:])
+    assert np.abs(likely - turned.measured.tensions).max() < 3.0 * tension_doubt(rig)
 
 
 def test_what_leaving_a_place_out_changes_is_what_fits_without_it_find(
@@ -215,7 +255,7 @@ def test_what_leaving_a_place_out_changes_is_what_fits_without_it_find(
     parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
     fit, observability = identified(parameters, data, LENGTH_DEVIATION)
     known = observability.known
-    found = uncertainty_of_rig(parameters, data, fit, observability, LENGTH_DEVIATION)
+    found = uncertainty_of_rig(parameters, data, fit, observability)
     rests = [data.part(np.arange(20) != k) for k in range(20)]
     changes = np.array(
         [RigFitter(parameters, rest, LENGTH_DEVIATION).fit(known).values for rest in rests]
