@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -83,15 +84,23 @@ class RigCalibration:
             "pulleys": (np.array([geometry.pulley_radius * 1e3]), "_mm", np.array([1e3])),
             "drum_scale": (drums * (1.0 + geometry.drum_scale), "_mm_per_rev", drums),
             "offsets": (geometry.offsets * 1e3, "_mm", np.full(m, 1e3)),
-            "stiffness": (np.array([geometry.stiffness]), "_n", np.array([geometry.stiffness])),
         }
         half_widths = self.uncertainty.half_widths
         for group, place in self.parameters.slices().items():
+            if group == "stiffness":
+                found["stiffness_n"] = self._stiffness()
+                continue
             values, unit, scale = tables[group]
             widths = half_widths[place] * scale
             rows = zip(self.parameters.names[place], values, widths, strict=True)
             found |= {f"{n}{unit}": Interval(float(v), float(w)) for n, v, w in rows}
         return found
+
+    def _stiffness(self) -> Interval:
+        """Of the cables, [N]: its logarithm is as uncertain to both sides, itself is not."""
+        width = float(self.uncertainty.half_widths[self.parameters.slices()["stiffness"]][0])
+        stiffness = self.geometry.stiffness
+        return Interval.between(stiffness * math.exp(-width), stiffness * math.exp(width))
 
     def position_error(self, positions: Array, rotations: Array) -> Array:
         """How far off the platform may be where its drives are told to bring it, 95 %.

@@ -8,6 +8,7 @@ intervals would be false. Where the stiffness is among them, the doubt that was 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +29,7 @@ class Compliance:
     """What the data tell of the cables' compliance, 1 / stiffness.
 
     Attributes:
-        drawn: By the rig file, [1/N].
+        drawn: By the rig file, to first order about the fit, [1/N].
         told: By the data, [1/N].
         deviation: Standard deviation of the difference, [1/N].
     """
@@ -81,7 +82,7 @@ def compliance_told(result: RigCalibration) -> Compliance | None:
     if not np.isfinite(result.measured.tensions).all():
         return None
     information, pull = _told(result, np.ones((result.rig.cable_count, 1)))
-    drawn = 1.0 / result.rig.cable_stiffness
+    drawn = _drawn(result)
     own = float(information[0, 0])
     return Compliance(drawn, drawn - float(pull[0]) / own, own**-0.5)
 
@@ -98,8 +99,18 @@ def differences_told(result: RigCalibration) -> Differences | None:
     information, pull = _told(result, np.eye(cables))
     change = -np.asarray(np.linalg.solve(information, pull))
     chance = float(chi2.sf(-pull @ change, cables))
-    told: Array = 1.0 / result.rig.cable_stiffness + change
+    told: Array = _drawn(result) + change
     return Differences(told, chance)
+
+
+def _drawn(result: RigCalibration) -> float:
+    """The rig file's compliance as the fit sees it, [1/N].
+
+    Changes are solved about the fit, whose unknown is the logarithm of the stiffness: the rig
+    file is as far off as the tangent there says, not as the reciprocal of its own number.
+    """
+    fit = result.geometry.stiffness
+    return (1.0 + math.log(fit / result.rig.cable_stiffness)) / fit
 
 
 def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:

@@ -102,15 +102,24 @@ def _far_numbers(result: RigCalibration) -> list[Lack]:
         return []
     group = next(g for g, place in parameters.slices().items() if place.start <= k < place.stop)
     share = group in ("drum_scale", "stiffness")
-    far = f"{abs(values[k]) * 1e2:.3g} %" if share else f"{abs(values[k]) * 1e3:.3g} mm"
     option = f"--{group.replace('_', '-')}-{'percent' if share else 'mm'}"
     return [
         Lack(
-            f"{parameters.names[k]} is {far} from the rig file, {times[k]:.3g} times {option}",
+            f"{parameters.names[k]} is {_far(group, float(values[k]))},"
+            f" {times[k]:.3g} times {option}",
             "check units, the order of the cables and the rig file; where it is truly that far"
             f" off, pass a larger {option}",
         )
     ]
+
+
+def _far(group: str, value: float) -> str:
+    """How far a number is from the rig file, in words; of a stiffness it is the logarithm."""
+    if group == "stiffness":
+        return f"{math.exp(value):.3g} times that of the rig file, as a logarithm"
+    if group == "drum_scale":
+        return f"{abs(value) * 1e2:.3g} % from the rig file"
+    return f"{abs(value) * 1e3:.3g} mm from the rig file"
 
 
 def _other_stiffness(result: RigCalibration) -> list[Lack]:

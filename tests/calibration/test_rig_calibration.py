@@ -193,7 +193,9 @@ def test_a_stiffness_that_is_found_is_applied(rig: Rig, turned: Truth) -> None:
     result = calibrate_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     told = rig_result(result, judge_rig(result, 1e-3, 0.0), "rig", TODAY)
     corrected = calibrated(drawn, [told])
-    assert corrected.cable_stiffness == told.stiffness_n == result.intervals["stiffness_n"].value
+    assert corrected.cable_stiffness == told.stiffness_n == result.geometry.stiffness
+    low, high = told.intervals["stiffness_n"]
+    assert low * high == pytest.approx(told.stiffness_n**2)
     others = places(rig, 20, tilt=0.1, seed=4)
     assert rms(errors_of(corrected, others)) < 0.3e-3
 
@@ -205,8 +207,9 @@ def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
     result = calibrate_rig(rig, blind, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     assert result.geometry.stiffness == pytest.approx(rig.cable_stiffness, rel=1e-12)
     assert "the stiffness of the cables" in result.not_identified
-    width = result.intervals["stiffness_n"].half_width
-    assert width == pytest.approx(0.2 * 6000.0 * 2.0, rel=0.01)  # Student's factor of 59
+    ends = result.intervals["stiffness_n"].bounds
+    width = 0.2 * 2.0  # Student's factor of 59
+    assert ends == pytest.approx([6000.0 * np.exp(-width), 6000.0 * np.exp(width)], rel=0.01)
     assert share_inside(result.intervals, true_numbers(rig)) >= 0.9
     verdict = judge_rig(result, 10e-3, 0.0).verdict
     assert not verdict.good
@@ -559,6 +562,38 @@ def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool)
     assert not verdict.good
     assert any("848230 N" in reason for reason in verdict.reasons)
     assert any("stiffness_n" in step for step in verdict.next_steps)
+
+
+@pytest.mark.parametrize("stiffness", [3500.0, 12000.0, 60000.0])
+def test_the_stiffness_that_the_data_tell_is_the_same_for_every_rig_file(
+    rig: Rig, turned: Truth, stiffness: float
+) -> None:
+    drawn = drawn_with(rig, stiffness)
+    result = calibrate_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    compliance, differences = compliance_told(result), differences_told(result)
+    assert compliance is not None
+    assert differences is not None
+    assert 1.0 / compliance.told == pytest.approx(6000.0, rel=0.05)
+    assert 1.0 / differences.told == pytest.approx(6000.0, rel=0.3)
+
+
+def test_a_stiffness_far_from_the_rig_file_is_told_as_a_factor(rig: Rig, turned: Truth) -> None:
+    drawn = drawn_with(rig, 60000.0)
+    result = calibrate_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    factor = result.geometry.stiffness / 60000.0
+    assert factor < 0.3
+    reason = judge_rig(result, 1e-3, 0.0).verdict.reasons[0]
+    assert reason.startswith(f"stiffness is {factor:.3g} times that of the rig file")
+
+
+def test_a_stiffness_that_nothing_tells_is_positive_however_uncertain(
+    rig: Rig, turned: Truth
+) -> None:
+    blind = replace(turned.measured, tensions=np.full_like(turned.measured.tensions, np.nan))
+    loose = {"outlets": 4e-3, "stiffness": 2.0}
+    stiffness = calibrate_rig(rig, blind, loose, LENGTH_DEVIATION).intervals["stiffness_n"]
+    assert 0.0 < stiffness.bounds[0] < 6000.0 / 20.0
+    assert stiffness.bounds[1] > 6000.0 * 20.0
 
 
 def test_a_stiffness_that_is_hardly_known_is_found_from_afar(turned: Truth) -> None:
