@@ -44,10 +44,10 @@ class TagSights:
         return TagSights(left, {**self.unused, **unused})
 
     def each_view_once(self) -> TagSights:
-        """Without pictures in which all tags are where an earlier one has them."""
+        """Without pictures in which all tags are where another, which shows no fewer, has them."""
         kept: dict[str, Mapping[int, RefinedTag]] = {}
         unused = {}
-        for name, squares in self.squares.items():
+        for name, squares in sorted(self.squares.items(), key=lambda sight: -len(sight[1])):
             first = next((n for n, before in kept.items() if _alike(squares, before)), None)
             if first is None:
                 kept[name] = squares

@@ -127,6 +127,17 @@ def test_the_same_view_counts_once(rig: Rig) -> None:
     assert found.unused["again 3.png"] == "shows the same as 3.png: nothing moved in between"
 
 
+def test_of_two_views_of_one_stand_the_one_with_more_tags_counts(rig: Rig) -> None:
+    sights, _ = session(rig, 4, 0.3, 1e-4, seed=7)
+    squares = max(sights.squares.values(), key=len)
+    assert len(squares) > 1
+    fewer = dict(list(squares.items())[:1])
+    for order in ({"a": fewer, "b": squares}, {"b": squares, "a": fewer}):
+        once = TagSights(order, {}).each_view_once()
+        assert set(once.squares) == {"b"}
+        assert once.unused == {"a": "shows the same as b: nothing moved in between"}
+
+
 def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> None:
     sights, told = session(rig, 6, 0.3, 1e-4, seed=6)
     del told["2.png"]
