@@ -9,6 +9,7 @@ import typer
 
 from cdpr.cli.calibration_output import FolderOption, ForceOption, JsonOption, WantedOption
 from cdpr.cli.calibrations import CalibrationOption
+from cdpr.cli.finite import finite
 
 if TYPE_CHECKING:
     from calibration.extrinsics import ExtrinsicCalibration
@@ -42,12 +43,16 @@ def extrinsics(
         ),
     ] = None,
     survey_mm: Annotated[
-        float, typer.Option(min=0.0, help="how well corners of frame tags were surveyed, deviation")
+        float,
+        typer.Option(
+            min=0.0, callback=finite, help="how well corners of frame tags were surveyed, deviation"
+        ),
     ] = 0.5,
     survey_deg: Annotated[
         float | None,
         typer.Option(
             min=0.0,
+            callback=finite,
             help="how well turns of frame tags are known, deviation; --survey-mm is then of whole"
             " tags (default: each corner was surveyed by itself)",
         ),
@@ -156,13 +161,14 @@ def _poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
 
     run = RunFolder.open(folder)
     cycles, alone = run.cycles(), run.poses_by_camera()
-    looks = alone.get(camera) if alone else run.poses()
-    if looks is None:
+    names = [one["name"] for one in run.summary().get("cameras", [])]
+    if camera not in names:
         raise BadInput(
             f"camera {camera!r} took no pictures in this run",
             where=str(folder),
-            next_step=f"name one of its cameras with --camera: {', '.join(alone)}",
+            next_step=f"name one of its cameras with --camera: {', '.join(names)}",
         )
+    looks = alone[camera] if alone else run.poses()
     times = cycles.time
     poses = {}
     for time, picture in zip(looks.time, looks.picture, strict=True):

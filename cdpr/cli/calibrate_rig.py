@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cdpr.cli.calibration_output import FolderOption, ForceOption, JsonOption, WantedOption
+from cdpr.cli.finite import finite
 
 if TYPE_CHECKING:
     from calibration.rig_calibration import RigCalibration
@@ -47,26 +48,46 @@ def rig(
         typer.Option(help="numbers to leave as in the rig file; again for more"),
     ] = None,
     outlets_mm: Annotated[
-        float, typer.Option(min=1e-6, help="how far off outlets may be, one standard deviation")
+        float,
+        typer.Option(
+            min=1e-6, callback=finite, help="how far off outlets may be, one standard deviation"
+        ),
     ] = 4.0,
-    anchors_mm: Annotated[float, typer.Option(min=1e-6, help="likewise anchors")] = 1.0,
-    pulleys_mm: Annotated[float, typer.Option(min=1e-6, help="the pulleys' radius")] = 0.5,
+    anchors_mm: Annotated[
+        float, typer.Option(min=1e-6, callback=finite, help="likewise anchors")
+    ] = 1.0,
+    pulleys_mm: Annotated[
+        float, typer.Option(min=1e-6, callback=finite, help="the pulleys' radius")
+    ] = 0.5,
     drum_scale_percent: Annotated[
-        float, typer.Option(min=1e-6, help="cable per turn of each drum")
+        float, typer.Option(min=1e-6, callback=finite, help="cable per turn of each drum")
     ] = 0.5,
     offsets_mm: Annotated[
-        float, typer.Option(min=1e-6, help="cable at the reference (home)")
+        float, typer.Option(min=1e-6, callback=finite, help="cable at the reference (home)")
     ] = 2.0,
-    stiffness_percent: Annotated[float, typer.Option(min=1e-6, help="of the cables")] = 20.0,
+    stiffness_percent: Annotated[
+        float, typer.Option(min=1e-6, max=1000.0, callback=finite, help="of the cables")
+    ] = 20.0,
     length_mm: Annotated[
-        float, typer.Option(min=1e-6, help="how far off lengths by drive positions may be")
+        float,
+        typer.Option(
+            min=1e-6, callback=finite, help="how far off lengths by drive positions may be"
+        ),
     ] = 0.1,
     pose_mm: Annotated[
-        float, typer.Option(min=1e-6, help="how far off poses may be beside what their file tells")
+        float,
+        typer.Option(
+            min=1e-6, callback=finite, help="how far off poses may be beside what their file tells"
+        ),
     ] = 0.1,
-    pose_deg: Annotated[float, typer.Option(min=1e-6, help="their turns, likewise")] = 0.02,
+    pose_deg: Annotated[
+        float, typer.Option(min=1e-6, callback=finite, help="their turns, likewise")
+    ] = 0.02,
     tilt_deg: Annotated[
-        float, typer.Option(min=0.0, max=90.0, help="how far the platform will be turned")
+        float,
+        typer.Option(
+            min=0.0, max=90.0, callback=finite, help="how far the platform will be turned"
+        ),
     ] = 5.0,
     wanted_mm: WantedOption = 1.0,
     name: Annotated[str, typer.Option(help="of the result")] = "rig",

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cdpr.cli.finite import finite
+
 if TYPE_CHECKING:
     from calibration.result_file import ResultDocument
 
@@ -19,7 +21,9 @@ ForceOption = Annotated[
     bool, typer.Option("--force", help="replace the result of the same name and day")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
-WantedOption = Annotated[float, typer.Option(min=0.001, help="what is good enough, 95 %")]
+WantedOption = Annotated[
+    float, typer.Option(min=0.001, callback=finite, help="what is good enough, 95 %")
+]
 
 
 def begin(kind: str, name: str, output: Path | None, force: bool) -> date:

@@ -113,6 +113,35 @@ def test_a_run_tells_its_poses_by_the_drives(short_plan: Path, tmp_path: Path) -
         assert low <= place <= high
 
 
+def test_the_pictures_of_another_camera_are_refused(short_plan: Path, tmp_path: Path) -> None:
+    run, two = tmp_path / "run", tmp_path / "two.yaml"
+    assert call("run", short_plan, "--rig", RIG, "-o", run, "--fast").code == 0
+    document = yaml.safe_load(RIG.read_text())
+    document["cameras"].append({**document["cameras"][0], "name": "side"})
+    two.write_text(yaml.safe_dump(document))
+    options = ("--poses", run, "--camera", "side")
+    answer = call("calibrate", "extrinsics", two, run / "pictures", *options)
+    one_message(answer, 2, "camera 'side' took no pictures in this run", "front")
+
+
+@pytest.mark.parametrize("number", ["inf", "nan"])
+@pytest.mark.parametrize(
+    ("verb", "option"),
+    [
+        ("extrinsics", "--survey-deg"),
+        ("extrinsics", "--survey-mm"),
+        ("extrinsics", "--wanted-mm"),
+        ("rig", "--stiffness-percent"),
+        ("rig", "--length-mm"),
+        ("rig", "--tilt-deg"),
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(folder, verb, option, number: str) -> None:
+    answer = call("calibrate", verb, RIG, folder, option, number)
+    assert answer.code == 2
+    assert option in answer.err
+
+
 def test_people_read_the_verdict_first(folder) -> None:
     answer = call("calibrate", "extrinsics", RIG, folder, "--survey-mm", "5")
     assert answer.code == 3
