@@ -6,19 +6,22 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 PIP := install --quiet --disable-pip-version-check
-PACKAGES := cdpr planner executor drivers tracking calibration simulation
-COMPILE_EDGES := from cdpr.cli.compiling import ready_to_measure; ready_to_measure(shown=False)
+PACKAGES := cdpr calibration executor simulation planner drivers tracking model
+COMPILE_REST := from executor.kernels import ready_to_measure, ready_to_simulate; ready_to_measure(); ready_to_simulate()
+
+# The theme of the documentation advertises another program in each build.
+export NO_MKDOCS_2_WARNING := 1
 
 # A sourced ROS or Conda shell puts its own packages in front of ours.
 unexport PYTHONPATH PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test hil hil-subset lint docs schema clean distclean
+.PHONY: help install demo docs-run wheel test test-root test-quiet test-lowest check-arm64 mutation fuzz hil hil-runs hil-table hil-makers hil-subset lint docs schema clean distclean
 
 help:  ## Show this help
 	@echo "cdpr: plan, prove, run and measure paths of cable-driven parallel robots"
 	@echo
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
 	@echo
 	@echo "The Python to build on: make PYTHON=python3.12 ... (3.11 or newer; now: $(PYTHON))"
 
@@ -41,36 +44,74 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: --no-build-isolation -c constraints.txt -e ".[dev]" && \
 	"$(BIN)/python" -m pip check --disable-pip-version-check && \
-	echo "Compiling the planner and the tags' edge finder (once; a minute or two) ..." && \
+	echo "Compiling the planner, the tags' edge finder and the simulated platform (once; a minute or two) ..." && \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml -o "$(VENV)/first-plan.json" --force --json >/dev/null && \
-	"$(BIN)/python" -c '$(COMPILE_EDGES)' && \
+	"$(BIN)/python" -c '$(COMPILE_REST)' && \
 	echo "$$place, $$pins" > "$(STAMP)"
 
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
 	"$(BIN)/cdpr" demo
 
-# Kernels of searches and edges that the installation did not run are compiled first, by one process each: the tests' own
+# Kernels that the installation did not run are compiled first, by one process each: the tests' own
 # processes would compile them twice.
 test: install  ## Run the whole test suite on two cores
 	@"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml --planner adaptive \
 	  -o "$(VENV)/paper-plan.json" --force --json >/dev/null & paper=$$!; \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/turn.yaml --free-rotation --rounds 1 \
 	  -o "$(VENV)/turning-plan.json" --force --json >/dev/null && \
-	"$(BIN)/python" -c '$(COMPILE_EDGES)' && \
+	"$(BIN)/python" -c '$(COMPILE_REST)' && \
 	wait $$paper
 	"$(BIN)/python" -m pytest -n 2
 
-hil: install  ## Run the tests that need a CAN bus of the kernel, here or in a virtual machine
+mutation: install  ## Try small changes of the code that keeps people safe (PATHS=executor/safety, or CHANGED=BASE)
+	"$(BIN)/python" tools/mutation/run.py $(if $(CHANGED),--changed "$(CHANGED)") $(PATHS)
+
+test-quiet: install  ## Run the tests in real time at 100 Hz, on a computer that does nothing else (real-time rights help)
+	"$(BIN)/python" -m pytest -q -m quiet
+
+test-root: install  ## Run the tests that act for two users, which only root may
+	"$(BIN)/python" -m pytest -q -m root
+
+# Only what must be installed is pinned to its lowest version; the tools of the tests are the newest that go with it.
+test-lowest:  ## Run the quick tests in .venv-lowest, with the lowest version of every dependency
+	"$(PYTHON)" -m venv .venv-lowest
+	"$(PYTHON)" tools/lowest.py > .venv-lowest/constraints.txt
+	.venv-lowest/bin/python -m pip $(PIP) --only-binary :all: -c .venv-lowest/constraints.txt hatchling
+	.venv-lowest/bin/python -m pip $(PIP) --only-binary :all: --no-build-isolation -c .venv-lowest/constraints.txt -e ".[dev]"
+	.venv-lowest/bin/python -m pip check --disable-pip-version-check
+	.venv-lowest/bin/python -m pytest -n 2 -m "not slow" --ignore tests/repository
+
+# Nothing is downloaded but what tells the versions apart. Left out: the extra `apriltag`, which has no wheel there.
+check-arm64:  ## Check that every pinned package has a wheel for 64-bit ARM (Raspberry Pi, Jetson)
+	@sed -e '/^# The extra .apriltag/,$$d' -e '/^#/d' -e '/^$$/d' constraints.txt > "$${TMPDIR:-/tmp}/cdpr-pins-$$$$" && \
+	"$(PYTHON)" -m pip $(PIP) --dry-run --ignore-installed --no-deps --only-binary :all: --python-version 3.11 \
+	  --platform manylinux_2_28_aarch64 --platform manylinux_2_17_aarch64 --platform manylinux2014_aarch64 \
+	  --target "$${TMPDIR:-/tmp}/cdpr-arm64" -r "$${TMPDIR:-/tmp}/cdpr-pins-$$$$"; \
+	status=$$?; rm -f "$${TMPDIR:-/tmp}/cdpr-pins-$$$$"; exit $$status
+
+hil: hil-runs hil-table hil-makers  ## Run the tests that need a CAN bus of the kernel, here or in virtual machines (-j2: two parts at once)
+
+hil-runs: install  ## Its first part: whole runs, homing, a master that dies or hangs
 	@"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_3.yaml -o "$(VENV)/hil-plan.json" --force --json >/dev/null
-	CDPR_HIL_PLAN="$$PWD/$(VENV)/hil-plan.json" "$(BIN)/python" tools/hil/run.py
+	CDPR_HIL_PLAN="$$PWD/$(VENV)/hil-plan.json" "$(BIN)/python" tools/hil/run.py --part runs
+
+hil-table: install  ## Its second part: the fault table
+	"$(BIN)/python" tools/hil/run.py --part table
+
+hil-makers: install  ## Its third part: rigs of three makes from doctor to release
+	"$(BIN)/python" tools/hil/run.py --part makers
 
 hil-subset: install  ## Run those of them that take a few minutes, as .ci/run does
 	"$(BIN)/python" tools/hil/run.py --limit-s 1200 -m "hil and not slow"
+
+fuzz: install  ## Feed every reader and verb mutated files and odd arguments for an hour; FUZZ="--seed 2" for other ones
+	"$(BIN)/python" tools/fuzz/run.py --minutes 60 --seed 1 $(FUZZ)
 
 lint: install  ## Check style, types, import contracts, and that the docs build without a warning
 	"$(BIN)/python" -m ruff check
 	"$(BIN)/python" -m ruff format --check
 	"$(BIN)/python" -m mypy
+	"$(BIN)/python" -m mypy examples/*.py
 	"$(BIN)/lint-imports"
 	"$(BIN)/python" -m mkdocs build --strict --quiet
 
@@ -78,12 +119,18 @@ docs: install  ## Build the documentation into site/
 	"$(BIN)/python" -m mkdocs build --strict
 	@echo "Open site/index.html"
 
+docs-run: install  ## Run the commands of README and docs in order, from an empty folder (FAST=1: not those in real time)
+	"$(BIN)/python" tools/run_docs.py $(if $(FAST),--fast)
+
+wheel: install  ## Build the wheel into dist/ and try it in a clean environment outside the repository
+	"$(BIN)/python" tools/wheel.py
+
 schema: install  ## Write the JSON schemas of the rig, scene and plan files into docs/schema/
-	"$(BIN)/python" -m cdpr.schema
+	"$(BIN)/python" -m model.files.schema
 
 clean:  ## Remove build output and caches (never .venv or your runs)
 	rm -rf build dist site htmlcov .coverage .coverage.* .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find $(PACKAGES) tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## Remove .venv too
-	rm -rf "$(VENV)"
+	rm -rf "$(VENV)" .venv-lowest

@@ -18,10 +18,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from calibration.camera import calibrate_camera
-from calibration.camera_verdict import judge_camera
-from calibration.chessboard import Chessboard
-from calibration.uncertainty import NAMES
+from calibration.intrinsics.calibrate import fit_camera
+from calibration.intrinsics.quality import judge_camera
+from calibration.intrinsics.uncertainty import NAMES
+from calibration.targets.chessboard import Chessboard
 from tests.calibration.board_pictures import (
     DISTORTION,
     MATRIX,
@@ -66,7 +66,7 @@ def main() -> None:
     inside, errors, peers, verdicts = [], [], [], []
     for trial in range(arguments.trials):
         pictures = rendered(arguments.pictures, 100 + trial)
-        found = calibrate_camera(pictures, BOARD)
+        found = fit_camera(pictures, BOARD)
         off = np.array([interval.value for interval in found.intervals.values()]) - TRUTH
         inside.append(np.abs(off) <= found.uncertainty.half_widths)
         errors.append(off)

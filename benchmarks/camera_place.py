@@ -19,16 +19,15 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from calibration.extrinsics import workspace_corners
-from calibration.survey import Survey
-from calibration.surveyed_tags import locate_camera
-from calibration.tag_sights import TagSights
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector, skew
-from cdpr.rig import Rig, Tag, load_rig
-from tracking.bundle import moved
-from tracking.edges import RefinedTag
-from tracking.marks import tag_corners
-from tracking.projection import ideal_of
+from calibration.extrinsics.quality import workspace_corners
+from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
+from calibration.tag_map.observations import TagSights
+from model.pose import Array, Pose, matrix_from_rotation_vector, skew
+from model.rig import Rig, Tag, load_rig
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import tag_corners
+from tracking.edges.refine import RefinedTag
+from tracking.pnp import moved
 
 RIG = Path(__file__).parents[1] / "configs/gachon_8_6.yaml"
 NOISE, SIZE = 0.03, 0.12
@@ -54,7 +53,7 @@ def by_pose(rig: Rig, tags: tuple[Tag, ...], camera_from_world: Pose) -> Array:
 
     def pixels(step: Array) -> Array:
         pose = moved(camera_from_world, step)
-        return ideal_of(rig.cameras[0], pose.apply(corners)).ravel()
+        return project_undistorted(rig.cameras[0], pose.apply(corners)).ravel()
 
     return np.column_stack([(pixels(d) - pixels(-d)) / 2e-6 for d in 1e-6 * np.eye(6)])
 
@@ -82,12 +81,12 @@ def error(
     for tag in tags:
         slopes = survey.slopes(tag)
         off = (slopes @ rng.standard_normal(slopes.shape[1])).reshape(4, 3)
-        pixels = ideal_of(camera, there.apply(tag_corners(tag) + off))
+        pixels = project_undistorted(camera, there.apply(tag_corners(tag) + off))
         pixels = pixels + NOISE * rng.standard_normal((4, 2))
         whitening = np.eye(8) / NOISE
         target = whitening @ pixels.ravel()
-        squares[tag.id] = RefinedTag(pixels, whitening, target, np.ones(4, bool), NOISE)
-    found = locate_camera(
+        squares[tag.id] = RefinedTag(pixels, whitening, target, np.ones(4, bool))
+    found = locate_by_frame_tags(
         replace(rig, frame_tags=tags), camera, TagSights({"picture": squares}, {}), survey
     )
     back = found.world_from_camera.apply(there.apply(found.points)) - found.points

@@ -22,18 +22,16 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from cdpr.cli.camera_choice import choose_cameras
-from cdpr.cli.carry_out import prepared_run
 from cdpr.cli.demo import RIG, configs
-from cdpr.cli.run_motion import run_prepared
-from cdpr.errors import CdprError
-from cdpr.plan import load_plan, save_plan
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import load_scene
-from executor.run_folder import RunFolder
+from executor import runner
+from executor.recording.run_folder import RunFolder
+from model.errors import CdprError
+from model.plan import load_plan, save_plan
+from model.rig import Rig, load_rig
+from model.scene import load_scene
 from planner.check import check_path
-from planner.optimal.settings import OptimalSettings
-from planner.plan import make_plan
+from planner.planning import make_plan
+from planner.settings import OptimalSettings
 
 GOAL_ERROR_M = 1e-6
 FOLLOWING_MM = 0.1
@@ -109,17 +107,9 @@ def run_one(
     begin = time.perf_counter()
     with TemporaryDirectory(prefix="cdpr-campaign-") as place:
         output = Path(place) / "run"
-        eyes = choose_cameras(rig, [], not camera, in_process=True)
-        prepared = prepared_run(load_plan(path), rig, quiet=True)
-        summary = run_prepared(
-            prepared,
-            output,
-            eyes,
-            fast=True,
-            start=None,
-            without_real_time=False,
-            quiet=True,
-        )
+        cameras = None if camera else ()
+        done = runner.run(load_plan(path), rig, folder=output, cameras=cameras, realtime=False)
+        summary = done.summary
         seconds = time.perf_counter() - begin
         rows = RunFolder.open(output).clearance()
         beyond = rows.planned_distance - rows.distance - rows.uncertainty

@@ -22,17 +22,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from cdpr.poses import Array, Pose
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
-from cdpr.tag_families import tags_in
-from simulation.camera import SyntheticCamera
+from model.files.rig_file import tags_in
+from model.pose import Array, Pose
+from model.rig import load_rig
+from model.scene import load_scene
+from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_pictures import Condition, HardPicture, HardPrinter
-from tracking.detector import TagDetector
-from tracking.edges import refine
-from tracking.marks import dictionary, modules_across, upright_corners
-from tracking.picture import Image
-from tracking.projection import pixels_from_ideal
+from tracking.camera_model import Image, pixels_from_ideal
+from tracking.detection.detector import TagDetector
+from tracking.detection.tags import dictionary, modules_across, upright_corners
+from tracking.edges.refine import refine
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Corners farther off than this share of a module are of something else, not a tag found.

@@ -1,12 +1,16 @@
 """The fault table: stop time, spread and worst step of every fault, and a soak of random ones.
 
     python benchmarks/faults.py -o DIR [--transport virtual,udp] [--seeds 200] [--minutes 10]
+        [--hours 0] [--jobs 2] [--drive-behaviour NAME[=VALUE] ...] [--only TEXT]
 
 writes `faults.json` and `faults.md` (a row a fault and transport), and `soak.csv` with a line for
-every random run: seed, faults, how it ended, violated invariants, memory. The rows of `vcan` come
-from the tests on a CAN bus of the kernel: `--vcan FILE` names the `faults.json` that they left
-(`make hil`, then ~/.cache/cdpr/hil/last/faults.json). The exit code is 1 when anything is not as it
-must be. Not a test: it takes minutes.
+every random run: seed, faults, how it ended, violated invariants, memory of its process. The soak
+lasts until there are N runs, it took N minutes, and N hours were simulated; processes share it, and
+a seed gives the same run in each of them. In all of it the drives do what `--drive-behaviour` says
+(`cdpr sim RIG --drive-behaviour list`), beside what their row of the table says. The rows of `vcan`
+come from the tests on a CAN bus of the kernel: `--vcan FILE` names the `faults.json` that they left
+(`make hil`, then ~/.cache/cdpr/hil/last/table/faults.json). The exit code
+is 1 when anything is not as it must be. Not a test: it takes minutes.
 """
 
 from __future__ import annotations
@@ -19,48 +23,87 @@ import resource
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from cdpr.plan import load_plan  # noqa: E402
-from cdpr.rig import load_rig  # noqa: E402
-from drivers.bus import BusSettings  # noqa: E402
-from executor.prepare import PreparedRun, prepare  # noqa: E402
+from drivers.can_bus import BusSettings  # noqa: E402
+from executor.trajectory.prepare import (  # noqa: E402
+    PreparedRun,
+    prepare,
+)
+from model.plan import load_plan  # noqa: E402
+from model.rig import load_rig  # noqa: E402
 from planner.check import verify  # noqa: E402
-from tests.cli.plans import RIG, write_short_plan  # noqa: E402
-from tests.scenarios.faults.bench import live, simulated  # noqa: E402
-from tests.scenarios.faults.cases import TABLE, Fault, complaints, held_up, row  # noqa: E402
+from simulation.drives.behaviour import (  # noqa: E402
+    DriveBehaviour,
+    behaviour_named,
+)
+from tests.cli.plans import (  # noqa: E402
+    RIG,
+    write_short_plan,
+)
+from tests.scenarios.faults.bench import (  # noqa: E402
+    live,
+    simulated,
+)
+from tests.scenarios.faults.cases import (  # noqa: E402
+    Fault,
+    complaints,
+    held_up,
+    row,
+)
+from tests.scenarios.faults.drive_cases import ROWS  # noqa: E402
 from tests.scenarios.faults.masters import Masters  # noqa: E402
-from tests.scenarios.faults.random_faults import random_run  # noqa: E402
+from tests.scenarios.faults.random_faults import (  # noqa: E402
+    RandomRun,
+    random_run,
+)
 
 ATTEMPTS = 5
+SHARE = 16
+"""Runs of the soak that each process is given at a time."""
 
 
-def on_virtual(prepared: PreparedRun, folder: Path) -> list[dict[str, Any]]:
+def on_virtual(
+    prepared: PreparedRun, folder: Path, faults: dict[str, Fault], base: DriveBehaviour
+) -> list[dict[str, Any]]:
     """Every fault in simulated time."""
     rows = []
-    for name, fault in TABLE.items():
-        path = folder / f"virtual {name}"
-        with simulated(prepared, path, fault.script(), bitrate=fault.bitrate) as bench:
+    for number, (name, fault) in enumerate(faults.items()):
+        with simulated(
+            prepared,
+            folder / f"virtual {number}",
+            fault.script(),
+            bitrate=fault.bitrate,
+            behaviour=fault.drives(base),
+            profile=fault.profile,
+        ) as bench:
             ended = bench.run()
             cycle = prepared.checked.table.cycle
             found = complaints(fault, bench, ended, bench.cause, cycle)
-            rows.append(row(name, "virtual", bench, ended, bench.cause, found))
+            rows.append(row(name, fault, "virtual", bench, ended, bench.cause, found))
         told(rows[-1])
     return rows
 
 
-def on_udp(prepared: PreparedRun, folder: Path, masters: Masters) -> list[dict[str, Any]]:
+def on_udp(
+    prepared: PreparedRun,
+    folder: Path,
+    masters: Masters,
+    faults: dict[str, Fault],
+    base: DriveBehaviour,
+) -> list[dict[str, Any]]:
     """Those that are possible between two processes, in real time."""
     channel = f"239.74.163.26:{20000 + os.getpid() % 20000}"
     settings = BusSettings("udp_multicast", channel)
     rows = []
-    for name, fault in TABLE.items():
+    for name, fault in faults.items():
         if fault.live:
-            rows.append(_one_on_udp(prepared, folder, masters, settings, name, fault))
+            rows.append(_one_on_udp(prepared, folder, masters, settings, name, fault, base))
             told(rows[-1])
     return rows
 
@@ -72,11 +115,13 @@ def _one_on_udp(
     settings: BusSettings,
     name: str,
     fault: Fault,
+    base: DriveBehaviour,
 ) -> dict[str, Any]:
     """Again where this computer held the simulated drives up."""
     for attempt in range(ATTEMPTS):
-        path = folder / f"udp {name} {attempt}"
-        with live(prepared, path, fault.script(), settings, masters) as bench:
+        path = folder / f"udp {name.replace('/', ' ')} {attempt}"
+        behaviour = fault.drives(base)
+        with live(prepared, path, fault.script(), settings, masters, behaviour=behaviour) as bench:
             ended = bench.run()
             cause = str(bench.outcome.get("cause", ""))
             if held_up(fault, bench, cause) and attempt < ATTEMPTS - 1:
@@ -85,7 +130,7 @@ def _one_on_udp(
                 return {"fault": name, "transport": "udp", "violations": [f"never came: {cause}"]}
             cycle = prepared.checked.table.cycle
             found = complaints(fault, bench, ended, cause, cycle)
-            return row(name, "udp", bench, ended, cause, found)
+            return row(name, fault, "udp", bench, ended, cause, found)
     raise AssertionError("the last attempt returned")
 
 
@@ -94,31 +139,72 @@ def told(entry: dict[str, Any]) -> None:
     print(json.dumps(entry, ensure_ascii=False), flush=True)
 
 
-def soak(prepared: PreparedRun, output: Path, seeds: int, minutes: float) -> int:
-    """Random faults, at least so many and so long; the number of runs with a violation."""
+_soaked: PreparedRun
+"""What a process of the soak runs."""
+_behaviour: DriveBehaviour
+"""And what its drives do."""
+
+
+def soak(plan: Path, output: Path, options: argparse.Namespace) -> int:
+    """Random faults, at least as many and as long as asked; the number of runs with a violation."""
     begin, bad, passed, number = time.monotonic(), 0, 0.0, 0
-    with (output / "soak.csv").open("w") as file:
+    with (
+        (output / "soak.csv").open("w") as file,
+        ProcessPoolExecutor(
+            options.jobs, initializer=_get_ready, initargs=(plan, options.drive_behaviour)
+        ) as pool,
+    ):
         file.write("seed,faults,ended,violations,simulated_s,resident_mb,objects\n")
-        while number < seeds or time.monotonic() - begin < 60.0 * minutes:
-            with tempfile.TemporaryDirectory() as folder:
-                done = random_run(prepared, Path(folder) / "run", number)
-            bad += bool(done.violations)
-            passed += done.simulated_s
-            ended = done.ended.value if done.ended else "killed"
-            if number % 50 == 0:
-                gc.collect()
-            resident = int(Path("/proc/self/statm").read_text().split()[1])
-            size = resident * resource.getpagesize() / 2**20
-            faults = " + ".join(done.faults)
-            file.write(f"{number},{faults},{ended},{'; '.join(done.violations)!r},")
-            file.write(f"{done.simulated_s:.2f},{size:.1f},{len(gc.get_objects())}\n")
+        while (
+            number < options.seeds
+            or time.monotonic() - begin < 60.0 * options.minutes
+            or passed < 3600.0 * options.hours
+        ):
+            seeds = range(number, number + SHARE * options.jobs)
+            if options.seeds > number:
+                seeds = seeds[: options.seeds - number]
+            for seed, (done, size, objects) in zip(seeds, pool.map(_one, seeds), strict=True):
+                faults, ended = (
+                    " + ".join(done.faults),
+                    done.ended.value if done.ended else "killed",
+                )
+                bad += bool(done.violations)
+                passed += done.simulated_s
+                file.write(f"{seed},{faults},{ended},{'; '.join(done.violations)!r},")
+                file.write(f"{done.simulated_s:.2f},{size:.1f},{objects}\n")
+                if done.violations:
+                    print(seed, faults, done.violations[:3], flush=True)
             file.flush()
-            if done.violations:
-                print(number, faults, done.violations[:3], flush=True)
-            number += 1
-    hours = passed / 3600.0
-    print(f"{number} runs, {hours:.2f} h of simulated time, {bad} with a violation", flush=True)
+            number = seeds.stop
+    print(_soak_line(number, passed, time.monotonic() - begin, bad), flush=True)
     return bad
+
+
+def _soak_line(runs: int, passed: float, took: float, bad: int) -> str:
+    rate = passed / took if took > 0.0 else 0.0
+    return (
+        f"{runs} runs, {passed / 3600.0:.2f} h of simulated time in {took / 60.0:.1f} min"
+        f" ({rate:.1f} times real time), {bad} with a violation"
+    )
+
+
+def _get_ready(plan: Path, behaviour: list[str]) -> None:
+    """Of a process of the soak."""
+    global _soaked, _behaviour
+    _soaked, _behaviour = (
+        prepare(verify(load_plan(plan)), load_rig(RIG)),
+        behaviour_named(behaviour),
+    )
+
+
+def _one(seed: int) -> tuple[RandomRun, float, int]:
+    """A random run; its process's memory [MB], and its objects."""
+    with tempfile.TemporaryDirectory() as folder:
+        done = random_run(_soaked, Path(folder) / "run", seed, _behaviour)
+    if seed % 50 == 0:
+        gc.collect()
+    resident = int(Path("/proc/self/statm").read_text().split()[1])
+    return done, resident * resource.getpagesize() / 2**20, len(gc.get_objects())
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -146,8 +232,14 @@ def main() -> int:
     parser.add_argument("--transport", default="virtual,udp", help="virtual, udp, or none")
     parser.add_argument("--seeds", type=int, default=200, help="random runs at least")
     parser.add_argument("--minutes", type=float, default=10.0, help="of random runs at least")
+    parser.add_argument("--hours", type=float, default=0.0, help="of simulated time at least")
+    parser.add_argument("--jobs", type=int, default=2, help="processes of the soak")
     parser.add_argument("--vcan", type=Path, help="faults.json of `make hil`")
+    parser.add_argument("--drive-behaviour", action="append", default=[], metavar="NAME[=VALUE]")
+    parser.add_argument("--only", default="", help="rows with this text in their name")
     options = parser.parse_args()
+    base = behaviour_named(options.drive_behaviour)
+    faults = {name: fault for name, fault in ROWS.items() if options.only in name}
     output: Path = options.output
     output.mkdir(parents=True, exist_ok=True)
     plan = write_short_plan(output / "plan.json")
@@ -155,17 +247,17 @@ def main() -> int:
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
         if "virtual" in options.transport:
-            rows += on_virtual(prepared, Path(scratch))
+            rows += on_virtual(prepared, Path(scratch), faults, base)
         if "udp" in options.transport:
             masters = Masters(plan, RIG)
-            rows += on_udp(prepared, Path(scratch), masters)
+            rows += on_udp(prepared, Path(scratch), masters, faults, base)
             masters.close()
     if options.vcan:
         rows += [json.loads(line) for line in options.vcan.read_text().splitlines()]
     (output / "faults.json").write_text(json.dumps(rows, indent=1, ensure_ascii=False))
     (output / "faults.md").write_text(table(rows))
     print(table(rows))
-    bad = soak(prepared, output, options.seeds, options.minutes)
+    bad = soak(plan, output, options)
     return int(bad > 0 or any(entry["violations"] for entry in rows))
 
 

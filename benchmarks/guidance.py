@@ -20,10 +20,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import load_scene
-from simulation.camera import Optics, SyntheticCamera
+from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.rig import Rig, load_rig
+from model.scene import load_scene
+from simulation.camera.camera import Optics, SyntheticCamera
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 

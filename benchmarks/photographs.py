@@ -23,13 +23,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from cdpr.poses import Array
-from cdpr.rig import Camera, load_rig
+from model.pose import Array
+from model.rig import Camera, load_rig
 from tests.tracking.reference_tags import nearest_gap, tags_found_by_apriltag
-from tracking.detector import TagDetector
-from tracking.edges import refine
-from tracking.marks import dictionary, modules_across
-from tracking.picture import Image
+from tracking.camera_model import Image
+from tracking.detection.detector import TagDetector
+from tracking.detection.tags import dictionary, modules_across
+from tracking.edges.refine import refine
 
 ROOT = Path(__file__).parents[1]
 #: Corners farther off than this are of another tag, [px].

@@ -14,14 +14,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.second_opinion import Nearness
-from cdpr.clearance import ClearanceModel
-from cdpr.errors import CdprError
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, load_rig, rig_from_document
-from cdpr.rig_file import RigDocument
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from planner.feasibility import capacity_margins
+from model.clearance import ClearanceModel
+from model.errors import CdprError
+from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument
+from model.pose import Array, Pose
+from model.rig import Rig, load_rig, rig_from_document
+from model.scene import Scene, scene_from_document
+from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 SHAPES = ("box", "turned box", "sphere", "capsule", "cylinder", "convex", "closed mesh", "mesh")

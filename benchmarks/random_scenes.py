@@ -29,18 +29,17 @@ from rich.progress import Progress
 
 from benchmarks.random_robots import Robot, random_robot, random_scene
 from benchmarks.second_opinion import second_opinion
-from cdpr.cli.workers import worker_pool
-from cdpr.errors import NoSolution
-from cdpr.poses import Pose, matrix_from_quaternion
-from cdpr.rig import Rig, rig_from_document
-from cdpr.rig_file import RigDocument
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
+from model.errors import NoSolution
+from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument
+from model.pose import Pose, matrix_from_quaternion
+from model.rig import Rig, rig_from_document
+from model.scene import Scene, scene_from_document
+from planner.anytime.path import optimal_route
 from planner.check import check_path
-from planner.cost import KinematicCost
-from planner.optimal.routing import optimal_route
-from planner.optimal.settings import OptimalSettings
-from planner.weights import OBJECTIVES
+from planner.costs import KinematicCost
+from planner.parallel import worker_pool
+from planner.settings import OBJECTIVES, OptimalSettings
 
 SCENES_OF_A_ROBOT = 50
 NO_ROOM, PLANNED, NOT_FOUND, SEPARATED = "no room", "planned", "not found", "proved separated"

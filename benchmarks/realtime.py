@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import os
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import Connection
@@ -28,20 +30,22 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from cdpr.cli.demo import RIG, configs
-from cdpr.cli.drives import drives_of
-from cdpr.plan import load_plan, save_plan
-from cdpr.poses import Array
-from cdpr.rig import Rig, load_rig, rig_from_document
-from cdpr.scene import load_scene
-from executor.path_in_real_time import run_in_real_time
-from executor.prepare import PreparedRun, prepare
-from executor.recorder import Recorder
-from executor.run_folder import RunFolder
-from executor.shared_board import SharedBoard
-from executor.status import RunStatus
+from drivers.can_load import SLOWEST_TENTHS_MS, TESTED_HZ, check_bus_load
+from executor.control.path_runs import run_in_real_time
+from executor.drives import drives_of
+from executor.realtime.shared_memory import SharedRequests
+from executor.recording.recorder import Recorder
+from executor.recording.run_folder import RunFolder
+from executor.remote.status import RunStatus
+from executor.trajectory.prepare import PreparedRun, prepare
+from model.errors import BadInput, CdprError
+from model.plan import load_plan, save_plan
+from model.pose import Array
+from model.rig import Rig, load_rig, rig_from_document
+from model.scene import load_scene
 from planner.check import verify
-from planner.optimal.settings import OptimalSettings
-from planner.plan import make_plan
+from planner.planning import make_plan
+from planner.settings import OptimalSettings
 
 ENVIRONMENT = "environment_3.yaml"
 
@@ -62,7 +66,7 @@ def with_cycle(rig: Rig, cycle_ms: float) -> Rig:
 
 def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Array:
     """Of every cycle of a run that is stopped after a time, [ms]."""
-    board = SharedBoard()
+    board = SharedRequests()
     run = RunFolder.create(folder)
     status = RunStatus(prepared, folder, board, simulated_time=False)
     cycle = prepared.checked.table.cycle
@@ -160,28 +164,68 @@ def measured(rate: float, busy: bool, seconds: float, folder: Path) -> list[str]
     prepared = prepared_at(rate, folder)
     with all_cores_busy(busy):
         plain.start()
-        ours = process_lateness(prepared, folder / f"{rate:g}-{busy}", seconds)
-        link.send(None)
-        theirs = link.recv()
-        plain.join()
+        try:
+            ours = process_lateness(prepared, folder / f"{rate:g}-{busy}", seconds)
+            link.send(None)
+            theirs = link.recv()
+        except BaseException:
+            plain.kill()
+            raise
+        finally:
+            plain.join()
     return [
         row(rate, load, "real-time process", ours),
         row(rate, load, "thread with `time.sleep`", theirs),
     ]
 
 
-def main() -> None:
-    """The command line."""
+SLOWEST_HZ = 10_000.0 / SLOWEST_TENTHS_MS
+
+
+def require_measurable(rates: Sequence[float], seconds: float) -> None:
+    """Nothing is planned and no core is kept busy for a case that arming would refuse.
+
+    Raises:
+        BadInput: A rate is outside what a rig may have, or there is no time to measure in.
+        Refused: The bus has no room for the rate.
+    """
+    for rate in rates:
+        if not SLOWEST_HZ <= rate <= TESTED_HZ:
+            raise BadInput(
+                f"{rate:g} Hz is outside {SLOWEST_HZ:g} to {TESTED_HZ:g} Hz",
+                where="--rates",
+                why="arming refuses shorter cycles than were tested, the rig file longer ones",
+                next_step="name rates in that range",
+            )
+        check_bus_load(with_cycle(load_rig(configs() / RIG), 1000.0 / rate))
+    if not (math.isfinite(seconds) and seconds > 0.0):
+        what = f"{seconds:g} s leave no time to measure in"
+        raise BadInput(what, where="--seconds", next_step="give a time above 0 s")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; 0, or 2 where something was asked that cannot be measured."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=15.0, help="of motion, each case")
     parser.add_argument("--rates", type=float, nargs="+", default=[100.0, 250.0], help="[Hz]")
-    wishes = parser.parse_args()
+    wishes = parser.parse_args(arguments)
+    try:
+        require_measurable(wishes.rates, wishes.seconds)
+        show_measured(wishes.rates, wishes.seconds)
+    except CdprError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def show_measured(rates: Sequence[float], seconds: float) -> None:
+    """The whole table."""
     began = os.getloadavg()[0]
     rows: list[str] = []
     with TemporaryDirectory(prefix="cdpr-realtime-") as folder:
-        for rate in wishes.rates:
+        for rate in rates:
             for busy in (False, True):
-                rows += measured(rate, busy, wishes.seconds, Path(folder))
+                rows += measured(rate, busy, seconds, Path(folder))
     print(f"\n{os.cpu_count()} cores, load average {began:.1f} before; lateness in ms\n")
     print("| Hz | load | loop | cycles | p50 | p99 | p99.9 | max |")
     print("|---|---|---|---|---|---|---|---|")
@@ -189,4 +233,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

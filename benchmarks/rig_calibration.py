@@ -26,13 +26,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from calibration.kinds import calibrated, load_result
-from calibration.rig_calibration import calibrate_rig
-from calibration.rig_parameters import DEFAULT_DEVIATIONS
-from calibration.rig_verdict import judge_rig
-from cdpr.kinematics import poses_near
-from cdpr.rig import Rig, load_rig
-from cdpr.winches import WinchMap
+from calibration.geometry.calibrate import fit_rig
+from calibration.geometry.model import DEFAULT_DEVIATIONS
+from calibration.geometry.quality import judge_rig
+from calibration.load import load_result
+from model.kinematics import poses_near
+from model.rig import Rig, load_rig
+from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
     built_otherwise,
@@ -120,7 +120,7 @@ def whole_round(folder: Path, count: int) -> None:
         show("not identified", line)
     (file,) = out.glob("*.yaml")
     rig = load_rig(RIG)
-    corrected = calibrated(rig, [load_result(file)])
+    corrected = rig.with_calibration(load_result(file))
     for name, tilt in (("level", 0.0), ("turned by up to 8 deg", math.radians(8.0))):
         truth = places(rig, 100, tilt=tilt, seed=77, noise=0.0)
         errors = (told_wrong(rig, truth), told_wrong(corrected, truth))
@@ -143,7 +143,7 @@ def never_turned(count: int) -> None:
     rig = load_rig(RIG)
     level = places(rig, count, tilt=0.0, seed=5).measured
     for name, data in (("poses, never turned", level), ("lengths alone", level.without_poses())):
-        result = calibrate_rig(rig, data, DEFAULT_DEVIATIONS, 1e-4)
+        result = fit_rig(rig, data, DEFAULT_DEVIATIONS, 1e-4)
         quality = judge_rig(result, 1e-3, math.radians(5.0))
         unknown = result.observability.unknown
         moved = unknown.T @ (result.fit.values / result.parameters.deviations)
@@ -165,7 +165,7 @@ def coverage(plants: int, count: int) -> None:
             built = built_otherwise(rig, seed)
             data = places(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
             drawn = drawn_with(built, share * rig.cable_stiffness)
-            result = calibrate_rig(drawn, data, DEFAULT_DEVIATIONS, 1e-4)
+            result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, 1e-4)
             verdict = judge_rig(result, 1e-3, math.radians(5.0)).verdict
             inside.append(share_inside(result.intervals, true_numbers(built)))
             good += verdict.good

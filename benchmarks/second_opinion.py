@@ -19,11 +19,11 @@ import numpy as np
 
 from benchmarks.coal_bodies import EXACT, Body, distance, geometries, thread
 from benchmarks.tension_opinion import tension_problem
-from cdpr.cables import cables_to
-from cdpr.clearance import PLATFORM, cable_name
-from cdpr.poses import Array
-from cdpr.rig import Rig
-from cdpr.scene import Scene
+from model.clearance import PLATFORM, cable_name
+from model.kinematics import cables_to
+from model.pose import Array
+from model.rig import Rig
+from model.scene import Scene
 
 SPACING = 0.040
 CLOSEST = 20e-6

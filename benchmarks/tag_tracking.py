@@ -25,16 +25,11 @@ from scipy.stats import chi2
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.detection import Finder, apriltag_library, plain
-from cdpr.poses import (
-    Array,
-    Pose,
-    matrix_from_rotation_vector,
-    rotation_vector_from_matrix,
-)
-from cdpr.rig import Camera, Rig, load_rig
-from cdpr.scene import Scene, load_scene
-from simulation.camera import Optics, SyntheticCamera
-from tracking.marks import tag_corners
+from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.rig import Camera, Rig, load_rig
+from model.scene import Scene, load_scene
+from simulation.camera.camera import Optics, SyntheticCamera
+from tracking.detection.tags import tag_corners
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 

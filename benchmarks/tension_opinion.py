@@ -7,10 +7,10 @@ from itertools import product
 import daqp
 import numpy as np
 
-from cdpr.cables import cables_to
-from cdpr.poses import Array
-from cdpr.rig import Rig
-from cdpr.scene import Scene
+from model.kinematics import cables_to
+from model.pose import Array
+from model.rig import Rig
+from model.scene import Scene
 
 GRAVITY = 9.80665
 _BALANCED = 1e-6

@@ -1,1 +1,52 @@
-"""Camera, extrinsic and rig calibration: dated result files with residuals."""
+"""Calibrations of cameras, tags and rig: dated results beside the rig file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from model.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from calibration.extrinsics.result import ExtrinsicsResult
+    from calibration.geometry.pose_selection import measurement_poses
+    from calibration.geometry.result import RigResult
+    from calibration.intrinsics.result import CameraResult
+    from calibration.load import load_result
+    from calibration.procedures import Calibration
+    from calibration.results import ResultDocument
+    from calibration.tag_map.result import TagsResult
+    from calibration.targets.charuco import Charuco
+    from calibration.targets.chessboard import Chessboard
+    from calibration.targets.tag_grid import TagGrid
+
+__all__ = [
+    "Calibration",
+    "CameraResult",
+    "Charuco",
+    "Chessboard",
+    "ExtrinsicsResult",
+    "ResultDocument",
+    "RigResult",
+    "TagGrid",
+    "TagsResult",
+    "load_result",
+    "measurement_poses",
+]
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "calibration.extrinsics.result": "ExtrinsicsResult",
+            "calibration.geometry.pose_selection": "measurement_poses",
+            "calibration.geometry.result": "RigResult",
+            "calibration.intrinsics.result": "CameraResult",
+            "calibration.load": "load_result",
+            "calibration.procedures": "Calibration",
+            "calibration.results": "ResultDocument",
+            "calibration.tag_map.result": "TagsResult",
+            "calibration.targets.charuco": "Charuco",
+            "calibration.targets.chessboard": "Chessboard",
+            "calibration.targets.tag_grid": "TagGrid",
+        },
+    )

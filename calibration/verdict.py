@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
-USE = "use it: pass the result's file with --calibration, or copy its numbers into the rig file"
+USE = (
+    "use it: pass the result's file with --calibration, or write a new rig file with"
+    " `cdpr calibrate apply`"
+)
 """What to do with a result that is good enough."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lack:
+class Issue:
     """Something that a calibration lacks.
 
     Attributes:
@@ -24,7 +27,7 @@ class Lack:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class CalibrationVerdict:
     """What a calibration is good for.
 
     Attributes:
@@ -42,7 +45,7 @@ class Verdict:
     next_steps: tuple[str, ...]
 
     @classmethod
-    def of(cls, error: float, wanted: float, where: str, lacks: Sequence[Lack]) -> Self:
+    def of(cls, error: float, wanted: float, where: str, lacks: Sequence[Issue]) -> Self:
         """The verdict of what was found to be lacking; each next step once."""
         reasons = tuple(lack.reason for lack in lacks)
         steps = tuple(dict.fromkeys(lack.next_step for lack in lacks)) or (USE,)

@@ -1,1 +1,120 @@
-"""The shared model of a cable robot: files, kinematics, statics, and the command line."""
+"""Plans, proves, runs and measures paths of cable-driven parallel robots.
+
+One function for each verb of the command line, with its defaults; lengths in metres, forces in
+newtons, angles in radians. Nothing is loaded before it is used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from model.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from calibration.geometry.pose_selection import measurement_poses
+    from calibration.targets.chessboard import Chessboard
+    from cdpr.measurement import (
+        calibrate_camera,
+        calibrate_rig,
+        load_calibration,
+        locate_camera,
+        locate_tags,
+        open_camera,
+        track,
+    )
+    from cdpr.operation import report, stop
+    from cdpr.planning import check, plan, workspace_map
+    from executor.homing import home
+    from executor.jogging import jog
+    from executor.run_result import RunResult, load_run
+    from executor.runner import run
+    from executor.service import release, reset, status
+    from model.errors import (
+        BadInput,
+        CdprError,
+        Fault,
+        HardwareMissing,
+        NoSolution,
+        Refused,
+        StoppedByOperator,
+    )
+    from model.plan import Plan, load_plan
+    from model.pose import Pose
+    from model.rig import Rig, load_rig
+    from model.scene import Scene, load_scene
+    from planner.check_report import CheckReport, PlanRejected
+    from planner.planning import plan_from_waypoints
+    from tracking.tracker import Tracker
+
+__all__ = [
+    "BadInput",
+    "CdprError",
+    "CheckReport",
+    "Chessboard",
+    "Fault",
+    "HardwareMissing",
+    "NoSolution",
+    "Plan",
+    "PlanRejected",
+    "Pose",
+    "Refused",
+    "Rig",
+    "RunResult",
+    "Scene",
+    "StoppedByOperator",
+    "Tracker",
+    "calibrate_camera",
+    "calibrate_rig",
+    "check",
+    "home",
+    "jog",
+    "load_calibration",
+    "load_plan",
+    "load_rig",
+    "load_run",
+    "load_scene",
+    "locate_camera",
+    "locate_tags",
+    "measurement_poses",
+    "open_camera",
+    "plan",
+    "plan_from_waypoints",
+    "release",
+    "report",
+    "reset",
+    "run",
+    "status",
+    "stop",
+    "track",
+    "workspace_map",
+]
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "calibration.geometry.pose_selection": "measurement_poses",
+            "calibration.targets.chessboard": "Chessboard",
+            "cdpr.measurement": (
+                "calibrate_camera calibrate_rig load_calibration locate_camera "
+                "locate_tags open_camera track"
+            ),
+            "cdpr.operation": "report stop",
+            "cdpr.planning": "check plan workspace_map",
+            "executor.homing": "home",
+            "executor.jogging": "jog",
+            "executor.run_result": "RunResult load_run",
+            "executor.runner": "run",
+            "executor.service": "release reset status",
+            "model.errors": (
+                "BadInput CdprError Fault HardwareMissing NoSolution Refused StoppedByOperator"
+            ),
+            "model.plan": "Plan load_plan",
+            "model.pose": "Pose",
+            "model.rig": "Rig load_rig",
+            "model.scene": "Scene load_scene",
+            "planner.check_report": "CheckReport PlanRejected",
+            "planner.planning": "plan_from_waypoints",
+            "tracking.tracker": "Tracker",
+        },
+    )

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Protocol
 
-import can
 import numpy as np
 from numpy.typing import NDArray
-
-from cdpr.rig import Rig
 
 Counts = NDArray[np.int64]
 Pump = Callable[[], None]
 """Lets drives that live in the caller's process work off what the bus holds for them."""
+
+Pace = Callable[[], float]
+"""Waits for the moment of a cycle; the time that replies have, [s]."""
 
 OnRestarted = Callable[[tuple[int, ...]], None]
 """Takes note of nodes that were found without this program's set-up; see `DriveGroup.configure`."""
@@ -54,6 +54,9 @@ class GroupCommand(Enum):
     """Brakes close, then the torque goes, of all drives together: for a platform that stands on
     something."""
     RESET_FAULT = auto()
+    END_MONITORING = auto()
+    """Drives that follow nothing stop watching this master, which is about to leave; one step a
+    cycle, until `DriveGroup.is_monitored` is false."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,10 @@ class Capabilities:
         max_hz: Highest tested rate of cycles, [Hz].
         watchdog_ms: A drive without SYNC disarms itself, which closes its brake, after this time
             without a set-point, [ms]; None where there is no such watchdog.
+        sync_timeout: Cycles without SYNC after which a drive stops by itself; None where drives
+            know no SYNC.
+        master_timeout: Longest time after which a drive acts on the loss of this master, [s].
+        simulated: All drives say that they are simulated; known once they are configured.
     """
 
     sync: bool
@@ -76,6 +83,24 @@ class Capabilities:
     has_brake: bool
     max_hz: float
     watchdog_ms: float | None
+    sync_timeout: float | None
+    master_timeout: float
+    simulated: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DriveWarning:
+    """What a drive reported in a cycle although it stays enabled.
+
+    Attributes:
+        node: Of the drive.
+        text: What, with cable and drive.
+        stops: The path must stop for it; false for a mere warning.
+    """
+
+    node: int
+    text: str
+    stops: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +125,7 @@ class CycleStatus:
         rejected: Frames thrown away since `configure` because their length or their content could
             not be true.
         error_frames: Error frames of the bus since `configure`.
+        warnings: What drives that stay enabled reported in this cycle; none of it is latched.
     """
 
     positions: Counts
@@ -113,10 +139,11 @@ class CycleStatus:
     stopped: bool
     rejected: int
     error_frames: int
+    warnings: tuple[DriveWarning, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DrivesSeen:
+class DriveSnapshot:
     """What drives tell who only looks; in the order of the winches, as in `CycleStatus`.
 
     Attributes:
@@ -183,8 +210,12 @@ class DriveGroup(Protocol):
         """
         ...
 
-    def read_positions(self) -> CycleStatus:
+    def read_positions(self, pace: Pace | None = None) -> CycleStatus:
         """Waits until every drive has told its position; changes no drive's state.
+
+        Args:
+            pace: Called before each cycle that is sent: waits for its moment and returns the time
+                in which replies must come, [s]; left out, cycles follow on each other at once.
 
         Raises:
             HardwareMissing: A drive does not answer; with its node.
@@ -192,12 +223,17 @@ class DriveGroup(Protocol):
         """
         ...
 
-    def send_cycle(self, targets: Sequence[int]) -> None:
+    def send_cycle(
+        self, targets: Sequence[int], may_enable: Callable[[], bool] = lambda: True
+    ) -> None:
         """Sends one cycle: all set-points, and what makes them count together where there is such.
 
         Args:
             targets: One position a drive, [counts]. They count in state ENABLED; in every other
                 state each drive is told to stay where it is.
+            may_enable: Asked at the last moment, just before the frame that makes set-points count.
+                Where it is false no drive is told to follow: a cycle that would do so becomes a
+                quick stop of all drives, for good.
 
         Raises:
             Fault: The bus did not take a frame.
@@ -223,6 +259,14 @@ class DriveGroup(Protocol):
         """
         ...
 
+    def require_releasable(self) -> None:
+        """Whether RELEASE may be commanded where the drives are now.
+
+        Raises:
+            Refused: It would leave the platform less safe than it is.
+        """
+        ...
+
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; waits for nothing.
 
@@ -231,68 +275,28 @@ class DriveGroup(Protocol):
         """
         ...
 
+    def is_monitored(self, *, silent_too: bool) -> bool:
+        """Whether drives still watch this master, as far as they have confirmed the contrary.
+
+        Args:
+            silent_too: Drives that do not answer any more count as well.
+        """
+        ...
+
+    def look(self, pace: Pace) -> CycleStatus:
+        """Asks every drive how it stands without sending a cycle: after the last one.
+
+        A drive that did not answer the last cycle is not asked; it is missing, as is one that does
+        not answer now.
+
+        Args:
+            pace: Called before each question, as for `read_positions`.
+
+        Raises:
+            Fault: The bus failed.
+        """
+        ...
+
     def close(self) -> None:
         """Lets go of the bus without sending anything; the bus itself is the caller's."""
         ...
-
-
-def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
-    """What status words of a `CycleStatus` say, for people."""
-    if rig.document.drives.type == "odrive":
-        from drivers.odrive.messages import state_text
-
-        return tuple(state_text(word) for word in status_words)
-    from drivers.cia402.states import state_of
-
-    return tuple(state_of(word).value for word in status_words)
-
-
-def look_at_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DrivesSeen:
-    """Asks drives that nobody moves how they stand; changes nothing, not even their set-up.
-
-    Args:
-        rig: The robot; its winches name the nodes.
-        bus: An open bus; it stays the caller's.
-        pump: As for `make_drive_group`.
-
-    Raises:
-        HardwareMissing: A drive does not answer.
-        Refused: It will not tell.
-        Fault: The bus failed.
-    """
-    document = rig.document.drives
-    if document.type == "odrive":
-        from drivers.odrive import look as odrive
-
-        return odrive.look(rig, document, bus, pump)
-    from drivers.cia402 import look as cia402
-
-    return cia402.look(rig, bus, pump)
-
-
-def make_drive_group(
-    rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None = None
-) -> DriveGroup:
-    """The drives of a rig, not yet configured.
-
-    Args:
-        rig: The robot; its winches name the nodes.
-        bus: An open bus; it stays the caller's.
-        pump: Given when the drives are simulated in this process (`Rehearsal.pump`): called
-            wherever an answer is waited for, and nothing is waited for after it.
-        max_tension: From which the drives' torque limit comes, [N]; the rig's own if None. One that
-            is below what a drive holds lets its cable slip as soon as `configure` writes it.
-
-    Raises:
-        Refused: The bus is too slow for the rig's cycle.
-        BadInput: The rig's numbers do not fit the drives, or a package or file that they need is
-            not there.
-    """
-    # The protocol's library is loaded only by those who talk to drives.
-    if rig.document.drives.type == "odrive":
-        from drivers.odrive.group import OdriveGroup
-
-        return OdriveGroup(rig, bus, pump, max_tension=max_tension)
-    from drivers.cia402.group import Cia402Group
-
-    return Cia402Group(rig, bus, pump, max_tension=max_tension)

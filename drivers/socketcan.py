@@ -9,7 +9,7 @@ import subprocess
 from dataclasses import dataclass
 from typing import Any
 
-from cdpr.errors import HardwareMissing
+from model.errors import HardwareMissing
 
 #: Where `ip` is for users whose PATH has no system folders.
 SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")

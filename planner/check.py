@@ -4,7 +4,7 @@ It shares neither the swept hulls nor the rules of the search, only the model. E
 sampled along the path, and between samples bounded by how fast it can change (`planner.bounds`):
 
 * obstacle clearance: no faster than the motion, as no point of the robot moves farther; without
-  turning and pulleys by separating planes over whole stretches (`planner.stretches`);
+  turning and pulleys by separating planes over whole stretches (`planner.bounds`);
 * self clearance: with level point exits no faster than the motion, else by a stated multiple;
 * capacity margin: by the sum of what each cable's wrench can change at its largest tension.
 
@@ -20,25 +20,28 @@ from itertools import pairwise
 
 import numpy as np
 
-from cdpr.cables import cables_at
-from cdpr.clearance import ClearanceModel, Nearest
-from cdpr.errors import BadInput, Refused
-from cdpr.kinematics import structure_matrix
-from cdpr.legs import legs_of
-from cdpr.plan import Plan
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from cdpr.statics.dexterity import rms_anchor_radius
-from cdpr.statics.feasibility import WrenchBox, capacity_margin
-from cdpr.statics.gravity import STANDARD_GRAVITY
-from cdpr.statics.tension_solution import TensionInfeasible
-from cdpr.statics.working import weight_wrench, working_tensions
-from planner.bounds import Smallest, smallest_along
-from planner.check_report import CheckReport, Closest, VerifiedPlan, Violation, verified
-from planner.joined_report import joined
-from planner.stretches import smallest_over_stretches
-from planner.track import Track
+from model.clearance import ClearanceModel, Nearest
+from model.errors import BadInput
+from model.kinematics import cables_at, structure_matrix
+from model.plan import Plan
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.scene import Scene, legs_of
+from model.statics.dexterity import rms_anchor_radius
+from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.gravity import STANDARD_GRAVITY, weight_wrench, working_tensions
+from model.statics.tension_distribution import TensionInfeasible
+from planner.bounds import Smallest, smallest_along, smallest_over_stretches
+from planner.check_report import (
+    CheckReport,
+    Closest,
+    PlanRejected,
+    VerifiedPlan,
+    Violation,
+    joined,
+    verified,
+)
+from planner.pose_path import PosePath
 
 SPACING = 0.005
 CLEARANCE_TOLERANCE = 0.1e-3
@@ -57,16 +60,14 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
         rig: The rig as it is now, when its winches or motion may differ from the plan's own.
 
     Raises:
-        Refused: With every violation, what by how much and where.
+        PlanRejected: With every violation, what by how much and where.
     """
     report = check_path(rig or plan.rig, plan.scene, plan.waypoints, plan.stops)
     if not report.passed:
-        listed = "; ".join(v.sentence() for v in report.violations)
-        raise Refused(
-            f"the plan fails its check: {listed}",
+        raise PlanRejected(
+            report,
             where=f"plan for {plan.rig.name} in {plan.scene.name}",
             next_step="make the plan anew with `cdpr plan`; nothing has moved",
-            values={f"violation_{i + 1}": v.sentence() for i, v in enumerate(report.violations)},
         )
     return verified(plan, report)
 
@@ -95,7 +96,7 @@ def check_path(
         BadInput: There is no pose, or not one in order for each stop.
     """
     legs = legs_of(scene)
-    tracks = [Track(rig, part) for part in parted(poses, stops, len(legs) - 1)]
+    tracks = [PosePath(rig, part) for part in parted(poses, stops, len(legs) - 1)]
     reports = [
         _Check(rig, leg.scene, track).report((leg.begin, leg.end) if ends else None)
         for leg, track in zip(legs, tracks, strict=True)
@@ -127,7 +128,7 @@ def parted(poses: Sequence[Pose], stops: Sequence[int], count: int) -> list[Sequ
 class _Check:
     """One check of one path."""
 
-    def __init__(self, rig: Rig, scene: Scene, track: Track) -> None:
+    def __init__(self, rig: Rig, scene: Scene, track: PosePath) -> None:
         self.rig, self.scene, self.track = rig, scene, track
         self.model = ClearanceModel(rig, scene)
         self.places = track.places(SPACING)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Any
 
-from cdpr.clearance import Nearest
-from cdpr.plan import Plan
-from cdpr.poses import Array, Pose
+import numpy as np
+
+from model.clearance import Nearest
+from model.display import html_table
+from model.errors import Refused
+from model.plan import Plan
+from model.pose import Array, Pose
 
 _SCALE = {"mm": 1000.0, "mm/s": 1000.0, "N": 1.0, "°": 180.0 / math.pi}
 
@@ -117,6 +123,30 @@ class CheckReport:
             return 0.0
         return self.obstacle_clearance.nearest.distance - self.proved_obstacle_clearance
 
+    def __repr__(self) -> str:
+        """Whether the path passed, and its figures."""
+        return f"<CheckReport {'; '.join(f'{name} {value}' for name, value in self._rows())}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html_table("Check of a path", self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        """What is shown of it: name and value."""
+        near, count = self.obstacle_clearance, len(self.violations)
+        rows = [
+            ("verdict", "passed" if self.passed else f"rejected: {count} violations"),
+            ("length", f"{self.length * 1e3:.1f} mm"),
+            ("self clearance", f"≥ {self.proved_self_clearance * 1e3:.2f} mm"),
+            ("capacity margin", f"≥ {self.proved_capacity_margin:.1f} N"),
+            ("tension", f"{self.min_tension:.1f} to {self.max_tension:.1f} N"),
+        ]
+        if near is not None:
+            proved = self.proved_obstacle_clearance * 1e3
+            pair = f"{near.nearest.first} to {near.nearest.second}"
+            rows.insert(2, ("clearance", f"≥ {proved:.2f} mm, {pair}"))
+        return [*rows, *(("violation", v.sentence()) for v in self.violations)]
+
     def as_dict(self) -> dict[str, Any]:
         """For `--json`: units in the keys, no NaN and no infinity."""
         obstacle = self.obstacle_clearance
@@ -144,6 +174,34 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
+class PlanRejected(Refused):
+    """A path that its check does not pass.
+
+    Args:
+        report: What the check found, with at least one violation.
+        where: Which path.
+        next_step: What the user can do now.
+
+    Attributes:
+        report: What the check found.
+    """
+
+    def __init__(self, report: CheckReport, *, where: str, next_step: str) -> None:
+        sentences = [violation.sentence() for violation in report.violations]
+        super().__init__(
+            f"the plan fails its check: {'; '.join(sentences)}",
+            where=where,
+            next_step=next_step,
+            values={f"violation_{i}": text for i, text in enumerate(sentences, start=1)},
+        )
+        self.report = report
+
+    @property
+    def violations(self) -> tuple[Violation, ...]:
+        """Every violation, what by how much and where."""
+        return self.report.violations
+
+
 _PROOF = object()
 
 
@@ -169,3 +227,48 @@ class VerifiedPlan:
 def verified(plan: Plan, report: CheckReport) -> VerifiedPlan:
     """For `planner.check.verify` alone."""
     return VerifiedPlan(plan, report, _PROOF)
+
+
+# The reports of a path's legs as one report of the whole path.
+
+
+def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckReport:
+    """One report: sums of lengths, extremes of everything else, all violations.
+
+    Args:
+        reports: Of the legs in their order, all of one rig and of the same clearances.
+        motions: Of the legs, by which places on the path are told, [m].
+    """
+    if len(reports) == 1:
+        return reports[0]
+    begins = list(accumulate(motions, initial=0.0))
+    own = [_moved(r.self_clearance, begin) for r, begin in zip(reports, begins, strict=False)]
+    obstacles = [
+        _moved(r.obstacle_clearance, begin)
+        for r, begin in zip(reports, begins, strict=False)
+        if r.obstacle_clearance is not None
+    ]
+    return replace(
+        reports[0],
+        length=sum(r.length for r in reports),
+        samples=sum(r.samples for r in reports),
+        obstacle_clearance=min(obstacles, key=_distance, default=None),
+        proved_obstacle_clearance=min(r.proved_obstacle_clearance for r in reports),
+        self_clearance=min(own, key=_distance),
+        proved_self_clearance=min(r.proved_self_clearance for r in reports),
+        # NaN stands for tensions that do not exist, and stays.
+        min_tension=float(np.min([r.min_tension for r in reports])),
+        max_tension=float(np.max([r.max_tension for r in reports])),
+        capacity_margin=min(r.capacity_margin for r in reports),
+        proved_capacity_margin=min(r.proved_capacity_margin for r in reports),
+        max_cable_speed=max(r.max_cable_speed for r in reports),
+        violations=tuple(v for r in reports for v in r.violations),
+    )
+
+
+def _moved(closest: Closest, begin: float) -> Closest:
+    return replace(closest, place=begin + closest.place)
+
+
+def _distance(closest: Closest) -> float:
+    return closest.nearest.distance

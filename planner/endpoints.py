@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpr.clearance import ClearanceModel, Nearest
-from cdpr.errors import BadInput
-from cdpr.legs import Leg, legs_of
-from cdpr.poses import Pose
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from planner.feasibility import capacity_margins
+from model.clearance import ClearanceModel, Nearest
+from model.errors import BadInput
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Leg, Scene, legs_of
+from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 
@@ -36,6 +35,24 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
             _require_in_workspace(rig, name, pose)
             _require_clear(scene, model, name, pose)
             _require_holdable(rig, leg.scene, name, pose)
+
+
+def require_room_for_the_way(scene: Scene, longest: float) -> None:
+    """Refuses a longest path, [m], that is shorter than the straight way from start to goal.
+
+    Raises:
+        BadInput: It is.
+    """
+    straight = scene.start.distance_to(scene.goal)
+    if longest >= straight - 1e-9:
+        return
+    raise BadInput(
+        f"no path of at most {longest * 1e3:.1f} mm joins start and goal: the straight way is"
+        f" {straight * 1e3:.1f} mm long",
+        where=f"scene {scene.name}",
+        next_step="allow a longer path with --longest-mm, or leave it out",
+        values={"longest_mm": longest * 1e3, "straight_mm": straight * 1e3},
+    )
 
 
 def _require_same_orientation(leg: Leg) -> None:
@@ -83,7 +100,8 @@ def _require_clear(scene: Scene, model: ClearanceModel, name: str, pose: Pose) -
 def _too_near(name: str, near: Nearest, needed: float, key: str) -> BadInput:
     distance, limit = near.distance * 1e3, needed * 1e3
     if near.distance <= 0.0:
-        what = f"at the {name} {near.first} touches {near.second} ({-distance:.1f} mm inside)"
+        depth = f" ({-distance:.1f} mm inside)" if distance < -0.05 else ""
+        what = f"at the {name} {near.first} touches {near.second}{depth}"
     else:
         what = (
             f"at the {name} {near.first} is {distance:.2f} mm from {near.second},"

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from cdpr.poses import Array
-from planner.cost import Cost
+from model.pose import Array
+from planner.costs import Cost
 
 IsFree = Callable[[Array, Array], bool]
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig
+from model.pose import Array, Pose
+from model.rig import Rig
 
 
 class Space(Protocol):
@@ -68,3 +70,69 @@ class TranslationSpace:
     def coordinates(self, pose: Pose) -> Array:
         """The position of a pose, shape (3,), [m]."""
         return pose.position
+
+
+# A regular lattice of points over a box, and trilinear interpolation between them.
+
+
+_CELLS = 20
+"""Cells along the longest side. Source: measured on both ready rigs, where the kinematic cost
+between lattice points is then within 1 % of the exact one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lattice:
+    """Points ``lower + spacing * (i, j, k)``, numbered with k fastest.
+
+    Attributes:
+        lower: The first point, shape (3,), [m].
+        spacing: Between points along each axis, shape (3,), [m].
+        shape: Number of points along each axis.
+    """
+
+    lower: Array
+    spacing: Array
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def over(cls, lower: Array, upper: Array) -> Lattice:
+        """A lattice over a box, both ends included, cells about as wide as high."""
+        size = upper - lower
+        cells = np.maximum(1, np.ceil(_CELLS * size / size.max() - 1e-9)).astype(int)
+        x, y, z = (int(c) + 1 for c in cells)
+        return cls(lower, size / cells, (x, y, z))
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return int(np.prod(self.shape))
+
+    def points(self, numbers: NDArray[np.int64]) -> Array:
+        """The points with given numbers, shape (k,) → (k, 3), [m]."""
+        index = np.stack(np.unravel_index(numbers, self.shape), axis=-1)
+        points: Array = self.lower + index * self.spacing
+        return points
+
+
+def corners_and_weights(lattice: Lattice, points: Array) -> tuple[NDArray[np.int64], Array]:
+    """Numbers of the eight points around each point, and their trilinear weights.
+
+    Args:
+        lattice: The lattice.
+        points: Shape (k, 3), [m]; outside the box the nearest cell is used.
+
+    Returns:
+        Shape (k, 8) each.
+    """
+    last = np.array(lattice.shape) - 2
+    scaled = (points - lattice.lower) / lattice.spacing
+    cell = np.clip(np.floor(scaled).astype(np.int64), 0, last)
+    part = np.clip(scaled - cell, 0.0, 1.0)
+    strides = np.array([lattice.shape[1] * lattice.shape[2], lattice.shape[2], 1])
+    first = cell @ strides
+    offsets = _CORNERS @ strides
+    factors = np.where(_CORNERS, part[:, None, :], 1.0 - part[:, None, :])
+    return first[:, None] + offsets, factors[..., 0] * factors[..., 1] * factors[..., 2]
+
+
+_CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])

@@ -13,7 +13,7 @@ from collections.abc import Callable, Container, Iterable
 
 import can
 
-from drivers.bus_load import frame_bits
+from drivers.can_load import frame_bits
 
 Arrivals = Iterable[tuple[float, can.Message]]
 """What becomes of a frame: frames and how much later than it each of them comes, [s]."""

@@ -6,23 +6,184 @@ matter of millinewtons. Deterministic: the same lengths from the same start give
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cdpr.cables import Cables, cables_at
-from cdpr.errors import Fault
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector, read_only
-from cdpr.rig import Rig
-from cdpr.scene import Load
-from cdpr.statics.working import working_tensions
-from cdpr.winches import WinchMap
-from simulation.suspension import Suspension
+from model.errors import Fault
+from model.kinematics import Cables, cables_at
+from model.pose import Array, Pose, matrix_from_rotation_vector, read_only, skew
+from model.rig import Rig
+from model.scene import Load
+from model.statics.gravity import STANDARD_GRAVITY, working_tensions
+from model.winches import WinchMap
+from simulation.equilibrium.hanging import Hanging
+from simulation.equilibrium.newton import hang_still
+
+# A platform on elastic cables that only pull, under gravity: its energy and what follows of it.
+#
+# Pure. Twists are a translation, then a rotation, both in the world and about the platform's
+# origin.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspension:
+    """What the platform hangs on, and what it weighs.
+
+    A cable of axial stiffness EA wound off to the unstrained length L0 pulls with
+    EA · max(0, (l + d) / L0 − 1), l from outlet to anchor and d from drum to outlet.
+
+    Attributes:
+        rig: The robot.
+        axial: EA of each cable, shape (m,), [N].
+        behind: d of each cable, shape (m,), [m].
+        unstrained: L0 of each cable, shape (m,), [m].
+        weight: Of platform and payload, [N].
+        centre: Their centre of mass, platform frame, shape (3,), [m].
+        hanging: The same for compiled code, without the lengths.
+    """
+
+    rig: Rig
+    axial: Array
+    behind: Array
+    unstrained: Array
+    weight: float
+    centre: Array
+    hanging: Hanging
+
+    @classmethod
+    def wound(
+        cls, rig: Rig, winch_map: WinchMap, unstrained: Array, load: Load | None
+    ) -> Suspension:
+        """The rig with its cables wound off to given lengths, shape (m,), [m]."""
+        axial = np.broadcast_to(winch_map.stiffness, rig.cable_count)
+        behind, (weight, centre) = winch_map.behind_outlet, _weight(rig, load)
+        hanging = _for_kernels(rig, axial, behind, weight, centre)
+        return cls(rig, axial, behind, unstrained, weight, centre, hanging)
+
+    def with_load(self, load: Load) -> Suspension:
+        """The same with another load on the platform."""
+        weight, centre = _weight(self.rig, load)
+        hanging = _for_kernels(self.rig, self.axial, self.behind, weight, centre)
+        return replace(self, weight=weight, centre=centre, hanging=hanging)
+
+    def with_lengths(self, unstrained: Array) -> Suspension:
+        """The same with cables of other unstrained lengths, shape (m,), [m]."""
+        return replace(self, unstrained=unstrained)
+
+    def strained(self, pose: Pose) -> tuple[Cables, Array]:
+        """The cables at a pose and how far each is stretched, by its length; negative when slack.
+
+        Raises:
+            ValueError: An anchor is inside its pulley.
+        """
+        cables = cables_at(self.rig, pose)
+        return cables, (cables.lengths + self.behind) / self.unstrained - 1.0
+
+    def pulled(self, pose: Pose) -> tuple[Cables, Array]:
+        """The cables at a pose and their tensions, shape (m,), [N]; errors as for `strained`."""
+        cables, strain = self.strained(pose)
+        tensions: Array = self.axial * np.maximum(strain, 0.0)
+        return cables, tensions
+
+    def energy(self, pose: Pose, tensions: Array) -> float:
+        """Elastic and potential energy at a pose with the tensions there, [J]."""
+        elastic = (tensions * tensions) @ (self.unstrained / (2.0 * self.axial))
+        height = pose.position[2] + pose.rotation[2] @ self.centre
+        return float(elastic + self.weight * height)
+
+    def gradient(self, pose: Pose, cables: Cables, tensions: Array) -> Array:
+        """Energy by a twist: minus the wrench, shape (6,), [N, N·m]."""
+        gradient: Array = -(tensions @ _columns(pose, cables))
+        arm_x, arm_y = (pose.rotation @ self.centre)[:2].tolist()
+        gradient[2] += self.weight
+        gradient[3] += arm_y * self.weight
+        gradient[4] -= arm_x * self.weight
+        return gradient
+
+    def rates(self, pulling: NDArray[np.bool_]) -> Array:
+        """Tension by length of each cable that pulls, 0 for the others, shape (m,), [N/m]."""
+        return np.where(pulling, self.axial / self.unstrained, 0.0)
+
+    def stiffness(self, pose: Pose, cables: Cables, rates: Array, tensions: Array) -> Array:
+        """Second derivative of the energy by the twist, shape (6, 6).
+
+        Over a pulley the exit moves with the anchor; that part is left out, which costs steps
+        and no accuracy, since the equilibrium is decided by the gradient.
+
+        Args:
+            pose: ``world_from_platform``.
+            cables: The cables there.
+            rates: Tension by length of each cable, 0 for a slack one, shape (m,), [N/m].
+            tensions: Shape (m,), [N].
+        """
+        arms = cables.anchors - pose.position
+        directions = cables.directions
+        columns = _columns(pose, cables)
+        straight = np.linalg.norm(cables.exits - cables.anchors, axis=1)
+        swing = tensions / straight
+        stiffness: Array = (columns.T * (rates - swing)) @ columns
+        # Sum of swing · Gᵀ G with G = [1, −[a]×], the motion of an anchor under the twist.
+        weighted = swing @ arms
+        coupling = skew(weighted)
+        stiffness[:3, :3] += swing.sum() * np.eye(3)
+        stiffness[:3, 3:] -= coupling
+        stiffness[3:, :3] += coupling
+        spread = (arms.T * swing) @ arms
+        stiffness[3:, 3:] += np.trace(spread) * np.eye(3) - spread
+        # Turning also bends the arms of the forces themselves.
+        forces = directions * tensions[:, None]
+        moment = forces.T @ arms
+        moment[2] -= self.weight * (pose.rotation @ self.centre)
+        stiffness[3:, 3:] += np.trace(moment) * np.eye(3) - (moment + moment.T) / 2.0
+        return stiffness
+
+
+def _weight(rig: Rig, load: Load | None) -> tuple[float, Array]:
+    """Weight of platform and payload [N] and their centre, platform frame, shape (3,), [m]."""
+    payload = load.payload_mass if load else 0.0
+    mass = rig.mass + payload
+    centre = rig.mass * rig.centre_of_mass
+    if load:
+        centre = centre + payload * np.asarray(load.payload_centre)
+    return mass * STANDARD_GRAVITY, read_only(centre / mass)
+
+
+def _for_kernels(rig: Rig, axial: Array, behind: Array, weight: float, centre: Array) -> Hanging:
+    """Arrays that may be written to and lie in one piece: for others, code is compiled again."""
+    return Hanging(
+        outlets=np.array(rig.outlets, order="C"),
+        feeds=np.array(rig.feed_directions, order="C"),
+        radius=float(rig.pulley_radius),
+        anchors=np.array(rig.anchors, order="C"),
+        axial=np.array(axial),
+        behind=np.array(behind),
+        weight=float(weight),
+        centre=np.array(centre),
+    )
+
+
+def _columns(pose: Pose, cables: Cables) -> Array:
+    """Columns of the structure matrix, one a row, shape (m, 6)."""
+    arms = cables.anchors - pose.position
+    return np.concatenate([cables.directions, _cross(arms, cables.directions)], axis=1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Rows' cross products, shape (m, 3); for a few rows faster than `numpy.cross`."""
+    x, y, z = a[:, 0], a[:, 1], a[:, 2]
+    u, v, w = b[:, 0], b[:, 1], b[:, 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+
 
 FORCE_TOLERANCE = 1e-7
 """Largest force [N] and moment over the platform's reach [N] left at an equilibrium."""
 
 QUICK_STEPS = 12
+"""Of Newton's method, from where the platform is; it takes three as a rule, over pulleys more."""
+
 MAX_STEPS = 200
 
 
@@ -117,49 +278,28 @@ class Plant:
         if self._on_a_stand:
             self.tensions = read_only(self._pulled(self.pose)[1])
             self._on_a_stand = bool(self.tensions.min() < self._rig.min_tension)
-        if not (self._on_a_stand or (yield from self._settling_quickly())):
+        yield
+        if not (self._on_a_stand or self._settles_quickly()):
             yield from self._settling_anyhow()
 
-    def _settling_quickly(self) -> Generator[None, None, bool]:
-        """The quick way: from the cables that pulled before to those that pull in the end.
-
-        Newton's method in which the cables that pull may push as well, and the others do neither:
-        on the way a step of the drums may press some of them together. Where it comes to rest with
-        one that pushes, or with a slack one that is stretched, it goes on with those that pull
-        there. False when it does not come to an end, or ends where the platform is not stable.
-        """
-        pose, pull = self.pose, self.tensions > 0.0
-        for _ in range(QUICK_STEPS):
-            yield
-            hung = self._suspension
-            try:
-                cables, strain = hung.strained(pose)
-            except ValueError:  # an anchor inside its pulley
-                return False
-            tensions = np.where(pull, hung.axial * strain, 0.0)
-            gradient = hung.gradient(pose, cables, tensions)
-            if self._small(gradient):
-                if np.array_equal(pull, strain > 0.0):
-                    return self._comes_to_rest(pose, cables, tensions)
-                pull = strain > 0.0
-                continue
-            without_push = np.maximum(tensions, 0.0)
-            stiffness = hung.stiffness(pose, cables, hung.rates(pull), without_push)
-            try:
-                pose = _moved(pose, np.asarray(np.linalg.solve(stiffness, -gradient)))
-            except np.linalg.LinAlgError:
-                return False
-        return False
-
-    def _comes_to_rest(self, pose: Pose, cables: Cables, tensions: Array) -> bool:
-        """Takes over an equilibrium, unless the platform would fall or tip from it."""
-        rates = self._suspension.rates(tensions > 0.0)
-        try:
-            np.linalg.cholesky(self._suspension.stiffness(pose, cables, rates, tensions))
-        except np.linalg.LinAlgError:
-            return False
-        self.pose, self.tensions = pose, read_only(tensions)
-        return True
+    def _settles_quickly(self) -> bool:
+        """Newton's method from here; False when it finds nothing. See `newton.hang_still`."""
+        hung = self._suspension
+        position, rotation = np.array(self.pose.position), np.array(self.pose.rotation, order="C")
+        tensions = np.array(self.tensions)
+        found = hang_still(
+            hung.hanging,
+            hung.unstrained,
+            position,
+            rotation,
+            tensions,
+            self._reach,
+            FORCE_TOLERANCE,
+            QUICK_STEPS,
+        )
+        if found:
+            self.pose, self.tensions = Pose(position, rotation), read_only(tensions)
+        return bool(found)
 
     def _settling_anyhow(self) -> Iterator[None]:
         """Down the energy, step by step, with cables that only pull."""
@@ -239,6 +379,13 @@ class Plant:
             + " m",
             next_step="check what the drives were told",
         )
+
+
+def load_kernels() -> None:
+    """Loads the machine code of the search, or compiles it, so that no drive waits for it."""
+    point, one = np.zeros((1, 3)), np.ones(1)
+    hanging = Hanging(point, point, 0.0, point, one, one, 1.0, np.zeros(3))
+    hang_still(hanging, one, np.zeros(3), np.eye(3), np.ones(1), 1.0, FORCE_TOLERANCE, 0)
 
 
 def _moved(pose: Pose, step: Array) -> Pose:

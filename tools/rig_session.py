@@ -19,18 +19,18 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from calibration.rig_parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.rig_poses import Wish, chosen_poses
-from cdpr.cables import cables_at
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from cdpr.statics.working import working_tensions
-from cdpr.winches import WinchMap
-from simulation.as_built import rig_as_built
+from calibration.geometry.model import DEFAULT_DEVIATIONS, Parameters
+from calibration.geometry.pose_selection import Wish, chosen_poses
+from model.files.scene_file import SceneDocument
+from model.kinematics import cables_at
+from model.pose import Pose
+from model.rig import Rig, load_rig
+from model.scene import Scene, scene_from_document
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
+from simulation.factory import make_synthetic_camera
+from simulation.ground_truth import rig_as_built
 from simulation.plant import Plant
-from simulation.simulate import make_synthetic_camera
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 

@@ -1,1 +1,42 @@
-"""The platform's pose from AprilTags in camera images, and its measured clearance."""
+"""From a camera image to the platform's pose with a covariance, and on to measured clearance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from model.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from tracking.camera_check import CameraMoved
+    from tracking.clearance import MeasuredClearance, clearance_of
+    from tracking.measurement import NoPose, PoseMeasurement
+    from tracking.multi_camera import MultiCameraFusion
+    from tracking.pose_log import write_pose_log
+    from tracking.settings import TrackerSettings
+    from tracking.tracker import Tracker
+
+__all__ = [
+    "CameraMoved",
+    "MeasuredClearance",
+    "MultiCameraFusion",
+    "NoPose",
+    "PoseMeasurement",
+    "Tracker",
+    "TrackerSettings",
+    "clearance_of",
+    "write_pose_log",
+]
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "tracking.camera_check": "CameraMoved",
+            "tracking.clearance": "MeasuredClearance clearance_of",
+            "tracking.measurement": "NoPose PoseMeasurement",
+            "tracking.multi_camera": "MultiCameraFusion",
+            "tracking.pose_log": "write_pose_log",
+            "tracking.settings": "TrackerSettings",
+            "tracking.tracker": "Tracker",
+        },
+    )

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpr.errors import Fault
-from cdpr.poses import Array, Pose, read_only, skew
-from cdpr.rig import Camera
-from tracking.bundle import TagView, solve_bundle
-from tracking.marks import tag_corners
-from tracking.projection import ideal_of
+from model.errors import Fault
+from model.pose import Array, Pose, read_only, skew
+from model.rig import Camera
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import tag_corners
+from tracking.pnp import TagView, solve_pnp
 
 
 class CameraMoved(Fault):
@@ -53,7 +53,7 @@ def check_camera(camera: Camera, views: Sequence[TagView]) -> CameraCheck:
     errors, distances = [], []
     for view in whole:
         points = camera_from_world.apply(tag_corners(view.tag))
-        gap = ideal_of(camera, points) - view.seen.corners
+        gap = project_undistorted(camera, points) - view.seen.corners
         errors.append(float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))))
         distances.append(errors[-1] * float(points[:, 2].mean()) / float(camera.matrix[0, 0]))
     tags = tuple(view.tag.id for view in whole)
@@ -67,7 +67,7 @@ def measured_camera(camera: Camera, views: Sequence[TagView]) -> tuple[Pose, Arr
         ``world_from_camera`` and the covariance of position [m] and rotation vector [rad] along the
         world's axes, shape (6, 6); None when the tags do not give one.
     """
-    found = solve_bundle(camera, views, camera.world_from_camera.inverse())
+    found = solve_pnp(camera, views, camera.world_from_camera.inverse())
     if found is None or not np.all(np.isfinite(found.covariance)):
         return None
     change = change_of_inverse(found.camera_from_body)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpr.poses import Pose
-from cdpr.rig import Camera
-from tracking.bundle import TagView, square_poses
-from tracking.marks import tag_corners
-from tracking.projection import ideal_of
+from model.pose import Pose
+from model.rig import Camera
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import tag_corners
+from tracking.pnp import TagView, square_poses
 
 #: A square agrees with a pose when its corners are this near, as a share of its own side, and [px].
 AGREEMENT, LEAST_AGREEMENT = 0.15, 3.0
@@ -79,7 +79,9 @@ def _fitting(
             continue
         seen = view.seen.corners
         side = float(np.sqrt(np.mean(np.sum((seen - np.roll(seen, 1, axis=0)) ** 2, axis=1))))
-        gap = float(np.sqrt(np.mean(np.sum((ideal_of(camera, points) - seen) ** 2, axis=1))))
+        gap = float(
+            np.sqrt(np.mean(np.sum((project_undistorted(camera, points) - seen) ** 2, axis=1)))
+        )
         near = gap < max(LEAST_AGREEMENT, AGREEMENT * side)
         if near and (view.tag.id not in best or gap < best[view.tag.id][0]):
             best[view.tag.id] = (gap, view)

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cdpr.poses import Array, Pose
-from cdpr.rig import Camera, Rig
-from tracking.marks import tag_corners
-from tracking.measured_clearance import MeasuredClearance
+from model.pose import Array, Pose
+from model.rig import Camera, Rig
+from tracking.camera_model import Image, pixels_of
+from tracking.clearance import MeasuredClearance
+from tracking.detection.tags import tag_corners
 from tracking.measurement import Observation, PoseMeasurement
-from tracking.picture import Image
-from tracking.projection import pixels_of
 
 #: Colours, blue green red.
 USED, BOX, TEXT = (80, 220, 60), (230, 160, 40), (255, 255, 255)
@@ -94,7 +93,7 @@ def _lines(found: Observation, clearance: MeasuredClearance | None) -> list[str]
         nearest = min(clearance.nearest, key=lambda n: n.distance)
         low, high = clearance.distance - clearance.uncertainty, clearance.at_most
         text.append(
-            f"clearance {clearance.distance * 1e3:.1f} mm, surely {low * 1e3:.1f} to"
+            f"clearance {clearance.distance * 1e3:.1f} mm, bounds {low * 1e3:.1f} to"
             f" {high * 1e3:.1f}  {nearest.first} to {nearest.second}"
         )
     return text

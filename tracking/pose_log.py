@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.documents import write_atomic
-from tracking.measured_clearance import MeasuredClearance
+from model.files.documents import write_atomic
+from tracking.clearance import MeasuredClearance
 from tracking.measurement import NoPose, Observation
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Protocol
 
-from cdpr.clearance import ClearanceModel
-from cdpr.errors import BadInput
-from tracking.measured_clearance import MeasuredClearance, clearance_of
+import numpy as np
+
+from model.clearance import ClearanceModel
+from model.errors import BadInput
+from tracking.camera_model import Image
+from tracking.clearance import MeasuredClearance, clearance_of
+from tracking.detection.diagnostics import what_else_is_seen
 from tracking.measurement import NoPose, PoseMeasurement
-from tracking.other_tags import what_else_is_seen
-from tracking.picture import Image
+from tracking.multi_camera import MultiCameraFusion, moments
 from tracking.pose_log import LoggedPicture
 from tracking.tracker import Tracker
 
 
 class Picture(Protocol):
-    """A picture of a source, such as a `drivers.cameras.Frame`."""
+    """A picture of a source, such as a `drivers.cameras.live.live.Frame`."""
 
     @property
     def time(self) -> float:
@@ -128,3 +131,123 @@ def _nothing_seen(
         next_step=next_step,
         values={"pictures": pictures, "family": tracker.rig.tag_family, "expected": wanted},
     )
+
+
+# Measuring the sources of several cameras at once, as ``cdpr track`` does with more than one.
+
+
+@dataclass(slots=True)
+class TogetherCount:
+    """What was not taken together so far.
+
+    Attributes:
+        without_partner: Pictures to which no other camera has one of about the same time.
+        apart: Moments in which a pose was left out as its picture is too far from the others.
+        without_speed: Moments in which one was left out as it could not be carried on.
+    """
+
+    without_partner: int = 0
+    apart: int = 0
+    without_speed: int = 0
+
+
+def track_together(
+    streams: Mapping[str, Iterator[LoggedPicture]],
+    within: float,
+    count: TogetherCount,
+    model: ClearanceModel | None = None,
+) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
+    """The pose of all cameras, moment by moment, until the last source ends.
+
+    Args:
+        streams: What `tracking.track.track` gives for each camera, by the camera's name.
+        within: Pictures taken farther than this from the median time of a moment's pictures are
+            not taken together with the others, [s].
+        count: Kept up to date.
+        model: Where obstacles are; the clearance is measured too.
+
+    Returns:
+        What all cameras say together, and what each alone that has a picture of the moment.
+
+    Raises:
+        NoPlatformSeen: At the end, when no camera gave a pose.
+        BadInput: A picture is not of its camera's size.
+        CameraMoved: Frame tags are not where they should be.
+    """
+    poses, reason, common = 0, "the sources have no pictures", MultiCameraFusion(within)
+    running = {name: _without_end(stream) for name, stream in streams.items()}
+    for alone in moments(running, 2.0 * within):
+        found = common.of({name: one.observation for name, one in alone.items()})
+        count.without_partner += len(alone) == 1
+        count.apart, count.without_speed = common.apart, common.without_speed
+        clearance = None
+        if isinstance(found, PoseMeasurement):
+            poses += 1
+            clearance = clearance_of(model, found) if model is not None else None
+        else:
+            reason = found.reason
+        yield LoggedPicture(next(iter(alone.values())).name, found, clearance), alone
+    if not poses:
+        raise NoPlatformSeen(
+            f"no camera gives a pose of the platform: {reason}",
+            where=f"cameras {', '.join(streams)}",
+            next_step="check that the cameras see the platform; `cdpr track` with one source alone"
+            " tells more",
+        )
+
+
+def _without_end(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPicture]:
+    """A camera that sees nothing at all ends without an error: the others may see."""
+    try:
+        yield from stream
+    except NoPlatformSeen:
+        return
+
+
+# How fast pictures are measured now.
+
+
+#: Live figures are those of so many of the newest pictures.
+NEWEST = 10
+
+
+def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: int) -> str:
+    """Live figures: how fast, how long a picture takes, how many tags are seen."""
+    fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
+    long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
+    return f"{fast} pictures/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
+
+
+class FrameRate:
+    """Of the newest pictures: how many a second, and how long one takes."""
+
+    def __init__(self) -> None:
+        """None was measured yet."""
+        self._times: deque[float] = deque(maxlen=NEWEST)
+        self._seconds: deque[float] = deque(maxlen=NEWEST)
+
+    def take(self, time: float, seconds: float) -> None:
+        """One more picture.
+
+        Args:
+            time: On a clock that only goes forward, [s].
+            seconds: How long it took to measure, [s]; NaN where nothing was measured.
+        """
+        self._times.append(time)
+        self._seconds.append(seconds)
+
+    @property
+    def pictures_per_second(self) -> float | None:
+        """None before there are two."""
+        took = self._times[-1] - self._times[0] if self._times else 0.0
+        return round((len(self._times) - 1) / took, 1) if took > 0.0 else None
+
+    @property
+    def measuring_ms(self) -> float | None:
+        """Median time for one; None where none was measured."""
+        known = [one for one in self._seconds if np.isfinite(one)]
+        return round(float(np.median(known)) * 1e3, 2) if known else None
+
+    def text(self, tags: int) -> str:
+        """See `rates`."""
+        return rates(self.pictures_per_second, self.measuring_ms, tags)

@@ -4,19 +4,79 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cdpr.errors import BadInput
-from cdpr.poses import Pose
-from cdpr.rig import Camera, Rig
+import numpy as np
+
+from model.errors import BadInput
+from model.pose import Array, Pose, interpolate
+from model.rig import Camera, Rig
 from tracking.camera_check import CameraCheck, refuse_moved_camera
-from tracking.detector import Detection
-from tracking.detectors import make_detector
-from tracking.frame_tags import near_places, nearest_to, region_around
-from tracking.guidance import Guidance
-from tracking.measurement import NoPose, Observation, PoseMeasurement
-from tracking.picture import Image, refuse_wrong_picture
-from tracking.platform_sight import PlatformSight
-from tracking.prediction import predicted
+from tracking.camera_model import Image, require_image_format
+from tracking.detection.detector import Detection, near_places, nearest_to, region_around
+from tracking.detection.libraries import make_detector
+from tracking.estimator import PlatformEstimator
+from tracking.measurement import NoPose, Observation, PoseMeasurement, predicted
 from tracking.settings import TrackerSettings
+
+# Where the platform should be seen, by the positions of its drives.
+#
+# Drives are off by whatever cable lengths are off, so a camera's last pose tells by how much; from
+# there on they tell how the platform went, however fast and however long no tag was to be seen.
+# This says only where to look: what is found there is judged as if nobody had said so.
+
+
+#: Drives' poses farther apart in time than this do not tell how the platform goes on, [s].
+MEMORY = 0.5
+
+
+class EncoderPrior:
+    """Keeps by how much the drives were off when the camera saw the platform last."""
+
+    def __init__(self) -> None:
+        """It never did: the drives are taken at their word."""
+        self._shift: Array = np.zeros(3)
+        self._turn: Array = np.eye(3)
+
+    def expected(self, by_drives: Pose) -> Pose:
+        """Where the platform should be, ``world_from_platform``.
+
+        Args:
+            by_drives: Where the drives' positions put it.
+        """
+        return Pose(by_drives.position + self._shift, self._turn @ by_drives.rotation)
+
+    def learn(self, measured: Pose, by_drives: Pose) -> None:
+        """The camera saw the platform.
+
+        Args:
+            measured: Where.
+            by_drives: Where the drives' positions put it at the same time.
+        """
+        self._shift = measured.position - by_drives.position
+        self._turn = measured.rotation @ by_drives.rotation.T
+
+
+class DrivesAhead:
+    """The drives' pose at the time of a picture, a little after they were heard or before."""
+
+    def __init__(self) -> None:
+        """They were not heard yet."""
+        self._last: tuple[float, Pose] | None = None
+
+    def at(self, picture: float, heard: float, pose: Pose | None) -> Pose | None:
+        """The pose when the picture was taken, if the drives go as they went.
+
+        Args:
+            picture: When it was taken, [s].
+            heard: When the drives stood at ``pose``, [s].
+            pose: ``world_from_platform`` by the drives; None when it is not known.
+        """
+        before, self._last = self._last, None if pose is None else (heard, pose)
+        if before is None or pose is None:
+            return pose
+        between, ahead = heard - before[0], picture - heard
+        if not (0.0 < between <= MEMORY and 0.0 < abs(ahead) <= MEMORY):
+            return pose
+        return interpolate(before[1], pose, 1.0 + ahead / between)
 
 
 class Tracker:
@@ -47,10 +107,10 @@ class Tracker:
         self.camera_check: CameraCheck | None = None
         self._detector = make_detector(rig.tag_detector, rig.tag_family)
         self._frame = {tag.id: tag for tag in rig.frame_tags}
-        self._sight = PlatformSight(rig, camera, self.settings)
+        self._sight = PlatformEstimator(rig, camera, self.settings)
         self._last: PoseMeasurement | None = None
         self._before: PoseMeasurement | None = None
-        self._guidance = Guidance()
+        self._guidance = EncoderPrior()
         self._pictures = 0
 
     @property
@@ -75,7 +135,7 @@ class Tracker:
             BadInput: The picture is not a grey one of the camera's size.
             CameraMoved: The frame tags are not where they should be.
         """
-        refuse_wrong_picture(image, self.camera, self.rig.name)
+        require_image_format(image, self.camera, self.rig.name)
         self._pictures += 1
         result: Observation | None = None
         if self._last is not None:

@@ -30,9 +30,11 @@ from pictures import curves_figure
 from result import Result
 from rich.progress import Progress
 
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene
 
+OMPL_RANGE = 0.2
+"""Steps of OMPL's planners unless told otherwise, as part of the space's extent."""
 CONFIGS = Path(__file__).parents[2] / "configs"
 BEST_MM = {1: 628.5, 2: 661.0, 3: 813.5}
 """Source: a fine reference search, polished; see docs/paper.md."""
@@ -59,7 +61,7 @@ def main() -> None:
     ompl_runs.seed(wishes.seed)
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     runs: list[Run] = []
-    inside_us: dict[int, float] = {}
+    inside_us: dict[int, list[float]] = {}
     with Progress(disable=not sys.stderr.isatty()) as bar:
         contests = 1 + len(ompl_runs.PLANNERS) * len(wishes.checkers)
         total = contests * wishes.runs * len(wishes.environments)
@@ -78,13 +80,17 @@ def main() -> None:
 
 def contest(
     rig: Rig, scene: Scene, environment: int, wishes: argparse.Namespace,
-    inside_us: dict[int, float],
+    inside_us: dict[int, list[float]],
 ) -> Iterator[Run]:  # fmt: skip
-    """All runs in one environment; also writes our mean time to a first path in compiled code."""
+    """All runs in one environment; also writes mean times to a first path in compiled code.
+
+    Ours, and those of RRTConnect at OMPL's default range and without a limit of steps.
+    """
     marks_s = tuple(mark / 1e3 for mark in wishes.marks_ms)
     exact = exact_edges(rig, scene)
     contestant = ours.Contestant(rig, scene)
-    inside_us[environment] = contestant.mean_first_us()
+    rivals = [contestant.mean_rival_us(share) for share in (OMPL_RANGE, 1.0)]
+    inside_us[environment] = [contestant.mean_first_us(), *rivals]
     for number in range(wishes.runs):
         result = contestant.run(wishes.seed + number, marks_s)
         yield _run(result, environment, "exact", ours.NAME, number, exact)

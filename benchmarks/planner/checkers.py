@@ -13,14 +13,14 @@ import fcl
 import numba
 import numpy as np
 
-from cdpr.cables import cables_at
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from cdpr.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
-from planner.exact.edge import edge_free
-from planner.exact.fields import World
-from planner.exact.world import build_world
+from model.geometry.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
+from model.kinematics import cables_at
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.scene import Scene
+from planner.collision.edges import edge_free
+from planner.collision.world import build_world
+from planner.kernels.scene_arrays import World
 
 EdgeCheck = Callable[[float, float, float, float, float, float], bool]
 SPACING = 0.005

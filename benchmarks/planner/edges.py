@@ -15,13 +15,13 @@ import coal
 import fcl
 import numpy as np
 
-from cdpr.poses import Array
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene
-from planner.exact.checks import ExactChecks
-from planner.exact.edge import edges_free
-from planner.exact.holding import edges_held
-from planner.exact.self_edge import self_edges_free
+from model.pose import Array
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene
+from planner.collision.edges import edges_free
+from planner.collision.self_collision import self_edges_free
+from planner.edge_checks import ExactChecks
+from planner.wrench.translation import edges_held
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CLEARANCE = 0.010

@@ -24,12 +24,12 @@ import ours
 from pictures import growth_figure
 from rich.progress import track
 
-from cdpr.poses import Array, Pose, read_only
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from planner.exact.edge import edges_free
-from planner.exact.world import build_world
+from model.files.scene_file import SceneDocument
+from model.pose import Array, Pose, read_only
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene, scene_from_document
+from planner.collision.edges import edges_free
+from planner.collision.world import build_world
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 OBSTACLES = (1, 2, 5, 10, 20, 50, 100)

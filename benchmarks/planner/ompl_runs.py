@@ -16,9 +16,9 @@ from checkers import SPACING, EdgeCheck, FclStates
 from ompl import base, geometric, util
 from result import Result
 
-from cdpr.poses import Array
-from cdpr.rig import Rig
-from cdpr.scene import Scene
+from model.pose import Array
+from model.rig import Rig
+from model.scene import Scene
 
 PLANNERS = ("RRTConnect", "RRTConnect*", "RRTstar", "InformedRRTstar", "BITstar", "AORRTC")
 """`RRTConnect*` is RRTConnect with unlimited steps, which suits exact edges best."""
@@ -35,25 +35,22 @@ class Question:
             bounds.setLow(axis, float(rig.workspace_lower[axis]))
             bounds.setHigh(axis, float(rig.workspace_upper[axis]))
         self._space.setBounds(bounds)
-        self._information = base.SpaceInformation(self._space)
+        self.information = base.SpaceInformation(self._space)
         self.checks = 0
         if isinstance(check, FclStates):
             self._check_states(check)
         else:
             self._check_edges(check)
-        self._information.setup()
-        self._start, self._goal = (
-            self._state(scene.start.position),
-            self._state(scene.goal.position),
-        )
+        self.information.setup()
+        self.ends = self._state(scene.start.position), self._state(scene.goal.position)
 
     def run(self, planner: str, marks_s: Sequence[float]) -> Result:
         """Runs a planner until the last mark; one that never improves, until its first path."""
         self.checks = 0
-        problem = base.ProblemDefinition(self._information)
-        problem.setStartAndGoalStates(self._start, self._goal)
-        problem.setOptimizationObjective(base.PathLengthOptimizationObjective(self._information))
-        made = getattr(geometric, planner.rstrip("*"))(self._information)
+        problem = base.ProblemDefinition(self.information)
+        problem.setStartAndGoalStates(*self.ends)
+        problem.setOptimizationObjective(base.PathLengthOptimizationObjective(self.information))
+        made = getattr(geometric, planner.rstrip("*"))(self.information)
         if planner.endswith("*"):
             made.setRange(self._space.getMaximumExtent())
         made.setProblemDefinition(problem)
@@ -88,18 +85,18 @@ class Question:
             x, y, z = state[0], state[1], state[2]
             return check(x, y, z, x, y, z)
 
-        self._validator = Edges(self._information)
-        self._information.setStateValidityChecker(valid)
-        self._information.setMotionValidator(self._validator)
+        self._validator = Edges(self.information)
+        self.information.setStateValidityChecker(valid)
+        self.information.setMotionValidator(self._validator)
 
     def _check_states(self, check: FclStates) -> None:
         def valid(state: Any) -> bool:
             self.checks += 1
             return check.free(state[0], state[1], state[2])
 
-        self._information.setStateValidityChecker(valid)
+        self.information.setStateValidityChecker(valid)
         share = SPACING / self._space.getMaximumExtent()
-        self._information.setStateValidityCheckingResolution(share)
+        self.information.setStateValidityCheckingResolution(share)
 
     def _state(self, position: Array) -> Any:
         state = self._space.allocState()

@@ -25,17 +25,17 @@ import numpy as np
 from reference import Question, question, reference_of
 from rich.progress import Progress
 
-from cdpr.poses import Array, Pose
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
+from model.pose import Array, Pose
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.anytime.path import best_path
+from planner.anytime.prepare import problem_of
+from planner.anytime.problem import PathProblem
+from planner.anytime.rounds import advance
+from planner.anytime.state import new_search
 from planner.check import check_path
-from planner.cost import KinematicCost
-from planner.optimal.preparation import problem_of
-from planner.optimal.problem import Problem
-from planner.optimal.rounds import advance
-from planner.optimal.routing import best_path
-from planner.optimal.search import new_search
-from planner.weights import OBJECTIVES, Weights
+from planner.costs import KinematicCost
+from planner.settings import OBJECTIVES, Weights
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 KNOWN_MM = {1: 628.5, 2: 661.0, 3: 813.5}
@@ -85,7 +85,7 @@ def main() -> None:
         _write(wishes.output, rows, text)
 
 
-def _problem(asked: Question, weights: Weights) -> Problem:
+def _problem(asked: Question, weights: Weights) -> PathProblem:
     return problem_of(asked.rig, asked.scene, weights, asked.cost)
 
 

@@ -5,21 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+import compiled_rrt
 import numpy as np
 from numpy.typing import NDArray
 from result import Result
 
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from planner.cost import KinematicCost
-from planner.exact.compiled import kernel
-from planner.optimal.connect import connect
-from planner.optimal.preparation import problem_of
-from planner.optimal.problem import Problem
-from planner.optimal.random import State
-from planner.optimal.rounds import advance
-from planner.optimal.search import BEST, Search, new_search
-from planner.weights import Weights
+from model.rig import Rig
+from model.scene import Scene
+from planner.anytime.connect import connect
+from planner.anytime.prepare import problem_of
+from planner.anytime.problem import PathProblem
+from planner.anytime.random import State
+from planner.anytime.rounds import advance
+from planner.anytime.state import BEST, AnytimeSearch, new_search
+from planner.costs import KinematicCost
+from planner.kernels.jit import kernel
+from planner.settings import Weights
 
 NAME = "optimal"
 Array = NDArray[np.float64]
@@ -85,6 +86,12 @@ class Contestant:
         spent = time.process_time() - begin
         return spent / _MANY * 1e6 if found == _MANY else np.inf
 
+    def mean_rival_us(self, share: float) -> float:
+        """The same of RRTConnect, compiled, its steps at most a share of the space's extent."""
+        low, high = self._problem.world.limits
+        extent = float(np.linalg.norm(high - low))
+        return compiled_rrt.mean_first_us(self._problem, self._start, self._goal, share * extent)
+
     def _first(self, seed: int) -> float:
         """Processor time to the first path, [s]."""
         search = new_search(self._start, self._goal, seed)
@@ -100,7 +107,8 @@ class Contestant:
 
 @kernel
 def _many(
-    problem: Problem, ends: Array, state: State, trees: Array, parents: Integers, grown: Integers,
+    problem: PathProblem, ends: Array, state: State, trees: Array, parents: Integers, grown:
+        Integers,
     path: Array, times: int,
 ) -> int:  # fmt: skip
     """Searches for a first path so many times; returns how often there was one."""
@@ -112,5 +120,5 @@ def _many(
     return found
 
 
-def _checks(search: Search) -> int:
+def _checks(search: AnytimeSearch) -> int:
     return int(search.totals[2] + search.counts[:, 1].sum())

@@ -24,14 +24,13 @@ from pictures import pareto_figure
 from reference import LIGHT, Question, question, reference_of
 from rich.progress import track
 
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import load_scene
-from planner.campaign.boxes import OWN, SHARES, WIDE, box_text, with_box
+from model.pose import Array, Pose
+from model.rig import Rig, load_rig
+from model.scene import load_scene
+from planner.campaign.cases import OWN, SHARES, WIDE, box_text, with_box
 from planner.check import check_path
-from planner.optimal.settings import OptimalSettings
-from planner.plan import make_plan
-from planner.weights import OBJECTIVES
+from planner.planning import make_plan
+from planner.settings import OBJECTIVES, OptimalSettings
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CLAIM = 18.2

@@ -13,20 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from cdpr.poses import Array
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from planner.cost import KinematicCost
-from planner.lattice import Lattice
-from planner.optimal.lattice_path import lattice_path
-from planner.optimal.polish import polish
-from planner.optimal.polyline import MOST_VERTICES, Polyline, measure
-from planner.optimal.preparation import problem_of
-from planner.optimal.problem import KINEMATIC, LENGTH, UNIT, VERTEX, Problem
-from planner.optimal.random import seeded
-from planner.optimal.rounds import advance
-from planner.optimal.search import BEST, new_search
-from planner.weights import Weights
+from model.pose import Array
+from model.rig import Rig
+from model.scene import Scene
+from planner.anytime.lattice_path import lattice_path
+from planner.anytime.local_search import MOST_VERTICES, Polyline, measure, polish
+from planner.anytime.prepare import problem_of
+from planner.anytime.problem import KINEMATIC, LENGTH, UNIT, VERTEX, PathProblem
+from planner.anytime.random import seeded
+from planner.anytime.rounds import advance
+from planner.anytime.state import BEST, new_search
+from planner.costs import KinematicCost
+from planner.settings import Weights
+from planner.space import Lattice
 
 DENSE = 0.008
 """Between points of the dense graph, [m]."""
@@ -74,8 +73,8 @@ class Question:
     rig: Rig
     scene: Scene
     cost: KinematicCost
-    problem: Problem
-    fine: Problem
+    problem: PathProblem
+    fine: PathProblem
 
     @property
     def ends(self) -> Array:
@@ -153,7 +152,7 @@ def reference_of(
     return min(polished, key=lambda path: asked.value(length, kinematic, path))
 
 
-def _from_dense_graph(asked: Question, fine: Problem, effort: Effort) -> list[Array]:
+def _from_dense_graph(asked: Question, fine: PathProblem, effort: Effort) -> list[Array]:
     found = []
     for seed, spread in enumerate(effort.spreads):
         points, counts = np.zeros((1000, 3)), np.zeros(2, dtype=np.int64)
@@ -163,7 +162,7 @@ def _from_dense_graph(asked: Question, fine: Problem, effort: Effort) -> list[Ar
     return found
 
 
-def _from_long_searches(asked: Question, fine: Problem, effort: Effort) -> list[Array]:
+def _from_long_searches(asked: Question, fine: PathProblem, effort: Effort) -> list[Array]:
     found = []
     coarse = asked.problem._replace(terms=fine.terms.copy())
     for seed in range(effort.searches):
@@ -173,7 +172,7 @@ def _from_long_searches(asked: Question, fine: Problem, effort: Effort) -> list[
     return found
 
 
-def _polished(fine: Problem, path: Array, seed: int, rounds: int) -> Array:
+def _polished(fine: PathProblem, path: Array, seed: int, rounds: int) -> Array:
     room = max(len(path) + 8, MOST_VERTICES)
     line = Polyline(np.zeros((room, 3)), np.zeros((room, 3)), np.array([len(path), 0]))
     line.points[: len(path)] = path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cdpr.poses import Array
+from model.pose import Array
 
 
 @dataclass(frozen=True)

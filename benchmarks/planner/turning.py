@@ -14,20 +14,20 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.poses import Array
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from planner.cost import KinematicCost
-from planner.exact.moving_edge import turning_edge_free
-from planner.exact.self_edge import self_turning_edge_free
-from planner.exact.turning_held import turning_edge_held
+from model.files.scene_file import SceneDocument
+from model.pose import Array
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene, scene_from_document
+from planner.anytime_6d.moves import matrix_of, put_turned, turn_between
+from planner.anytime_6d.path import turning_problem
+from planner.anytime_6d.problem import RotatingProblem, move_allowed
+from planner.anytime_6d.rounds import RotatingSearch
+from planner.collision.rotating_edges import turning_edge_free
+from planner.collision.self_collision import self_turning_edge_free
+from planner.costs import KinematicCost
+from planner.settings import OBJECTIVES
 from planner.space import PoseSpace
-from planner.turning.moves import matrix_of, put_turned, turn_between
-from planner.turning.problem import Problem, move_allowed
-from planner.turning.routing import turning_problem
-from planner.turning.search import Search
-from planner.weights import OBJECTIVES
+from planner.wrench.rotation import turning_edge_held
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 WAY, ANGLE = 0.040, np.radians(2.0)
@@ -45,7 +45,7 @@ def hall() -> tuple[Rig, Scene]:
     return load_rig(CONFIGS / "hall_10_6.yaml"), scene
 
 
-def allowed_moves(problem: Problem, count: int) -> list[tuple[Array, Array]]:
+def allowed_moves(problem: RotatingProblem, count: int) -> list[tuple[Array, Array]]:
     """Random moves of `WAY` and `ANGLE` that keep everything."""
     random, found = np.random.default_rng(0), []
     limits, tallies = problem.world.limits, np.zeros(6, dtype=np.int64)
@@ -73,7 +73,7 @@ def microseconds(check: Callable[[int], object], count: int) -> float:
     return (time.process_time() - began) / (REPEATS * count) * 1e6
 
 
-def edges(problem: Problem) -> None:
+def edges(problem: RotatingProblem) -> None:
     """Prints what the parts of the proof of one allowed move take."""
     moves = allowed_moves(problem, 60)
     given = [
@@ -91,14 +91,14 @@ def edges(problem: Problem) -> None:
     print(f"  µs for an allowed move of {WAY * 1e3:g} mm and {np.degrees(ANGLE):g} deg: {told}")
 
 
-def searches(rig: Rig, scene: Scene, problem: Problem, seeds: int) -> None:
+def searches(rig: Rig, scene: Scene, problem: RotatingProblem, seeds: int) -> None:
     """Prints the time to the first path, and the lengths reached."""
     space = PoseSpace(rig)
     ends = space.coordinates(scene.start), space.coordinates(scene.goal)
-    Search(problem, *ends, 0).advance()
+    RotatingSearch(problem, *ends, 0).advance()
     firsts, lengths = [], []
     for seed in range(seeds):
-        search, began, first = Search(problem, *ends, seed), time.process_time(), 0.0
+        search, began, first = RotatingSearch(problem, *ends, seed), time.process_time(), 0.0
         reached = []
         for mark in MARKS:
             while time.process_time() - began < mark:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import gc
+import io
 import json
+import os
 import sys
 import tempfile
 import traceback
-from importlib.metadata import version
-from typing import Annotated
+from contextlib import suppress
+from typing import Annotated, NoReturn
 
 import typer
 
-from cdpr.cli.verbs import add_verbs
-from cdpr.errors import CdprError
+from cdpr.cli.verbs import LazyGroup
+from model.errors import BadInput, CdprError, Fault
+from model.files.reading import shown
 
 EPILOG = (
     "Exit codes: 0 ok, 1 fault, 2 bad input, 3 refused by a safety check,"
@@ -23,6 +26,9 @@ EPILOG = (
 
 def _tell_version(wanted: bool) -> None:
     if wanted:
+        # Takes longer to import than all else here, and only this option needs it.
+        from importlib.metadata import version
+
         print(f"cdpr {version('cdpr')}")
         raise typer.Exit
 
@@ -30,6 +36,7 @@ def _tell_version(wanted: bool) -> None:
 def build_app() -> typer.Typer:
     """The whole command line."""
     app = typer.Typer(
+        cls=LazyGroup,
         epilog=EPILOG,
         no_args_is_help=True,
         add_completion=True,
@@ -38,7 +45,6 @@ def build_app() -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_options)
-    add_verbs(app)
     return app
 
 
@@ -58,20 +64,71 @@ def main() -> None:
     # Importing makes some 10^5 objects that stay; looking through them again and again for
     # rubbish took a tenth of the time of a plan.
     gc.set_threshold(100_000, 50, 50)
+    _print_anything()
     try:
         build_app()()
+    except SystemExit:
+        _end_of_output()
+        raise
     except CdprError as error:
-        _tell(error)
-        sys.exit(error.exit_code)
+        _end(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+    except OSError as error:
+        _end(_of_the_system(error))
+    except MemoryError:
+        _end(Fault("not enough memory", next_step="take less of it at once, or a larger computer"))
     except Exception as error:
         _tell_bug(error)
         sys.exit(1)
     finally:
         # Nor is there rubbish to be found in them at the end, which took another fifth.
         gc.freeze()
+
+
+def _print_anything() -> None:
+    """A sign that the terminal cannot show, or a file name that is no text, ends no command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _end(error: CdprError) -> NoReturn:
+    with suppress(OSError):  # the cause may be that nothing can be written
+        _tell(error)
+    with suppress(OSError):
+        sys.stdout.flush()
+    _forget_output()
+    sys.exit(error.exit_code)
+
+
+def _end_of_output() -> None:
+    """What was printed is written before the command says that it went well."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:  # such as `cdpr … | head`
+        _forget_output()
+    except OSError as error:
+        _end(_of_the_system(error))
+
+
+def _forget_output() -> None:
+    """The interpreter would try again to write it at its end, and complain."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _of_the_system(error: OSError) -> CdprError:
+    """The operating system refused a file that a verb did not expect it to, or its output."""
+    why = error.strerror or str(error)
+    if error.filename is not None:
+        hint = "check the path, who may use it, and the space on its disk"
+        return BadInput(
+            "the path cannot be used", where=shown(str(error.filename)), why=why, next_step=hint
+        )
+    hint = "check where its output goes, and the space there"
+    return Fault("the command could not write all its output", why=why, next_step=hint)
 
 
 def _tell(error: CdprError) -> None:

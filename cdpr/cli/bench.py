@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-import os
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
+from rich.table import Table
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from cdpr.rig import Rig
-    from cdpr.scene import Scene
-    from planner.campaign.results import Results
+from cdpr.cli.demo import RIG, configs
+from cdpr.cli.options import DaskOption, WorkersOption
+from cdpr.cli.output import Terminal, out, show_json
+from model.files.output import make_folder
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.campaign.cases import OWN
+from planner.campaign.claims import Finding, findings
+from planner.campaign.evaluation import about, run_campaign, write_campaign
+from planner.campaign.page import change_text
 
 ENVIRONMENTS = ("environment_1", "environment_2", "environment_3")
 DEFAULT_FOLDER = Path("bench-paper")
@@ -24,12 +30,8 @@ def paper(
         Path, typer.Option("-o", "--output", help="folder to write", metavar="DIR")
     ] = DEFAULT_FOLDER,
     seeds: Annotated[int, typer.Option(min=2, help="searches of each planner in each case")] = 100,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="processes; else one a core", metavar="N")
-    ] = None,
-    dask: Annotated[
-        str | None, typer.Option(help="do the work on this Dask cluster", metavar="ADDRESS")
-    ] = None,
+    workers: WorkersOption = None,
+    dask: DaskOption = None,
     check: Annotated[
         bool, typer.Option("--check", help="put every path of Fig. 9 to `cdpr check` as well")
     ] = False,
@@ -47,88 +49,32 @@ def paper(
 
       cdpr bench paper --seeds 100 -o bench-paper
     """
-    from cdpr.cli.compiling import told_when_compiling
-    from cdpr.cli.demo import RIG, configs
-    from cdpr.cli.output import out, progress_bar, show_json, spinner
-    from cdpr.cli.workers import Count, make_folder, worker_pool
-    from cdpr.rig import load_rig
-    from cdpr.scene import load_scene
-    from planner.campaign.boxes import OWN
-    from planner.campaign.claims import findings
-    from planner.campaign.results import Results
-    from planner.campaign.running import run_all
-    from planner.campaign.studies import batches
-    from planner.campaign.trial import run_batch
-
     rig = load_rig(configs() / RIG)
     scenes = [load_scene(configs() / f"{name}.yaml") for name in ENVIRONMENTS]
     make_folder(output, force)
-    work = batches(rig, scenes, seeds, checked=check)
-    with told_when_compiling("paper", not as_json):
-        run_batch(work[0])  # before several processes would compile the same
-    total = sum(len(batch.seeds) for batch in work)
-    with (
-        worker_pool(workers or os.cpu_count() or 1, dask) as pool,
-        progress_bar("searching", total, not as_json) as advance,
-    ):
-        results = Results(run_all(work, pool, Count(advance).more))
-    told = about(rig, scenes, seeds, results)
-    with spinner("drawing", not as_json):
-        _write(output, results, told)
+    listener = Terminal(quiet=as_json)
+    results = run_campaign(
+        rig, scenes, seeds, checked=check, workers=workers, dask=dask, listener=listener
+    )
+    described = about(rig, scenes, seeds, results)
+    with listener.waiting("drawing"):
+        write_campaign(output, results, described)
     if as_json:
-        from json import loads
-
-        show_json(loads((output / "findings.json").read_text(encoding="utf-8")))
+        show_json(json.loads((output / "findings.json").read_text(encoding="utf-8")))
     else:
         out.print(_table([finding for finding in findings(results) if finding.box == OWN]))
-        for name in ("searches without a path", "paths checked", "paths that failed their check"):
-            out.print(f"{name}: {told[name]}")
+        out.print(f"searches without a path: {described['searches without a path']}")
+        if described["paths checked"]:
+            for name in ("paths checked", "paths that failed their check"):
+                out.print(f"{name}: {described[name]}")
+        else:
+            out.print("paths were not checked; give --check to check each of them")
         out.print(f"larger boxes, every reading, figures: open {output / 'index.html'}")
-    if told["paths that failed their check"]:
+    if described["paths that failed their check"]:
         raise typer.Exit(1)
 
 
-def about(rig: Rig, scenes: Sequence[Scene], seeds: int, results: Results) -> dict[str, Any]:
-    """What the campaign was, for its page and its findings."""
-    import platform
-    from importlib.metadata import version
-
-    from planner.campaign.boxes import SHARES, box_text, with_box
-    from planner.campaign.studies import STUDIES
-
-    lost = {study: results.lost(study) for study in STUDIES}
-    checked = [t.path.passed for t in results.trials if t.path.passed == t.path.passed]
-    return {
-        "seeds": seeds,
-        "searches": len(results.trials),
-        "searches without a path": ", ".join(f"{study} {count}" for study, count in lost.items()),
-        "paths checked": len(checked),
-        "paths that failed their check": int(len(checked) - sum(checked)),
-        "boxes": {name: box_text(with_box(rig, name)) for name in SHARES},
-        "rig": f"{rig.name}, hash {rig.plan_hash}",
-        "scenes": ", ".join(f"{scene.name}, hash {scene.hash}" for scene in scenes),
-        "version": f"cdpr {version('cdpr')}, Python {platform.python_version()}",
-    }
-
-
-def _write(folder: Path, results: Results, described: dict[str, Any]) -> None:
-    from cdpr.documents import write_atomic
-    from planner.campaign.figures import save_figures
-    from planner.campaign.page import page
-    from planner.campaign.tables import findings_json, summary_csv, trials_csv
-
-    save_figures(results, folder)
-    write_atomic(folder / "trials.csv", trials_csv(results))
-    write_atomic(folder / "summary.csv", summary_csv(results))
-    write_atomic(folder / "findings.json", findings_json(results, described))
-    write_atomic(folder / "index.html", page(results, described))
-
-
-def _table(found: Any) -> Any:
-    from rich.table import Table
-
-    from planner.campaign.page import change_text
-
+def _table(found: Sequence[Finding]) -> Table:
     table = Table(
         title="the paper's claims in the rig's own box",
         box=None,

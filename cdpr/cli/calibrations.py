@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from cdpr.rig import Rig
+from cdpr.cli.output import Terminal
+from model.rig import Rig
 
 CalibrationOption = Annotated[
     list[Path] | None,
@@ -22,22 +22,14 @@ CalibrationOption = Annotated[
 
 
 def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
-    """The rig with the results of files in place of its file's numbers, in memory only.
-
-    Of each result that was not good enough it is told why: it may be used all the same.
+    """See `calibration.load.with_calibrations`.
 
     Raises:
         BadInput: A file cannot be used, or is not about this rig.
     """
     if not files:
         return rig
-    from calibration.kinds import calibrated, load_result
-    from cdpr.cli.output import err
+    # Scientific libraries, of which `cdpr stop` and others without this option must not wait.
+    from calibration.load import with_calibrations
 
-    results = [load_result(file) for file in files]
-    better = calibrated(rig, results)
-    for result in results:
-        if not result.good_enough:
-            what = f"calibration {result.kind} {result.name}, {result.date}"
-            err.print(f"note: {what}: {result.verdict}", markup=False, soft_wrap=True)
-    return better
+    return with_calibrations(rig, files, Terminal())

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from planner.check_report import CheckReport, Closest
+from cdpr.cli.options import JsonOption
+from cdpr.cli.output import Terminal, out, show_facts, show_json
+from cdpr.cli.stop_facts import stop_facts
+from model.plan import load_plan, require_same_rig
+from model.rig import load_rig
+from planner.check import check_path
+from planner.check_report import CheckReport, Closest
 
 
 def check(
@@ -18,7 +23,7 @@ def check(
         Path | None,
         typer.Option(help="check for this rig file as it is now"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Prove a plan by an independent route: distances on dense poses, with a stated bound.
 
@@ -30,17 +35,10 @@ def check(
 
       cdpr check plan.json --rig configs/gachon_8_6.yaml --json
     """
-    from cdpr.cli.output import out, show_facts, show_json, spinner
-    from cdpr.cli.plan_for_rig import require_same_rig
-    from cdpr.cli.stop_facts import stop_facts
-    from cdpr.plan import load_plan
-    from cdpr.rig import load_rig
-    from planner.check import check_path
-
     the_plan = load_plan(plan)
     the_rig = the_plan.rig if rig is None else load_rig(rig)
     require_same_rig(the_plan, the_rig, plan)
-    with spinner("checking", not as_json):
+    with Terminal(quiet=as_json).waiting("checking"):
         report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
     if as_json:
         show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
@@ -88,6 +86,6 @@ def _distance(closest: Closest, proved: float, required: float) -> str:
     x, y, z = closest.pose.position * 1000
     return (
         f"{near.distance * 1000:.2f} mm, {near.first} to {near.second}, with the platform at"
-        f" {x:.1f}, {y:.1f}, {z:.1f} mm; proved {proved * 1000:.2f} mm,"
+        f" {x:z.1f}, {y:z.1f}, {z:z.1f} mm; proved {proved * 1000:.2f} mm,"
         f" asked {required * 1000:g} mm"
     )

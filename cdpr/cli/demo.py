@@ -7,6 +7,20 @@ from typing import Annotated
 
 import typer
 
+import cdpr
+from cdpr.cli.output import Terminal, out, show_facts
+from cdpr.cli.plan_facts import sentences_of
+from cdpr.cli.run import agreement, show, show_files
+from cdpr.cli.supervision import RunSupervisor
+from executor import runner
+from executor.recording.run_course import free_folder
+from executor.recording.run_folder import RunFolder
+from model.plan import plan_from_document
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.planning import plan_path
+from planner.settings import OptimalSettings
+
 RIG = "gachon_8_6.yaml"
 
 
@@ -25,35 +39,33 @@ def demo(
 
       cdpr demo --environment 3
     """
-    from cdpr.cli.camera_choice import choose_cameras
-    from cdpr.cli.carry_out import carry_out, prepared_run
-    from cdpr.cli.output import out, show_facts
-    from cdpr.cli.plan import planned, sentences_of
-    from cdpr.cli.run_folders import free_folder
-    from cdpr.plan import plan_from_document
-    from cdpr.rig import load_rig
-    from cdpr.scene import load_scene
-    from executor.run_folder import RunFolder
-    from planner.optimal.settings import OptimalSettings
-
     folder = output or free_folder("demo")
     RunFolder.require_free(folder)
     rig = load_rig(configs() / RIG)
     scene = load_scene(configs() / f"environment_{environment}.yaml")
-    document = planned(rig, scene, OptimalSettings(seed=seed), True)
+    document = plan_path(rig, scene, OptimalSettings(seed=seed), Terminal())
     show_facts("plan", sentences_of(document))
-    prepared = prepared_run(plan_from_document(document), rig, quiet=False)
-    code = carry_out(
-        prepared, folder, choose_cameras(rig, [], without=False, in_process=True), fast=True
-    )
+    with RunSupervisor(lambda result: show(result, False)) as supervisor:
+        result = runner.run(
+            plan_from_document(document),
+            rig,
+            folder=folder,
+            realtime=False,
+            listener=Terminal(),
+            confirm=agreement(supervisor, rig, False, False),
+            supervisor=supervisor,
+        )
+        show_files(result, False)
     out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
-    raise typer.Exit(code)
+    raise typer.Exit(result.exit_code)
 
 
-def configs() -> Path:
-    """The folder of the ready rigs and scenes: in the package, or in the repository."""
-    import cdpr
+def configs(name: str = "configs") -> Path:
+    """The folder of the ready rigs and scenes: in the package, or in the repository.
 
+    Args:
+        name: ``examples`` for the recorded sessions instead.
+    """
     package = Path(cdpr.__file__).resolve().parent
-    inside = package / "configs"
-    return inside if inside.is_dir() else package.parent / "configs"
+    inside = package / name
+    return inside if inside.is_dir() else package.parent / name

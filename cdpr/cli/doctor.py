@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 
-from cdpr.cli.doctor_answer import Answer
+from cdpr.cli.options import JsonOption
+from cdpr.cli.output import out, show_json
+from executor.doctor import MachineCheck, check_machine, check_rig, examine, stopping_text
+from model.errors import BadInput
+from model.rig import Rig, load_rig
 
-if TYPE_CHECKING:
-    from cdpr.rig import Rig
-
-PACKAGES = ("cdpr", "planner", "executor", "drivers", "tracking", "calibration", "simulation")
-LIBRARIES = {
-    "pydantic": "pydantic",
-    "yaml": "pyyaml",
-    "rich": "rich",
-    "numpy": "numpy",
-    "numba": "numba",
-    "scipy": "scipy",
-    "cv2": "opencv-python-headless",
-    "fcl": "python-fcl",
-    "can": "python-can",
-    "canopen": "canopen",
-    "msgpack": "msgpack",
-    "ruckig": "ruckig",
-    "daqp": "daqp",
-    "mcap": "mcap",
-    "matplotlib": "matplotlib",
-}
+if TYPE_CHECKING:  # needs canopen, which may be missing
+    from drivers.cia402.inspection import Examined
 
 
 def doctor(
@@ -40,168 +27,99 @@ def doctor(
     camera: Annotated[
         str | None, typer.Option(help="also take a picture with the camera of this index")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
+    drives: Annotated[
+        bool, typer.Option("--drives", help="also read every object of every CANopen drive")
+    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Look whether this machine has what a run needs; with a rig file, whether its bus opens.
 
-    Each thing that is missing comes with the command that mends it. Nothing is sent on the bus.
+    Each thing that is missing comes with the command that mends it. Nothing is sent on the bus;
+    with --drives only questions are, and no drive is changed.
 
     [dim]Examples:[/dim]
 
       cdpr doctor
 
       cdpr doctor rig.yaml --camera 0
-    """
-    from cdpr.cli.output import out, show_json
-    from cdpr.errors import BadInput
-    from cdpr.rig import load_rig
 
+      cdpr doctor rig.yaml --drives
+    """
     if camera is not None and rig is None:
         raise BadInput(
             "a camera is looked at with the rig file that describes it",
             where="--camera",
             next_step="name the rig file too: cdpr doctor RIG --camera INDEX",
         )
-    answers = [python_version(), *own_packages(), *libraries(), *machine()]
-    if rig is not None:
-        the_rig = load_rig(rig)
-        answers += [*rig_drives(the_rig), *rig_bus(the_rig), *rig_cameras(the_rig, camera)]
+    if drives and rig is None:
+        raise BadInput(
+            "drives are read with the rig file that names them",
+            where="--drives",
+            next_step="name the rig file too: cdpr doctor RIG --drives",
+        )
+    checks = check_machine()
+    the_rig = None if rig is None else load_rig(rig)
+    if the_rig is not None:
+        checks += check_rig(the_rig, camera)
+    if not as_json:
+        _show_checks(checks)
+    objects = examine(the_rig) if the_rig is not None and drives else None
     if as_json:
         keys = ("name", "good", "text", "fix")
-        show_json([{key: getattr(answer, key) for key in keys} for answer in answers])
-    else:
-        for answer in answers:
-            mark = "[green]ok  [/]" if answer.good else "[red]miss[/]"
-            out.print(f"{mark} {answer.name}: {answer.text}", soft_wrap=True)
-            if not answer.good and answer.fix:
-                out.print(f"     next: {answer.fix}", soft_wrap=True)
-    if not all(answer.good for answer in answers):
+        plain = [{key: getattr(check, key) for key in keys} for check in checks]
+        show_json(plain if objects is None else {"checks": plain, "drives": _plain(objects)})
+    elif objects is not None and the_rig is not None:
+        _show_table(objects, the_rig)
+    if not all(check.good for check in checks) or (objects is not None and not objects.good):
         raise typer.Exit(4)
 
 
-def python_version() -> Answer:
-    """Python itself."""
-    import platform
-    import sys
-
-    good = sys.version_info >= (3, 11)
-    return Answer("python", good, platform.python_version(), "install Python 3.11 or newer")
-
-
-def own_packages() -> list[Answer]:
-    """Whether the imported packages are ours: others of the same names exist."""
-    from importlib.util import find_spec
-
-    ours = Path(__file__).resolve().parents[2]
-    answers = []
-    for name in PACKAGES:
-        spec = find_spec(name)
-        origin = Path(spec.origin).resolve() if spec and spec.origin else None
-        good = origin is not None and origin.parents[1] == ours
-        text = "ours" if good else f"another package: {origin}" if origin else "not found"
-        fix = f"uninstall the other {name!r}, or use an environment of its own for cdpr"
-        answers.append(Answer(f"package {name}", good, text, fix))
-    return answers
+def _show_checks(checks: Iterable[MachineCheck]) -> None:
+    """One line for each, and the next step where one is missing."""
+    for check in checks:
+        mark = "[green]ok  [/]" if check.good else "[red]miss[/]"
+        out.print(f"{mark} {check.name}: {check.text}", soft_wrap=True)
+        if not check.good and check.fix:
+            out.print(f"     next: {check.fix}", soft_wrap=True)
 
 
-def libraries() -> list[Answer]:
-    """Whether every library can be imported, and its version."""
-    from importlib import import_module
-    from importlib.metadata import version
-
-    answers = []
-    for module, package in LIBRARIES.items():
-        try:
-            import_module(module)
-            answers.append(Answer(package, True, version(package)))
-        except ImportError as error:
-            answers.append(Answer(package, False, str(error), f"pip install {package}"))
-    return answers
-
-
-def machine() -> list[Answer]:
-    """What real time and real buses need; only told, since a rehearsal needs none of it."""
-    import os
-
-    from cdpr.cli.doctor_bus import kernel_support
-
-    cores = os.cpu_count() or 1
-    kernel = kernel_support()
-    text = kernel.text if kernel.good else f"{kernel.text}; other interfaces work"
-    return [
-        Answer("processors", cores >= 2, f"{cores}", "use a machine with two or more cores"),
-        Answer("kernel", True, text),
-    ]
+def _plain(found: Examined) -> dict[str, Any]:
+    """The table for `--json`."""
+    return {
+        "answered": list(found.nodes),
+        "silent": list(found.silent),
+        "objects": [
+            {
+                "object": row.object,
+                "verdict": row.verdict,
+                "needed": row.needed,
+                "found": [{"drives": nodes, "value": text} for text, nodes in row.found.items()],
+                "meaning": row.meaning,
+                "change": row.change,
+            }
+            for row in found.rows
+        ],
+    }
 
 
-def rig_drives(rig: Rig) -> list[Answer]:
-    """Whether the package and the files are there that the drives of a rig need."""
-    from cdpr.drives_file import OdriveDocument
-    from cdpr.errors import BadInput
-
-    drives = rig.document.drives
-    if not isinstance(drives, OdriveDocument):
-        return []
-    from drivers.odrive.dbc import OWN_DBC, read_layouts
-    from drivers.odrive.endpoints import read_endpoints
-
-    try:
-        read_layouts(Path(drives.dbc) if drives.dbc else OWN_DBC)
-        if drives.endpoints is not None:
-            read_endpoints(Path(drives.endpoints), drives)
-    except BadInput as error:
-        return [Answer("drives", False, f"{error.where}: {error.what}", error.next_step)]
-    known = "read back" if drives.endpoints else "not read back: the rig file names no endpoints"
-    return [Answer("drives", True, f"ODrives; their settings are {known}")]
-
-
-def rig_bus(rig: Rig) -> list[Answer]:
-    """Whether the bus of a rig is fast enough, is set up, and can be opened."""
-    from cdpr.cli.doctor_bus import kernel_bus
-    from cdpr.cli.doctor_real_time import real_time_permission
-    from cdpr.errors import CdprError
-    from drivers.bus import IN_PROCESS, BusSettings, open_bus
-    from drivers.bus_load import check_bus_load
-    from drivers.socketcan import can_interfaces
-
-    settings = BusSettings.of(rig)
-    answers: list[Answer] = []
-    try:
-        load = check_bus_load(rig)
-        answers.append(Answer("bus load", True, f"{load:.0%} at worst"))
-    except CdprError as error:
-        answers.append(Answer("bus load", False, error.what, error.next_step))
-    if settings.interface == "socketcan":
-        try:
-            answers += kernel_bus(settings, can_interfaces())
-        except CdprError as error:
-            answers.append(Answer("interfaces", False, error.what, error.next_step))
-    try:
-        open_bus(settings).shutdown()
-        answers.append(Answer(f"bus {settings}", True, "opens"))
-    except CdprError as error:
-        answers.append(Answer(f"bus {settings}", False, error.what, error.next_step))
-    if settings.interface != IN_PROCESS:
-        answers += real_time_permission()
-    return answers
-
-
-def rig_cameras(rig: Rig, source: str | None) -> list[Answer]:
-    """Whether a camera opens and its pictures have the size that the rig file states."""
-    from cdpr.errors import CdprError
-
-    if not rig.cameras:
-        return [Answer("camera", source is None, "the rig file has none", "leave --camera out")]
-    camera = rig.cameras[0]
-    if source is None:
-        devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
-        text = f"not tried (--camera INDEX tries it); devices here: {devices or 'none'}"
-        return [Answer(f"camera {camera.name}", True, text)]
-    from drivers.cameras import LiveCamera
-
-    try:
-        LiveCamera(source, camera).close()
-    except CdprError as error:
-        return [Answer(f"camera {camera.name}", False, error.what, error.next_step)]
-    text = f"{source} opens and gives pictures of {camera.width} x {camera.height} px"
-    return [Answer(f"camera {camera.name}", True, text)]
+def _show_table(found: Examined, rig: Rig) -> None:
+    """What needs a change first, then the rest, then the sum."""
+    table = Table("", "object", "needed", "found", "what it means", "what to change")
+    marks = {"ok": "[green]ok[/]", "remark": "[yellow]note[/]", "wrong": "[red]wrong[/]"}
+    for verdict in ("wrong", "remark", "ok"):
+        for row in found.rows:
+            if row.verdict == verdict:
+                text = row.found_text(found.nodes)
+                cells = (row.object, row.needed, text, row.meaning, row.change)
+                table.add_row(marks[verdict], *cells)
+    if found.rows:
+        out.print(table)
+    if found.silent:
+        names = ", ".join(map(str, found.silent))
+        out.print(f"[red]no answer[/] from drive {names}: check power, wiring and node id")
+    wrong = sum(row.verdict == "wrong" for row in found.rows)
+    out.print(
+        f"{len(found.rows)} objects of {len(found.nodes)} drives read, nothing written;"
+        f" {wrong} to change"
+    )
+    out.print(stopping_text(rig), soft_wrap=True)

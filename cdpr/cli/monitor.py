@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+import json
+from collections.abc import Iterator
+from typing import Annotated, Any
 
 import typer
+from rich.console import Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rich.console import Group
+from cdpr.cli.facts import camera_line
+from cdpr.cli.output import out, show_json
+from executor.remote.client import follow_run, request_run
 
 #: Of a run that ended so; what ends without a word was killed.
 _EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
@@ -39,53 +45,22 @@ def monitor(
 
       cdpr monitor --once --json
     """
-    from cdpr.cli.operate import told
-    from cdpr.cli.output import out, show_json
-
     if once:
-        status = told("status", process)
+        status = request_run("status", process, verb="monitor")
         if as_json:
             show_json(status)
         else:
             typer.echo(_plain(status))
         return
-    looks = _looks(process, rate)
+    looks = follow_run(process, rate)
     if as_json or not out.is_terminal:
         _lines(looks, as_json)
     else:
         _live(looks)
 
 
-def _looks(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
-    """How the run stands, again and again, on one connection; until it ends.
-
-    Raises:
-        Fault: It is still there and does not say how it stands.
-    """
-    import time
-
-    from executor.command_client import ask_all, last_word, no_answer, the_one
-    from executor.running import reached_runs
-
-    with reached_runs() as runs:
-        run = the_one(runs, process, "monitor")
-        while True:
-            (answer,) = ask_all([run], "status")
-            if answer.ended:
-                last = last_word(run)
-                if last is not None:
-                    yield last
-                return
-            if answer.status is None:
-                raise no_answer("monitor", [answer])
-            yield answer.status
-            time.sleep(1.0 / rate)
-
-
 def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
     """For a file or a program: a line a look, and each event once."""
-    import json
-
     seen: list[dict[str, Any]] = []
     status: dict[str, Any] = {"state": "gone"}
     try:
@@ -104,9 +79,6 @@ def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
 
 
 def _live(looks: Iterator[dict[str, Any]]) -> None:
-    from rich.live import Live
-
-    from cdpr.cli.output import out
 
     status: dict[str, Any] = {"state": "gone"}
     try:
@@ -164,8 +136,6 @@ def _number(value: float | None, form: str) -> str:
 
 def _plain(status: dict[str, Any]) -> str:
     """Everything as text without a terminal."""
-    from cdpr.cli.camera_line import camera_line
-
     drives = [
         f"  drive {d['node']:<3} {d['state']:<24} {d['position_counts']:>11}"
         f" ({d['position_counts'] - d['set_counts']:+d}) counts {d['tension_n']:8.2f} N"
@@ -179,13 +149,6 @@ def _plain(status: dict[str, Any]) -> str:
 
 def _view(status: dict[str, Any]) -> Group:
     """The live picture."""
-    from rich.console import Group
-    from rich.progress_bar import ProgressBar
-    from rich.table import Table
-    from rich.text import Text
-
-    from cdpr.cli.camera_line import camera_line
-
     title = Text.assemble(
         (status["state"].upper(), _STATES.get(status["state"], "bold")),
         f"  {status['rig']} on {status['bus']}  process {status['process']}  {status['folder']}",

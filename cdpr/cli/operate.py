@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+
+from cdpr.cli.output import out, show_json
+from executor.remote.client import request_run
 
 _Process = Annotated[
     int | None, typer.Option("--process", help="which run, where several are under way")
@@ -49,9 +52,7 @@ def speed(
 
 
 def _tell(verb: str, process: int | None, as_json: bool, percent: int | None = None) -> None:
-    from cdpr.cli.output import out, show_json
-
-    status = told(verb, process, percent)
+    status = request_run(verb, process, percent)
     if as_json:
         show_json(status)
         return
@@ -61,20 +62,3 @@ def _tell(verb: str, process: int | None, as_json: bool, percent: int | None = N
     )
     if verb == "speed" and status["wished"]["hold"]:
         out.print("it holds: the speed counts from `cdpr resume` on")
-
-
-def told(verb: str, process: int | None, percent: int | None = None) -> dict[str, Any]:
-    """Says it to the run that is meant; how that run stands.
-
-    Raises:
-        Fault: No run is under way, or it does not answer.
-        BadInput: It is not clear which run is meant.
-    """
-    from executor.command_client import ask_all, no_answer, the_one
-    from executor.running import reached_runs
-
-    with reached_runs() as runs:
-        (answer,) = ask_all([the_one(runs, process, verb)], verb, percent)
-    if answer.status is None:
-        raise no_answer(verb, [answer])
-    return answer.status

@@ -6,13 +6,15 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import IO, Any, Protocol, cast
+from typing import IO, Any, cast
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from model.progress import Advance, Listener
 
 out = Console(highlight=False)
 
@@ -67,14 +69,6 @@ def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> N
     on.print(table)
 
 
-class Advance(Protocol):
-    """Moves a bar."""
-
-    def __call__(self, value: float, note: str = "") -> None:
-        """So far it is now, with a remark beside it."""
-        ...
-
-
 @contextmanager
 def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Advance]:
     """A bar on stderr where somebody looks; what is given back moves it."""
@@ -89,7 +83,11 @@ def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Advanc
         *columns, console=err, transient=True, disable=not (shown and err.is_terminal)
     ) as bar:
         task = bar.add_task(text, total=total, note="")
-        yield lambda value, note="": bar.update(task, completed=value, note=note)
+
+        def advance(value: float, note: str = "", text: str = "") -> None:
+            bar.update(task, completed=value, description=text or None, note=note)
+
+        yield advance
 
 
 @contextmanager
@@ -100,3 +98,49 @@ def spinner(text: str, shown: bool) -> Iterator[None]:
         return
     with err.status(text):
         yield
+
+
+class Terminal(Listener):
+    """Shows the reports of a library function on stderr."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        """Shows everything, or only remarks and warnings.
+
+        Args:
+            quiet: Standard output is for a program: no notes, no spinner, no bar.
+        """
+        self._shown, self._shown_already = not quiet, False
+
+    def note(self, text: str) -> None:
+        """See `Listener`."""
+        if self._shown:
+            err.print(text, markup=False, soft_wrap=True)
+
+    def remark(self, text: str) -> None:
+        """See `Listener`."""
+        err.print(f"[yellow]remark[/] {escape(text)}", soft_wrap=True)
+
+    def warning(self, text: str) -> None:
+        """See `Listener`."""
+        err.print(f"[red]warning[/] {escape(text)}", soft_wrap=True)
+
+    @contextmanager
+    def waiting(self, text: str) -> Iterator[None]:
+        """See `Listener`."""
+        with self._alone() as shown, spinner(text, shown):
+            yield
+
+    @contextmanager
+    def progress(self, text: str, total: float | None) -> Iterator[Advance]:
+        """See `Listener`."""
+        with self._alone() as shown, progress_bar(text, total, shown) as advance:
+            yield advance
+
+    @contextmanager
+    def _alone(self) -> Iterator[bool]:
+        """Whether a spinner or a bar may be shown: a terminal shows one at a time."""
+        before, self._shown_already = self._shown_already, True
+        try:
+            yield self._shown and not before
+        finally:
+            self._shown_already = before

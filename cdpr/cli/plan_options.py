@@ -1,12 +1,16 @@
-"""The options of `cdpr plan`."""
+"""The options of `cdpr plan` that choose a planner and its settings."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from enum import StrEnum
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from planner.options import PlanningOptions
+
+_PANEL = "The paper's text where it is open (docs/paper.md)"
 
 
 class PlannerName(StrEnum):
@@ -33,48 +37,116 @@ class ModeName(StrEnum):
     paper = "paper"
 
 
-PlannerOption = Annotated[
-    PlannerName,
-    typer.Option(help="the one we recommend; the paper's; or half of all samples at the goal"),
-]
-CostOption = Annotated[
-    CostName | None,
-    typer.Option(help="what to optimise (optimal: length; the paper's planners: kinematic)"),
-]
-WeightOption = Annotated[
-    list[str] | None,
-    typer.Option("--weight", help="NAME=NUMBER, again for a sum: length, kinematic, …"),
-]
-BudgetOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.001, help="optimal: how long it goes on improving; 50 ms, or 500 with --free-rotation"
-    ),
-]
-RoundsOption = Annotated[
-    list[int] | None,
-    typer.Option(min=1, help="optimal: so many rounds instead, the same path again"),
-]
-LongestOption = Annotated[
-    float | None, typer.Option(min=0.001, help="optimal: the best path that is no longer")
-]
-FreeRotationOption = Annotated[
-    bool,
-    typer.Option("--free-rotation", help="optimal: turn as well, within the scene's limits"),
-]
-ViaOption = Annotated[
-    list[str] | None,
-    typer.Option(help="way-pose before the scene's stops; again for more", metavar="X,Y,Z"),
-]
-FromRunOption = Annotated[
-    Path | None,
-    typer.Option(help="begin where this run ended, with the stops left", metavar="RUNDIR"),
-]
-ModeOption = Annotated[
-    ModeName | None,
-    typer.Option(help="the paper's planners: RRT* (rewire), or stop at the first path (paper)"),
-]
-IterationsOption = Annotated[
-    int | None,
-    typer.Option(min=1, max=1_000_000, help="the paper's planners: give up after so many samples"),
-]
+class FailureRateName(StrEnum):
+    """The rate e_r at which samples are drawn backward."""
+
+    streak = "k/(k+1)"
+    streak_and_two = "k/(k+2)"
+    tree = "tree"
+    node = "node"
+
+
+class FocusName(StrEnum):
+    """The node x_c that the forward cone opens to."""
+
+    last_failed = "last-failed"
+    most_failed = "most-failed"
+    highest_rate = "highest-rate"
+
+
+class ConeDrawName(StrEnum):
+    """How points of the forward cone are drawn."""
+
+    radius = "radius"
+    volume = "volume"
+
+
+class SteerName(StrEnum):
+    """How far a new node is from the one it grows from."""
+
+    full_step = "full-step"
+    to_sample = "to-sample"
+
+
+@dataclass(frozen=True, slots=True)
+class SearchOptions:
+    """Which planner searches, and how; every field is an option of `cdpr plan`."""
+
+    planner: Annotated[
+        PlannerName,
+        typer.Option(help="the one we recommend; the paper's; or half of all samples at the goal"),
+    ] = PlannerName.optimal
+    cost: Annotated[
+        CostName | None,
+        typer.Option(help="what to optimise (optimal: length; the paper's planners: kinematic)"),
+    ] = None
+    weight: Annotated[
+        list[str] | None,
+        typer.Option("--weight", help="NAME=NUMBER, again for a sum: length, kinematic, …"),
+    ] = None
+    longest_mm: Annotated[
+        float | None, typer.Option(min=0.001, help="optimal: the best path that is no longer")
+    ] = None
+    budget_ms: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001,
+            help="optimal: how long it goes on improving; 50 ms, or 500 with --free-rotation",
+        ),
+    ] = None
+    rounds: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="optimal: so many rounds instead, the same path again"),
+    ] = None
+    free_rotation: Annotated[
+        bool,
+        typer.Option("--free-rotation", help="optimal: turn as well, within the scene's limits"),
+    ] = False
+    mode: Annotated[
+        ModeName | None,
+        typer.Option(help="the paper's planners: RRT* (rewire), or stop at the first path (paper)"),
+    ] = None
+    max_iterations: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=1_000_000, help="the paper's planners: give up after so many samples"
+        ),
+    ] = None
+    failure_rate: Annotated[
+        FailureRateName | None,
+        typer.Option(help="e_r, k: failures in a row", rich_help_panel=_PANEL),
+    ] = None
+    focus: Annotated[
+        FocusName | None, typer.Option(help="the node x_c", rich_help_panel=_PANEL)
+    ] = None
+    cone_draw: Annotated[
+        ConeDrawName | None,
+        typer.Option(help="r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL),
+    ] = None
+    steer: Annotated[
+        SteerName | None,
+        typer.Option(help="steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL),
+    ] = None
+    spacing_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="reject nodes nearer than this to another", rich_help_panel=_PANEL
+        ),
+    ] = None
+    goal_sight: Annotated[
+        bool,
+        typer.Option("--goal-sight", help="every new node tries the goal", rich_help_panel=_PANEL),
+    ] = False
+
+    def with_seed(self, seed: int) -> PlanningOptions:
+        """As the planner's library takes them."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        plain: dict[str, Any] = {
+            name: value.value if isinstance(value, StrEnum) else value
+            for name, value in given.items()
+            if value is not None
+        }
+        return PlanningOptions(seed=seed, **plain)
+
+
+DEFAULT_SEARCH = SearchOptions()

@@ -1,4 +1,4 @@
-"""`cdpr report`: makes the report of a run anew."""
+"""`cdpr report`: makes the report of a run from its folder."""
 
 from __future__ import annotations
 
@@ -7,25 +7,28 @@ from typing import Annotated
 
 import typer
 
+from cdpr.cli.output import Terminal, out, show_json
+from executor.evaluation import rewrite_report
+from executor.recording.run_folder import RunFolder
+
 
 def report(
     run: Annotated[Path, typer.Argument(help="run folder", metavar="RUNDIR")],
     as_json: Annotated[bool, typer.Option("--json", help="print the run's summary")] = False,
 ) -> None:
-    """Write the report of a run folder anew, from its files alone.
+    """Write the report of a run folder again, from its files alone.
+
+    Of a run whose program was killed, or whose disk was full, it writes what is missing from what
+    is there.
 
     [dim]Example:[/dim]
 
       cdpr report runs/first
     """
-    from cdpr.cli.output import out, show_json, spinner
-    from executor.report import build_report
-    from executor.run_folder import RunFolder
-
-    folder = RunFolder.open(run)
-    with spinner("writing the report", not as_json):
-        page = build_report(folder)
+    folder = RunFolder.open_cut_short(run)
+    with Terminal(quiet=as_json).waiting("writing the report"):
+        rewrite_report(folder)
     if as_json:
         show_json(folder.summary())
         return
-    out.print(f"report: {page}", soft_wrap=True)
+    out.print(f"report: {folder.report}", markup=False, soft_wrap=True)

@@ -2,31 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption
-from cdpr.cli.motion_options import (
+from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
+from cdpr.cli.facts import show_missing, show_prepared, show_summary
+from cdpr.cli.options import (
     ChannelOption,
     FastOption,
     InterfaceOption,
+    SummaryJsonOption,
     WithoutRealTimeOption,
     YesOption,
     require_unused,
+    rig_on_bus,
 )
-
-if TYPE_CHECKING:
-    from cdpr.poses import Pose
+from cdpr.cli.output import Terminal, out
+from cdpr.cli.supervision import RunSupervisor, confirmation, say
+from drivers.can_bus import IN_PROCESS
+from executor import runner
+from executor.drives import is_simulated
+from executor.runner import MotionProposal, RunResult
+from model.errors import BadInput
+from model.files.documents import millimetres
+from model.plan import load_plan
+from model.pose import Pose
+from model.rig import Rig
 
 
 def run(
     plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
-    rig: Annotated[Path, typer.Option("--rig", help="rig file (YAML)", metavar="RIG")],
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="rig file (YAML); without it the plan's own rig, on simulated drives",
+            metavar="RIG",
+        ),
+    ] = None,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUNDIR")
-    ],
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="run folder to make, with its parents (default: runs/ and the time)",
+            metavar="RUNDIR",
+        ),
+    ] = None,
     fast: FastOption = False,
     camera: Annotated[
         list[str] | None,
@@ -50,7 +74,7 @@ def run(
         bool,
         typer.Option("--no-clearance-stop", help="go on when the camera sees too little clearance"),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
+    as_json: SummaryJsonOption = False,
 ) -> None:
     """Run a plan: prove it, make its set-points, arm the drives, move, measure, report.
 
@@ -59,64 +83,90 @@ def run(
 
     [dim]Examples:[/dim]
 
-      cdpr run plan.json --rig configs/gachon_8_6.yaml -o runs/first --fast
+      cdpr run plan.json --fast
 
       cdpr run plan.json --rig rig.yaml -o runs/second --camera 0
 
       cdpr run plan.json --rig rig.yaml -o runs/third --camera front=0 --camera side=1
     """
-    from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.camera_choice import choose_cameras, require_simulated_pictures
-    from cdpr.cli.carry_out import carry_out, prepared_run
-    from cdpr.cli.named_bus import rig_on_bus
-    from cdpr.cli.plan_for_rig import require_same_rig
-    from cdpr.plan import load_plan
-    from drivers.bus import IN_PROCESS
-    from executor.custody import Custody
-    from executor.run_folder import RunFolder
-
-    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
-    in_process = the_rig.document.bus.interface == IN_PROCESS
-    eyes = choose_cameras(the_rig, camera or [], no_camera, in_process)
-    require_simulated_pictures(eyes.values(), fast)
-    if not eyes:
-        why = "without a camera no clearance is measured, and nothing stops the run for it"
-        require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
-    start = _simulated_start(simulated_start_mm, in_process, fast)
-    RunFolder.require_free(output)
-    Custody(the_rig).require_free()
-    the_rig = Custody(the_rig).referenced_rig()
     the_plan = load_plan(plan)
-    require_same_rig(the_plan, the_rig, plan)
-    code = carry_out(
-        prepared_run(the_plan, the_rig, quiet=as_json),
-        output,
-        eyes,
-        fast=fast,
-        start=start,
-        yes=yes,
-        without_real_time=without_real_time,
-        clearance_stop=not no_clearance_stop,
-        as_json=as_json,
-    )
-    raise typer.Exit(code)
-
-
-def _simulated_start(
-    start_mm: tuple[float, float, float] | None, in_process: bool, fast: bool
-) -> Pose | None:
-    from cdpr.cli.named_bus import require_own_time
-    from cdpr.document_types import millimetres
-    from cdpr.errors import BadInput
-    from cdpr.poses import Pose
-
-    require_own_time(fast, in_process)
-    if start_mm is None:
-        return None
-    if not in_process:
-        raise BadInput(
-            "only a platform that is simulated in this process can be placed",
-            where="--simulated-start-mm",
-            next_step="leave it out, or use the interface 'virtual'",
+    if rig is None:
+        the_rig = calibrated_rig(_simulated(the_plan.rig, interface, channel), calibration)
+    else:
+        the_rig = rig_on_bus(rig, interface, channel, calibration)
+    if no_camera:
+        _refuse_camera_options(camera, no_clearance_stop)
+    with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
+        result = runner.run(
+            the_plan,
+            the_rig,
+            folder=output,
+            cameras=[] if no_camera else camera or None,
+            realtime=not fast,
+            start=_level(simulated_start_mm),
+            clearance_stop=not no_clearance_stop,
+            need_real_time_rights=not without_real_time,
+            listener=Terminal(quiet=as_json),
+            confirm=agreement(supervisor, the_rig, yes, as_json),
+            supervisor=supervisor,
+            plan_file=plan,
         )
-    return Pose.level(millimetres(list(start_mm)))
+        show_files(result, as_json)
+    raise typer.Exit(result.exit_code)
+
+
+def agreement(
+    supervisor: RunSupervisor, rig: Rig, yes: bool, as_json: bool
+) -> Callable[[MotionProposal], bool]:
+    """A `confirm` callback after whose yes the signals are the run's."""
+    ask = confirmation(show_prepared, asks=not (is_simulated(rig) or yes), as_json=as_json)
+
+    def confirm(proposal: MotionProposal) -> bool:
+        agreed = ask(proposal)
+        if agreed:
+            supervisor.take_over()
+        return agreed
+
+    return confirm
+
+
+def show(result: RunResult, as_json: bool) -> None:
+    """The verdict of a run."""
+    show_summary(result.summary, result.folder, as_json)
+
+
+def show_files(result: RunResult, as_json: bool) -> None:
+    """The report of a run, and what could not be written."""
+    if result.report is not None and not as_json:
+        line = f"report: {result.report}"
+        say(lambda: out.print(line, markup=False, soft_wrap=True), result)
+    show_missing(result)
+
+
+def _simulated(rig: Rig, interface: str | None, channel: str | None) -> Rig:
+    """The rig of a plan, with drives that are simulated in this process.
+
+    Raises:
+        BadInput: A bus was named; a plan must not decide which drives move.
+    """
+    if channel is not None or interface not in (None, IN_PROCESS):
+        raise BadInput(
+            "a run on a bus needs the rig file",
+            where="--rig",
+            why="without it the plan's own rig runs on simulated drives",
+            next_step="name the rig file with --rig, or leave out --interface and --channel",
+        )
+    return rig.with_bus(IN_PROCESS)
+
+
+def _refuse_camera_options(camera: list[str] | None, no_clearance_stop: bool) -> None:
+    if camera:
+        raise BadInput(
+            "--camera and --no-camera contradict each other", next_step="leave one of them out"
+        )
+    why = "without a camera no clearance is measured, and nothing stops the run for it"
+    require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
+
+
+def _level(position_mm: tuple[float, float, float] | None) -> Pose | None:
+    return None if position_mm is None else Pose.level(millimetres(list(position_mm)))

@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption
-from cdpr.cli.motion_options import ChannelOption, InterfaceOption
-
-if TYPE_CHECKING:
-    from cdpr.poses import Pose
-    from cdpr.rig import Rig
-    from cdpr.scene import Load
+from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
+from cdpr.cli.options import ChannelOption, InterfaceOption, RigArgument, Triple, rig_on_bus
+from cdpr.cli.output import Terminal, out
+from cdpr.cli.supervision import stop_requests
+from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
+from executor.kernels import ready_to_simulate
+from executor.operator_requests import LocalRequests
+from executor.realtime.scheduling import real_time
+from model.errors import BadInput
+from model.files.documents import millimetres
+from model.plan import load_plan, require_same_rig
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Load
+from simulation.drives.behaviour import DriveBehaviour, behaviour_named, table
+from simulation.factory import check_drives, make_rehearsal
+from simulation.ground_truth import PowerLoss
 
 
 def sim(
-    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    rig: RigArgument,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     start_mm: Annotated[
-        tuple[float, float, float] | None,
+        Triple | None,
         typer.Option("--at-mm", help="where the platform stands: x y z (default: home)"),
     ] = None,
     power_lost: Annotated[
@@ -40,6 +50,21 @@ def sim(
     plan: Annotated[
         Path | None, typer.Option(help="put the platform at the start of this plan, with its load")
     ] = None,
+    eds: Annotated[
+        Path | None,
+        typer.Option(
+            help="EDS file of the simulated drives, such as their maker's"
+            " (default: that of the rig file's drive profile)"
+        ),
+    ] = None,
+    drive_behaviour: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--drive-behaviour",
+            metavar="NAME[=VALUE]",
+            help="what the drives do beyond strict CiA 402, again for more; 'list' shows them",
+        ),
+    ] = None,
     calibration: CalibrationOption = None,
 ) -> None:
     """Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.
@@ -53,17 +78,7 @@ def sim(
       --channel 239.74.163.2 --no-camera -o runs/udp --yes
       --without-real-time
     """
-    from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.named_bus import rig_on_bus
-    from cdpr.cli.output import err, out
-    from cdpr.errors import BadInput
-    from drivers.bus import IN_PROCESS, BusSettings, open_bus
-    from executor.realtime import real_time
-    from executor.running import stop_requests
-    from executor.wishes import OwnBoard
-    from simulation.power_loss import PowerLoss
-    from simulation.simulate import make_rehearsal
-
+    behaviour = _behaviour(drive_behaviour or [])
     the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     if the_rig.document.bus.interface == IN_PROCESS:
         raise BadInput(
@@ -72,39 +87,45 @@ def sim(
             why="`cdpr run` simulates the drives itself on that interface",
             next_step="pass --interface udp_multicast, or socketcan with a vcan channel",
         )
+    check_drives(the_rig, behaviour, eds)
     pose, load = _start(the_rig, start_mm, plan)
+    listener = Terminal()
+    ready_to_simulate(listener)
     bus = open_bus(BusSettings.of(the_rig))
     try:
-        rehearsal = make_rehearsal(the_rig, bus, pose, load)
+        rehearsal = make_rehearsal(the_rig, bus, pose, load, behaviour=behaviour, eds=eds)
         if power_lost is not None:
             loss = PowerLoss.drawn(the_rig, power_lost, slack_mm / 1000.0, on_a_stand=on_a_stand)
             loss.happen_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         x, y, z = rehearsal.pose.position * 1000.0
         out.print(
             f"{the_rig.cable_count} simulated drives of {the_rig.name} on"
-            f" {BusSettings.of(the_rig)}; platform at {x:.1f}, {y:.1f}, {z:.1f} mm; Ctrl-C ends it",
+            f" {BusSettings.of(the_rig)}; platform at {x:z.1f}, {y:z.1f}, {z:z.1f} mm;"
+            " Ctrl-C ends it",
             soft_wrap=True,
         )
-        board = OwnBoard()
+        board = LocalRequests()
         with stop_requests(board), real_time() as denied:
             if denied:
-                err.print(f"[yellow]remark[/] {denied}", soft_wrap=True)
+                listener.remark(denied)
             rehearsal.serve(lambda: board.read().stop)
     finally:
         bus.shutdown()
     out.print("the simulated drives are gone")
 
 
-def _start(
-    rig: Rig, start_mm: tuple[float, float, float] | None, plan: Path | None
-) -> tuple[Pose, Load | None]:
-    """Where the platform stands, and what it carries."""
-    from cdpr.cli.plan_for_rig import require_same_rig
-    from cdpr.document_types import millimetres
-    from cdpr.errors import BadInput
-    from cdpr.plan import load_plan
-    from cdpr.poses import Pose
+def _behaviour(names: list[str]) -> DriveBehaviour:
+    """Of the simulated drives; the name ``list`` prints all names and ends the program."""
+    if "list" in names:
+        width = max(len(name) for name, _ in table())
+        for name, says in table():
+            out.print(f"{name:<{width}}  {says}", soft_wrap=True, markup=False, highlight=False)
+        raise typer.Exit
+    return behaviour_named(names)
 
+
+def _start(rig: Rig, start_mm: Triple | None, plan: Path | None) -> tuple[Pose, Load | None]:
+    """Where the platform stands, and what it carries."""
     if start_mm is not None and plan is not None:
         raise BadInput(
             "--at-mm and --plan contradict each other", next_step="leave one of them out"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import typer
+
+from cdpr.cli.options import JsonOption
+from cdpr.cli.output import out, show_json
+from executor.remote.client import no_answer, no_run, stop_runs
 
 
 def stop(
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Stop every run of this user: all drives slow down together along the path, then hold.
 
@@ -18,18 +20,13 @@ def stop(
 
       cdpr stop
     """
-    from cdpr.cli.output import out, show_json
-    from executor.command_client import ask_all, no_answer, no_run
-    from executor.running import reached_runs
-
-    with reached_runs() as runs:
-        answers = ask_all(runs, "stop")
-    stopped = [answer.process for answer in answers if answer.status is not None]
-    silent = [answer for answer in answers if answer.status is None]
+    result = stop_runs()
+    stopped, silent = result.stopped, result.silent
     if as_json:
-        show_json({"stopped_processes": stopped, "silent_processes": [a.process for a in silent]})
+        silent_processes = [answer.process for answer in silent]
+        show_json({"stopped_processes": list(stopped), "silent_processes": silent_processes})
         raise typer.Exit(0 if stopped and not silent else 1)
-    if not answers:
+    if not (stopped or silent):
         raise no_run("stop")
     if stopped:
         out.print(f"stop sent to process {', '.join(map(str, stopped))}")

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cdpr.scene import Scene
+    from model.scene import Scene
 
 
 def stop_facts(scene: Scene) -> list[tuple[str, str]]:
     """Stops with what happens there and what is carried on; nothing for a scene without."""
-    from cdpr.legs import legs_of
+    from model.scene import legs_of
 
     carried = [leg.scene.load.payload_mass for leg in legs_of(scene)]
     told = []
@@ -24,24 +24,25 @@ def stop_facts(scene: Scene) -> list[tuple[str, str]]:
 
 
 def by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
-    """The scene with level way-poses before its own stops, given as ``x,y,z``.
+    """The scene with level way-poses before its own stops, given as ``x y z`` (`joined_points`).
 
     Raises:
         BadInput: A way-pose cannot be read.
     """
-    from cdpr.errors import BadInput
-    from cdpr.scene_stops import StopDocument
+    from model.errors import BadInput
+    from model.files.scene_file import StopDocument
 
     ways = []
     for number, text in enumerate(via_mm, start=1):
         try:
-            x, y, z = (float(part) for part in text.split(","))
+            x, y, z = map(float, text.split())
         except ValueError:
             raise BadInput(
-                f"--via-mm {text}: needs three numbers with commas between",
-                next_step="write --via-mm 0,40,430",
+                f"--via-mm {text}: needs three numbers", next_step="write --via-mm 0 40 430"
             ) from None
         if not all(map(math.isfinite, (x, y, z))):
-            raise BadInput(f"--via-mm {text}: needs finite numbers", next_step="mend it")
+            raise BadInput(
+                f"--via-mm {text}: needs finite numbers", next_step="write --via-mm 0 40 430"
+            )
         ways.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
     return scene.changed(stops=[*ways, *scene.document.stops]) if ways else scene

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption
-
-if TYPE_CHECKING:
-    from cdpr.clearance import ClearanceModel
-    from cdpr.rig import Camera, Rig
-    from cdpr.scene import Scene
-    from tracking.pose_log import LoggedPicture
-    from tracking.track import Picture
-    from tracking.track_together import TogetherCount
-
-#: A live camera that shows no tag for so many pictures is given up.
-PATIENCE = 50
+from cdpr.cli.arguments import refuse_overwriting
+from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
+from cdpr.cli.options import JsonOption, RigArgument
+from cdpr.cli.output import Terminal, show_facts, show_json
+from cdpr.cli.supervision import stop_requests
+from executor.cameras.sources import parse_camera_sources
+from executor.operator_requests import LocalRequests
+from executor.track import TrackResult, own_drawing, own_file, require_plan_used, track_sources
+from model.files.output import require_new_file
+from model.plan import load_plan, require_same_rig
+from model.rig import Camera, load_rig
+from model.scene import load_scene
 
 
 def track(
-    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    rig: RigArgument,
     source: Annotated[
         list[str],
         typer.Argument(
@@ -64,7 +65,7 @@ def track(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace what exists already")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure the platform's pose from its tags, picture by picture.
 
@@ -78,104 +79,57 @@ def track(
 
       cdpr track rig.yaml front=0 side=1 -o poses.csv
     """
-    import time
-    from dataclasses import replace
-    from itertools import islice, takewhile
-
-    from cdpr.clearance import ClearanceModel
-    from cdpr.cli.calibrations import calibrated_rig
-    from cdpr.cli.camera_line import rates
-    from cdpr.cli.compiling import ready_to_measure
-    from cdpr.cli.output import progress_bar, show_facts, show_json
-    from cdpr.cli.plan import check_output
-    from cdpr.cli.track_facts import track_facts
-    from cdpr.cli.track_sources import eyes_of, picture_source, refuse_unused_plan
-    from cdpr.rig import load_rig
-    from executor.running import stop_requests
-    from executor.track_mcap import write_track_mcap
-    from executor.wishes import OwnBoard
-    from tracking.measurement import PoseMeasurement
-    from tracking.pace import Pace
-    from tracking.pose_log import write_pose_log
-    from tracking.track import TrackCount
-    from tracking.track import track as tracked
-    from tracking.track_together import TogetherCount
-    from tracking.tracker import Tracker
-
-    check_output(output, force)
-    if mcap is not None:
-        check_output(mcap, force)
     the_rig = calibrated_rig(load_rig(rig), calibration)
     if detector is not None:
         the_rig = replace(the_rig, tag_detector=detector)
-    eyes = eyes_of(the_rig, source, camera)
-    several = len(eyes) > 1
-    logs = {eye.name: _own_file(output, eye.name) for eye in eyes} if several else {}
-    for path in logs.values():
-        check_output(path, force)
-    refuse_unused_plan(eyes.values(), plan)
-    the_scene = _scene(scene, plan)
-    ready_to_measure(not as_json)
-    unused: dict[str, dict[str, str]] = {eye.name: {} for eye in eyes}
-    opened = [
-        picture_source(the_rig, the_scene, eye, name, plan, unused[eye.name])
-        for eye, name in eyes.items()
-    ]
-    totals = [total for _, total in opened if total is not None]
-    total = max(totals) if len(totals) == len(opened) else None
-    model = ClearanceModel(the_rig, the_scene) if the_scene and the_scene.obstacles else None
-    logged: list[LoggedPicture] = []
-    each: dict[str, list[LoggedPicture]] = {eye.name: [] for eye in eyes}
-    count, shared, pace, board = TrackCount(), TogetherCount(), Pace(), OwnBoard()
-    began = time.time_ns()
-    with (
-        ExitStack() as drawing,
-        stop_requests(board),
-        progress_bar("tracking", pictures or total, not as_json) as show,
-    ):
-        streams: dict[str, Iterator[LoggedPicture]] = {}
-        for eye, (frames, length) in zip(eyes, opened, strict=True):
-            place = _own_drawing(overlay, eye.name) if overlay and several else overlay
-            streams[eye.name] = tracked(
-                takewhile(lambda _: not board.read().stop, islice(frames, pictures)),
-                Tracker(the_rig, eye),
-                count,
-                give_up_after=PATIENCE if length is None and not several else None,
-                model=model,
-                on_picture=drawing.enter_context(_overlay(place, the_rig, eye, force)),
-            )
-        # The fastest tells what one moment is, whichever is named first.
-        within = 0.5 / max(eye.rate for eye in eyes)
-        for found, alone in _all_of(streams, within, shared, model):
-            logged.append(found)
-            for name, one in alone.items():
-                each[name].append(one)
-            pace.take(time.monotonic(), count.seconds[-1])
-            seen = found.observation
-            tags = len(seen.tags) if isinstance(seen, PoseMeasurement) else 0
-            show(len(logged), rates(pace.pictures_per_second, pace.measuring_ms, tags))
-    for name, path in logs.items():
-        write_pose_log(path, each[name], with_clearance=model is not None)
-    write_pose_log(output, logged, with_clearance=model is not None)
-    if mcap is not None:
-        write_track_mcap(mcap, logged, each if several else {}, began)
-    took = (time.time_ns() - began) * 1e-9
-    facts = track_facts(logged, output, count, shared if several else None, took)
+    sources = parse_camera_sources(the_rig, source, camera)
+    _require_outputs(sources, output, mcap, overlay, force)
+    require_plan_used(sources.values(), plan)
+    the_scene = None if scene is None else load_scene(scene)
+    the_plan = None if plan is None else load_plan(plan)
+    if plan is not None and the_plan is not None:
+        require_same_rig(the_plan, the_rig, plan)
+    requests = LocalRequests()
+    with stop_requests(requests):
+        result = track_sources(
+            the_rig,
+            sources,
+            scene=the_scene,
+            plan=the_plan,
+            pictures=pictures,
+            overlay=overlay,
+            replace_overlay=force,
+            stopped=lambda: requests.read().stop,
+            listener=Terminal(quiet=as_json),
+        )
+    result.save(output, mcap)
+    facts = _facts(result, output)
     if as_json:
-        show_json({**facts, "unused": _by_file(unused)})
+        show_json({**facts, "unused": _by_file(result.unused)})
     else:
         show_facts(f"poses in {output}", [(k.replace("_", " "), str(v)) for k, v in facts.items()])
 
 
-def _own_file(output: Path, name: str) -> Path:
-    """Where one of several cameras is logged alone: ``poses-front.csv`` beside ``poses.csv``."""
-    return output.with_name(f"{output.stem}-{name}{output.suffix}")
-
-
-def _own_drawing(overlay: Path, name: str) -> Path:
-    """Where one of several cameras' pictures are drawn: a video like a log, or a folder inside."""
-    is_folder = overlay.is_dir() or not overlay.suffix
-    return overlay / name if is_folder else _own_file(overlay, name)
+def _require_outputs(
+    sources: Mapping[Camera, str],
+    output: Path,
+    mcap: Path | None,
+    overlay: Path | None,
+    force: bool,
+) -> None:
+    """Refuses outputs that cannot be written, are one another, or are an input."""
+    several = len(sources) > 1
+    logs = {eye.name: own_file(output, eye.name) for eye in sources} if several else {}
+    for path in [output, *([] if mcap is None else [mcap]), *logs.values()]:
+        require_new_file(path, force)
+    written: dict[str, Path | None] = {"--output": output, "--mcap": mcap, "--overlay": overlay}
+    written |= {f"the log of {name}": path for name, path in logs.items()}
+    if overlay is not None and several:
+        written |= {f"the drawing of {e.name}": own_drawing(overlay, e.name) for e in sources}
+    refuse_overwriting(
+        {name: path for name, path in written.items() if path is not None},
+        [Path(place) for place in sources.values()],
+    )
 
 
 def _by_file(unused: dict[str, dict[str, str]]) -> dict[str, str]:
@@ -188,47 +142,27 @@ def _by_file(unused: dict[str, dict[str, str]]) -> dict[str, str]:
     }
 
 
-def _all_of(
-    streams: dict[str, Iterator[LoggedPicture]],
-    within: float,
-    count: TogetherCount,
-    model: ClearanceModel | None,
-) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
-    """What is measured together and by each camera alone."""
-    from tracking.track_together import track_together
-
-    if len(streams) > 1:
-        yield from track_together(streams, within, count, model)
-        return
-    for name, stream in streams.items():
-        for found in stream:
-            yield found, {name: found}
-
-
-def _scene(scene: Path | None, plan: Path | None) -> Scene | None:
-    from cdpr.plan import load_plan
-    from cdpr.scene import load_scene
-
-    if scene is not None:
-        return load_scene(scene)
-    return load_plan(plan).scene if plan is not None else None
-
-
-@contextmanager
-def _overlay(
-    place: Path | None, rig: Rig, camera: Camera, force: bool
-) -> Iterator[Callable[[Picture, LoggedPicture], None] | None]:
-    """What draws each picture's measurement into it; None without a place for it."""
-    if place is None:
-        yield None
-        return
-    from drivers.picture_output import PictureOutput
-    from tracking.overlay import drawn_over
-
-    with PictureOutput(place, camera.rate, force) as out:
-
-        def draw(picture: Picture, logged: LoggedPicture) -> None:
-            found = logged.observation
-            out.write(drawn_over(picture.image, rig, camera, found, logged.clearance), picture.name)
-
-        yield draw
+def _facts(result: TrackResult, output: Path) -> dict[str, Any]:
+    """What was measured, in numbers."""
+    poses, logged = result.poses, result.pictures
+    deviations = np.array([np.linalg.norm(p.position_deviation) for p in poses])
+    facts: dict[str, Any] = {
+        "poses_file": str(output),
+        "pictures": len(logged),
+        "poses": len(poses),
+        "position_deviation_mm": round(float(np.median(deviations)) * 1000, 4),
+        "reprojection_px": round(float(np.median([p.reprojection for p in poses])), 4),
+        "pictures_per_second": round(len(logged) / result.seconds, 1),
+        "measuring_ms": round(float(np.median(result.count.seconds)) * 1000, 2),
+    }
+    if result.together is not None:
+        facts["pictures_without_partner"] = result.together.without_partner
+        facts["moments_apart"] = result.together.apart
+        facts["moments_without_speed"] = result.together.without_speed
+    clearances = [p.clearance for p in logged if p.clearance is not None]
+    if clearances:
+        nearest = min(clearances, key=lambda c: c.distance)
+        facts["smallest_clearance_mm"] = round(nearest.distance * 1000, 3)
+        facts["clearance_uncertainty_mm"] = round(nearest.uncertainty * 1000, 3)
+        facts["clearance_at_most_mm"] = round(nearest.at_most * 1000, 3)
+    return facts

@@ -1,83 +1,256 @@
-"""The list of verbs, in the order of the help text."""
+"""The verbs of the command line: a table, and groups that import a verb only when it is called."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import islice
+from typing import Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from cdpr.cli import bench, calibrate
-from cdpr.cli.calibrate_diff import diff
-from cdpr.cli.calibrate_extrinsics import extrinsics
-from cdpr.cli.calibrate_poses import poses
-from cdpr.cli.calibrate_print import print_
-from cdpr.cli.calibrate_rig import rig
-from cdpr.cli.calibrate_tags import tags
-from cdpr.cli.check import check
-from cdpr.cli.demo import demo
-from cdpr.cli.doctor import doctor
-from cdpr.cli.home import home
-from cdpr.cli.jog import jog
-from cdpr.cli.monitor import monitor
-from cdpr.cli.operate import hold, resume, speed
-from cdpr.cli.plan import plan
-from cdpr.cli.release import release
-from cdpr.cli.report import report
-from cdpr.cli.reset import reset
-from cdpr.cli.run import run
-from cdpr.cli.sim import sim
-from cdpr.cli.status import status
-from cdpr.cli.stop import stop
-from cdpr.cli.track import track
-from cdpr.cli.workspace import workspace
-from cdpr.errors import StoppedByOperator
+from cdpr.cli.arguments import check_arguments
+from model.errors import StoppedByOperator
 
-VERBS = (
-    demo,
-    plan,
-    check,
-    run,
-    stop,
-    hold,
-    resume,
-    speed,
-    monitor,
-    status,
-    reset,
-    home,
-    jog,
-    release,
-    track,
-    sim,
-    report,
-    workspace,
-    doctor,
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """A line of the help text, and where the verb is.
+
+    Attributes:
+        name: As it is typed.
+        help: The first line of the verb's own help, or all of a group's.
+        target: ``module:function`` below `cdpr.cli`; ``name:name`` when left out.
+        verbs: Of a group.
+    """
+
+    name: str
+    help: str
+    target: str = ""
+    verbs: tuple[Verb, ...] = ()
+
+
+CALIBRATE = (
+    Verb(
+        "camera",
+        "Find a camera's matrix and lens distortion, and say whether they are good enough.",
+        "calibrate.camera:camera",
+    ),
+    Verb(
+        "extrinsics",
+        "Find where a camera stands, by surveyed tags on the frame or by the rig's own motion.",
+        "calibrate.extrinsics:extrinsics",
+    ),
+    Verb(
+        "tags",
+        "Find where the tags are on the platform, from pictures that show two or more at once.",
+        "calibrate.tags:tags",
+    ),
+    Verb(
+        "poses",
+        "Choose the poses that tell most about the rig, and plan a way through them with stops.",
+        "calibrate.poses:poses",
+    ),
+    Verb(
+        "rig",
+        "Find outlets, anchors, pulleys, drum scales, references and the cables' stiffness.",
+        "calibrate.rig:rig",
+    ),
+    Verb(
+        "print",
+        "Make a board, or the tags of a rig, as PDF in exact size, with the white that they need.",
+        "calibrate.targets:print_",
+    ),
+    Verb(
+        "diff",
+        "Compare two calibration results: every number against its interval, and the effect in mm.",
+        "calibrate.compare:diff",
+    ),
+    Verb(
+        "apply",
+        "Write a new rig file with calibration results in place of the rig file's numbers.",
+        "calibrate.apply:apply",
+    ),
 )
+BENCH = (
+    Verb(
+        "paper",
+        "Repeat the paper's evaluation (section 5.3, Fig. 9) and tell which claims hold.",
+        "bench:paper",
+    ),
+)
+PLAN = (
+    Verb(
+        "demo",
+        "Plan, check, run on simulated drives, track with a synthetic camera, and report.",
+    ),
+    Verb("examples", "List the ready rigs, scenes and recorded sessions, or copy some of them."),
+    Verb("new", "Ask for the least that a rig file needs, and write a commented one."),
+    Verb("plan", "Plan a collision-free path and write it to a file."),
+    Verb(
+        "check",
+        "Prove a plan by an independent route: distances on dense poses, with a stated bound.",
+    ),
+)
+OPERATE = (
+    Verb(
+        "run",
+        "Run a plan: prove it, make its set-points, arm the drives, move, measure, report.",
+    ),
+    Verb(
+        "stop",
+        "Stop every run of this user: all drives slow down together along the path, then hold.",
+    ),
+    Verb(
+        "hold",
+        "Feed hold: the platform slows down along the path, waits there, and keeps its tension.",
+        "operate:hold",
+    ),
+    Verb(
+        "resume",
+        "Go on after `cdpr hold`, at the speed that was asked for last.",
+        "operate:resume",
+    ),
+    Verb(
+        "speed",
+        "Go at a share of the planned speed along the path, from the next cycle on.",
+        "operate:speed",
+    ),
+    Verb(
+        "monitor",
+        "Watch a run: its state, every drive, tension, lateness, progress and events, to its end.",
+    ),
+    Verb(
+        "status",
+        "Tell how a rig stands: faults, reference, drives, tensions, pose. Moves and"
+        " writes nothing.",
+    ),
+    Verb(
+        "reset",
+        "Take a latched fault off, after its cause is gone: resets drives in fault; moves nothing.",
+    ),
+    Verb(
+        "home",
+        "Wind slack cables in until all are taut, then reference the drives at a pose"
+        " that is known.",
+    ),
+    Verb("jog", "Move the platform straight by a few millimetres, slowly, from where it stands."),
+    Verb(
+        "release",
+        "End the day: with the platform on a support, close the brakes and take the torque off.",
+    ),
+)
+SET_UP = (
+    Verb(
+        "doctor",
+        "Look whether this machine has what a run needs; with a rig file, whether its bus opens.",
+    ),
+    Verb(
+        "sim",
+        "Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.",
+    ),
+    Verb("calibrate", "Calibrate and compare.", verbs=CALIBRATE),
+)
+MEASURE = (Verb("track", "Measure the platform's pose from its tags, picture by picture."),)
+ANALYSE = (
+    Verb("report", "Write the report of a run folder again, from its files alone."),
+    Verb(
+        "explain",
+        "Explain a fault that a run reported: meaning, likely cause, state of the"
+        " machine, next step.",
+    ),
+    Verb("workspace", "Map where the robot can be and how well it can work there."),
+    Verb("bench", "Measure the planner.", verbs=BENCH),
+)
+PANELS: dict[str, tuple[Verb, ...]] = {
+    "Plan": PLAN,
+    "Operate": OPERATE,
+    "Set up": SET_UP,
+    "Measure": MEASURE,
+    "Analyse": ANALYSE,
+}
+VERBS = tuple(verb for verbs in PANELS.values() for verb in verbs)
 
 
-def add_verbs(app: typer.Typer) -> None:
-    """Adds every verb to the command line."""
-    for verb in VERBS:
-        app.command()(_interruptible(verb))
-    calibrations = (calibrate.camera, extrinsics, tags, poses, rig, print_, diff)
-    _add_group(app, "calibrate", "Calibrate and compare.", *calibrations)
-    _add_group(app, "bench", "Measure the planner.", bench.paper)
+class LazyGroup(TyperGroup):
+    """Verbs of a table; the help text and completion of names need no module of theirs."""
+
+    verbs: tuple[Verb, ...] = VERBS
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        panels = {verb: panel for panel, verbs in PANELS.items() for verb in verbs}
+        self.commands = {
+            verb.name: TyperCommand(verb.name, help=verb.help, rich_help_panel=panels.get(verb))
+            for verb in self.verbs
+        }
+
+    def loaded(self, name: str) -> TyperCommand | TyperGroup:
+        """The verb itself, with its options, from its module."""
+        return _loaded(next(verb for verb in self.verbs if verb.name == name))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """As Typer does; the verb that is called is imported."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, self.loaded(name) if command is not None and name else command, rest
 
 
-def _add_group(app: typer.Typer, name: str, text: str, *verbs: Callable[..., None]) -> None:
-    group = typer.Typer(help=text, no_args_is_help=True)
-    for verb in verbs:
-        group.command(verb.__name__.rstrip("_"))(_interruptible(verb))
-    app.add_typer(group, name=name)
+class _CalibrateGroup(LazyGroup):
+    verbs = CALIBRATE
 
 
-def _interruptible(verb: Callable[..., None]) -> Callable[..., None]:
-    """Ctrl-C where no run is going on is the operator's stop too, with its exit code."""
+class _BenchGroup(LazyGroup):
+    verbs = BENCH
+
+
+_GROUPS = {"calibrate": _CalibrateGroup, "bench": _BenchGroup}
+
+
+def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
+    if verb.verbs:
+        return _GROUPS[verb.name](
+            name=verb.name, help=verb.help, no_args_is_help=True, rich_markup_mode="rich"
+        )
+    module, _, function = (verb.target or f"{verb.name}:{verb.name}").partition(":")
+    app = typer.Typer(rich_markup_mode="rich", add_completion=False)
+    called = getattr(import_module(f"cdpr.cli.{module}"), function)
+    app.command(verb.name, cls=_Command)(_guarded(called))
+    command: Any = typer.main.get_command(app)
+    return command  # type: ignore[no-any-return]
+
+
+class _Command(TyperCommand):
+    """A verb whose points are typed as X Y Z everywhere."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As Typer does, once points are one word each."""
+        return super().parse_args(ctx, joined_points(args))
+
+
+def joined_points(arguments: Sequence[str]) -> list[str]:
+    """The arguments with the three words after each ``--via-mm`` as one.
+
+    Typer knows options of three values and options that may be repeated, not both at once.
+    """
+    words = iter(arguments)
+    joined: list[str] = []
+    for word in words:
+        joined.append(word)
+        if word == "--via-mm":
+            joined.append(" ".join(islice(words, 3)))
+    return joined
+
+
+def _guarded(verb: Callable[..., None]) -> Callable[..., None]:
+    """With arguments that can be used; Ctrl-C where no run is going on is the operator's stop."""
 
     @functools.wraps(verb)
     def guarded(*args: object, **options: object) -> None:
         try:
+            check_arguments(options)
             verb(*args, **options)
         except KeyboardInterrupt:
             raise StoppedByOperator("interrupted") from None

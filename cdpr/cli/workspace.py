@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-if TYPE_CHECKING:
-    from cdpr.poses import Array
-    from cdpr.rig import Rig
-    from planner.workspace.computing import Maps
-    from planner.workspace.grid import Grid
-    from planner.workspace.maps import Question
-
-CELLS_OF_A_SLICE = 50
-CELLS_OF_THE_FRAME = 40
-POINTS_FOR_ONE_PROCESS = 20000
-"""Fewer are done before other processes have started."""
-
-Triple = tuple[float, float, float]
+from cdpr.cli.options import DaskOption, RigArgument, Triple, WorkersOption
+from cdpr.cli.output import Terminal, show_facts, show_json
+from model.errors import BadInput
+from model.files.documents import millimetres
+from model.files.output import make_folder
+from model.pose import Array, matrix_from_quaternion
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.workspace.compute import map_workspace, workspace_grids
+from planner.workspace.files import write_maps
+from planner.workspace.grid import parsed_slice
+from planner.workspace.maps import Question
 
 
 def workspace(
-    rig: Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")],
+    rig: RigArgument,
     output: Annotated[Path, typer.Option("-o", "--output", help="folder to write", metavar="DIR")],
     scene: Annotated[
         Path | None, typer.Option(help="scene file: obstacles, clearances, load", metavar="SCENE")
@@ -55,12 +54,8 @@ def workspace(
             help="divides moments in the condition number; else the anchors' mean radius",
         ),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="processes; else one a core", metavar="N")
-    ] = None,
-    dask: Annotated[
-        str | None, typer.Option(help="do the work on this Dask cluster", metavar="ADDRESS")
-    ] = None,
+    workers: WorkersOption = None,
+    dask: DaskOption = None,
     force: Annotated[bool, typer.Option("--force", help="replace the maps in the folder")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> None:
@@ -75,36 +70,22 @@ def workspace(
       cdpr workspace configs/gachon_8_6.yaml --scene configs/environment_1.yaml
       --slice z=445 --slice x=0 --step-mm 5 -o maps
     """
-    from cdpr.cli.compiling import told_when_compiling
-    from cdpr.cli.output import progress_bar, show_facts, show_json, spinner
-    from cdpr.cli.workers import Count, make_folder, worker_pool
-    from cdpr.cli.workspace_files import write_maps
-    from cdpr.rig import load_rig
-    from cdpr.scene import load_scene
-    from planner.workspace.computing import compute
-    from planner.workspace.costs import Extremes
-    from planner.workspace.maps import Question
-
     the_rig = load_rig(rig)
     the_scene = None if scene is None else load_scene(scene)
     length = None if length_mm is None else length_mm / 1000.0
     question = Question.about(the_rig, the_scene, _rotation(rotation_wxyz), length)
-    grids = _grids(the_rig, slices or [], volume, step_mm, lower_mm, upper_mm)
+    grids = workspace_grids(
+        the_rig,
+        [parsed_slice(text) for text in slices or []],
+        volume=volume,
+        step=None if step_mm is None else step_mm / 1000.0,
+        lower=None if lower_mm is None else millimetres(list(lower_mm)),
+        upper=None if upper_mm is None else millimetres(list(upper_mm)),
+    )
     make_folder(output, force)
-    with told_when_compiling("maps", not as_json):
-        extremes = Extremes.over_workspace(question)
-        _warm_up(question)
-    total = sum(grid.count for grid in grids)
-    made: list[Maps] = []
-    cores = 1 if total <= POINTS_FOR_ONE_PROCESS else os.cpu_count() or 1
-    with (
-        worker_pool(workers or cores, dask) as pool,
-        progress_bar("mapping", total, not as_json) as advance,
-    ):
-        done = Count(advance)
-        for grid in grids:
-            made.append(compute(question, extremes, grid, pool=pool, progress=done.more))
-    with spinner("drawing", not as_json):
+    listener = Terminal(quiet=as_json)
+    made = map_workspace(question, grids, workers=workers, dask=dask, listener=listener)
+    with listener.waiting("drawing"):
         where = f" in {the_scene.name}" if the_scene else ""
         title = f"Workspace of {the_rig.name}{where}"
         summary = write_maps(output, made, title, _lead(question))
@@ -117,53 +98,10 @@ def workspace(
 def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array | None:
     if rotation_wxyz is None:
         return None
-    import numpy as np
-
-    from cdpr.errors import BadInput
-    from cdpr.poses import matrix_from_quaternion
-
     norm = float(np.linalg.norm(rotation_wxyz))
     if not 1e-6 < norm < np.inf:
         raise BadInput("the rotation is not a quaternion w x y z of a length above 0")
     return matrix_from_quaternion(np.array(rotation_wxyz) / norm)
-
-
-def _grids(
-    rig: Rig,
-    slices: list[str],
-    volume: bool | None,
-    step_mm: float | None,
-    lower_mm: Triple | None,
-    upper_mm: Triple | None,
-) -> list[Grid]:
-    """The slices, and with the volume the frame around it and the region itself."""
-    import numpy as np
-
-    from cdpr.document_types import millimetres
-    from planner.workspace import grid
-
-    lower = rig.workspace_lower if lower_mm is None else millimetres(list(lower_mm))
-    upper = rig.workspace_upper if upper_mm is None else millimetres(list(upper_mm))
-    step = float(np.max(upper - lower)) / CELLS_OF_A_SLICE
-    if step_mm is not None:
-        step = step_mm / 1000.0
-    wanted = [grid.parsed_slice(text) for text in slices]
-    if not wanted:
-        wanted = [(2, float(np.clip(rig.home.position[2], lower[2], upper[2])))]
-    grids = [grid.slice_through(axis, value, lower, upper, step) for axis, value in wanted]
-    if volume or (volume is None and not slices):
-        around = grid.frame_box(rig)
-        coarse = float(np.max(around[1] - around[0])) / CELLS_OF_THE_FRAME
-        grids.append(grid.volume("frame", *around, coarse))
-        grids.append(grid.volume("workspace", lower, upper, step))
-    return grids
-
-
-def _warm_up(question: Question) -> None:
-    """Compiles what is needed once, before several processes would do so."""
-    from planner.workspace.maps import values_at
-
-    values_at(question, question.rig.home.position[None, :])
 
 
 def _lead(question: Question) -> str:

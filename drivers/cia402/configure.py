@@ -3,39 +3,60 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import can
 
-from cdpr.errors import HardwareMissing, Refused
-from cdpr.rig import Rig
-from cdpr.winches import WinchMap
-from drivers.cia402.frames import NmtCommand
-from drivers.cia402.objects import (
-    AFTER,
-    BEFORE,
-    HEARTBEAT_CONSUMERS,
-    PDO_INVALID,
-    UNUSED_PDOS,
-    Expectation,
-    Setting,
-    heartbeat_consumers,
-    identity,
-    settings_for,
-)
-from drivers.cia402.sdo import OBJECT_DOES_NOT_EXIST, SetupNetwork
-from drivers.cia402.states import FAULTED, DriveState, state_of
-from drivers.drive_group import OnRestarted, Pump
-from drivers.set_up_refusals import (
+from drivers.can_errors import (
     SETTING_UP,
+    all_of_them,
     answers_twice,
     in_fault,
     keeps_another,
     moved_by_another,
 )
+from drivers.cia402.error_codes import abort_text
+from drivers.cia402.object_dictionary import (
+    BEFORE,
+    HEARTBEAT_CONSUMERS,
+    MODE_DISPLAY,
+    PDO_IDENTIFIER,
+    PDO_INVALID,
+    UNUSED_PDOS,
+    USED_PDOS,
+    Expectation,
+    Setting,
+    expected_by,
+    heartbeat_consumers,
+    identity,
+    left_out,
+    settings_for,
+)
+from drivers.cia402.pdo import NmtCommand
+from drivers.cia402.profile import profile_of
+from drivers.cia402.sdo import NOT_NOW, OBJECT_DOES_NOT_EXIST, SetupNetwork, silent
+from drivers.cia402.state_machine import FAULTED, DriveState, state_of
+from drivers.drive_group import OnRestarted, Pump
+from model.errors import HardwareMissing, Refused
+from model.rig import Rig
+from model.winches import WinchMap
 
-#: Communication parameters that are 0 in a drive that was just switched on. Source: CiA 301, 7.5.2.
-FORGOTTEN = (0x1006, 0x1017)
+#: What a drive that was just switched on holds another value of, and keeps after an ordered end:
+#: its heartbeat is 0, and a lost connection means nothing. Source: CiA 301, 7.5.2; CiA 402-2.
+FORGOTTEN = (0x1017, 0x6007)
+
+MODE_WAIT = 0.5
+"""So long a drive may take to show a mode that was written, [s]."""
+
+MODE_ASKED = 10
+"""Times that it is asked meanwhile."""
+
+READ_ONLY = frozenset({0x06010000, 0x06010002})
+"""Not writable: an object of a fixed value, which counts when it is the wanted one."""
+
+PDO_OBJECTS = 0xF9FF
+"""Makes one of a PDO's communication parameters (1400h, 1800h) and its mapping (1600h, 1A00h)."""
 
 
 def configure_drives(
@@ -52,7 +73,7 @@ def configure_drives(
     Args:
         rig: The robot; its winches name the nodes.
         bus: An open bus.
-        pump: As for `drivers.drive_group.make_drive_group`.
+        pump: As for `drivers.factory.make_drive_group`.
         max_tension: From which the torque limit comes, [N]; the rig's own if None.
         to_reset: Also takes drives in fault, which are going to be reset.
         on_restarted: Called, before anything is written, with the nodes that do not hold our set-up
@@ -68,31 +89,73 @@ def configure_drives(
         BadInput: A value of the rig does not fit its object.
         Fault: The bus does not take frames.
     """
-    winch_map = WinchMap(rig)
+    winch_map, profile = WinchMap(rig), profile_of(rig)
     settings = [settings_for(rig, i, winch_map, max_tension) for i in range(rig.cable_count)]
     nodes = [winch.node_id for winch in rig.winches]
-    network = SetupNetwork(bus, pump, nodes)
+    network = SetupNetwork(bus, pump, nodes, timeout=profile.sdo_timeout_ms / 1000.0)
     network.discard_waiting()
-    _find_all(network, nodes, (*BEFORE, *identity(rig)))
+    require_answers(network, nodes)
     _refuse_duplicates(network)
-    for node in nodes:
-        _check_idle(network, node, to_reset)
+    wrong = WrongObjects()
+    for drive, node in enumerate(nodes):
+        for expected in (*BEFORE, *identity(rig), *expected_by(profile)):
+            wrong.note(_expect, network, node, expected)
+        wrong.note(_check_idle, network, node, to_reset)
+        for setting in settings[drive]:
+            wrong.note(_require_there, network, node, setting)
+    wrong.refuse()
+    _refuse_duplicates(network)
     on_restarted(
         tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
     )
     entries = []
-    absent: dict[Setting, list[int]] = {}
+    absent: dict[str, list[int]] = {}
     for drive, node in enumerate(nodes):
         network.command(NmtCommand.PRE_OPERATIONAL, node)
-        for setting in _write_all(network, node, settings[drive]):
-            absent.setdefault(setting, []).append(node)
-        entries.append(_watch_heartbeats(network, node, rig, drive))
-        _switch_off_unused(network, node)
-        _expect(network, node, AFTER)
+        wrong.note(_switch_off_used, network, node)
+        for remark in _write_all(network, node, settings[drive], wrong):
+            absent.setdefault(remark, []).append(node)
+        entries.append(_watch_heartbeats(network, node, rig, drive, wrong))
+        wrong.note(_switch_off_unused, network, node)
+    wrong.refuse()  # a mode that was not taken is not waited for
+    if not profile.mode_display_when_enabled:
+        for node in nodes:
+            wrong.note(_await_mode, network, node)
+    wrong.refuse()
     for node in nodes:
         network.command(NmtCommand.START, node)
     network.take_waiting()
-    return (*_absent(absent), *_unwatched_peers(nodes, entries))
+    for remark in left_out(profile):
+        absent.setdefault(remark, []).extend(nodes)
+    return (*_absent(absent), *_unwatched_peers(nodes, entries, profile.monitoring))
+
+
+class WrongObjects:
+    """Gathers what drives refuse, so that one look at them tells everything."""
+
+    def __init__(self) -> None:
+        """Begins with nothing."""
+        self._found: list[Refused] = []
+
+    def note(self, action: Callable[..., None], *arguments: Any) -> bool:
+        """Does something with a drive; false when the drive refused, which is kept."""
+        try:
+            action(*arguments)
+        except Refused as error:
+            if "node" not in error.values:  # the bus is another's: nothing more can be said
+                raise
+            self._found.append(error)
+            return False
+        return True
+
+    def refuse(self) -> None:
+        """Does nothing unless something was found.
+
+        Raises:
+            Refused: With everything that was found.
+        """
+        if self._found:
+            raise all_of_them(self._found)
 
 
 def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
@@ -110,13 +173,20 @@ def _refuse_duplicates(network: SetupNetwork) -> None:
         raise answers_twice(node)
 
 
-def _absent(absent: dict[Setting, list[int]]) -> Iterator[str]:
-    for setting, nodes in absent.items():
-        yield f"drive {', '.join(map(str, nodes))}: there is no {setting}: {setting.instead}"
+def _absent(absent: dict[str, list[int]]) -> Iterator[str]:
+    for remark, nodes in absent.items():
+        yield f"drive {', '.join(map(str, nodes))}: {remark}"
 
 
-def _unwatched_peers(nodes: Sequence[int], entries: Sequence[int]) -> Iterator[str]:
+def _unwatched_peers(
+    nodes: Sequence[int], entries: Sequence[int], monitoring: str
+) -> Iterator[str]:
     """One remark for all drives that have the same number of heartbeat entries too few."""
+    instead = (
+        "the master's heartbeat stops the drive"
+        if monitoring == "heartbeat"
+        else "SYNC and set-point time-outs stop the drive"
+    )
     for count in sorted(set(entries)):
         if count >= len(nodes):
             continue
@@ -124,24 +194,24 @@ def _unwatched_peers(nodes: Sequence[int], entries: Sequence[int]) -> Iterator[s
         yield (
             f"drive {drives}: 1016h has {count} heartbeat {'entry' if count == 1 else 'entries'},"
             f" so the master and {count - 1} of {len(nodes) - 1} other drives are watched; when"
-            " another one falls silent together with the master, SYNC and set-point time-outs stop"
-            " the drive instead"
+            f" another one falls silent together with the master, {instead} instead"
         )
 
 
-def _find_all(
-    network: SetupNetwork, nodes: Iterable[int], expectations: Sequence[Expectation]
-) -> None:
-    """Every drive answers and is what it must be; the silent ones are named together."""
-    silent: list[HardwareMissing] = []
-    for node in nodes:
-        try:
-            _expect(network, node, expectations)
-        except HardwareMissing as error:
-            silent.append(error)
-    if len(silent) > 1:
-        names = ", ".join(str(error.values["node"]) for error in silent)
-        first = silent[0]
+def require_answers(network: SetupNetwork, nodes: Sequence[int]) -> None:
+    """First contact with all drives at once; the silent ones are named together.
+
+    Raises:
+        HardwareMissing: Drives do not answer.
+        Refused: The one that does not answers something else.
+    """
+    nothing = network.silent_nodes(nodes)
+    if len(nothing) == 1:
+        where = f"drive {nothing[0]}, object 1000h:00 device type"
+        raise network.client(nothing[0]).no_answer(where)
+    if nothing:
+        names = ", ".join(str(node) for node in nothing)
+        first = silent(nothing[0], SETTING_UP)
         raise HardwareMissing(
             f"drives {names} do not answer",
             where=SETTING_UP,
@@ -149,18 +219,40 @@ def _find_all(
             next_step=first.next_step,
             values={"nodes": names},
         )
-    if silent:
-        raise silent[0]
 
 
-def _expect(network: SetupNetwork, node: int, expectations: Sequence[Expectation]) -> None:
-    for expected in expectations:
-        data = network.client(node).read(expected.index, expected.sub, expected.name)
-        value = int.from_bytes(data, "little")
-        if value & expected.mask != expected.expected:
-            raise _wrong(
-                node, str(expected), f"{value:X}h", f"{expected.expected:X}h", expected.why
-            )
+def _expect(network: SetupNetwork, node: int, expected: Expectation) -> None:
+    data = network.client(node).read(expected.index, expected.sub, expected.name)
+    value = int.from_bytes(data, "little")
+    if value & expected.mask != expected.expected:
+        found, wanted = f"{value:X}h", f"{expected.expected:X}h"
+        raise _wrong(node, str(expected), found, wanted, expected.why)
+
+
+def _require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
+    """Objects that are not there are all told before any is written; what else is wrong shows then.
+
+    Raises:
+        Refused: A drive does not have an object that it needs.
+    """
+    if setting.optional or setting.transient:
+        return
+    try:
+        network.client(node).read(setting.index, setting.sub, setting.name)
+    except Refused as error:
+        if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
+            raise
+
+
+def _await_mode(network: SetupNetwork, node: int) -> None:
+    """The mode that was written shows within `MODE_WAIT`; drives need not follow at once."""
+    deadline = network.clock() + MODE_WAIT
+    for _ in range(MODE_ASKED):
+        data = network.client(node).read(MODE_DISPLAY.index, 0, MODE_DISPLAY.name)
+        if int.from_bytes(data, "little") == MODE_DISPLAY.expected or network.clock() >= deadline:
+            break
+        network.wait(MODE_WAIT / MODE_ASKED)
+    _expect(network, node, MODE_DISPLAY)
 
 
 _STATUS_WORD = "object 6041h:00 status word"
@@ -178,50 +270,109 @@ def _check_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
 
 
 def _write_all(
-    network: SetupNetwork, node: int, settings: Sequence[Setting]
-) -> tuple[Setting, ...]:
-    """Writes and reads back; those that the drive does not have and need not have."""
-    client = network.client(node)
-    absent = []
+    network: SetupNetwork, node: int, settings: Sequence[Setting], wrong: WrongObjects
+) -> list[str]:
+    """Writes and reads back; remarks on what the drive does not have and need not have."""
+    remarks: list[str] = []
+    refused: set[int] = set()
     for setting in settings:
-        try:
-            client.write(setting.index, setting.sub, setting.data(), setting.name)
-        except Refused as error:
-            if setting.instead and error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
-                absent.append(setting)
-                continue
-            raise
-        if setting.transient:
+        # Of a PDO that refuses one object the others fail for the same reason.
+        if setting.index & PDO_OBJECTS in refused:
             continue
-        kept = client.read(setting.index, setting.sub, setting.name)
-        if kept != setting.data():
-            found = _number(kept, setting.form)
-            raise _wrong(node, str(setting), found, str(setting.value), setting.why)
-    return tuple(absent)
+        if not wrong.note(_write, network, node, setting, remarks) and _is_pdo(setting.index):
+            refused.add(setting.index & PDO_OBJECTS)
+    return remarks
 
 
-def _watch_heartbeats(network: SetupNetwork, node: int, rig: Rig, drive: int) -> int:
+def _is_pdo(index: int) -> bool:
+    return 0x1400 <= index < 0x1C00
+
+
+def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str]) -> None:
+    """Writes one object and reads it back; what an optional one lacks becomes a remark."""
+    client = network.client(node)
+    if setting.per_mille_of is not None:
+        index, sub = setting.per_mille_of
+        rated = int.from_bytes(client.read(index, sub, "rated value of the limit"), "little")
+        setting = setting.of_rated(rated)
+    try:
+        client.write(setting.index, setting.sub, setting.data(), setting.name)
+    except Refused as error:
+        code = error.values.get("abort_code")
+        if code in NOT_NOW or not (setting.optional or code in READ_ONLY):
+            raise
+        if _holds(network, node, setting):
+            return
+        if not setting.optional:
+            raise
+        if setting.instead:
+            lost = "there is no" if code in OBJECT_DOES_NOT_EXIST else "the drive refuses"
+            reason = "" if code in OBJECT_DOES_NOT_EXIST else f" ({abort_text(int(code or 0))})"
+            remarks.append(f"{lost} {setting}{reason}: {setting.instead}")
+        return
+    if setting.transient:
+        return
+    kept = client.read(setting.index, setting.sub, setting.name)
+    if not setting.is_kept(kept):
+        found = _number(kept, setting.form)
+        raise _wrong(node, str(setting), found, str(setting.value), setting.why)
+
+
+def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
+    """Whether an object that cannot be written holds what it must anyway."""
+    try:
+        kept = network.client(node).read(setting.index, setting.sub, setting.name)
+    except Refused:
+        return False
+    return setting.is_kept(kept)
+
+
+def _watch_heartbeats(
+    network: SetupNetwork, node: int, rig: Rig, drive: int, wrong: WrongObjects
+) -> int:
     """Sets the heartbeat consumer up; returns how many producers it can watch."""
+    entries: list[int] = []
+    if not wrong.note(_count_heartbeats, network, node, profile_of(rig).heartbeat_entries, entries):
+        return 0
+    _write_all(network, node, heartbeat_consumers(rig, drive, entries[0]), wrong)
+    return entries[0]
+
+
+def _count_heartbeats(
+    network: SetupNetwork, node: int, most: int | None, entries: list[int]
+) -> None:
     data = network.client(node).read(HEARTBEAT_CONSUMERS, 0, "consumer heartbeat entries")
-    entries = int.from_bytes(data, "little")
-    if entries < 1:
+    count = int.from_bytes(data, "little")
+    if count < 1:
         raise _wrong(
             node, "1016h:00 consumer heartbeat entries", "0", "1 or more", "watch the master"
         )
-    _write_all(network, node, heartbeat_consumers(rig, drive, entries))
-    return entries
+    entries.append(count if most is None else min(count, most))
+
+
+def _switch_off_used(network: SetupNetwork, node: int) -> None:
+    """The identifier of a PDO may change only while it is off. Source: CiA 301, 7.5.2.35."""
+    for index in USED_PDOS:
+        data = network.client(node).read(index, 1, "PDO identifier")
+        value = int.from_bytes(data, "little")
+        if not value & PDO_INVALID:
+            _switch_off(network, node, index, value)
 
 
 def _switch_off_unused(network: SetupNetwork, node: int) -> None:
     """Process data that nobody asked for would only fill the bus."""
-    client = network.client(node)
     for index in UNUSED_PDOS:
-        data = client.read_if_there(index, 1, "PDO identifier")
-        if data is None or int.from_bytes(data, "little") & PDO_INVALID:
-            continue
-        value = int.from_bytes(data, "little") | PDO_INVALID
-        off = Setting(index, 1, "<I", value, "PDO identifier", "not used, switched off")
-        _write_all(network, node, [off])
+        data = network.client(node).read_if_there(index, 1, "PDO identifier")
+        if data is not None and not int.from_bytes(data, "little") & PDO_INVALID:
+            _switch_off(network, node, index, int.from_bytes(data, "little"))
+
+
+def _switch_off(network: SetupNetwork, node: int, index: int, value: int) -> None:
+    off = Setting(
+        *(index, 1, "<I", value | PDO_INVALID, "PDO identifier", "switched off"),
+        mask=PDO_IDENTIFIER,
+    )
+    _write(network, node, off, [])
 
 
 def _number(data: bytes, form: str) -> str:

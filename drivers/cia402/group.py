@@ -2,37 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import can
 import numpy as np
 
-from cdpr.errors import HardwareMissing, Refused
-from cdpr.rig import Rig
-from cdpr.winches import WinchMap
-from drivers.bus import hears_itself
-from drivers.bus_load import TESTED_HZ, check_bus_load, heartbeat_cycles
+from drivers.can_bus import EchoFilter, SentFrame, echoes_own_frames
+from drivers.can_load import TESTED_HZ, check_bus_load, heartbeat_cycles, heartbeat_timeout
+from drivers.cia402.cob_ids import commanding_ids, foreign_text
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.cyclic import CyclicFrames
-from drivers.cia402.master_ids import commanding_ids, foreign_text
-from drivers.cia402.sequence import Goal, next_words
-from drivers.cia402.states import FAULTED, TORQUE_ON, ControlWord, DriveState
-from drivers.cia402.watch import DriveWatch
-from drivers.cyclic_bus import CyclicBus
-from drivers.cyclic_group import CyclicGroup
+from drivers.cia402.monitor import DriveMonitor
+from drivers.cia402.pdo import CyclicFrames
+from drivers.cia402.profile import profile_of
+from drivers.cia402.read_state import say_simulated
+from drivers.cia402.sdo_jobs import (
+    ABSENT,
+    ASKED_AGAIN_AFTER,
+    LOOK_TIMEOUT,
+    MODE_WAIT,
+    MONITORING_OFF,
+    REQUESTS_A_CYCLE,
+    STANDING,
+    AnswerListener,
+    ModeCheck,
+    SdoJobs,
+    mode_text,
+)
+from drivers.cia402.state_machine import (
+    FAULTED,
+    ControlWord,
+    DriveState,
+    Goal,
+    next_words,
+)
+from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
     Capabilities,
     Counts,
     CycleStatus,
+    DriveWarning,
     GroupCommand,
     GroupState,
     OnRestarted,
+    Pace,
     Pump,
 )
-from drivers.own_frames import OwnFrames
-from drivers.reply_check import largest_steps
-from drivers.torque import winding_signs
-from drivers.travel import position_limits
+from drivers.plausibility import largest_steps, require_within_limits, winding_signs
+from model.errors import HardwareMissing, Refused
+from model.rig import Rig
 
 STEP_TIMEOUT = 1.0
 """For enabling and for releasing, [s]: a brake takes a few tenths to open or close."""
@@ -61,19 +78,26 @@ class Cia402Group(CyclicGroup):
         check_bus_load(rig)
         self._signs = winding_signs(rig)
         cycle = rig.document.bus.cycle_ms / 1000.0
+        self._cycle_s, self._profile = cycle, profile_of(rig)
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
+        self._again_after = max(1, round(ASKED_AGAIN_AFTER / cycle))
         self._max_tension = max_tension
         self._max_steps = largest_steps(rig, cycle)
         self._restarted: tuple[int, ...] = ()
+        self._simulated = False
         self._reset_memory()
 
     def _reset_memory(self) -> None:
         count = len(self._nodes)
-        own = OwnFrames(commanding_ids(self._nodes), hears_itself=hears_itself(self._bus))
+        own = EchoFilter(
+            commanding_ids(self._nodes), echoes_own_frames=echoes_own_frames(self._bus)
+        )
         self._cyclic = CyclicBus(self._bus, own, foreign_text)
         self._frames = CyclicFrames(self._nodes)
-        self._watch = DriveWatch(self._rig.drive_names, self._max_steps)
+        is_warning = self._profile.is_warning
+        self._watch = DriveMonitor(self._rig.drive_names, self._max_steps, is_warning)
+        self._warnings: tuple[DriveWarning, ...] = ()
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
         self._told_to_stop = [False] * count
@@ -84,6 +108,8 @@ class Cia402Group(CyclicGroup):
         self._cycles_to_goal = 0
         self._left_stop = False  # told "enable operation" since the last release began
         self._known = False
+        self._unwatching: SdoJobs | None = None
+        self._modes: ModeCheck | None = None
 
     @property
     def capabilities(self) -> Capabilities:
@@ -95,10 +121,15 @@ class Cia402Group(CyclicGroup):
             has_brake=all(winch.brake for winch in self._rig.winches),
             max_hz=TESTED_HZ,
             watchdog_ms=None,
+            sync_timeout=self._profile.sync_timeout_periods,
+            master_timeout=max(
+                heartbeat_timeout(self._cycle_s), self._profile.sync_timeout_periods * self._cycle_s
+            ),
+            simulated=self._simulated,
         )
 
     @property
-    def _heard(self) -> DriveWatch:
+    def _heard(self) -> DriveMonitor:
         return self._watch
 
     @property
@@ -137,16 +168,18 @@ class Cia402Group(CyclicGroup):
             to_reset=to_reset,
             on_restarted=take,
         )
+        self._simulated = say_simulated(self._bus, self._pump, self._nodes)
         self._state = GroupState.CONFIGURED
         return remarks
 
-    def read_positions(self) -> CycleStatus:
+    def read_positions(self, pace: Pace | None = None) -> CycleStatus:
         """Sends SYNC until every drive has told its position; see `DriveGroup.read_positions`."""
         self._watch.forget_positions()
         agreed = 0
         for _ in range(FIRST_READING_ATTEMPTS):
+            time_left = FIRST_READING_TIMEOUT if pace is None else pace()
             self.send_cycle(self._watch.positions)
-            status = self.receive(FIRST_READING_TIMEOUT)
+            status = self.receive(time_left)
             if status.missing.any():
                 self._watch.forget_positions()
                 agreed = 0
@@ -164,7 +197,9 @@ class Cia402Group(CyclicGroup):
             values={"nodes": names},
         )
 
-    def send_cycle(self, targets: Sequence[int]) -> None:
+    def send_cycle(
+        self, targets: Sequence[int], may_enable: Callable[[], bool] = lambda: True
+    ) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
         self._discard_stale()
@@ -179,11 +214,14 @@ class Cia402Group(CyclicGroup):
             # Not under power, or held by the drives themselves: the targets follow the drives.
             # Once enabling has begun they stay, so that a sagging drive is not followed down.
             self._targets = list(self._watch.positions)
-        self._send(words)
+        self._send(words, may_enable)
         self._known = True
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
             self._cyclic.send((self._frames.heartbeat,))
+        for jobs in (self._modes, self._unwatching):
+            if jobs is not None:
+                self._ask(jobs, REQUESTS_A_CYCLE)
 
     def command(self, command: GroupCommand) -> None:
         """Sets where the group goes; see `DriveGroup.command`."""
@@ -194,20 +232,74 @@ class Cia402Group(CyclicGroup):
             self._begin_enabling()
         elif command is GroupCommand.RELEASE:
             self._begin_release()
+        elif command is GroupCommand.END_MONITORING:
+            self._begin_unwatching()
         else:
             self._reset_fault()
 
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
         self._stop()  # first: whatever the bus does now, no later cycle enables the drives again
-        self._send((ControlWord.QUICK_STOP,) * len(self._nodes))
+        self._send((ControlWord.QUICK_STOP,) * len(self._nodes), lambda: False)
 
-    def _send(self, words: tuple[ControlWord, ...]) -> None:
+    def is_monitored(self, *, silent_too: bool) -> bool:
+        """Whether drives still watch this master; see `DriveGroup.is_monitored`."""
+        if self._unwatching is None:
+            return True
+        refused = {
+            node for (node, _), code in self._unwatching.failed.items() if code not in ABSENT
+        }
+        watching = self._unwatching.unfinished() | (refused if silent_too else set())
+        return bool(watching if silent_too else watching & self._answering)
+
+    @property
+    def _answering(self) -> set[int]:
+        return {n for n, heard in zip(self._nodes, self._watch.answered, strict=True) if heard}
+
+    def look(self, pace: Pace) -> CycleStatus:
+        """Asks every drive by SDO how it stands; see `DriveGroup.look`."""
+        self._online()
+        jobs = SdoJobs({node: STANDING for node in self._answering}, self._again_after)
+        self._watch.begin_cycle()
+        self._watch.on_answer = jobs.take
+        for _ in range(round(LOOK_TIMEOUT / self._cycle_s)):
+            if not jobs.unfinished():
+                break
+            left = pace()
+            self._ask(jobs, len(self._nodes))
+            if self._pump is not None:
+                self._pump()
+                left = 0.0
+            self._cyclic.take_replies(AnswerListener(self._watch.take, jobs), left)
+        self._watch.take_standing(jobs.values)
+        self._look_for_faults()
+        return self._status()
+
+    def _ask(self, jobs: SdoJobs | ModeCheck, most: int) -> None:
+        self._cyclic.send(SentFrame(can_id, data) for can_id, data in jobs.next_requests(most))
+
+    def _begin_unwatching(self) -> None:
+        """Heartbeat first and SYNC last: what is still watched is still sent."""
+        if self._state in (GroupState.ENABLING, GroupState.ENABLED):
+            raise Refused("enabled drives must watch this program", where="drive group")
+        self._unwatching = SdoJobs(dict.fromkeys(self._nodes, MONITORING_OFF), self._again_after)
+        self._modes = None
+        self._watch.on_answer = self._unwatching.take
+
+    def _send(self, words: tuple[ControlWord, ...], may_enable: Callable[[], bool]) -> None:
         """One cycle's frames; what was asked for is remembered even if the bus fails."""
         self._words = words
         self._note_told_to_stop()
         self._watch.begin_cycle()
-        self._cyclic.send(self._frames.of_cycle(words, self._targets))
+        try:
+            self._cyclic.send(self._frames.set_points(words, self._targets))
+            if not may_enable() and ControlWord.ENABLE_OPERATION in words:
+                # The drives have these set-points and act on them at SYNC: the last word counts.
+                self._stop()
+                self._words = (ControlWord.QUICK_STOP,) * len(words)
+                self._cyclic.send(self._frames.set_points(self._words, self._targets))
+        finally:  # a frame that the bus did not take must not keep a stop from the other drives
+            self._cyclic.send((self._frames.sync,))
 
     def _note_told_to_stop(self) -> None:
         for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):
@@ -218,6 +310,8 @@ class Cia402Group(CyclicGroup):
 
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
+        warnings = self._watch.warnings()
+        self._warnings = warnings if powered else ()
         found = self._watch.news()
         if not powered:  # an emergency of a drive that moves nothing becomes its state's reason
             found = [(node, text) for node, text in found if node in self._watch.restarted]
@@ -258,7 +352,7 @@ class Cia402Group(CyclicGroup):
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLING:
             if all(state is DriveState.OPERATION_ENABLED for state in states):
-                self._state = GroupState.ENABLED
+                self._check_modes()
             elif self._cycles_to_goal > self._patience:
                 self._latch(self._late((DriveState.OPERATION_ENABLED,)))
         elif self._goal is Goal.RELEASE:
@@ -266,6 +360,23 @@ class Cia402Group(CyclicGroup):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > self._patience:
                 self._latch(self._late(_WITHOUT_TORQUE))
+
+    def _check_modes(self) -> None:
+        """Set-points are followed once every drive shows CSP; most were asked at set-up."""
+        if not self._profile.mode_display_when_enabled:
+            self._state = GroupState.ENABLED
+            return
+        if self._modes is None:
+            wait = MODE_WAIT + self._profile.sdo_timeout_ms / 1000.0
+            cycles = len(self._nodes) + round(wait / self._cycle_s)
+            self._modes = ModeCheck(self._nodes, cycles, self._again_after)
+            self._watch.on_answer = self._modes.take
+        wrong = self._modes.wrong()
+        if not wrong:
+            self._modes, self._state = None, GroupState.ENABLED
+        elif self._modes.is_overdue:
+            self._modes = None
+            self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
 
     def _late(self, wanted: tuple[DriveState, ...]) -> list[tuple[int, str]]:
         names = self._rig.drive_names
@@ -299,6 +410,7 @@ class Cia402Group(CyclicGroup):
             stopped=DriveState.OPERATION_ENABLED not in watch.states and not missing.any(),
             rejected=watch.rejected,
             error_frames=self._cyclic.error_frames,
+            warnings=self._warnings,
         )
 
     def _stop(self) -> None:
@@ -311,55 +423,22 @@ class Cia402Group(CyclicGroup):
             return
         self._refuse_latched("enable the drives")
         self._goal, self._state, self._cycles_to_goal = Goal.ENABLE, GroupState.ENABLING, 0
+        self._modes = None
+
+    def require_releasable(self) -> None:
+        """Whether the drives may be released; see `DriveGroup.require_releasable`."""
+        self._refuse_latched("release the drives")
+        require_within_limits(self._rig, self._watch.positions)
 
     def _begin_release(self) -> None:
-        self._refuse_latched("release the drives")
-        self._require_within_limits()
+        self.require_releasable()
         self._goal, self._cycles_to_goal, self._left_stop = Goal.RELEASE, 0, False
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
 
-    def _require_within_limits(self) -> None:
-        """The way out of quick stop enables the drives: one beyond its limits would run to them.
-
-        Raises:
-            Refused: A drive stands beyond its position limits (607Dh).
-        """
-        winch_map = WinchMap(self._rig)
-        for drive, (node, position) in enumerate(
-            zip(self._nodes, self._watch.positions, strict=True)
-        ):
-            low, high = position_limits(self._rig, drive, winch_map)
-            if not low <= position <= high:
-                raise Refused(
-                    f"{self._rig.drive_names[node]} stands at {position} counts, beyond its"
-                    f" position limits of {low} and {high}",
-                    where="drive group",
-                    why="once enabled it would run to its limit (607Dh)",
-                    next_step="set the drives up for where they stand, or reference them with"
-                    " `cdpr home RIG`; nothing was enabled",
-                    values={"node": node},
-                )
-
     def _reset_fault(self) -> None:
         """Clears the latch; a drive in fault is reset only when no other holds the platform."""
-        states = self._watch.states
-        names, restarted = self._rig.drive_names, sorted(self._watch.restarted)
-        if restarted:
-            raise Refused(
-                f"{names[restarted[0]]} restarted: its set-up and its position are lost",
-                where="drive group",
-                next_step="set the drives up again and check the reference (home) positions",
-            )
-        faulted = [n for n, s in zip(self._nodes, states, strict=True) if s in FAULTED]
-        if faulted and any(s in TORQUE_ON for s in states):
-            raise Refused(
-                f"{names[faulted[0]]} cannot be reset while other drives hold the platform",
-                where="drive group",
-                why="resetting one drive of a platform under tension moves it",
-                next_step="support the platform, press the emergency stop so that no drive holds,"
-                " release it, then reset the fault",
-            )
+        faulted = self._watch.require_resettable()
         self._cycles_to_goal = 0
         self._faults.clear()
         self._watch.forget_emergencies()

@@ -1,84 +1,140 @@
-"""Reading and writing objects of drives with canopen, without a thread.
+"""Reading and writing objects of drives by SDO, without a thread and without canopen's client.
 
-canopen waits for replies that a receiving thread of python-can hands over. That thread dies for
-good when the interface goes down, and it would share the bus with the cyclic loop, so here the
-caller of a request takes the frames off the bus itself.
+An answer counts for a request only when it names the same object and is of the same kind, so that
+one that comes late, twice or for another object is never taken for this one's. The caller of a
+request takes the frames off the bus itself: a receiving thread would share the bus with the cyclic
+loop, and dies for good when the interface goes down.
+
+Source: CiA 301, 7.2.4 (SDO protocols).
 """
 
 from __future__ import annotations
 
+import struct
 import time
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 
 import can
-import canopen
-from canopen.sdo.client import SdoClient
 
-from cdpr.errors import CdprError, Fault, HardwareMissing, Refused
-from drivers.bus import bus_name, hears_itself, take, transmit
-from drivers.bus_faults import ForeignMaster
-from drivers.cia402.frames import (
-    NMT_ID,
-    SDO_REPLY_BASE,
-    SDO_REQUEST_BASE,
-    NmtCommand,
-    make_nmt,
-)
-from drivers.cia402.master_ids import foreign_text, set_up_ids
-from drivers.cia402.texts import abort_text
+from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, take, transmit
+from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
+from drivers.cia402.cob_ids import foreign_text, set_up_ids
+from drivers.cia402.error_codes import abort_text
+from drivers.cia402.pdo import NMT_ID, SDO_REPLY_BASE, SDO_REQUEST_BASE, NmtCommand, make_nmt
 from drivers.drive_group import Pump
-from drivers.error_frames import error_frame_fault
-from drivers.own_frames import OwnFrames
-from drivers.set_up_refusals import SETTING_UP
+from model.errors import CdprError, Fault, HardwareMissing, Refused
 
-RESPONSE_TIMEOUT = 0.5
-"""For the answer to one request, [s]."""
+RESPONSE_TIMEOUT = 2.0
+"""For the answer to one request unless the drive's profile says otherwise, [s]."""
 
 ATTEMPTS = 2
-"""A first request may be lost while a drive starts up."""
+"""A request or its answer may be lost while a drive starts up."""
 
-T = TypeVar("T")
+CONTACT_REPEAT = 0.5
+"""After this time, [s], a drive that has not answered at first contact is asked again."""
 
 ECHO_WAIT = 0.05
 """A second device with the same node id answers within this time of the first, [s]."""
 
 OBJECT_DOES_NOT_EXIST = frozenset({0x06020000, 0x06090011})
+"""There is no such object; there is no such sub-index."""
+
+NOT_NOW = frozenset({0x08000020, 0x08000021, 0x08000022})
+"""The drive has the object, and does not transfer it in its present state."""
+
+Key = tuple[int, int, int]
+"""Kind of an answer, index and sub-index."""
+
+_UPLOAD, _DOWNLOAD, _SEGMENT = 0x40, 0x60, 0x00
+_ABORT = 0x80
+_KIND = 0xE0
+_HEAD = struct.Struct("<BHB")
+
+
+class _Aborted(Exception):
+    """The drive said no, with an abort code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"{code:08X}h")
+        self.code = code
+
+
+class _NoAnswer(Exception):
+    """Nothing came in time."""
 
 
 class SetupNetwork:
     """The bus during set-up: sends NMT and SDO frames and takes the replies."""
 
-    def __init__(self, bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> None:
-        """Takes an open bus, ``pump`` as for `drivers.drive_group.make_drive_group`, the drives."""
-        self._bus, self._pump = bus, pump
-        self._network = canopen.Network(bus)
-        self._clients: dict[int, _Client] = {}
-        self._own = OwnFrames(set_up_ids(nodes), hears_itself=hears_itself(bus))
+    def __init__(
+        self,
+        bus: can.BusABC,
+        pump: Pump | None,
+        nodes: Sequence[int],
+        *,
+        timeout: float = RESPONSE_TIMEOUT,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Takes an open bus and sends nothing yet.
 
-    def client(self, node: int) -> _Client:
+        Args:
+            bus: The bus.
+            pump: As for `drivers.factory.make_drive_group`.
+            nodes: The drives.
+            timeout: For the answer to one request, [s].
+            clock: Monotonic, [s].
+        """
+        self._bus, self._pump = bus, pump
+        self.timeout, self.clock = timeout, clock
+        self._clients: dict[int, Client] = {}
+        self._own = EchoFilter(set_up_ids(nodes), echoes_own_frames=echoes_own_frames(bus))
+
+    def client(self, node: int) -> Client:
         """The SDO client for a node."""
         if node not in self._clients:
-            client = _Client(node, self)
-            client.network = self._network
-            self._network.subscribe(SDO_REPLY_BASE + node, client.on_response)
-            self._clients[node] = client
+            self._clients[node] = Client(node, self)
         return self._clients[node]
 
     def command(self, command: NmtCommand, node: int) -> None:
         """Sends an NMT command to one node."""
-        data = make_nmt(command, node)
-        self.note_sent(NMT_ID)
-        transmit(self._bus, can.Message(arbitration_id=NMT_ID, data=data, is_extended_id=False))
+        self.send(NMT_ID, make_nmt(command, node))
 
-    def note_sent(self, can_id: int) -> None:
-        """A frame of this identifier goes out; it is not another master's when it comes back."""
+    def send(self, can_id: int, data: bytes) -> None:
+        """Sends a frame; it is not another master's when it comes back."""
         self._own.sent(can_id)
+        transmit(self._bus, can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def silent_nodes(self, nodes: Iterable[int]) -> list[int]:
+        """Asks all nodes for their device type (1000h) at once; those that do not answer.
+
+        A silent drive costs one time-out, however many of them there are.
+        """
+        clients = [self.client(node) for node in nodes]
+        for client in clients:
+            client.ask_device_type()
+        begin = self.clock()
+        self._await(clients, begin + min(CONTACT_REPEAT, self.timeout))
+        for client in clients:
+            if client.waits:
+                client.ask_device_type()
+        self._await(clients, begin + self.timeout)
+        waiting = [client for client in clients if client.waits]
+        for client in waiting:
+            client.give_up()
+        return [client.node for client in waiting]
+
+    def _await(self, clients: Sequence[Client], deadline: float) -> None:
+        """Takes answers until all have come, or it is that late."""
+        while any(client.waits for client in clients):
+            left = deadline - self.clock()
+            if left <= 0.0 or (not self.hand_over(left) and self._pump is not None):
+                return
 
     def nodes_answering_twice(self) -> list[int]:
         """Nodes from which more answers have come than requests went to them."""
-        deadline = time.monotonic() + ECHO_WAIT
-        while (left := deadline - time.monotonic()) > 0.0 and self.hand_over(left):
+        deadline = self.clock() + ECHO_WAIT
+        while (left := deadline - self.clock()) > 0.0 and self.hand_over(left):
             pass
         return [node for node, client in self._clients.items() if client.has_surplus]
 
@@ -109,8 +165,17 @@ class SetupNetwork:
             self._judge_error(message)
         elif not (message.is_remote_frame or message.is_extended_id):
             self._refuse_foreign(message.arbitration_id)
-            self._network.notify(message.arbitration_id, message.data, message.timestamp)
+            client = self._clients.get(message.arbitration_id - SDO_REPLY_BASE)
+            if client is not None:
+                client.take(bytes(message.data))
         return True
+
+    def wait(self, seconds: float) -> None:
+        """Lets time pass and takes what comes meanwhile; returns at once with drives of here."""
+        deadline = self.clock() + seconds
+        while (left := deadline - self.clock()) > 0.0:
+            if not self.hand_over(left) and self._pump is not None:
+                return
 
     def _judge_error(self, message: can.Message) -> None:
         where = bus_name(self._bus)
@@ -128,50 +193,59 @@ class SetupNetwork:
             )
 
 
-class _NoAnswer(canopen.SdoCommunicationError):
-    """Nothing came in time."""
-
-
-class _Client(SdoClient):
-    """canopen's SDO client, which takes its replies off the bus while it waits."""
+class Client:
+    """Asks one drive, one request at a time."""
 
     def __init__(self, node: int, network: SetupNetwork) -> None:
-        nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
-        super().__init__(  # type: ignore[no-untyped-call]
-            SDO_REQUEST_BASE + node, SDO_REPLY_BASE + node, nothing_known
-        )
+        """Takes the node and the bus that it is on."""
         self.node = node
-        self._setup = network
-        self._gave_up = False
+        self._network = network
+        self._wanted: Key | None = None
+        self._answer: bytes | None = None
+        self._asked: Counter[Key] = Counter()
+        self._answered: Counter[Key] = Counter()
+        self._strange = 0  # answers that no request ever asked for
+
+    @property
+    def waits(self) -> bool:
+        """A request is out and its answer has not come."""
+        return self._wanted is not None and self._answer is None
 
     @property
     def has_surplus(self) -> bool:
-        """Whether an answer waits that no request asked for; a late one does not count."""
-        return not (self._gave_up or self.responses.empty())
+        """A request was answered more often than it was sent: two devices have this node id."""
+        return any(self._answered[key] > times for key, times in self._asked.items())
 
-    def send_request(self, request: bytes) -> None:
-        """Puts a request on the bus."""
-        self._setup.note_sent(SDO_REQUEST_BASE + self.node)
-        super().send_request(request)  # type: ignore[no-untyped-call]
+    def no_answer(self, where: str) -> CdprError:
+        """Why a request stays without its answer: silence, or answers to other questions."""
+        if not self._strange:
+            return silent(self.node, where)
+        return Refused(
+            f"drive {self.node} answers something else than it was asked",
+            where=where,
+            why="two devices have this node id, or another program talks to the drive",
+            next_step="give every device on the bus its own node id; end other programs",
+            values={"node": self.node},
+        )
 
-    def request_response(self, sdo_request: bytes) -> bytes:
-        """Sends one request and returns the reply.
+    def take(self, data: bytes) -> None:
+        """Takes in a frame of the drive; one that answers no open request is thrown away."""
+        if len(data) != 8:
+            return
+        command, index, sub = _HEAD.unpack_from(data)
+        known = [key for key in self._asked if _answers(key, command, index, sub)]
+        self._answered.update(known)
+        self._strange += not known
+        if self.waits and self._wanted is not None and _answers(self._wanted, command, index, sub):
+            self._answer = data
 
-        Raises:
-            canopen.SdoAbortedError: The drive said no.
-            canopen.SdoCommunicationError: It did not answer.
-        """
-        while not self.responses.empty():  # replies to requests given up before
-            self.responses.get_nowait()
-        self.send_request(sdo_request)
-        deadline = time.monotonic() + RESPONSE_TIMEOUT
-        while self.responses.empty():
-            left = deadline - time.monotonic()
-            if left <= 0.0 or not self._setup.hand_over(left):
-                self._gave_up = True
-                raise _NoAnswer("no answer")
-        reply: bytes = self.read_response()  # type: ignore[no-untyped-call]
-        return reply
+    def ask_device_type(self) -> None:
+        """Sends the request of first contact; `waits` says whether it was answered."""
+        self._ask(_upload(0x1000, 0), (_UPLOAD, 0x1000, 0))
+
+    def give_up(self) -> None:
+        """The answer to the open request is not waited for any longer; it may still come."""
+        self._wanted = None
 
     def read(self, index: int, sub: int, name: str) -> bytes:
         """Reads an object.
@@ -180,7 +254,7 @@ class _Client(SdoClient):
             HardwareMissing: The drive does not answer.
             Refused: It will not read the object.
         """
-        return self._attempt(lambda: self.upload(index, sub), f"{index:04X}h:{sub:02X} {name}")
+        return self._attempt(lambda: self._read(index, sub), f"{index:04X}h:{sub:02X} {name}")
 
     def read_if_there(self, index: int, sub: int, name: str) -> bytes | None:
         """Reads an object that not every drive has; None where it has not.
@@ -197,31 +271,75 @@ class _Client(SdoClient):
             raise
 
     def write(self, index: int, sub: int, data: bytes, name: str) -> None:
-        """Writes an object.
+        """Writes an object of one to four bytes.
 
         Raises:
             HardwareMissing: The drive does not answer.
             Refused: It will not take the value.
         """
         place = f"{index:04X}h:{sub:02X} {name}"
-        self._attempt(lambda: self.download(index, sub, data), place)
+        request = _HEAD.pack(0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
+        self._attempt(lambda: self._exchange(request, (_DOWNLOAD, index, sub)), place)
 
-    def _attempt(self, transfer: Callable[[], T], place: str) -> T:
-        """Runs a transfer; the library's errors become ours, with node and object."""
+    def _read(self, index: int, sub: int) -> bytes:
+        reply = self._exchange(_upload(index, sub), (_UPLOAD, index, sub))
+        command = reply[0]
+        if command & 0x02:  # expedited: the data are in this frame
+            return reply[4 : 8 - (command >> 2 & 0x03)] if command & 0x01 else reply[4:]
+        return self._read_segments(index, sub)
+
+    def _read_segments(self, index: int, sub: int) -> bytes:
+        """The other legal answer: the data follow in segments of up to seven bytes."""
+        data, toggle = b"", 0
+        while True:
+            request = bytes((0x60 | toggle,)) + bytes(7)
+            reply = self._exchange(request, (_SEGMENT | toggle, index, sub))
+            data += reply[1 : 8 - (reply[0] >> 1 & 0x07)]
+            if reply[0] & 0x01:
+                return data
+            toggle ^= 0x10
+
+    def _ask(self, request: bytes, wanted: Key) -> None:
+        self._wanted, self._answer = wanted, None
+        self._asked[wanted] += 1
+        self._network.send(SDO_REQUEST_BASE + self.node, request)
+
+    def _exchange(self, request: bytes, wanted: Key) -> bytes:
+        """Sends one request and returns its answer.
+
+        Raises:
+            _Aborted: The drive said no.
+            _NoAnswer: It did not answer in time.
+        """
+        self._ask(request, wanted)
+        deadline = self._network.clock() + self._network.timeout
+        while self._answer is None:
+            left = deadline - self._network.clock()
+            if left <= 0.0 or not self._network.hand_over(left):
+                self.give_up()
+                raise _NoAnswer
+        answer, self._wanted, self._answer = self._answer, None, None
+        if answer[0] == _ABORT:
+            raise _Aborted(int.from_bytes(answer[4:], "little"))
+        return answer
+
+    def _attempt(self, transfer: Callable[[], bytes], place: str) -> bytes:
+        """Runs a transfer; what goes wrong is told with node and object."""
         where = f"drive {self.node}, object {place}"
         for attempt in range(1, ATTEMPTS + 1):
             try:
                 return transfer()
-            except canopen.SdoAbortedError as error:
+            except _Aborted as error:
                 raise Refused(
                     f"the drive refused: {abort_text(error.code)}",
                     where=where,
-                    next_step="compare the object with the drive's manual and its EDS file",
+                    next_step="compare the object with the drive's manual and its EDS file;"
+                    " `cdpr doctor RIG --drives` lists all objects of all drives",
                     values={"node": self.node, "object": place, "abort_code": error.code},
-                ) from error
-            except canopen.SdoCommunicationError as error:
+                ) from None
+            except _NoAnswer:
                 if attempt == ATTEMPTS:
-                    raise _no_sense(self.node, where, error) from error
+                    raise self.no_answer(where) from None
             except can.CanError as error:
                 raise Fault(
                     f"the bus did not take a frame: {error}",
@@ -231,16 +349,25 @@ class _Client(SdoClient):
         raise AssertionError("the last attempt either returned or raised")
 
 
-def _no_sense(node: int, where: str, error: canopen.SdoCommunicationError) -> CdprError:
-    """No answer, or one to another question."""
-    if not isinstance(error, _NoAnswer):
-        return Refused(
-            f"drive {node} answers something else than it was asked: {error}",
-            where=where,
-            why="two devices have this node id, or another program talks to the drive",
-            next_step="give every device on the bus its own node id; end other programs",
-            values={"node": node},
-        )
+def _upload(index: int, sub: int) -> bytes:
+    return _HEAD.pack(0x40, index, sub) + bytes(4)
+
+
+def _answers(wanted: Key, command: int, index: int, sub: int) -> bool:
+    """Whether a frame is an answer of the kind and to the object that are waited for.
+
+    A segment names no object; its toggle bit tells it from the one before.
+    """
+    kind, wanted_index, wanted_sub = wanted
+    if command == _ABORT:
+        return (index, sub) == (wanted_index, wanted_sub)
+    if kind in (_SEGMENT, _SEGMENT | 0x10):
+        return command & (_KIND | 0x10) == kind
+    return command & _KIND == kind and (index, sub) == (wanted_index, wanted_sub)
+
+
+def silent(node: int, where: str) -> HardwareMissing:
+    """A drive does not answer."""
     return HardwareMissing(
         f"drive {node} does not answer",
         where=where,

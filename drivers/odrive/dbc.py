@@ -11,9 +11,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from cdpr.errors import BadInput
+from model.errors import BadInput
+from model.files.reading import MEGABYTE, read_bytes
 
 OWN_DBC = Path(__file__).with_name("cansimple.dbc")
+
+DBC_LIMIT = 2 * MEGABYTE
+"""Of a file, [bytes]; ODrive's own has a twentieth of it."""
 
 #: What is needed of each message, in the order of its bytes.
 NEEDED: dict[str, tuple[str, ...]] = {
@@ -114,10 +118,22 @@ def _database(path: Path) -> Any:
             where="drives.type: odrive",
             next_step="pip install 'cdpr[odrive]'",
         ) from error
+    # As cantools itself reads it: DBC files are of code page 1252.
+    text = read_bytes(path, DBC_LIMIT).decode("cp1252", errors="replace")
     try:
         # Not strict: in ODrive's own file some signals have more bits than the message.
-        return cantools.database.load_file(path, database_format="dbc", strict=False)
-    except (OSError, UnicodeError, cantools.database.errors.Error) as error:
+        return cantools.database.load_string(text, database_format="dbc", strict=False)
+    except RecursionError as error:
+        raise _unfit(path, "it is nested too deeply") from error
+    # What of a damaged file cantools does not foresee comes as it stumbles over it.
+    except (
+        cantools.database.errors.Error,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise BadInput(
             f"the DBC file cannot be read: {error}",
             where=str(path),
@@ -140,10 +156,22 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
         if size is None or odd or gap < 0 or signal.byte_order != "little_endian":
             raise _unfit(path, f"{name}.{signal.name} is no number of whole bytes in order")
         codes += f"{gap}x{size}"
-        scales.append(None if signal.conversion.scale == 1 else float(signal.conversion.scale))
+        scales.append(_scale(signal.conversion.scale, f"{name}.{signal.name}", path))
         end = signal.start + signal.length
+    if not end <= message.length * 8 <= 64:
+        raise _unfit(
+            path,
+            f"{name} has {message.length} bytes; its signals need {end // 8}, and 8 is the most",
+        )
     form = struct.Struct(f"{codes}{message.length - end // 8}x")
     return Layout(name, message.frame_id, form, tuple(scales))
+
+
+def _scale(given: float, name: str, path: Path) -> float | None:
+    """Value of one step of a signal; None where it is not scaled."""
+    if not 1e-9 <= abs(given) <= 1e9:
+        raise _unfit(path, f"{name} has steps of {str(given)[:40]}")
+    return None if given == 1 else float(given)
 
 
 def _unfit(path: Path, what: str) -> BadInput:

@@ -6,15 +6,16 @@ type behind each name of the API reference.
 
 from __future__ import annotations
 
-import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from cdpr.documents import read_text
-from cdpr.drives_file import OdriveDocument
-from cdpr.errors import BadInput
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from model.errors import BadInput
+from model.files.reading import read_json
+from model.files.rig_file import OdriveDocument
 
 _FORMS = {
     "bool": "<?",
@@ -26,6 +27,30 @@ _FORMS = {
     "int32": "<i",
     "float": "<f",
 }
+
+
+_OTHER_FILE = (
+    "take flat_endpoints.json of the drives' firmware and board from ODrive, or leave"
+    " drives.endpoints out"
+)
+
+
+class _EndpointEntry(BaseModel):
+    """One entry of the file; only those that are needed are read."""
+
+    model_config = ConfigDict(strict=True)
+
+    id: Annotated[int, Field(ge=0, le=0xFFFF)]
+    type: str
+
+
+class _EndpointsFile(BaseModel):
+    """What of ODrive's file is read; the rest of it is ODrive's own."""
+
+    model_config = ConfigDict(strict=True)
+
+    fw_version: Annotated[str, Field(max_length=100)]
+    endpoints: dict[str, object]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,22 +135,24 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
         BadInput: The file cannot be read, is no such file, or has no endpoint of a name that is
             needed.
     """
-    text = read_text(path)
+    content = read_json(path, _OTHER_FILE)
     try:
-        content: dict[str, Any] = json.loads(text)
-        firmware = str(content["fw_version"]).partition("-")[0].split(".")
-        major, minor, revision = (int(part) for part in firmware)
-        found = {w.name: _endpoint(w.name, content) for w in wanted_settings(document)}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        file = _EndpointsFile.model_validate(content)
+        major, minor, revision = map(int, file.fw_version.partition("-")[0].split("."))
+        found = {w.name: _endpoint(w.name, file) for w in wanted_settings(document)}
+    except (ValidationError, ValueError, KeyError) as error:
+        why = f"{error!r}"
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False)[0]
+            why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise BadInput(
-            f"these are not the endpoints that are needed: {error!r}",
+            f"these are not the endpoints that are needed: {why}",
             where=str(path),
-            next_step="take flat_endpoints.json of the drives' firmware and board from ODrive, or"
-            " leave drives.endpoints out",
+            next_step=_OTHER_FILE,
         ) from error
     return Endpoints((major, minor, revision), found)
 
 
-def _endpoint(name: str, content: dict[str, Any]) -> Endpoint:
-    entry = content["endpoints"][name]
-    return Endpoint(name, int(entry["id"]), _FORMS[entry["type"]])
+def _endpoint(name: str, file: _EndpointsFile) -> Endpoint:
+    entry = _EndpointEntry.model_validate(file.endpoints[name])
+    return Endpoint(name, entry.id, _FORMS[entry.type])

@@ -9,20 +9,16 @@ watchdogs disarm them: they were fed by the same batch of frames and run out tog
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum, auto
 from pathlib import Path
 
 import can
 import numpy as np
 
-from cdpr.drives_file import OdriveDocument
-from cdpr.errors import HardwareMissing, Refused
-from cdpr.rig import Rig
-from drivers.bus import hears_itself
-from drivers.bus_load import TESTED_HZ, check_bus_load
-from drivers.cyclic_bus import CyclicBus
-from drivers.cyclic_group import CyclicGroup
+from drivers.can_bus import EchoFilter, echoes_own_frames
+from drivers.can_load import TESTED_HZ, check_bus_load
+from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
     Capabilities,
     Counts,
@@ -30,17 +26,17 @@ from drivers.drive_group import (
     GroupCommand,
     GroupState,
     OnRestarted,
+    Pace,
     Pump,
 )
-from drivers.odrive.configure import configure_drives
+from drivers.odrive.configure import commanding_ids, configure_drives, foreign_text
 from drivers.odrive.dbc import OWN_DBC, read_layouts
-from drivers.odrive.frames import OdriveFrames
-from drivers.odrive.link import commanding_ids, foreign_text
-from drivers.odrive.messages import RESULT_TEXTS, AxisState, state_text
-from drivers.odrive.watch import OdriveWatch
-from drivers.own_frames import OwnFrames
-from drivers.reply_check import largest_steps
-from drivers.torque import winding_signs
+from drivers.odrive.messages import RESULT_TEXTS, AxisState, OdriveFrames, state_text
+from drivers.odrive.monitor import OdriveWatch
+from drivers.plausibility import largest_steps, winding_signs
+from model.errors import HardwareMissing, Refused
+from model.files.rig_file import OdriveDocument
+from model.rig import Rig
 
 STEP_TIMEOUT = 1.0
 """For enabling and for disarming, [s]: a brake takes a few tenths, and heartbeats are slow."""
@@ -88,7 +84,7 @@ class OdriveGroup(CyclicGroup):
 
     def _reset_memory(self) -> None:
         ids = commanding_ids(self._layouts, self._nodes)
-        own = OwnFrames(ids, hears_itself=hears_itself(self._bus))
+        own = EchoFilter(ids, echoes_own_frames=echoes_own_frames(self._bus))
         self._cyclic = CyclicBus(self._bus, own, foreign_text)
         self._watch = OdriveWatch(self._rig, self._document, self._layouts, self._max_steps)
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
@@ -109,6 +105,8 @@ class OdriveGroup(CyclicGroup):
             has_brake=all(winch.brake for winch in self._rig.winches),
             max_hz=TESTED_HZ,
             watchdog_ms=self._document.watchdog_ms,
+            sync_timeout=None,
+            master_timeout=0.0,
         )
 
     @property
@@ -151,8 +149,11 @@ class OdriveGroup(CyclicGroup):
         self._state = GroupState.CONFIGURED
         return remarks
 
-    def read_positions(self) -> CycleStatus:
-        """Listens until every drive has told position and state; see `DriveGroup`."""
+    def read_positions(self, pace: Pace | None = None) -> CycleStatus:
+        """Listens until every drive has told position and state; see `DriveGroup`.
+
+        Its drives report by themselves, so that nothing is sent and no pace is kept.
+        """
         self._online()
         self._cyclic.forget_waiting()
         self._watch.forget_positions()
@@ -176,8 +177,14 @@ class OdriveGroup(CyclicGroup):
             values={"nodes": names},
         )
 
-    def send_cycle(self, targets: Sequence[int]) -> None:
-        """Sends one cycle; see `DriveGroup.send_cycle`."""
+    def send_cycle(
+        self, targets: Sequence[int], may_enable: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Sends one cycle; see `DriveGroup.send_cycle`.
+
+        A set-point arms no axis that disarmed itself, so that `may_enable` decides nothing here.
+        """
+        may_enable()
         self._online()
         self._discard_stale()
         self._watch.begin_cycle()
@@ -205,18 +212,30 @@ class OdriveGroup(CyclicGroup):
             self._begin_enabling()
         elif command is GroupCommand.RESET_FAULT:
             self._reset_fault()
-        else:
+        elif command is not GroupCommand.END_MONITORING:  # axes that are idle watch nobody
             if command is GroupCommand.RELEASE:
-                self._refuse_latched("release the drives")
+                self.require_releasable()
             # Every stop of ODrives ends with closed brakes and without torque.
             self._begin_stop(GroupState.QUICK_STOP)
             self._releasing = command is GroupCommand.RELEASE
+
+    def require_releasable(self) -> None:
+        """Unless a fault is latched; see `DriveGroup.require_releasable`."""
+        self._refuse_latched("release the drives")
 
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
         self._begin_stop(GroupState.QUICK_STOP)
         if self._stop is _Stop.HOLDING:
             self._cyclic.send(self._frames.set_points(self._last(), self._last()))
+
+    def is_monitored(self, *, silent_too: bool) -> bool:
+        """Never at rest: only an armed axis has a watchdog; see `DriveGroup.is_monitored`."""
+        return False
+
+    def look(self, pace: Pace) -> CycleStatus:
+        """Listens once more; see `DriveGroup.look`."""
+        return self.read_positions(pace)
 
     def _last(self) -> list[int]:
         return self._recent[-1] if self._recent else list(self._watch.positions)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cdpr.documents import write_atomic
-from executor.run_folder import RunFolder
+from executor.recording.run_folder import RunFolder
+from model.files.documents import write_atomic
 
 
 def build_report(folder: RunFolder) -> Path:

@@ -2,61 +2,59 @@
 
 from __future__ import annotations
 
-import json
 from html import escape
-from importlib.resources import files
-from string import Template
 
-from executor.report.clearance_figure import clearance_figure
-from executor.report.drive_figures import length_figure, tension_figure, timing_figure
-from executor.report.frames import frames
-from executor.report.markup import chart, paragraph, section
-from executor.report.position_figure import position_figure
+from executor.report.figures import (
+    clearance_figure,
+    length_figure,
+    position_figure,
+    tension_figure,
+    timing_figure,
+)
 from executor.report.run_data import RunData
-from executor.report.scene_picture import AZIMUTH, ELEVATION, scene_picture
-from executor.report.scene_view import SceneView, scene_view, viewer_data
-from executor.report.tables import camera_table, event_table, facts, stop_table
-from executor.report.tiles import chips, key_figures, verdict_banner
+from executor.report.scene import RunScene, run_scene, scene_viewer
+from executor.report.tiles import (
+    camera_table,
+    chips,
+    event_table,
+    facts,
+    fault_texts,
+    frames,
+    key_figures,
+    stop_table,
+    verdict_banner,
+)
+from model.pages.page import contents, paragraph, section
+from model.pages.page import page as html_page
+from model.pages.scene import scene_data
 
-#: Layer, its name on the page, the colour's role, whether it is shown at first.
-_LAYERS = (
-    ("obstacles", "Obstacles", "obstacle", True),
-    ("robot", "Platform and cables", "platform", True),
-    ("frame", "Frame of outlets", "frame", True),
-    ("workspace", "Workspace", "muted", True),
-    ("tree", "Search tree", "tree", True),
-    ("raw", "Raw path", "raw", True),
-    ("path", "Final path", "ink", True),
-    ("driven", "Driven path", "encoder", True),
-    ("seen", "Seen by the camera", "tag", True),
+_HINT = (
+    "Charts: point or tap for values; drag, pinch or turn the wheel with Ctrl to zoom in time;"
+    " double-click to see all again."
 )
 Section = tuple[str, str, str]
 
 
 def page(run: RunData) -> str:
     """The whole page."""
-    view = scene_view(run)
+    view = run_scene(run)
     sections = [part for part in _sections(run, view) if part[2]]
     title = f"Run of {run.plan.scene.name} on {run.rig.name}"
-    links = "".join(f'<li><a href="#{name}">{escape(text)}</a></li>' for name, text, _ in sections)
-    return Template(_read("page.template")).substitute(
-        title=escape(title),
-        style=_read("page.css"),
-        chips=chips(run.summary),
-        contents=f"<ul>{links}</ul>",
-        verdict=verdict_banner(run.summary),
-        tiles=key_figures(run.summary),
-        sections="".join(section(name, text, body) for name, text, body in sections),
-        footer=escape(_footer(run)),
-        script=_script(run, view),
+    parts = [verdict_banner(run.summary), key_figures(run.summary), paragraph(_HINT, "hint")]
+    parts += [section(name, text, body) for name, text, body in sections]
+    parts.append(f"<footer>{escape(_footer(run))}</footer>")
+    lead = chips(run.summary) + contents((name, text) for name, text, _ in sections)
+    scripts = ("charts.js", "viewer.js")
+    return html_page(
+        title,
+        "\n".join(parts),
+        lead=lead,
+        scripts=scripts,
+        data={"scene-data": scene_data(view.scene)},
     )
 
 
-def _read(name: str) -> str:
-    return files("executor.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _sections(run: RunData, view: SceneView) -> list[Section]:
+def _sections(run: RunData, view: RunScene) -> list[Section]:
     moved = len(run.cycles) > 1
     return [
         ("scene", "Scene and path", _scene(run, view)),
@@ -68,29 +66,15 @@ def _sections(run: RunData, view: SceneView) -> list[Section]:
         ("timing", "Following and timing", _timing(run) if moved else ""),
         ("facts", "Plan, rig and bus", facts(run)),
         ("events", "Events", event_table(run)),
+        ("faults", "About the faults", fault_texts(run)),
     ]
 
 
-def _scene(run: RunData, view: SceneView) -> str:
-    present = {"tree": len(view.tree), "seen": len(view.seen), "obstacles": len(view.obstacles)}
-    layers = "".join(
-        f'<label><input type="checkbox" data-layer="{layer}"{" checked" if on else ""}>'
-        f'<span class="swatch" style="color:var(--{role})"></span>{name}</label>'
-        for layer, name, role, on in _LAYERS
-        if present.get(layer, 1)
-    )
+def _scene(run: RunData, view: RunScene) -> str:
     text = ""
-    if view.all_branches > len(view.tree):
-        text = paragraph(f"{len(view.tree)} of {view.all_branches} branches of the tree are drawn.")
-    names = ", ".join(name for name, _ in view.obstacles) or "none"
-    return text + Template(_read("scene.template")).substitute(
-        label=escape(
-            f"The robot, the obstacles ({names}), the search tree and the paths.", quote=True
-        ),
-        layers=layers,
-        last=max(len(view.moments) - 1, 0),
-        still=scene_picture(run, view),
-    )
+    if view.all_branches > view.branches:
+        text = paragraph(f"{view.branches} of {view.all_branches} branches of the tree are drawn.")
+    return text + scene_viewer(run, view)
 
 
 def _clearance(run: RunData) -> str:
@@ -100,25 +84,25 @@ def _clearance(run: RunData) -> str:
         "Distances between surfaces. The true one lies in the shaded band, as the measurement"
         " itself states; planned is the pose that was commanded at the same time."
     )
-    return paragraph(text) + chart(clearance_figure(run))
+    return paragraph(text) + clearance_figure(run)
 
 
 def _position(run: RunData) -> str:
     text = "Drives: the pose that fits the drives' actual positions. Camera: the pose of the tags."
     if run.alone:
         text += " Together: all cameras, each by its weight; the others are each camera's own pose."
-    return paragraph(text) + chart(position_figure(run)) + camera_table(run)
+    return paragraph(text) + position_figure(run) + camera_table(run)
 
 
 def _cables(run: RunData) -> str:
     upper = run.rig.max_tension
-    note = f"The upper limit is {upper:g} N; it is drawn only where the picture reaches so far."
+    note = f"The upper limit is {upper:g} N; it is drawn only where tensions come near it."
     return (
         "<h3>Lengths</h3>"
-        + chart(length_figure(run))
+        + length_figure(run)
         + "<h3>Tensions</h3>"
         + paragraph(note)
-        + chart(tension_figure(run))
+        + tension_figure(run)
     )
 
 
@@ -129,19 +113,10 @@ def _timing(run: RunData) -> str:
             "Simulated time: a cycle follows the one before as soon as it is computed, so lateness"
             " has no meaning here. A run in real time shows it."
         )
-    return note + chart(timing_figure(run))
+    return note + timing_figure(run)
 
 
 def _footer(run: RunData) -> str:
     version = run.summary["versions"].get("cdpr")
     maker = f"cdpr {version}" if version else "cdpr"
     return f"Made by {maker} from the files of the run folder; times count from its start."
-
-
-def _script(run: RunData, view: SceneView) -> str:
-    data = {**viewer_data(run, view), "view": {"azimuth": AZIMUTH, "elevation": ELEVATION}}
-    text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    return (
-        f'<script type="application/json" id="scene-data">{text}</script>'
-        f"<script>{_read('viewer.js')}</script>"
-    )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
-from cdpr.plan import Plan
-from cdpr.rig import Rig
-from executor.clearance_table import ClearanceTable
-from executor.cycle_table import CycleTable
-from executor.pose_table import PoseTable
-from executor.run_folder import RunEvent, RunFolder
+from executor.recording.clearance import ClearanceTable
+from executor.recording.record_files import AGAIN
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.tables import CycleTable, PoseTable
+from model.errors import BadInput
+from model.pages.page import prose
+from model.plan import Plan
+from model.rig import Rig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +42,7 @@ def read_run(folder: RunFolder) -> RunData:
     Raises:
         BadInput: A file of it is missing or was changed.
     """
-    return RunData(
+    run = RunData(
         folder=folder,
         plan=folder.plan(),
         rig=folder.rig(),
@@ -50,3 +53,35 @@ def read_run(folder: RunFolder) -> RunData:
         summary=folder.summary(),
         events=tuple(folder.events()),
     )
+    _require_agreement(run)
+    return run
+
+
+def _require_agreement(run: RunData) -> None:
+    """The files are of one run: the same stops, and as many cables."""
+    stops = [stop.name for stop in run.plan.scene.stops]
+    said = [stop["name"] for stop in run.summary["stops"]]
+    cables = len(run.rig.winches)
+    if said != stops:
+        what = f"summary.json has the stops {said}, plan.json {stops}"
+    elif run.cycles.tensions.shape[1] != cables:
+        what = f"cycles.csv is of {run.cycles.tensions.shape[1]} cables, rig.json of {cables}"
+    else:
+        return
+    raise BadInput(
+        what, where=str(run.folder.path), why="files of several runs were mixed", next_step=AGAIN
+    )
+
+
+# The little Markdown of the pages about faults.
+
+
+def markdown(text: str) -> str:
+    """The little Markdown of the pages about faults: headings, paragraphs, code and emphasis."""
+    parts = []
+    for block in filter(None, map(str.strip, text.split("\n\n"))):
+        kind, content = ("h3", block[3:]) if block.startswith("## ") else ("p", block)
+        content = re.sub(r"`([^`]+)`", r"<code>\1</code>", prose(" ".join(content.split())))
+        content = re.sub(r"\*([^*]+)\*", r"<em>\1</em>", content)
+        parts.append(f"<{kind}>{content}</{kind}>")
+    return "".join(parts)

@@ -75,17 +75,17 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class GateDecision:
     """Whether set-points may be sent, and why not."""
 
     allowed: bool
     reason: str = ""
 
 
-ALLOWED = Verdict(True)
+ALLOWED = GateDecision(True)
 
 
-def examine(limits: Limits, request: Request) -> Verdict:
+def examine(limits: Limits, request: Request) -> GateDecision:
     """Allows or denies one cycle's set-points."""
     count = len(limits.lowest)
     known = {"targets": request.targets, "actual positions": request.actual}
@@ -93,43 +93,43 @@ def examine(limits: Limits, request: Request) -> Verdict:
         known["previous targets"] = request.previous
     for name, positions in known.items():
         if len(positions) != count:
-            return Verdict(False, f"{len(positions)} {name} for {count} drives")
+            return GateDecision(False, f"{len(positions)} {name} for {count} drives")
         if not _whole(positions):
-            return Verdict(False, f"{name} that are not all whole numbers")
+            return GateDecision(False, f"{name} that are not all whole numbers")
     if request.purpose is Purpose.HOLD:
         return _hold(limits, request)
     if request.purpose is Purpose.MOVE:
         return _move(limits, request)
-    return Verdict(False, "unknown purpose")
+    return GateDecision(False, "unknown purpose")
 
 
-def _hold(limits: Limits, request: Request) -> Verdict:
+def _hold(limits: Limits, request: Request) -> GateDecision:
     if request.previous is not None and tuple(request.targets) == tuple(request.previous):
         return ALLOWED
     if request.enabled is not False:
-        return Verdict(False, "a hold would change the targets of drives that follow them")
+        return GateDecision(False, "a hold would change the targets of drives that follow them")
     return _near_actual(limits, request)
 
 
-def _move(limits: Limits, request: Request) -> Verdict:
+def _move(limits: Limits, request: Request) -> GateDecision:
     if request.latched is not False:
-        return Verdict(False, "a fault is latched")
+        return GateDecision(False, "a fault is latched")
     if request.armed is not True:
-        return Verdict(False, "not armed")
+        return GateDecision(False, "not armed")
     if request.enabled is not True:
-        return Verdict(False, "not all drives are enabled")
+        return GateDecision(False, "not all drives are enabled")
     if request.previous is None:
-        return Verdict(False, "no targets were sent before")
+        return GateDecision(False, "no targets were sent before")
     for drive, target in enumerate(request.targets):
         if not limits.lowest[drive] <= target <= limits.highest[drive]:
-            return Verdict(
+            return GateDecision(
                 False,
                 f"cable {drive + 1}: target {target} outside"
                 f" [{limits.lowest[drive]}, {limits.highest[drive]}] counts",
             )
         step = abs(target - request.previous[drive])
         if step > limits.largest_step[drive]:
-            return Verdict(
+            return GateDecision(
                 False,
                 f"cable {drive + 1}: step of {step} counts, allowed {limits.largest_step[drive]}",
             )
@@ -141,11 +141,11 @@ def _whole(values: Sequence[int]) -> bool:
     return all(type(value) is int for value in values)
 
 
-def _near_actual(limits: Limits, request: Request) -> Verdict:
+def _near_actual(limits: Limits, request: Request) -> GateDecision:
     for drive, target in enumerate(request.targets):
         lag = abs(target - request.actual[drive])
         if lag > limits.largest_lag[drive]:
-            return Verdict(
+            return GateDecision(
                 False,
                 f"cable {drive + 1}: target {lag} counts from the actual position,"
                 f" allowed {limits.largest_lag[drive]}",

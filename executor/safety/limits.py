@@ -7,18 +7,22 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cdpr.rig import Rig
 from executor.safety.gate import Limits
-from executor.safety.watch import WatchLimits
+from executor.safety.monitor import WatchLimits
+from executor.safety.stall import StuckLimits
+from executor.safety.sync_age import SyncAge
+from model.rig import Rig
 
 #: A cable is slack below this share of the least planned tension. Plans run at the least tension
 #: itself (in 6 % of the paper rig's box), and a whole count is worth 1.7 N there: not yet slack.
 SLACK_SHARE = 0.5
 #: Below this share of it a cable carries nothing: it is torn, or hangs loose.
 LOOSE_SHARE = 0.1
-#: Steps of set-points below this share of the largest following error say nothing about a drive
-#: that stands still: it may rest on its own friction.
-LEAST_STEP_SHARE = 0.01
+#: Set-points are whole counts and so are positions: both together are noise of one count, and a
+#: drive is judged over 8/3 of the noise at least. See `executor.safety.stall`.
+LEAST_TRAVEL = 3
+#: A step of one count may be rounding alone, [counts].
+LEAST_STEP = 2
 #: Above this share of the largest planned tension a cable is overloaded; torque is read in ‰.
 OVERLOAD_SHARE = 1.02
 
@@ -28,11 +32,12 @@ def tension_limits(rig: Rig) -> tuple[float, float]:
     return SLACK_SHARE * rig.min_tension, OVERLOAD_SHARE * rig.max_tension
 
 
-def watch_limits(rig: Rig, *, slack_counts: bool = True) -> WatchLimits:
+def watch_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) -> WatchLimits:
     """When the watch speaks up.
 
     Args:
         rig: The robot.
+        sync_age: How old the last SYNC may be.
         slack_counts: A cable that hangs slack is wrong; otherwise only one whose tension is no
             number.
     """
@@ -42,13 +47,25 @@ def watch_limits(rig: Rig, *, slack_counts: bool = True) -> WatchLimits:
         min_tension=low if slack_counts else -math.inf,
         max_tension=high,
         no_tension=LOOSE_SHARE * rig.min_tension if slack_counts else -math.inf,
+        gone_periods=sync_age.limit - 1.0,
     )
 
 
-def least_steps(rig: Rig) -> tuple[int, ...]:
-    """Steps of set-points that a drive must follow at once, one a drive, [counts]."""
-    least = LEAST_STEP_SHARE * rig.motion.following_error
-    return tuple(max(2, math.ceil(least * abs(w.counts_per_metre))) for w in rig.winches)
+def stuck_limits(rig: Rig, cycle: float) -> tuple[StuckLimits, ...]:
+    """When a drive stands still, from the rig file's motion; one a drive.
+
+    Args:
+        rig: The robot.
+        cycle: [s].
+    """
+    step, travel = rig.motion.stuck_speed * cycle, rig.motion.stuck_travel
+    return tuple(
+        StuckLimits(
+            least=max(LEAST_STEP, math.ceil(step * abs(winch.counts_per_metre))),
+            travel=max(LEAST_TRAVEL, math.ceil(travel * abs(winch.counts_per_metre))),
+        )
+        for winch in rig.winches
+    )
 
 
 def gate_limits(rig: Rig, setpoints: NDArray[np.int32], cycle: float) -> Limits:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from planner.campaign.boxes import OWN, WIDE
-from planner.campaign.results import Results
-from planner.campaign.statistics import Change
+from planner.campaign.cases import OWN, WIDE
+from planner.campaign.results import Change, Results
 from planner.campaign.studies import (
     BOTH_REJECT,
     ENDS,

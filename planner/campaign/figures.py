@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cdpr.poses import Array
-from planner.campaign.boxes import OWN, SHARES, WIDE
+from model.pose import Array
+from planner.campaign.cases import OWN, SHARES, WIDE
 from planner.campaign.claims import NODES
-from planner.campaign.results import Results
-from planner.campaign.statistics import summary
+from planner.campaign.results import Results, summary
 from planner.campaign.studies import (
     BOXES,
     COMPARISONS,

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
-from planner.campaign.boxes import OWN, SHARES, WIDE
+from model.pages.page import list_table, picture, section, table
+from model.pages.page import page as html_page
+from planner.campaign.cases import OWN, SHARES, WIDE
 from planner.campaign.claims import PLACES, findings
-from planner.campaign.results import COUNTED, MEASURED, Results
-from planner.campaign.statistics import Change, summary
+from planner.campaign.results import COUNTED, MEASURED, Change, Results, summary
 from planner.campaign.studies import (
     BOXES,
     COMPARISONS,
@@ -36,58 +36,39 @@ _QUANTITIES = {
     "cost": "kinematic cost",
     "clearance_mm": "true smallest clearance [mm]",
 }
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 80rem; margin: 2rem auto; padding: 0 1rem;
-  color: #20242b; background: #fff; }
-table { border-collapse: collapse; margin: 1rem 0; font-size: 13px; }
-th, td { padding: .25rem .7rem; border-bottom: 1px solid #dde1e7; text-align: left; }
-td + td { font-variant-numeric: tabular-nums; }
-p { max-width: 62rem; }
-img { max-width: 100%; }
-th { vertical-align: bottom; }
-.wide { overflow-x: auto; }
-.figures { font-size: 12px; }
-.figures th, .figures td { padding: .2rem .5rem; }
-.figures td { white-space: nowrap; }
-"""
 
 
 def page(results: Results, about: dict[str, Any]) -> str:
     """The whole page, HTML, with its pictures beside it as SVG."""
-    parts = [
-        "<h1>The paper's evaluation, repeated</h1>",
-        _paragraph(
-            f"{about['seeds']} seeds in each of {len(results.environments)} environments. Changes"
-            " are of the mean over the seeds, averaged over the environments; in brackets the 95 %"
-            f" bootstrap interval. The own box is {about['boxes'][OWN]}, the wide one"
-            f" {about['boxes'][WIDE]}. Random ends are as far apart as the scene's, with an"
-            " obstacle across the straight line."
-        ),
-        "<h2>Claims</h2>",
-        _claims(results),
-        _paragraph(
-            f"Reading: {_reading()}. Both planners take the same steps; the baseline rejects"
-            " nothing here, and below is shown how it does with the same rejection."
-        ),
-        "<h2>Fig. 9</h2>",
-        _image("figure_9", "Nodes and kinematic cost by environment"),
+    lead = _paragraph(
+        f"{about['seeds']} seeds in each of {len(results.environments)} environments. Changes"
+        " are of the mean over the seeds, averaged over the environments; in brackets the 95 %"
+        f" bootstrap interval. The own box is {about['boxes'][OWN]}, the wide one"
+        f" {about['boxes'][WIDE]}. Random ends are as far apart as the scene's, with an"
+        " obstacle across the straight line."
+    )
+    reading = _paragraph(
+        f"Reading: {_reading()}. Both planners take the same steps; the baseline rejects"
+        " nothing here, and below is shown how it does with the same rejection."
+    )
+    figure_9 = (
+        picture("figure_9.svg", "Nodes and kinematic cost by environment"),
         *(_figure_9_table(results, ends) for ends in ("scene", "random")),
-        _image("figure_9_random_ends", "The same with random starts and goals"),
-        "<h2>What makes the difference</h2>",
-        _comparisons(results),
-        "<h2>Every reading of the text</h2>",
-        _image("readings", "Change of nodes and of their deviation for every reading"),
-        _readings(results),
-        "<h2>The box</h2>",
-        _image("boxes", "Change of nodes against the size of the box"),
-        _boxes(results),
-        "<h2>About this run</h2>",
-        _table(["", ""], [(k, str(v)) for k, v in about.items() if k != "boxes"]),
+        picture("figure_9_random_ends.svg", "The same with random starts and goals"),
+    )
+    readings = picture("readings.svg", "Change of nodes and of their deviation for every reading")
+    boxes = picture("boxes.svg", "Change of nodes against the size of the box")
+    rows = [(k, str(v)) for k, v in about.items() if k != "boxes"]
+    parts = [
+        section("claims", "Claims", _claims(results), reading),
+        section("figure-9", "Fig. 9", *figure_9),
+        section("difference", "What makes the difference", _comparisons(results)),
+        section("readings", "Every reading of the text", readings, _readings(results)),
+        section("boxes", "The box", boxes, _boxes(results)),
+        section("about", "About this run", table(rows)),
     ]
-    title = "<title>The paper's evaluation, repeated</title>"
-    head = f'<meta charset="utf-8">{title}<style>{_STYLE}</style>'
-    body = "\n".join(parts)
-    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
+    title = "The paper's evaluation, repeated"
+    return html_page(title, "\n".join(parts), lead=lead, files_beside=True)
 
 
 def _claims(results: Results) -> str:
@@ -99,7 +80,7 @@ def _claims(results: Results) -> str:
             here = next(f for f in found if f.claim == claim and (f.box, f.ends) == place)
             row.append(f"{change_text(here.change)}\n{here.verdict}")
         rows.append(row)
-    return _table(["claim", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows)
+    return list_table(["claim", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows, "wide")
 
 
 def _figure_9_table(results: Results, ends: Any) -> str:
@@ -117,7 +98,7 @@ def _figure_9_table(results: Results, ends: Any) -> str:
     head = ["environment", "sampler", "minimises"]
     title = f"Own box, {ends} ends: mean ± standard deviation (interval of the mean)"
     quantities = [_QUANTITIES[q] for q in (*COUNTED, *MEASURED)]
-    return f"<h3>{title}</h3>" + _table([*head, *quantities], rows, "figures")
+    return f"<h3>{title}</h3>" + list_table([*head, *quantities], rows, "numbers")
 
 
 def _comparisons(results: Results) -> str:
@@ -129,7 +110,7 @@ def _comparisons(results: Results) -> str:
             mean, deviation = results.change(VARIANTS, box, ends, arms, "nodes")
             row.append(f"{change_text(mean)}\ndeviation {percent(deviation.mean)}")
         rows.append(row)
-    return _table(["nodes", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows)
+    return list_table(["nodes", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows, "wide")
 
 
 def _readings(results: Results) -> str:
@@ -143,7 +124,7 @@ def _readings(results: Results) -> str:
         [name, *(f"{change_text(m)}\ndeviation {percent(d.mean)}" for m, d in by_box)]
         for name, by_box in changes
     ]
-    return _table(["reading", "own box, scene ends", "wide box, scene ends"], rows)
+    return list_table(["reading", "own box, scene ends", "wide box, scene ends"], rows, "wide")
 
 
 def _boxes(results: Results) -> str:
@@ -156,7 +137,7 @@ def _boxes(results: Results) -> str:
             each = ", ".join(percent(part) for part in mean.each)
             row.append(f"{change_text(mean)}\nby environment {each}")
         rows.append(row)
-    return _table(["box", *(c.name for c in chosen)], rows)
+    return list_table(["box", *(c.name for c in chosen)], rows, "wide")
 
 
 def _reading() -> str:
@@ -178,20 +159,5 @@ def change_text(change: Change) -> str:
     return f"{percent(change.mean)} ({percent(change.low)} to {percent(change.high)})"
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    first = "".join(f"<th>{escape(name)}</th>" for name in head)
-    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>\n" for row in rows)
-    table = f'<table class="{kind}"><tr>{first}</tr>\n{body}</table>'
-    return f'<div class="wide">{table}</div>'
-
-
-def _cell(text: str) -> str:
-    return "<td>" + escape(text).replace("\n", "<br>") + "</td>"
-
-
 def _paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
-
-
-def _image(name: str, alternative: str) -> str:
-    return f'<p><img src="{name}.svg" alt="{escape(alternative)}"></p>'

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
 from itertools import product
 
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from planner.campaign.boxes import OWN, SHARES, WIDE
-from planner.campaign.trial import Arm, Batch, Case, Ends
-from planner.paper.readings import (
-    CONE_DRAWS,
-    FAILURE_RATES,
-    FOCUSES,
-    STEERS,
-    TEXT,
-    Readings,
-)
+from model.rig import Rig
+from model.scene import Scene
+from planner.campaign.cases import OWN, SHARES, WIDE
+from planner.campaign.trial import Arm, Batch, Case, Ends, Trial, run_batch
+from planner.rrt.variants import CONE_DRAWS, FAILURE_RATES, FOCUSES, STEERS, TEXT, AlgorithmVariant
 from planner.settings import CostName, SamplerName
 
 FIGURE_9, VARIANTS, READINGS, BOXES = "figure 9", "variants", "readings", "boxes"
@@ -28,7 +22,7 @@ ENDS: tuple[Ends, ...] = ("scene", "random")
 SAMPLERS: tuple[SamplerName, ...] = ("adaptive", "goal-bias")
 COSTS: tuple[CostName, ...] = ("kinematic", "length")
 
-TO_SAMPLE = Readings(steer="to-sample")
+TO_SAMPLE = AlgorithmVariant(steer="to-sample")
 SPACED = replace(TO_SAMPLE, spacing=SPACING)
 SIGHT = replace(TO_SAMPLE, goal_sight=True)
 
@@ -36,7 +30,7 @@ _SEEDS_IN_A_BATCH = 25
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class StudyComparison:
     """Adaptive sampling with one reading against the goal bias with another.
 
     Attributes:
@@ -46,17 +40,17 @@ class Comparison:
     """
 
     name: str
-    adaptive: Readings
-    baseline: Readings
+    adaptive: AlgorithmVariant
+    baseline: AlgorithmVariant
 
 
 COMPARISONS = (
-    Comparison("the text as written", TEXT, TEXT),
-    Comparison("steps end at the sample", TO_SAMPLE, TO_SAMPLE),
-    Comparison("… and adaptive rejects within 30 mm", SPACED, TO_SAMPLE),
-    Comparison("… and both reject within 30 mm", SPACED, SPACED),
-    Comparison("adaptive has the goal sight", SIGHT, TO_SAMPLE),
-    Comparison("both have the goal sight", SIGHT, SIGHT),
+    StudyComparison("the text as written", TEXT, TEXT),
+    StudyComparison("steps end at the sample", TO_SAMPLE, TO_SAMPLE),
+    StudyComparison("… and adaptive rejects within 30 mm", SPACED, TO_SAMPLE),
+    StudyComparison("… and both reject within 30 mm", SPACED, SPACED),
+    StudyComparison("adaptive has the goal sight", SIGHT, TO_SAMPLE),
+    StudyComparison("both have the goal sight", SIGHT, SIGHT),
 )
 NEAREST_TO_THE_CLAIM, BOTH_REJECT = COMPARISONS[2], COMPARISONS[3]
 
@@ -102,24 +96,24 @@ def figure_9_arm(sampler: SamplerName, cost: CostName) -> Arm:
     return Arm(sampler, cost, readings)
 
 
-def arms_of(comparison: Comparison) -> tuple[Arm, Arm]:
+def arms_of(comparison: StudyComparison) -> tuple[Arm, Arm]:
     """The adaptive planner and the baseline of a comparison, under the length."""
     return Arm("adaptive", "length", comparison.adaptive), _baseline(comparison.baseline)
 
 
-def all_readings() -> tuple[Comparison, ...]:
+def all_readings() -> tuple[StudyComparison, ...]:
     """Every reading without goal sight, against the goal bias with the same steps."""
     found = []
     for rate, focus, draw, steer, spacing in product(
         FAILURE_RATES, FOCUSES, CONE_DRAWS, STEERS, (0.0, SPACING)
     ):
-        readings = Readings(rate, focus, draw, steer, spacing)
+        readings = AlgorithmVariant(rate, focus, draw, steer, spacing)
         name = f"e_r {rate}, x_c {focus}, {draw}, {steer}, {spacing * 1e3:g} mm"
-        found.append(Comparison(name, readings, Readings(steer=steer)))
+        found.append(StudyComparison(name, readings, AlgorithmVariant(steer=steer)))
     return tuple(found)
 
 
-def _baseline(readings: Readings) -> Arm:
+def _baseline(readings: AlgorithmVariant) -> Arm:
     return Arm("goal-bias", "length", readings)
 
 
@@ -138,5 +132,38 @@ def _searches(environments: tuple[str, ...]) -> Iterator[tuple[str, Case, Arm]]:
             yield BOXES, Case(box, environment), arm
 
 
-def _distinct(comparisons: Sequence[Comparison]) -> tuple[Arm, ...]:
+def _distinct(comparisons: Sequence[StudyComparison]) -> tuple[Arm, ...]:
     return tuple(dict.fromkeys(arm for c in comparisons for arm in arms_of(c)))
+
+
+# Doing all searches of a campaign, in this process or wherever a pool does them.
+
+
+Progress = Callable[[int], None]
+"""Called with the number of searches newly done."""
+
+
+def run_all(batches: Sequence[Batch], pool: Executor | None, progress: Progress) -> list[Trial]:
+    """Does all batches; the trials are in the order of the batches whoever did them.
+
+    Args:
+        batches: What to do.
+        pool: Does it, in other processes or on other machines; this process without one.
+        progress: Told how many searches are newly done.
+    """
+    if pool is None:
+        trials = []
+        for batch in batches:
+            trials += run_batch(batch)
+            progress(len(batch.seeds))
+        return trials
+    done: dict[int, list[Trial]] = {}
+    tasks = {pool.submit(run_batch, batch): k for k, batch in enumerate(batches)}
+    try:
+        for task in as_completed(tasks):
+            done[tasks[task]] = task.result()
+            progress(len(batches[tasks[task]].seeds))
+    finally:
+        for task in tasks:
+            task.cancel()
+    return [trial for k in range(len(batches)) for trial in done[k]]

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from planner.campaign.claims import findings
-from planner.campaign.results import COUNTED, MEASURED, Results
-from planner.campaign.statistics import summary
+from planner.campaign.results import COUNTED, MEASURED, Results, summary
 from planner.campaign.studies import FIGURE_9
 from planner.campaign.trial import Arm, Case
 

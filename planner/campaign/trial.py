@@ -9,23 +9,22 @@ from typing import Literal
 
 import numpy as np
 
-from cdpr.clearance import ClearanceModel
-from cdpr.poses import Array
-from cdpr.rig import Rig, rig_from_document
-from cdpr.rig_file import RigDocument
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
+from model.clearance import ClearanceModel
+from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument
+from model.pose import Array
+from model.rig import Rig, rig_from_document
+from model.scene import Scene, scene_from_document
 from planner.bounds import smallest_along
-from planner.campaign.boxes import with_box
-from planner.campaign.ends import random_ends
+from planner.campaign.cases import random_ends, with_box
 from planner.check import check_path
-from planner.cost import KinematicCost
-from planner.exact.checks import ExactChecks
-from planner.paper.limits import exact_checks
-from planner.paper.readings import TEXT, Readings
-from planner.paper.search import PaperPlanner, SearchResult
+from planner.costs import KinematicCost
+from planner.edge_checks import ExactChecks
+from planner.pose_path import PosePath
+from planner.rrt.edge_checks import exact_checks
+from planner.rrt.search import PaperPlanner, SearchResult
+from planner.rrt.variants import TEXT, AlgorithmVariant
 from planner.settings import CLEARANCE_RESERVE, CostName, PlannerSettings, SamplerName
-from planner.track import Track
 
 Ends = Literal["scene", "random"]
 
@@ -40,7 +39,7 @@ class Arm:
 
     sampler: SamplerName
     cost: CostName = "length"
-    readings: Readings = TEXT
+    readings: AlgorithmVariant = TEXT
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +47,7 @@ class Case:
     """Where searches take place.
 
     Attributes:
-        box: Name of the workspace box (`planner.campaign.boxes`).
+        box: Name of the workspace box (`planner.campaign.cases`).
         environment: Name of the scene.
         ends: Whether start and goal are the scene's, or random ones as far apart.
     """
@@ -94,7 +93,8 @@ class PathFigures:
         length_mm: After Algorithm 3.
         raw_cost: Mean kinematic cost along the path before post-processing.
         cost: And after it.
-        clearance_mm: Smallest distance to an obstacle along the finished path, by `cdpr.clearance`.
+        clearance_mm: Smallest distance to an obstacle along the finished path, by
+            `model.clearance`.
         passed: 1 where the finished path passed its check, 0 where it did not.
     """
 
@@ -178,7 +178,7 @@ def _measured(
     rig, poses = _rig(batch.rig, batch.case.box), [planner.space.pose(point) for point in path]
     clearance = passed = _NAN
     if batch.clearance and scene.obstacles:
-        clearance = _clearance(rig, scene, Track(rig, poses)) * 1e3
+        clearance = _clearance(rig, scene, PosePath(rig, poses)) * 1e3
     if batch.checked:
         passed = float(check_path(rig, scene, poses, ends=False).passed)
     return PathFigures(
@@ -195,7 +195,7 @@ def _length(path: Array) -> float:
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
-def _clearance(rig: Rig, scene: Scene, track: Track) -> float:
+def _clearance(rig: Rig, scene: Scene, track: PosePath) -> float:
     """The smallest distance to an obstacle anywhere along a track, to 0.1 mm, [m]."""
     model = ClearanceModel(rig, scene)
 

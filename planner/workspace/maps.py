@@ -7,23 +7,22 @@ they are not numbers there, in every map.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdpr.cables import Cables, NoCable, cables_to
-from cdpr.kinematics import structure_matrix_of
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from cdpr.self_clearance import SelfModel
-from cdpr.statics.arguments import checked_length
-from cdpr.statics.closure import closure_margin
-from cdpr.statics.dexterity import condition_number, rms_anchor_radius
-from cdpr.statics.feasibility import WrenchBox, capacity_margin
-from cdpr.statics.working import weight_wrench
-from cdpr.statics.wrench_set import force_volume
+from model.clearance import SelfModel
+from model.kinematics import Cables, NoCable, cables_to, structure_matrix_of
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.scene import Scene
+from model.statics.dexterity import condition_number, rms_anchor_radius
+from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.gravity import weight_wrench
+from model.statics.wrench_closure import closure_margin
+from model.statics.wrench_sets import checked_length, force_volume
+from planner.space import Lattice
 
 Values = dict[str, Array]
 OBSTACLE_CLEARANCE = "obstacle_clearance"
@@ -169,8 +168,8 @@ def _own_clearance(robots: _Robots) -> Array:
 
 def _obstacle_clearances(question: Question, positions: Array) -> Array:
     """Exact distances to the nearest obstacle, [m]; 0 or less where something touches."""
-    from planner.exact.edge import edge_clearance
-    from planner.exact.world import build_world
+    from planner.collision.edges import edge_clearance
+    from planner.collision.world import build_world
 
     if question.scene is None:
         return np.full(len(positions), np.inf)
@@ -186,5 +185,50 @@ OF_THE_ROBOT: Mapping[str, Callable[[_Robots], Array]] = {
     "force_volume": _volume,
     "self_clearance": _own_clearance,
 }
-"""Name → what computes it. ``closure_margin`` [-] (`cdpr.statics.closure.closure_margin`),
+"""Name → what computes it. ``closure_margin`` [-] (`model.statics.wrench_closure.closure_margin`),
 ``capacity_margin`` [N], ``condition_number`` [-], ``force_volume`` [N³], ``self_clearance`` [m]."""
+
+
+# The paper's indices as costs: each scaled to 0..1 between its extremes over the workspace box.
+#
+# Source: Xu & Park, Eqs. 4, 5 and 8 and Fig. 7; see docs/paper.md for the corrections.
+
+
+INDICES = ("condition_number", "force_volume")
+
+
+@dataclass(frozen=True, slots=True)
+class Extremes:
+    """Smallest and largest condition number and inverse volume over the workspace box."""
+
+    condition: tuple[float, float]
+    inverse_volume: tuple[float, float]
+
+    @classmethod
+    def over_workspace(cls, question: Question) -> Extremes:
+        """Those on the planner's lattice, so that maps and plans mean the same cost."""
+        rig = question.rig
+        lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
+        points = lattice.points(np.arange(lattice.count))
+        values = values_at(replace(question, quantities=INDICES), points)
+        condition, inverse = values["condition_number"], 1.0 / values["force_volume"]
+        return cls(
+            (float(np.nanmin(condition)), float(np.nanmax(condition))),
+            (float(np.nanmin(inverse)), float(np.nanmax(inverse))),
+        )
+
+
+def costs(values: Values, extremes: Extremes) -> Values:
+    """Dexterity cost γ_d, wrench cost γ_f and their sum, shapes as given, from the two indices."""
+    with np.errstate(divide="ignore"):
+        inverse = 1.0 / values["force_volume"]
+    dexterity = _scaled(values["condition_number"], *extremes.condition)
+    wrench = _scaled(inverse, *extremes.inverse_volume)
+    return {"dexterity_cost": dexterity, "wrench_cost": wrench, "cost": dexterity + wrench}
+
+
+def _scaled(values: Array, low: float, high: float) -> Array:
+    if not low < high:
+        return np.zeros_like(values)
+    scaled: Array = (values - low) / (high - low)
+    return scaled

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (640, 480)
 MATRIX = np.array([[600.0, 0.0, 322.0], [0.0, 603.0, 238.0], [0.0, 0.0, 1.0]])

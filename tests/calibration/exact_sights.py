@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calibration.tag_sights import TagSights
-from cdpr.poses import Pose
-from cdpr.rig import Camera, Tag
-from tracking.edges import RefinedTag
-from tracking.marks import tag_corners
-from tracking.projection import ideal_of
+from calibration.tag_map.observations import TagSights
+from model.pose import Pose
+from model.rig import Camera, Tag
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import tag_corners
+from tracking.edges.refine import RefinedTag
 
 
 def seen_tag(
@@ -23,7 +23,7 @@ def seen_tag(
     middle = points.mean(axis=0)
     if middle[2] < 0.1 or normal @ middle > -0.3 * np.linalg.norm(middle):
         return None
-    pixels = ideal_of(camera, points)
+    pixels = project_undistorted(camera, points)
     if (pixels < 5).any() or (pixels > [camera.width - 5, camera.height - 5]).any():
         return None
     corners = pixels + noise * rng.standard_normal((4, 2))

@@ -6,8 +6,8 @@ import re
 
 import numpy as np
 
-from calibration.pdf import POINTS_A_MM
-from cdpr.poses import Array
+from calibration.targets.printing import POINTS_A_MM
+from model.pose import Array
 
 
 def pages_in(data: bytes) -> list[tuple[Array, Array, list[str]]]:

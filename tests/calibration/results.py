@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from datetime import date
 
-from calibration.camera_result import CameraResult
-from calibration.interval import Interval
-from calibration.result_file import common_keys
-from calibration.verdict import Verdict
+from calibration.intrinsics.result import CameraResult
+from calibration.results import common_keys
+from calibration.statistics import Interval
+from calibration.verdict import CalibrationVerdict
 
 
 def camera_result_of(name: str = "front", fx: float = 905.0, size=(1280, 720)) -> CameraResult:
-    verdict = Verdict.of(0.4e-3, 1e-3, "at 1.5 m", [])
+    verdict = CalibrationVerdict.of(0.4e-3, 1e-3, "at 1.5 m", [])
     intervals = {"fx_px": Interval(fx, 0.5), "cx_px": Interval(640.0, 0.7)}
     return CameraResult(
         **common_keys(name, date(2026, 3, 1), "ab" * 32, intervals, verdict, {"a.png": "is bad"}),

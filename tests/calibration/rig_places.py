@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.interval import Interval
-from calibration.rig_measurements import RigMeasurements
-from cdpr.cables import cables_at
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig, rig_from_document
-from cdpr.statics.tension_solution import TensionInfeasible
-from cdpr.statics.working import working_tensions
-from cdpr.winches import WinchMap
-from simulation.as_built import rig_as_built, stiffness_as_built
+from calibration.geometry.measurements import RigMeasurements
+from calibration.statistics import Interval
+from model.kinematics import cables_at
+from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.rig import Rig, rig_from_document
+from model.statics.gravity import working_tensions
+from model.statics.tension_distribution import TensionInfeasible
+from model.winches import WinchMap
+from simulation.ground_truth import rig_as_built, stiffness_as_built
 from simulation.plant import Plant
 
 POSITION_NOISE, TURN_NOISE = 0.2e-3, 0.5e-3

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.board import mirrored
-from calibration.camera import calibrate_camera
-from calibration.charuco import Charuco
-from calibration.chessboard import Chessboard
-from calibration.spread import Spread
-from calibration.tag_grid import TagGrid
-from cdpr.errors import BadInput
-from cdpr.poses import Pose
+from calibration.intrinsics.calibrate import fit_camera
+from calibration.intrinsics.views import EvenSample
+from calibration.targets.board import mirrored
+from calibration.targets.charuco import Charuco
+from calibration.targets.chessboard import Chessboard
+from calibration.targets.tag_grid import TagGrid
+from model.errors import BadInput
+from model.pose import Pose
 from tests.calibration.board_pictures import (
     DISTORTION,
     MATRIX,
@@ -83,7 +83,7 @@ def test_points_are_found_where_they_are(board: Charuco | TagGrid, limit: float)
 @pytest.mark.parametrize("board", [CHARUCO, TAGS])
 def test_the_camera_comes_back_from_parts_of_a_board(board: Charuco | TagGrid) -> None:
     named = [(f"{k}.png", image) for k, (image, _) in enumerate(pictures(board))]
-    found = calibrate_camera(named, board)
+    found = fit_camera(named, board)
     off = np.abs(found.matrix - MATRIX)[[0, 1, 0, 1], [0, 1, 2, 2]]
     assert (off < 4.0).all()
     assert found.error < 0.2
@@ -99,7 +99,7 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
     assert board.find(flipped) is None
     assert mirrored(board, flipped)
     with pytest.raises(BadInput) as caught:
-        calibrate_camera([("a", flipped), ("b", flipped)], board)
+        fit_camera([("a", flipped), ("b", flipped)], board)
     assert "mirrored" in caught.value.why
 
 
@@ -114,7 +114,7 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
 def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
     image = next(image for image, _ in pictures(board) if board.find(image) is not None)
     with pytest.raises(BadInput) as caught:
-        calibrate_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
+        fit_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
     assert "is to be seen in 0 of 2 pictures" in caught.value.what
     assert told in caught.value.why
     assert "; a shows " in caught.value.why
@@ -128,7 +128,7 @@ def test_what_most_pictures_show_instead_is_told_not_what_the_first_one_does() -
     )
     named = [("0.png", stray), *((f"{k}.png", image) for k in range(1, 13))]
     with pytest.raises(BadInput) as caught:
-        calibrate_camera(named, TagGrid(5, 4, 0.040, 0.012, "tag25h9"))
+        fit_camera(named, TagGrid(5, 4, 0.040, 0.012, "tag25h9"))
     found = re.search(r"; (\d+).png and (\d) of 4 others .* show tag36h11", caught.value.why)
     assert found is not None, caught.value.why
     assert found[1] != "0"
@@ -137,7 +137,7 @@ def test_what_most_pictures_show_instead_is_told_not_what_the_first_one_does() -
 
 @given(count=st.integers(0, 200), wanted=st.integers(1, 7))
 def test_a_few_of_many_are_spread_over_all(count: int, wanted: int) -> None:
-    spread = Spread[int](wanted)
+    spread = EvenSample[int](wanted)
     for number in range(count):
         spread.add(number)
     chosen = spread.chosen()

@@ -10,15 +10,19 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.board import Seen
-from calibration.camera import CameraCalibration, calibrate_camera, calibrate_from_views
-from calibration.camera_result import camera_result
-from calibration.camera_verdict import judge_camera
-from calibration.chessboard import Chessboard
-from calibration.kinds import load_result
-from calibration.result_file import write_result
-from cdpr.errors import BadInput
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+from calibration.intrinsics.calibrate import (
+    CameraCalibration,
+    calibrate_from_views,
+    fit_camera,
+)
+from calibration.intrinsics.quality import judge_camera
+from calibration.intrinsics.result import camera_result
+from calibration.load import load_result
+from calibration.results import write_result
+from calibration.targets.board import Seen
+from calibration.targets.chessboard import Chessboard
+from model.errors import BadInput
+from model.pose import Array, Pose, matrix_from_rotation_vector
 
 BOARD = Chessboard(9, 6, 0.025)
 SIZE = (640, 480)
@@ -131,7 +135,7 @@ def test_a_picture_whose_corners_are_mistaken_is_left_out_by_name() -> None:
 def test_rendered_pictures_are_calibrated_and_useless_ones_named() -> None:
     pictures = [(f"{k}.png", board_picture(pose)) for k, pose in enumerate(board_poses(8))]
     pictures.append(("wall.png", np.full((SIZE[1], SIZE[0]), 128, np.uint8)))
-    found = calibrate_camera(pictures, BOARD)
+    found = fit_camera(pictures, BOARD)
     check_values(found, pixels=4.0)
     assert found.unused == {"wall.png": "does not show the board"}
     assert set(found.view_errors) == {f"{k}.png" for k in range(8)}
@@ -141,12 +145,12 @@ def test_rendered_pictures_are_calibrated_and_useless_ones_named() -> None:
 def test_too_few_pictures_are_refused() -> None:
     wall = np.full((SIZE[1], SIZE[0]), 128, np.uint8)
     with pytest.raises(BadInput, match="in 0 of 2 pictures"):
-        calibrate_camera([("a", wall), ("b", wall)], BOARD)
+        fit_camera([("a", wall), ("b", wall)], BOARD)
 
 
 def test_pictures_of_two_sizes_are_refused_by_name() -> None:
     with pytest.raises(BadInput, match="64 x 48 px, the ones before 640 x 480"):
-        calibrate_camera(
+        fit_camera(
             [("a", np.zeros((480, 640), np.uint8)), ("b", np.zeros((48, 64), np.uint8))], BOARD
         )
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.board import Seen
-from calibration.capture import CaptureGuide
-from calibration.chessboard import Chessboard
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
+from calibration.intrinsics.capture import CaptureGuide
+from calibration.targets.board import Seen
+from calibration.targets.chessboard import Chessboard
+from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)
 POINTS = Chessboard(9, 6, 0.025).points()

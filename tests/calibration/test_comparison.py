@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from calibration.comparison import compare
-from cdpr.errors import BadInput
+from calibration.compare import compare
+from model.errors import BadInput
 from tests.calibration.results import camera_result_of
 
 

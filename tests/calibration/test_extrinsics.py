@@ -9,23 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.extrinsics import judge_extrinsics
-from calibration.extrinsics_result import extrinsics_result
-from calibration.kinds import calibrated, load_result
-from calibration.result_file import write_result
-from calibration.survey import Survey
-from calibration.surveyed_tags import locate_camera, require_frame_tags
-from calibration.tag_sights import sights_of
-from cdpr.errors import BadInput
-from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from cdpr.rig import Rig, Tag, load_rig
-from cdpr.scene import load_scene
-from simulation.camera import SyntheticCamera
+from calibration.extrinsics.quality import judge_extrinsics
+from calibration.extrinsics.result import extrinsics_result
+from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
+from calibration.load import load_result
+from calibration.results import write_result
+from calibration.tag_map.observations import sights_of
+from model.errors import BadInput
+from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.rig import Rig, Tag, load_rig
+from model.scene import load_scene
+from simulation.camera.camera import SyntheticCamera
 from tests.calibration.exact_sights import sights_at
-from tracking.bundle import moved
 from tracking.camera_check import change_of_inverse
-from tracking.marks import tag_corners
-from tracking.projection import ideal_of
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import tag_corners
+from tracking.pnp import moved
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -56,7 +55,7 @@ def numbers(rig: Rig) -> list[int]:
 
 def test_a_camera_is_located_to_half_a_millimetre(rig: Rig, pictures) -> None:
     truth, camera = elsewhere(rig), rig.cameras[0]
-    found = locate_camera(
+    found = locate_by_frame_tags(
         rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(0.1e-3)
     )
     pose = found.world_from_camera
@@ -94,7 +93,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         rng = np.random.default_rng(seed)
         tags = crooked(rig.frame_tags, survey, rng)
         poses = {str(k): truth.inverse() for k in range(3)}
-        found = locate_camera(
+        found = locate_by_frame_tags(
             rig, camera, sights_at(camera, tags, poses, 0.03, rng), Survey(survey)
         )
         pose = found.world_from_camera
@@ -127,7 +126,7 @@ def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(r
         sights = sights_at(camera, there, {"a": truth.inverse()}, 0.03, rng)
         errors.append([])
         for survey in (Survey(1e-3), Survey(1e-3, 0.0)):
-            found = locate_camera(rig, camera, sights, survey)
+            found = locate_by_frame_tags(rig, camera, sights, survey)
             back = found.world_from_camera.apply(truth.inverse().apply(found.points))
             off = np.sqrt(np.mean(np.sum((back - found.points) ** 2, axis=1)))
             errors[-1].append(off)
@@ -150,7 +149,7 @@ def test_the_pixels_of_a_survey_scatter_as_told(rig: Rig, turn: float | None) ->
             off = matrix_from_rotation_vector(turn * rng.standard_normal(3))
             middle = tag.pose.position
             corners = (corners - middle) @ off.T + middle + 1e-3 * rng.standard_normal(3)
-        pixels.append(ideal_of(camera, world.apply(corners)).ravel())
+        pixels.append(project_undistorted(camera, world.apply(corners)).ravel())
     told = survey.of_pixels(camera, world, tag)
     found = np.cov(np.array(pixels).T)
     np.testing.assert_allclose(found, told, atol=0.08 * np.diag(told).max())
@@ -163,7 +162,7 @@ def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) 
     rig = replace(rig, frame_tags=tuple(tags))
     knocked = [replace(tags[0], pose=Pose.level([0.44, 0.0, 0.0])), *tags[1:]]
     sights = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
-    found = locate_camera(rig, camera, sights, Survey(0.2e-3))
+    found = locate_by_frame_tags(rig, camera, sights, Survey(0.2e-3))
     assert list(found.unused) == ["tag 401"]
     away = float(found.unused["tag 401"].split()[2])
     assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, seen aslant
@@ -173,7 +172,7 @@ def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) 
 def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
     tags = crooked(rig.frame_tags, 10e-3, rng)
-    found = locate_camera(
+    found = locate_by_frame_tags(
         rig, camera, sights_at(camera, tags, {"a": truth.inverse()}, 0.02, rng), Survey(1e-4)
     )
     verdict = judge_extrinsics(found, 1.0)
@@ -182,13 +181,14 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
     assert any("again, or take it out of the rig file" in step for step in verdict.next_steps)
 
 
-def test_a_single_tag_is_not_good_enough(rig: Rig) -> None:
+@pytest.mark.parametrize(("count", "seen"), [(1, "1 frame tag is"), (2, "2 frame tags are")])
+def test_too_few_tags_are_not_good_enough(rig: Rig, count: int, seen: str) -> None:
     camera, truth = rig.cameras[0], elsewhere(rig)
     rng = np.random.default_rng(3)
-    sights = sights_at(camera, rig.frame_tags[:1], {"a": truth.inverse()}, 0.02, rng)
-    found = locate_camera(rig, camera, sights, Survey(0.5e-3))
+    sights = sights_at(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
+    found = locate_by_frame_tags(rig, camera, sights, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
-    assert "1 frame tag is seen, 3 are needed" in verdict.reasons
+    assert f"{seen} seen, 3 are needed" in verdict.reasons
     assert "survey more tags, all around what the camera sees" in verdict.next_steps
 
 
@@ -196,7 +196,7 @@ def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> N
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
     poses = {f"{k}.png": truth.inverse() for k in range(4)}
     poses["3.png"] = moved(truth.inverse(), np.array([0.01, 0, 0, 0, 0, 0]))
-    found = locate_camera(
+    found = locate_by_frame_tags(
         rig, camera, sights_at(camera, rig.frame_tags, poses, 0.02, rng), Survey(1e-4)
     )
     assert list(found.unused) == ["3.png"]
@@ -220,31 +220,37 @@ def test_the_inverse_of_a_pose_changes_as_told() -> None:
 
 def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_path: Path) -> None:
     camera = rig.cameras[0]
-    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4))
+    found = locate_by_frame_tags(
+        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+    )
     verdict = judge_extrinsics(found, 1e-3)
     result = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
     path = write_result(tmp_path, result)
     assert path.name == "calibration_extrinsics_front_2026-03-02.yaml"
     read = load_result(path)
     assert read == result.sealed()
-    better = calibrated(rig, [read])
+    better = rig.with_calibration(read)
     assert better.cameras[0].world_from_camera.distance_to(found.world_from_camera) < 1e-8
     assert result.apart_mm(result) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
-    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4))
+    found = locate_by_frame_tags(
+        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+    )
     result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
     other = rig.document.cameras[0].model_copy(update={"fx_px": 901.0})
     changed = replace(rig, document=rig.document.model_copy(update={"cameras": [other]}))
     with pytest.raises(BadInput, match="rests on other numbers of the camera or frame tags"):
-        calibrated(changed, [result])
+        changed.with_calibration(result)
 
 
 def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
-    found = locate_camera(rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4))
+    found = locate_by_frame_tags(
+        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+    )
     verdict = judge_extrinsics(found, 1e-3)
     one = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
     pose = found.world_from_camera

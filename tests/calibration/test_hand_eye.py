@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.extrinsics import judge_extrinsics
-from calibration.hand_eye import locate_by_motion
-from calibration.pose_file import read_poses
-from calibration.tag_sights import TagSights
-from cdpr.errors import BadInput, InvalidFile
-from cdpr.poses import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from cdpr.rig import Camera, Rig, load_rig
+from calibration.extrinsics.hand_eye import locate_by_motion, read_poses
+from calibration.extrinsics.quality import judge_extrinsics
+from calibration.tag_map.observations import TagSights
+from model.errors import BadInput, InvalidFile
+from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.rig import Camera, Rig, load_rig
 from tests.calibration.exact_sights import sights_at
 
 CONFIGS = Path(__file__).parents[2] / "configs"

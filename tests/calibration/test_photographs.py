@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.camera import CameraCalibration, calibrate_camera
-from calibration.camera_verdict import judge_camera
-from calibration.charuco import Charuco
-from calibration.chessboard import Chessboard
-from drivers.picture_folder import OneCamerasPictures, read_picture
+from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
+from calibration.intrinsics.quality import judge_camera
+from calibration.targets.charuco import Charuco
+from calibration.targets.chessboard import Chessboard
+from drivers.cameras.files import OneCamerasPictures, read_picture
 from tests.calibration.exif import turned_by_exif
-from tracking.detector import TagDetector
+from tracking.detection.detector import TagDetector
 
 FOLDER = Path(__file__).parent / "photographs"
 BOARD = Chessboard(9, 6, 0.025)
@@ -26,7 +26,7 @@ def chessboards() -> list[Path]:
 
 @pytest.fixture(scope="module")
 def found() -> CameraCalibration:
-    return calibrate_camera([(p.name, read_picture(p)) for p in chessboards()], BOARD)
+    return fit_camera([(p.name, read_picture(p)) for p in chessboards()], BOARD)
 
 
 def test_a_real_camera_is_calibrated_from_thirteen_photographs(found: CameraCalibration) -> None:

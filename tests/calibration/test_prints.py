@@ -11,16 +11,22 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.board import Board
-from calibration.charuco import Charuco
-from calibration.chessboard import Chessboard
-from calibration.pdf import pdf_of
-from calibration.prints import board_print, tag_print
-from calibration.sheets import MARGIN_MM, PAPERS, sheet_of, sheets_of
-from calibration.tag_grid import TagGrid
-from cdpr.errors import BadInput
+from calibration.targets.board import Board
+from calibration.targets.charuco import Charuco
+from calibration.targets.chessboard import Chessboard
+from calibration.targets.printing import (
+    MARGIN_MM,
+    PAPERS,
+    board_print,
+    pdf_of,
+    sheet_of,
+    sheets_of,
+    tag_print,
+)
+from calibration.targets.tag_grid import TagGrid
+from model.errors import BadInput
 from tests.calibration.pages import drawn, pages_in
-from tracking.detector import TagDetector
+from tracking.detection.detector import TagDetector
 
 BOARDS = [
     Chessboard(9, 6, 0.025),

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.interval import Interval
-from calibration.kinds import calibrated, load_result
-from calibration.result_file import write_result
-from calibration.verdict import Lack, Verdict
-from cdpr.errors import BadInput
-from cdpr.rig import Rig, load_rig
+from calibration.load import load_result
+from calibration.results import write_result
+from calibration.statistics import Interval
+from calibration.verdict import CalibrationVerdict, Issue
+from model.errors import BadInput
+from model.rig import Rig, load_rig
 from tests.calibration.results import camera_result_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -57,7 +57,7 @@ def test_a_seal_outlives_the_file_whatever_the_number(tmp_path_factory, value: f
 
 
 def test_a_camera_result_takes_the_place_of_the_rig_files_numbers(rig: Rig) -> None:
-    better = calibrated(rig, [camera_result_of()])
+    better = rig.with_calibration(camera_result_of())
     assert better.cameras[0].matrix[0, 0] == 905.0
     assert better.cameras[0].distortion.tolist() == [-0.1, 0.04, 0.0, 0.0, 0.0]
     old, new = rig.cameras[0], better.cameras[0]
@@ -75,12 +75,12 @@ def test_a_camera_result_takes_the_place_of_the_rig_files_numbers(rig: Rig) -> N
 )
 def test_a_result_for_another_camera_is_refused(rig: Rig, result, named: str) -> None:
     with pytest.raises(BadInput, match=named):
-        calibrated(rig, [result])
+        rig.with_calibration(result)
 
 
 def test_two_results_of_one_camera_are_refused(rig: Rig) -> None:
     with pytest.raises(BadInput, match="two results of kind camera for 'front'"):
-        calibrated(rig, [camera_result_of(), camera_result_of(fx=901.0)])
+        rig.with_calibration(camera_result_of(), camera_result_of(fx=901.0))
 
 
 @pytest.mark.parametrize(
@@ -117,9 +117,9 @@ def test_a_number_is_shown_to_two_digits_of_its_width(value: float, width: float
 
 
 def test_a_verdict_says_each_next_step_once() -> None:
-    lacks = [Lack("few", "take more"), Lack("wide", "take more"), Lack("flat", "tilt")]
-    verdict = Verdict.of(2e-3, 1e-3, "at 1 m", lacks)
+    lacks = [Issue("few", "take more"), Issue("wide", "take more"), Issue("flat", "tilt")]
+    verdict = CalibrationVerdict.of(2e-3, 1e-3, "at 1 m", lacks)
     assert not verdict.good
     assert verdict.next_steps == ("take more", "tilt")
     assert str(verdict) == "not good enough: few; wide; flat"
-    assert str(Verdict.of(5e-4, 1e-3, "at 1 m", [])) == "good enough for 0.5 mm at 1 m"
+    assert str(CalibrationVerdict.of(5e-4, 1e-3, "at 1 m", [])) == "good enough for 0.5 mm at 1 m"

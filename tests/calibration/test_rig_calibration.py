@@ -15,26 +15,35 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.kinds import calibrated, load_result
-from calibration.rig_calibration import RigCalibration, calibrate_rig
-from calibration.rig_fit import RigFitter
-from calibration.rig_measurements import Recording, RigMeasurements, at_rest, joined
-from calibration.rig_model import RigModel
-from calibration.rig_observability import Observability, identified, sentences
-from calibration.rig_page import rig_page
-from calibration.rig_parameters import DEFAULT_DEVIATIONS, CountedLengths, Parameters
-from calibration.rig_result import RigResult, require_one_drawing, rig_result
-from calibration.rig_stiffness import compliance_told, differences_told
-from calibration.rig_tensions import likely_tensions, tension_doubt
-from calibration.rig_uncertainty import uncertainty_of_rig
-from calibration.rig_verdict import judge_rig, judged_places
-from cdpr.errors import BadInput, InvalidFile
-from cdpr.kinematics import poses_near
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from cdpr.rig import Rig, load_rig, rig_from_document
-from cdpr.rig_file import RigDocument
-from cdpr.statics.working import working_tensions
-from cdpr.winches import WinchMap
+from calibration.geometry.calibrate import RigCalibration, fit_rig
+from calibration.geometry.fit import RigFitter
+from calibration.geometry.identifiability import (
+    Observability,
+    identified,
+    sentences,
+    uncertainty_of_rig,
+)
+from calibration.geometry.measurements import (
+    Recording,
+    RigMeasurements,
+    at_rest,
+    joined,
+    likely_tensions,
+    tension_doubt,
+)
+from calibration.geometry.model import DEFAULT_DEVIATIONS, CountedLengths, Parameters, RigModel
+from calibration.geometry.quality import judge_rig, judged_places
+from calibration.geometry.report import number_rows, rig_page
+from calibration.geometry.result import RigResult, require_one_drawing, rig_result
+from calibration.geometry.stiffness import compliance_told, differences_told
+from calibration.load import load_result
+from model.errors import BadInput, InvalidFile
+from model.files.rig_file import RigDocument
+from model.kinematics import poses_near
+from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.rig import Rig, load_rig, rig_from_document
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
     built_otherwise,
@@ -66,12 +75,12 @@ def level(rig: Rig) -> Truth:
 
 @pytest.fixture(scope="module")
 def found(rig: Rig, turned: Truth) -> RigCalibration:
-    return calibrate_rig(rig, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    return fit_rig(rig, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
 
 
 @pytest.fixture(scope="module")
 def found_level(rig: Rig, level: Truth) -> RigCalibration:
-    return calibrate_rig(rig, level.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    return fit_rig(rig, level.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
 
 
 def told_by(rig: Rig, truth: Truth) -> Array:
@@ -163,7 +172,7 @@ def test_places_that_were_not_measured_are_told_ten_times_better(
     quality = judge_rig(found, 1e-3, np.radians(5.0))
     result = rig_result(found, quality, "rig", TODAY)
     others = places(rig, 40, tilt=np.radians(8.0), seed=9)
-    corrected = calibrated(rig, [result])
+    corrected = rig.with_calibration(result)
     before, after = rms(errors_of(rig, others)), rms(errors_of(corrected, others))
     assert before > 1e-3
     assert after < 0.3e-3
@@ -179,7 +188,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(rig: Rig, stiffness
     built = built_otherwise(rig, seed=11)
     data = places(built, 60, tilt=np.radians(8.0), seed=12).measured
     drawn = drawn_with(built, stiffness)
-    result = calibrate_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     true = true_numbers(built)
     assert len(true) == 57
     assert share_inside(result.intervals, true) >= 0.9
@@ -190,9 +199,9 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(rig: Rig, stiffness
 def test_a_stiffness_that_is_found_is_applied(rig: Rig, turned: Truth) -> None:
     """The rig file tells half as much again as the cables have."""
     drawn = drawn_with(rig, 9000.0)
-    result = calibrate_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     told = rig_result(result, judge_rig(result, 1e-3, 0.0), "rig", TODAY)
-    corrected = calibrated(drawn, [told])
+    corrected = drawn.with_calibration(told)
     assert corrected.cable_stiffness == told.stiffness_n == result.geometry.stiffness
     low, high = told.intervals["stiffness_n"]
     assert low * high == pytest.approx(told.stiffness_n**2)
@@ -204,7 +213,7 @@ def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
     rig: Rig, turned: Truth
 ) -> None:
     blind = replace(turned.measured, tensions=np.full_like(turned.measured.tensions, np.nan))
-    result = calibrate_rig(rig, blind, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(rig, blind, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     assert result.geometry.stiffness == pytest.approx(rig.cable_stiffness, rel=1e-12)
     assert "the stiffness of the cables" in result.not_identified
     ends = result.intervals["stiffness_n"].bounds
@@ -276,7 +285,7 @@ def test_places_that_err_each_as_one_widen_the_intervals(rig: Rig, turned: Truth
     random = np.random.default_rng(8)
     shaken = turned.measured.positions + 2e-3 * random.standard_normal((60, 3))
     data = replace(turned.measured, positions=shaken)
-    result = calibrate_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     scatter, by_places = (
         np.sqrt(np.diag(covariance))
         for covariance in (result.uncertainty.by_scatter, result.uncertainty.by_places)
@@ -309,7 +318,7 @@ def test_one_cable_that_is_told_badly_does_not_spoil_the_rest(rig: Rig, turned: 
     counts[7, 3] += 0.005 * rig.winches[3].counts_per_metre
     positions[20] += [0.02, 0.0, 0.0]
     spoiled = replace(data, counts=counts, positions=positions)
-    result = calibrate_rig(rig, spoiled, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(rig, spoiled, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     quality = judge_rig(result, 1e-3, 0.0)
     assert quality.verdict.good
     told = rig_result(result, quality, "rig", TODAY)
@@ -317,9 +326,9 @@ def test_one_cable_that_is_told_badly_does_not_spoil_the_rest(rig: Rig, turned: 
     assert "cable 4 is" in told.unused["place 7"]
     assert "pose is" in told.unused["place 20"]
     assert told.places == 58
-    corrected = calibrated(rig, [told])
+    corrected = rig.with_calibration(told)
     assert rms(errors_of(corrected, places(rig, 20, tilt=0.1, seed=4))) < 0.3e-3
-    untouched = calibrate_rig(
+    untouched = fit_rig(
         rig, data.part(~np.isin(np.arange(60), [7, 20])), DEFAULT_DEVIATIONS, LENGTH_DEVIATION
     )
     assert result.uncertainty.half_widths == pytest.approx(untouched.uncertainty.half_widths)
@@ -330,20 +339,20 @@ def test_lengths_alone_make_cables_agree_and_tell_that_the_world_is_unknown(
 ) -> None:
     """As without a camera: eight lengths of a pose of six numbers must fit each other."""
     alone = turned.measured.without_poses()
-    result = calibrate_rig(rig, alone, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(rig, alone, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     quality = judge_rig(result, 1e-3, 0.0)
     assert not result.held_out.poses
     assert quality.held_out < quality.before / 10.0
     assert any("all outlets" in line for line in result.not_identified)
     assert not quality.verdict.good
     assert any("with a camera" in step for step in quality.verdict.next_steps)
-    corrected = calibrated(rig, [rig_result(result, quality, "rig", TODAY)])
+    corrected = rig.with_calibration(rig_result(result, quality, "rig", TODAY))
     assert rms(errors_of_shape(corrected, turned)) < 0.9 * rms(errors_of_shape(rig, turned))
 
 
 def test_groups_that_are_known_stay_as_drawn(rig: Rig, turned: Truth) -> None:
     only = {"drum_scale": 0.005, "offsets": 2e-3}
-    result = calibrate_rig(rig, turned.measured, only, LENGTH_DEVIATION)
+    result = fit_rig(rig, turned.measured, only, LENGTH_DEVIATION)
     assert np.array_equal(result.geometry.outlets, rig.outlets)
     assert result.parameters.groups == ("drum_scale", "offsets")
     assert set(result.intervals) == {
@@ -376,8 +385,10 @@ def test_a_rig_over_pulleys_is_told_better_than_by_its_file() -> None:
     }
     hall = rig_from_document(RigDocument.model_validate(document))
     data = places(hall, 40, tilt=0.12, seed=1).measured
-    result = calibrate_rig(hall, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    corrected = calibrated(hall, [rig_result(result, judge_rig(result, 1e-3, 0.0), "hall", TODAY)])
+    result = fit_rig(hall, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    corrected = hall.with_calibration(
+        rig_result(result, judge_rig(result, 1e-3, 0.0), "hall", TODAY)
+    )
     others = places(hall, 20, tilt=0.12, seed=2, noise=0.0)
     assert rms(errors_of(corrected, others)) < 0.3 * rms(errors_of(hall, others))
     radius = result.intervals["pulley_radius_mm"]
@@ -400,15 +411,33 @@ def test_a_result_file_is_applied_to_its_own_rig_only(
 ) -> None:
     quality = judge_rig(found, 1e-3, 0.0)
     result = rig_result(found, quality, "rig", TODAY)
-    corrected = calibrated(rig, [RigResult.model_validate(result.model_dump())])
+    corrected = rig.with_calibration(RigResult.model_validate(result.model_dump()))
     assert corrected.outlets == pytest.approx(found.geometry.outlets, abs=1e-9)
     assert corrected.anchors == pytest.approx(found.geometry.anchors, abs=1e-9)
     assert corrected.document.simulation == rig.document.simulation
     with pytest.raises(BadInput, match="rests on other outlets"):
-        calibrated(load_rig(ROOT / "configs/gachon_8_6.yaml"), [result])
-    page = rig_page(found, quality, "rig", "2026-03-14")
+        load_rig(ROOT / "configs/gachon_8_6.yaml").with_calibration(result)
+
+
+def test_the_report_sets_every_number_beside_the_rig_files(rig: Rig, found: RigCalibration) -> None:
+    rows = {row[0]: row[1:] for row in number_rows(found)}
+    assert rows.keys() == found.intervals.keys()
+    before, new, change, width, changed = rows["outlet_7_y_mm"]
+    assert float(before) == pytest.approx(1e3 * rig.outlets[6, 1], abs=0.006)
+    assert float(new) == pytest.approx(1e3 * found.geometry.outlets[6, 1], abs=0.006)
+    assert float(change) == pytest.approx(float(new) - float(before), abs=0.011)
+    assert (changed == "yes") == (abs(float(change)) > float(width))
+    quality = judge_rig(found, 1e-3, 0.0)
+    page = rig_page(found, quality, "<b>rig</b>", "2026-03-14")
+    assert f"{quality.before * 1e3:.2f} → {quality.held_out * 1e3:.2f} <small>mm" in page
     assert "good enough" in page
-    assert "cable 8" in page
+    assert "<b>rig</b>" not in page
+    for head in ("rig file", "new", "change", "± 95 %"):
+        assert f'<th scope="col">{head}</th>' in page
+    charts = page.split('<figure class="plot">')[1:]
+    assert len(charts) == 1 + rig.cable_count
+    assert all('aria-label="Line chart of the ' in chart for chart in charts)
+    assert page.count('class="viewer"') == 1
 
 
 @pytest.mark.parametrize("key", ["anchors_mm", "drums_mm_per_rev", "home_counts"])
@@ -431,7 +460,7 @@ def test_a_result_with_fewer_cables_throughout_is_told_of_the_result(
     keys = ("outlets_mm", "anchors_mm", "drums_mm_per_rev", "home_counts", "cable_residuals_mm")
     fewer = result.model_copy(update={key: getattr(result, key)[:-1] for key in keys})
     with pytest.raises(BadInput, match="of 7 cables, the rig has 8") as told:
-        calibrated(rig, [fewer])
+        rig.with_calibration(fewer)
     assert told.value.where == "calibration rig rig, 2026-03-14"
 
 
@@ -458,7 +487,7 @@ def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(
 ) -> None:
     """Its winches pay out for a count what the fit says, to a count."""
     result = rig_result(found, judge_rig(found, 1e-3, 0.0), "rig", TODAY)
-    corrected, data = calibrated(rig, [result]), found.measured
+    corrected, data = rig.with_calibration(result), found.measured
     winches = WinchMap(corrected)
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
     by_fit = RigModel(found.parameters, data).counted.by(found.geometry)
@@ -480,9 +509,9 @@ def test_runs_of_another_rig_or_of_two_references_are_refused(rig: Rig) -> None:
 def test_too_few_places_and_nothing_to_look_for_are_refused(rig: Rig, turned: Truth) -> None:
     few = turned.measured.part(np.arange(60) < 9)
     with pytest.raises(BadInput, match="only 9 places"):
-        calibrate_rig(rig, few, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+        fit_rig(rig, few, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     with pytest.raises(BadInput, match="nothing to look for"):
-        calibrate_rig(rig, turned.measured, {}, LENGTH_DEVIATION)
+        fit_rig(rig, turned.measured, {}, LENGTH_DEVIATION)
 
 
 def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
@@ -529,7 +558,7 @@ def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, turned: Tru
     counts[:, [0, 1]] = counts[:, [1, 0]]
     swapped = replace(turned.measured, counts=counts)
     verdicts = [
-        judge_rig(calibrate_rig(rig, data, deviations, LENGTH_DEVIATION), 1e-3, 0.0).verdict
+        judge_rig(fit_rig(rig, data, deviations, LENGTH_DEVIATION), 1e-3, 0.0).verdict
         for data, deviations in (
             (swapped, DEFAULT_DEVIATIONS),
             (turned.measured, {**DEFAULT_DEVIATIONS, "drum_scale": 2e-4}),
@@ -545,7 +574,7 @@ def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, turned: Tru
 def test_a_pose_outside_the_rig_is_refused_by_name(rig: Rig, turned: Truth) -> None:
     metres = replace(turned.measured, positions=turned.measured.positions / 1e3)
     with pytest.raises(BadInput, match="outside the rig") as told:
-        calibrate_rig(rig, metres, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+        fit_rig(rig, metres, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     assert told.value.where == "place 0"
 
 
@@ -554,7 +583,7 @@ def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool)
     """The data are of cables with 6000 N, and the file of the paper's rig says 848230 N."""
     drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
     data = turned.measured if poses else turned.measured.without_poses()
-    result = calibrate_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     compliance = compliance_told(result)
     assert compliance is not None
     assert 1.0 / compliance.told == pytest.approx(6000.0, rel=0.05 if poses else 0.35)
@@ -569,7 +598,7 @@ def test_the_stiffness_that_the_data_tell_is_the_same_for_every_rig_file(
     rig: Rig, turned: Truth, stiffness: float
 ) -> None:
     drawn = drawn_with(rig, stiffness)
-    result = calibrate_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     compliance, differences = compliance_told(result), differences_told(result)
     assert compliance is not None
     assert differences is not None
@@ -579,7 +608,7 @@ def test_the_stiffness_that_the_data_tell_is_the_same_for_every_rig_file(
 
 def test_a_stiffness_far_from_the_rig_file_is_told_as_a_factor(rig: Rig, turned: Truth) -> None:
     drawn = drawn_with(rig, 60000.0)
-    result = calibrate_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    result = fit_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     factor = result.geometry.stiffness / 60000.0
     assert factor < 0.3
     reason = judge_rig(result, 1e-3, 0.0).verdict.reasons[0]
@@ -591,7 +620,7 @@ def test_a_stiffness_that_nothing_tells_is_positive_however_uncertain(
 ) -> None:
     blind = replace(turned.measured, tensions=np.full_like(turned.measured.tensions, np.nan))
     loose = {"outlets": 4e-3, "stiffness": 2.0}
-    stiffness = calibrate_rig(rig, blind, loose, LENGTH_DEVIATION).intervals["stiffness_n"]
+    stiffness = fit_rig(rig, blind, loose, LENGTH_DEVIATION).intervals["stiffness_n"]
     assert 0.0 < stiffness.bounds[0] < 6000.0 / 20.0
     assert stiffness.bounds[1] > 6000.0 * 20.0
 
@@ -600,7 +629,7 @@ def test_a_stiffness_that_is_hardly_known_is_found_from_afar(turned: Truth) -> N
     """As the next step of a contradiction advises: a hundred and forty times too stiff."""
     drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
     loose = {**DEFAULT_DEVIATIONS, "stiffness": 5.0}
-    result = calibrate_rig(drawn, turned.measured, loose, LENGTH_DEVIATION)
+    result = fit_rig(drawn, turned.measured, loose, LENGTH_DEVIATION)
     stiffness = result.intervals["stiffness_n"]
     assert abs(stiffness.value - 6000.0) < stiffness.half_width < 1200.0
     assert judge_rig(result, 1e-3, 0.0).verdict.good
@@ -611,7 +640,7 @@ def test_cables_that_differ_are_told_and_others_are_not(rig: Rig) -> None:
     for weak in (6000.0, 3000.0):
         built = built_otherwise(rig, 5, [6000.0] * 2 + [weak] + [6000.0] * 5)
         data = places(built, 60, tilt=np.radians(8.0), seed=6).measured
-        result = calibrate_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+        result = fit_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
         differences = differences_told(result)
         assert differences is not None
         reasons = judge_rig(result, 1e-3, 0.0).verdict.reasons
@@ -619,7 +648,7 @@ def test_cables_that_differ_are_told_and_others_are_not(rig: Rig) -> None:
     assert np.argmax(differences.told) == 2
     assert 1.0 / differences.told[2] == pytest.approx(3000.0, rel=0.25)
     blind = replace(data, tensions=np.full_like(data.tensions, np.nan))
-    told = calibrate_rig(built, blind, {"offsets": 2e-3}, LENGTH_DEVIATION)
+    told = fit_rig(built, blind, {"offsets": 2e-3}, LENGTH_DEVIATION)
     assert differences_told(told) is None
 
 

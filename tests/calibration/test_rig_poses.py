@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.rig_parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.rig_poses import Wish, _in_order, _most_telling, chosen_poses
-from cdpr.clearance import ClearanceModel
-from cdpr.errors import NoSolution
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene
-from cdpr.statics.working import working_tensions
+from calibration.geometry.model import DEFAULT_DEVIATIONS, Parameters
+from calibration.geometry.pose_selection import Wish, _in_order, _most_telling, chosen_poses
+from model.clearance import ClearanceModel
+from model.errors import NoSolution
+from model.pose import Pose
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene
+from model.statics.gravity import working_tensions
 
 ROOT = Path(__file__).resolve().parents[2]
 WISH = Wish(12, np.radians(15.0), np.radians(15.0), 60, 4.0, 0.1e-3, (0.3e-3,) * 3 + (1e-3,) * 3)

@@ -12,20 +12,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calibration.kinds import calibrated, load_result
-from calibration.result_file import write_result
-from calibration.tag_graph import connected_tags
-from calibration.tag_layout import TagLayout, measure_layout, require_tags
-from calibration.tag_sights import TagSights
-from calibration.tag_views import TagViews, moved_tags
-from calibration.tags_result import tags_result
-from calibration.tags_verdict import judge_layout
-from cdpr.errors import BadInput
-from cdpr.poses import Pose
-from cdpr.rig import Rig, Tag, load_rig
+from calibration.load import load_result
+from calibration.results import write_result
+from calibration.tag_map.bundle_adjustment import (
+    TagLayout,
+    connected_tags,
+    measure_layout,
+    require_tags,
+)
+from calibration.tag_map.observations import TagSights, TagViews, moved_tags
+from calibration.tag_map.result import judge_layout, tags_result
+from model.errors import BadInput
+from model.pose import Pose
+from model.rig import Rig, Tag, load_rig
 from tests.calibration.exact_sights import sights_at
-from tracking.bundle import moved
-from tracking.marks import tag_corners
+from tracking.detection.tags import tag_corners
+from tracking.pnp import moved
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -224,7 +226,7 @@ def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> 
     assert path.name == "calibration_tags_gachon_8_6_2026-03-04.yaml"
     read = load_result(path)
     assert read == result.sealed()
-    better = calibrated(rig, [read])
+    better = rig.with_calibration(read)
     for tag, own in zip(better.platform_tags, found.tags, strict=True):
         assert tag.pose.distance_to(own.pose) < 1e-8
         assert tag.size == pytest.approx(own.size)
@@ -234,7 +236,7 @@ def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> 
     )
     changed = replace(rig, document=rig.document.model_copy(update={"tags": resized}))
     with pytest.raises(BadInput, match="rests on other sizes or numbers of tags"):
-        calibrated(changed, [read])
+        changed.with_calibration(read)
 
 
 def test_results_are_compared_tag_by_tag(rig: Rig) -> None:

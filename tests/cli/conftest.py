@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpr import machine_code
+from model import jit as machine_code
 from tests.cli.plans import RIG, write_short_plan
 from tests.cli.program import Answer, call
 

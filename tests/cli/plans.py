@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from cdpr.document_types import PoseDocument, millimetres
-from cdpr.plan import save_plan, sealed
-from cdpr.plan_file import PlanDocument
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
+from model.files.documents import PoseDocument, millimetres
+from model.files.plan_file import PlanDocument
+from model.files.scene_file import SceneDocument
+from model.plan import save_plan, sealed
+from model.pose import Pose
+from model.rig import Rig, load_rig
+from model.scene import Scene, scene_from_document
 from planner.check import check_path
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -26,6 +26,15 @@ def rig_with_two_pictures_a_second(folder: Path) -> Path:
     text = RIG.read_text()
     assert "rate_hz: 10" in text
     rig.write_text(text.replace("rate_hz: 10", "rate_hz: 2"))
+    return rig
+
+
+def rig_with_long_cycles(folder: Path) -> Path:
+    """The paper's rig for runs in real time: a busy host is late by a part of 100 ms, not by it."""
+    rig = folder / "rig.yaml"
+    text = RIG.read_text()
+    assert "cycle_ms: 10\n" in text
+    rig.write_text(text.replace("cycle_ms: 10\n", "cycle_ms: 100\n"))
     return rig
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.plan import save_plan
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
+from model.plan import save_plan
+from model.rig import load_rig
+from model.scene import load_scene
 from tests.cli.plans import CONFIGS, HALL, RIG, straight_plan
 from tests.cli.program import Answer, call, nothing_written, one_message
 
@@ -29,7 +29,7 @@ def verb(request: pytest.FixtureRequest) -> str:
 def test_a_plan_with_nan_is_not_read(short_plan: Path, tmp_path: Path, verb: str) -> None:
     plan = tmp_path / "plan.json"
     plan.write_text(short_plan.read_text().replace("445.0", "NaN", 1))
-    one_message(use(verb, plan, tmp_path), 2, f"{plan}: the plan holds NaN", "cdpr plan")
+    one_message(use(verb, plan, tmp_path), 2, f"{plan}: the file holds NaN", "cdpr plan")
 
 
 def test_an_edited_plan_is_not_used(short_plan: Path, tmp_path: Path, verb: str) -> None:

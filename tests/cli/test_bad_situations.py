@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from drivers.cia402 import sdo
-from executor import camera_process
-from executor.camera_process import CameraProcess
-from simulation.rehearsal import Rehearsal
+from executor.cameras import process as camera_process
+from executor.cameras.process import CameraProcess
+from simulation.drives.cia402_rig import SimulatedCia402Rig
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import Answer, call, nothing_written, one_message
 
@@ -38,7 +38,8 @@ def refused(folder: Path, code: int, *parts: str, **options: object) -> Answer:
     arguments: list[str] = []
     for name, value in options.items():
         option = f"--{name.replace('_', '-')}"
-        arguments += [option] if value is True else [option, *str(value).split()]
+        values = value if isinstance(value, tuple) else (value,)
+        arguments += [option] if value is True else [option, *map(str, values)]
     with nothing_written(folder):
         answer = call("run", folder / "plan.json", "-o", folder / "run", *arguments)
     one_message(answer, code, *parts)
@@ -107,19 +108,30 @@ def test_a_demo_does_not_write_into_an_existing_folder(tmp_path: Path) -> None:
         one_message(call("demo", "-o", tmp_path), 2, "exists already")
 
 
-@pytest.mark.parametrize("verb", ["plan", "run", "demo", "track"])
+@pytest.mark.parametrize("verb", ["plan", "track"])
 def test_a_result_in_a_folder_that_is_not_there_is_told_before_the_work(
     folder: Path, verb: str
 ) -> None:
     place = folder / "no such folder" / "result"
     rest = {
         "plan": [RIG, SCENE],
-        "run": [folder / "plan.json", "--rig", RIG, "--fast", "--no-camera"],
-        "demo": [],
         "track": [RIG, "synthetic", "--plan", folder / "plan.json"],
     }[verb]
     with nothing_written(folder):
         one_message(call(verb, *rest, "-o", place), 2, str(place))
+
+
+def test_a_run_folder_below_a_file_is_told_before_the_work(folder: Path) -> None:
+    (folder / "file").touch()
+    rest = ("--rig", RIG, "--fast", "--no-camera", "-o", folder / "file" / "above" / "run")
+    with nothing_written(folder):
+        one_message(call("run", folder / "plan.json", *rest), 2, str(folder / "file"), "-o")
+
+
+def test_without_a_rig_file_no_bus_is_moved(folder: Path) -> None:
+    """A plan is a file from anywhere; which drives move is for the rig file of this machine."""
+    refused(folder, 2, "--rig", interface="udp_multicast", no_camera=True, yes=True)
+    refused(folder, 2, "--rig", channel="can0", no_camera=True, yes=True)
 
 
 @pytest.fixture
@@ -193,20 +205,22 @@ def test_a_platform_that_stands_elsewhere_is_not_moved(folder: Path) -> None:
         rig=RIG,
         fast=True,
         no_camera=True,
-        simulated_start_mm="0 0 455",
+        simulated_start_mm=(0, 0, 455),
     )
 
 
 def test_a_drive_that_does_not_answer_is_named(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    switch_on = Rehearsal.__init__
+    switch_on = SimulatedCia402Rig.__init__
 
-    def with_a_dead_drive(rehearsal: Rehearsal, *arguments: object) -> None:
-        switch_on(rehearsal, *arguments)  # type: ignore[arg-type]
+    def with_a_dead_drive(
+        rehearsal: SimulatedCia402Rig, *arguments: object, **more: object
+    ) -> None:
+        switch_on(rehearsal, *arguments, **more)  # type: ignore[arg-type]
         rehearsal.drives[4].silent = True
 
-    monkeypatch.setattr(Rehearsal, "__init__", with_a_dead_drive)
+    monkeypatch.setattr(SimulatedCia402Rig, "__init__", with_a_dead_drive)
     refused(folder, 4, "drive 5", "answer", "check power", rig=RIG, fast=True, no_camera=True)
 
 
@@ -291,7 +305,7 @@ def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
         ({"camera": "front"}, ["camera 'front' has no source", "write front=0"]),
         ({"camera": "front="}, ["camera 'front' has no source", "write front=0"]),
         (
-            {"interface": "udp_multicast", "no_camera": True, "simulated_start_mm": "0 0 445"},
+            {"interface": "udp_multicast", "no_camera": True, "simulated_start_mm": (0, 0, 445)},
             ["--simulated-start-mm"],
         ),
     ],

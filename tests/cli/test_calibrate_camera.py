@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from cdpr.poses import Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import MATRIX, picture_of, poses_before_the_camera, with_noise
 from tests.calibration.exif import turned_by_exif
 from tests.cli.program import call, one_message

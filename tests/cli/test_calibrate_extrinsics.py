@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import yaml
 
-from cdpr.document_types import PoseDocument
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
-from simulation.camera import SyntheticCamera
+from model.files.documents import PoseDocument
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import load_rig
+from model.scene import load_scene
+from simulation.camera.camera import SyntheticCamera
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written, one_message
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cdpr.poses import Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import SIZE, picture_of
 from tests.cli.program import call, nothing_written, one_message
 from tests.cli.test_calibrate_camera import BOARD, MIDDLE, chessboard_print

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.cli import calibrate
-from cdpr.cli.board_options import BoardOptions
-from cdpr.cli.calibrate_print import print_
+from cdpr.cli.calibrate.board_options import BoardOptions
+from cdpr.cli.calibrate.camera import camera
+from cdpr.cli.calibrate.targets import print_
 from tests.calibration.pages import pages_in
 from tests.cli.plans import RIG
 from tests.cli.program import call, nothing_written, one_message
@@ -59,7 +59,7 @@ def test_prints_that_cannot_be_are_refused(tmp_path: Path, options, named: str) 
 
 
 def test_camera_and_print_know_boards_by_the_same_options() -> None:
-    commands = [inspect.signature(command).parameters for command in (calibrate.camera, print_)]
+    commands = [inspect.signature(command).parameters for command in (camera, print_)]
     for option in fields(BoardOptions):
         one, other = (command[option.name] for command in commands)
         assert one.default == other.default == option.default

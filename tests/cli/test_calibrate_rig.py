@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.kinds import calibrated, load_result
-from calibration.rig_parameters import DEFAULT_DEVIATIONS
-from cdpr.cli import calibrate_rig
-from cdpr.kinematics import poses_near
-from cdpr.rig import Rig, load_rig
-from cdpr.winches import WinchMap
+from calibration.geometry.model import DEFAULT_DEVIATIONS
+from calibration.load import load_result
+from cdpr.cli.calibrate import rig as rig_verb
+from model.kinematics import poses_near
+from model.rig import Rig, load_rig
+from model.winches import WinchMap
 from tests.calibration.rig_places import places, write_places
 from tests.cli.program import call
 
@@ -57,7 +57,7 @@ def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
     done = call("calibrate", "rig", RIG, SESSION / "places.csv", "-o", folder, "--json")
     assert done.code == 0, done
     (result,) = folder.glob("*.yaml")
-    corrected = calibrated(rig, [load_result(result)])
+    corrected = rig.with_calibration(load_result(result))
     truth = places(rig, 20, tilt=0.05, seed=8, noise=0.0)
     winches, data = WinchMap(corrected), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
@@ -178,7 +178,9 @@ def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path
 
 
 def test_a_file_in_place_of_the_folder_is_told_with_a_next_step(file: Path) -> None:
-    done = call("calibrate", "rig", RIG, file, "-o", file, "--json")
+    other = file.with_name("other")
+    other.write_text("mine")
+    done = call("calibrate", "rig", RIG, file, "-o", other, "--json")
     assert done.code == 2, done
     assert "name a folder, not a file" in json.loads(done.out)["next_step"]
 
@@ -190,8 +192,8 @@ def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
 
 
 def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
-    """The command line loads nothing heavy, so its defaults stand there once more."""
-    options = inspect.signature(calibrate_rig.rig).parameters
+    """The options have units of their own, so the defaults are written there once more."""
+    options = inspect.signature(rig_verb.rig).parameters
     for group, deviation in DEFAULT_DEVIATIONS.items():
         share = group in ("drum_scale", "stiffness")
         name, unit = (f"{group}_percent", 1e2) if share else (f"{group}_mm", 1e3)

@@ -13,15 +13,15 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from calibration.tag_views import moved_tags
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig, rig_from_document
-from cdpr.rig_file import TagDocument
-from cdpr.scene import load_scene
-from simulation.camera import SyntheticCamera
+from calibration.tag_map.observations import moved_tags
+from model.files.rig_file import TagDocument
+from model.pose import Pose
+from model.rig import Rig, load_rig, rig_from_document
+from model.scene import load_scene
+from simulation.camera.camera import SyntheticCamera
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written, one_message
-from tracking.marks import tag_corners
+from tracking.detection.tags import tag_corners
 
 ALONG_MM = np.array([[0.4, -1.1], [0.0, 0.9], [1.2, 0.3], [-0.8, 0.0], [0.6, 0.7], [-0.3, 1.0]])
 OUTWARD_MM = 1.2  # or the platform's faces would hide tags that are not parallel to them

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from calibration.result_file import write_result
+from calibration.load import load_result
+from calibration.results import write_result
+from model.rig import load_rig
 from tests.calibration.results import camera_result_of
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written, one_message
@@ -32,6 +34,8 @@ def test_results_about_another_camera_are_refused_by_name(tmp_path: Path, verb: 
         "home": (RIG, "--at-home", "--fast"),
         "track": (RIG, tmp_path, "-o", tmp_path / "poses.csv"),
     }[verb]
+    if verb == "run":
+        assert call("plan", RIG, SCENE, "-o", tmp_path / "plan.json").code == 0
     with nothing_written(tmp_path):
         answer = call(verb, *options, "--calibration", result)
     one_message(answer, 2, "no camera 'side'", "front")
@@ -43,7 +47,7 @@ def test_a_result_that_is_not_good_enough_is_used_and_told(tmp_path: Path, good:
     changes = {} if good else {"good_enough": False, "verdict": why}
     result = write_result(tmp_path, camera_result_of().model_copy(update=changes))
     answer = call("status", RIG, "--calibration", result)
-    told = f"note: calibration camera front, 2026-03-01: {why}"
+    told = f"remark calibration camera front, 2026-03-01: {why}"
     assert (told in answer.err) != good
 
 
@@ -65,3 +69,29 @@ def test_results_are_compared(tmp_path: Path) -> None:
     found = json.loads(answer.out)
     assert found["changes"]["fx_px"]["beyond"]
     assert found["apart_mm"] > found["stated_mm"]
+
+
+def test_a_result_is_applied_to_a_new_rig_file(tmp_path: Path) -> None:
+    """Which is read back as the rig that `--calibration` makes."""
+    result, new = write_result(tmp_path, camera_result_of()), tmp_path / "new.yaml"
+    answer = call("calibrate", "apply", RIG, result, "-o", new)
+    assert answer.code == 0, answer
+    expected = load_rig(Path(RIG)).with_calibration(load_result(result))
+    assert load_rig(new).document == expected.document
+    assert load_rig(new).document.cameras[0].fx_px == 905.0
+
+
+def test_applying_a_result_never_replaces_a_file(tmp_path: Path) -> None:
+    result, new = write_result(tmp_path, camera_result_of()), tmp_path / "new.yaml"
+    new.write_text("mine", encoding="utf-8")
+    with nothing_written(tmp_path):
+        answer = call("calibrate", "apply", RIG, result, "-o", new)
+    one_message(answer, 2, "exists already", "never replaced")
+    assert new.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_result_about_another_camera_is_not_applied(tmp_path: Path) -> None:
+    result = write_result(tmp_path, camera_result_of("side"))
+    with nothing_written(tmp_path):
+        answer = call("calibrate", "apply", RIG, result, "-o", tmp_path / "new.yaml")
+    one_message(answer, 2, "no camera 'side'", "front")

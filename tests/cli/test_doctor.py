@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpr.cli import doctor_bus
-from cdpr.cli.doctor_answer import Answer
-from cdpr.cli.doctor_bus import kernel_bus
-from cdpr.cli.doctor_real_time import memory_answer, priority_answer
-from drivers import cameras, socketcan
-from drivers.bus import BusSettings
+from drivers import socketcan
+from drivers.cameras import live as cameras
+from drivers.can_bus import BusSettings
 from drivers.socketcan import KernelInterface, can_interfaces, parse_interfaces
+from executor import doctor
+from executor.doctor import MachineCheck, kernel_bus, memory_check, priority_check
+from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.plans import RIG
 from tests.cli.program import call
 
@@ -44,7 +44,7 @@ def link(**changes: Any) -> dict[str, Any]:
     }
 
 
-def looked(**changes: Any) -> dict[str, Answer]:
+def looked(**changes: Any) -> dict[str, MachineCheck]:
     """The answers for one interface, by name."""
     found = parse_interfaces(json.dumps([link(**changes)]))
     return {answer.name: answer for answer in kernel_bus(CAN0, found)}
@@ -53,7 +53,7 @@ def looked(**changes: Any) -> dict[str, Answer]:
 @pytest.fixture(autouse=True)
 def kernel_with_can(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tests are about interfaces; this machine's kernel may have none."""
-    monkeypatch.setattr(doctor_bus, "kernel_support", lambda: Answer("kernel", True, "there"))
+    monkeypatch.setattr(doctor, "kernel_support", lambda: MachineCheck("kernel", True, "there"))
 
 
 def test_a_healthy_interface_has_nothing_to_mend() -> None:
@@ -143,7 +143,7 @@ def test_an_ip_that_says_something_else_is_told(tmp_path: Path) -> None:
     [(0, False, False), (49, False, False), (50, False, True), (0, True, True)],
 )
 def test_real_time_priority(limit: int, privileged: bool, good: bool) -> None:
-    answer = priority_answer(limit, 50, privileged=privileged)
+    answer = priority_check(limit, 50, privileged=privileged)
     assert answer.good is good
     assert "rtprio 50' | sudo tee -a /etc/security/limits.d/cdpr.conf" in answer.fix
 
@@ -153,7 +153,7 @@ def test_real_time_priority(limit: int, privileged: bool, good: bool) -> None:
     [(65536, False, False), (resource.RLIM_INFINITY, False, True), (65536, True, True)],
 )
 def test_locked_memory(limit: int, privileged: bool, good: bool) -> None:
-    answer = memory_answer(limit, privileged=privileged)
+    answer = memory_check(limit, privileged=privileged)
     assert answer.good is good
     assert "memlock unlimited'" in answer.fix
 
@@ -220,3 +220,42 @@ def test_a_bus_too_slow_and_an_interface_missing_are_both_told(tmp_path: Path) -
     assert "4 or more" in told["bus load"]["fix"]
     assert not told["interface can77"]["good"]
     assert "real-time priority" in told
+
+
+def with_profile(tmp_path: Path, profile: str) -> Path:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(f"{RIG.read_text()}drives: {{type: cia402, profile: {profile}}}\n")
+    return rig
+
+
+def test_objects_of_all_drives_are_read_in_one_table(tmp_path: Path) -> None:
+    answer = call("doctor", RIG, "--drives")
+    assert answer.code == 0, answer.said
+    assert "of 8 drives read, nothing written; 0 to change" in answer.out
+    assert "stop by SYNC after 30 ms: up to 0.7 mm" in answer.out
+    answer = call("doctor", RIG, "--drives", "--json")
+    told = json.loads(answer.out)
+    assert told["drives"]["answered"] == list(range(1, 9))
+    assert {one["verdict"] for one in told["drives"]["objects"]} <= {"ok", "remark"}
+
+
+def test_drives_of_another_make_are_told_with_what_to_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drives of the standard have no current limit of Maxon's, and no units."""
+    standard = read_eds(profile_path("cia402"))
+    monkeypatch.setattr("simulation.drives.cia402_rig.eds_of", lambda _rig, _path: standard)
+    answer = call("doctor", with_profile(tmp_path, "epos4"), "--drives", "--json")
+    assert answer.code == 4
+    objects = {one["object"][:8]: one for one in json.loads(answer.out)["drives"]["objects"]}
+    assert objects["3001h:02"]["verdict"] == "wrong"
+    assert objects["3001h:02"]["found"] == [{"drives": list(range(1, 9)), "value": "absent"}]
+
+
+def test_drives_need_the_rig_and_a_profile_that_is_there(tmp_path: Path) -> None:
+    answer = call("doctor", "--drives")
+    assert answer.code == 2
+    assert "cdpr doctor RIG --drives" in answer.said
+    answer = call("doctor", with_profile(tmp_path, "epos5"), "--drives")
+    assert answer.code == 2
+    assert "epos4" in answer.said

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.cli.named_bus import rig_on_bus
-from cdpr.errors import Refused
-from executor import camera_process
-from executor.camera_process import CameraProcess
-from executor.custody import Custody
-from executor.observer import Trigger
-from executor.reference import as_in_the_file
+from cdpr.cli.options import rig_on_bus
+from executor.cameras import process as camera_process
+from executor.cameras.process import CameraProcess
+from executor.cameras.worker import FrameRequest
+from executor.interlock.interlock import MotionInterlock
+from executor.interlock.reference import as_in_the_file
+from model.errors import Refused
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
 
@@ -41,13 +41,13 @@ def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (("--as-rig-file", "--tension-n", "7"), 2, "no effect here: --tension-n"),
         (("--as-rig-file", "--pictures", "9", "--fast"), 2, "no effect here: --pictures, --fast"),
         (("--pose-mm", "0", "0", "4450"), 2, "outside the workspace"),
-        (("--pose-mm", "0", "0", "nan"), 2, "outside the workspace"),
+        (("--pose-mm", "0", "0", "nan"), 2, "must be a finite number"),
         (("--at-home", "--limit-n", "5"), 3, "limit of 5 N"),
         (("--at-home", "--limit-n", "101"), 3, "limit of 101 N"),
         (("--at-home", "--tension-n", "4"), 3, "pretension of 4 N"),
         (("--at-home", "--tension-n", "50"), 3, "pretension of 50 N"),
-        (("--at-home", "--tension-n", "nan"), 3, "pretension of nan N"),
-        (("--at-home", "--limit-n", "nan"), 3, "limit of nan N"),
+        (("--at-home", "--tension-n", "nan"), 2, "must be a finite number"),
+        (("--at-home", "--limit-n", "nan"), 2, "must be a finite number"),
         (("--at-home", "--interface", "udp_multicast"), 2, "--fast"),
     ],
 )
@@ -105,7 +105,7 @@ def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) 
     """Ctrl-C is heard though the camera does not answer any more."""
     ask, asked = CameraProcess.ask, []
 
-    def stop_at_second(process: CameraProcess, trigger: Trigger) -> None:
+    def stop_at_second(process: CameraProcess, trigger: FrameRequest) -> None:
         asked.append(trigger.frame)
         if asked == [0, 0, 1]:  # the first before anything moved
             (camera,) = multiprocessing.active_children()
@@ -136,15 +136,17 @@ def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:
 def test_a_lost_reference_can_be_dropped_for_what_absolute_encoders_count(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41991")
     rig = rig_on_bus(RIG, *bus[1::2])
-    Custody(rig).file.write(as_in_the_file(rig).model_copy(update={"lost": "emergency stop"}))
+    MotionInterlock(rig).file.write(
+        as_in_the_file(rig).model_copy(update={"lost": "emergency stop"})
+    )
     with pytest.raises(Refused, match="no more referenced"):
-        Custody(rig).require_ready()
+        MotionInterlock(rig).require_ready()
     asked = call("home", RIG, "--as-rig-file", *bus, answers="n\n")
     assert asked.code == 130
     assert "does not count: the drives are no more referenced: emergency stop" in asked.out
-    assert Custody(rig).file.path.is_file()
+    assert MotionInterlock(rig).file.path.is_file()
     assert call("home", RIG, "--as-rig-file", *bus, "--yes").code == 0
-    Custody(rig).require_ready()
+    MotionInterlock(rig).require_ready()
     counting = tmp_path / "rig.yaml"
     counting.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
     one_message(call("home", counting, "--as-rig-file", *bus, "--yes"), 3, "never referenced")

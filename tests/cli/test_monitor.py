@@ -12,11 +12,10 @@ import typer
 from rich.console import Console
 
 from cdpr.cli.monitor import _lines, _plain, _view
-from cdpr.rig import load_rig
-from executor.machine import State
-from executor.records import CycleRecord, LoopEvent
-from executor.status import WinchStatus
-from executor.wishes import OwnBoard
+from executor.operator_requests import LocalRequests
+from executor.remote.status import WinchStatus
+from executor.state_machine import CycleRecord, LoopEvent, State
+from model.rig import load_rig
 from tests.cli.plans import RIG
 
 
@@ -100,7 +99,7 @@ def test_a_run_that_is_prepared_or_in_simulated_time_is_shown_too(shown: Any) ->
 @pytest.mark.parametrize("shown", [live, _plain])
 def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> None:
     rig = load_rig(RIG)
-    told = WinchStatus(rig, OwnBoard(), simulated_time=False)
+    told = WinchStatus(rig, LocalRequests(), simulated_time=False)
     before = told.as_dict()
     told.folder = Path("runs/[first]")
     assert before.keys() == status().keys()

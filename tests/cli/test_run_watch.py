@@ -7,21 +7,20 @@ from typing import Any
 
 import pytest
 
-from cdpr.cli.run_watch import RunWatch
-from executor.camera_eye import CameraEye
-from executor.run_cameras import RunCameras
-from executor.wishes import OwnBoard, StopReason
+from executor.cameras.client import CameraClient
+from executor.cameras.multi_camera import RunCameras, RunWatch
+from executor.operator_requests import LocalRequests, StopReason
 from tests.executor.test_run_cameras import MODEL, RATE, Scripted
 
 
 def watched(
     moments: int, limit: float, *cameras: Any, clearance_stop: bool = True
-) -> tuple[OwnBoard, list[tuple[str, str]]]:
+) -> tuple[LocalRequests, list[tuple[str, str]]]:
     """The board after so many moments, and what was told."""
-    board, told = OwnBoard(), list[tuple[str, str]]()
+    board, told = LocalRequests(), list[tuple[str, str]]()
     status: Any = SimpleNamespace(take_cameras=lambda _cameras: None)
     watch = RunWatch(
-        RunCameras([CameraEye(camera, "here") for camera in cameras], MODEL, limit, RATE),
+        RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE),
         status,
         board,
         lambda code, text, _at: told.append((code, text)),

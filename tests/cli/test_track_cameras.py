@@ -13,10 +13,10 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
-from cdpr.plan import load_plan, save_plan
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import load_rig
-from simulation.camera import SyntheticCamera
+from model.plan import load_plan, save_plan
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import load_rig
+from simulation.camera.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
 from tests.cli.program import call, nothing_written, one_message
 

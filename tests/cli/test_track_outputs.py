@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from cdpr.errors import BadInput
-from cdpr.rig import load_rig
-from drivers.picture_folder import ImageFolder, picture_files, read_picture
+from drivers.cameras.files import ImageFolder, picture_files, read_picture
+from model.errors import BadInput
+from model.rig import load_rig
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 from tracking.measurement import NoPose

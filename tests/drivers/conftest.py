@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.rig import Rig, load_rig
-from drivers.bus import BusSettings
-from drivers.drive_group import make_drive_group
-from simulation.rehearsal import Rehearsal
+from drivers.can_bus import BusSettings
+from drivers.factory import make_drive_group
+from model.rig import Rig, load_rig
+from simulation.drives.cia402_rig import SimulatedCia402Rig
 from tests.drivers.drive_bench import Bench, SteppedClock, free_udp_channel, three_on_a_bus
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,7 +34,7 @@ def bench(rig: Rig) -> Iterator[Bench]:
     """All in one thread, time passes with SYNC."""
     settings = BusSettings("virtual", f"drivers-{next(_CHANNELS)}")
     with three_on_a_bus(settings) as (master, drives, ear):
-        rehearsal = Rehearsal(rig, drives, rig.home)
+        rehearsal = SimulatedCia402Rig(rig, drives, rig.home)
         yield Bench(rig, make_drive_group(rig, master, rehearsal.pump), rehearsal, ear)
 
 
@@ -46,7 +46,7 @@ def served_bench(request: pytest.FixtureRequest, rig: Rig) -> Iterator[Bench]:
     clock = SteppedClock(rig.document.bus.cycle_ms / 1000.0)
     stop = threading.Event()
     with three_on_a_bus(BusSettings(kind, channel)) as (master, drives, ear):
-        rehearsal = Rehearsal(rig, drives, rig.home)
+        rehearsal = SimulatedCia402Rig(rig, drives, rig.home)
         server = threading.Thread(
             target=rehearsal.serve, args=(stop.is_set,), kwargs={"clock": clock}
         )

@@ -10,21 +10,23 @@ import can
 import numpy as np
 import pytest
 
-from cdpr.kinematics import cable_lengths
-from cdpr.poses import Pose
-from cdpr.rig import Rig
-from cdpr.statics.working import working_tensions
-from drivers.bus import BusSettings, open_bus
-from drivers.cia402.frames import parse_set_point
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.pdo import parse_set_point
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
-from simulation.drive import SimulatedDrive
-from simulation.rehearsal import Rehearsal
+from model.kinematics import cable_lengths
+from model.pose import Pose
+from model.rig import Rig
+from model.statics.gravity import working_tensions
+from simulation.drives.cia402 import SimulatedDrive
+from simulation.drives.cia402_rig import SimulatedCia402Rig
 
 
 class Bench:
     """Master, drives and a listener that hears every control word."""
 
-    def __init__(self, rig: Rig, group: DriveGroup, rehearsal: Rehearsal, ear: can.BusABC) -> None:
+    def __init__(
+        self, rig: Rig, group: DriveGroup, rehearsal: SimulatedCia402Rig, ear: can.BusABC
+    ) -> None:
         self.rig, self.group, self.rehearsal, self._ear = rig, group, rehearsal, ear
         self.status: CycleStatus | None = None
         self.before_cycle: Callable[[], None] = lambda: None

@@ -12,13 +12,13 @@ from typing import Any
 
 import can
 
-from cdpr.rig import Rig, load_rig, rig_from_document
-from drivers.bus import BusSettings, open_bus
+from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.odrive.endpoints import wanted_settings
 from drivers.odrive.group import OdriveGroup
-from simulation.odrive_drive import SimulatedOdrive
-from simulation.odrive_rehearsal import OdriveRehearsal
+from model.rig import Rig, load_rig, rig_from_document
+from simulation.drives.odrive import SimulatedOdrive
+from simulation.drives.odrive_rig import SimulatedOdriveRig
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ODRIVE_RIG = CONFIGS / "gachon_8_6_odrive.yaml"
@@ -53,7 +53,7 @@ class OdriveBench:
 
     rig: Rig
     group: OdriveGroup
-    rehearsal: OdriveRehearsal
+    rehearsal: SimulatedOdriveRig
     ear: can.BusABC
 
     @property
@@ -93,7 +93,7 @@ def odrive_bench(rig: Rig | None = None) -> Iterator[OdriveBench]:
     rig = rig or odrive_rig()
     settings = BusSettings("virtual", f"odrive-{next(_CHANNELS)}")
     with open_bus(settings) as master, open_bus(settings) as far, open_bus(settings) as ear:
-        rehearsal = OdriveRehearsal(rig, far, rig.home)
+        rehearsal = SimulatedOdriveRig(rig, far, rig.home)
         yield OdriveBench(
             rig, OdriveGroup(rig, master, rehearsal.pump, max_tension=None), rehearsal, ear
         )

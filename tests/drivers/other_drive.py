@@ -56,7 +56,6 @@ VARIABLES: dict[int, tuple[int, int]] = {
     0x6077: (INTEGER16, 0),
     0x607A: (INTEGER32, 0),
     0x6085: (UNSIGNED32, 0),
-    0x60B2: (INTEGER16, 0),
     0x6502: (UNSIGNED32, 0x1ED),
 }
 """Not there, as in many drives: 1007h, 1029h, 1400h:05 (no RPDO deadline), 605Ch, 605Eh."""
@@ -138,8 +137,8 @@ class OtherDrive:
                 self._network.notify(number, bytearray(data), 0.0)
             elif number == 0x080:
                 self._on_sync()
-            elif number == 0x200 + self.node and len(data) == 8:
-                word, target, _ = struct.unpack("<Hih", data)
+            elif number == 0x200 + self.node and len(data) == 6:
+                word, target = struct.unpack("<Hi", data)
                 self._waiting = word, target
             elif number == 0x600 + self.node:
                 time.sleep(self._late)

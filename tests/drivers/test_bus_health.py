@@ -11,26 +11,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import Fault, Refused
-from drivers.bus import BusSettings, lost_frames, open_bus
-from drivers.bus_faults import (
+from drivers.can_bus import BusSettings, EchoFilter, lost_frames, open_bus
+from drivers.can_errors import (
+    ERROR_CYCLES,
     BusDown,
     BusErrors,
     BusFault,
     BusGone,
     BusOff,
     BusPassive,
+    ErrorFrames,
     ForeignMaster,
     ReceiveOverflow,
     TransmitQueueFull,
     bus_fault,
+    error_frame_fault,
 )
-from drivers.cia402.master_ids import commanding_ids
-from drivers.cia402.states import DriveState
+from drivers.cia402.cob_ids import commanding_ids
+from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import WHOLE_BUS, GroupCommand, GroupState
-from drivers.error_frames import ERROR_CYCLES, ErrorFrames, error_frame_fault
-from drivers.own_frames import OwnFrames
-from drivers.reply_check import ReplyCheck
+from drivers.plausibility import ReplyCheck
+from model.errors import Fault, Refused
 from tests.drivers.drive_bench import Bench, free_udp_channel
 
 HOLDING = DriveState.QUICK_STOP_ACTIVE
@@ -341,10 +342,10 @@ def test_a_position_is_believed_exactly_when_the_drum_can_have_turned_so_far(
 
 @given(st.lists(st.sampled_from(["send", "own", "foreign"]), max_size=30))
 def test_where_a_sender_hears_itself_only_what_was_not_sent_is_foreign(script: list[str]) -> None:
-    own = OwnFrames(commanding_ids(NODES), hears_itself=True)
+    own = EchoFilter(commanding_ids(NODES), echoes_own_frames=True)
     waiting = 0
     for what in script:
-        if what == "send" and waiting < OwnFrames.MOST_CREDIT:
+        if what == "send" and waiting < EchoFilter.MOST_CREDIT:
             own.sent(0x080)
             waiting += 1
         elif what == "own" and waiting:

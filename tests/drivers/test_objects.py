@@ -7,17 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput
-from cdpr.kinematics import cable_lengths
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig
-from cdpr.winches import WinchMap
-from drivers.cia402.objects import (
-    heartbeat_consumers,
-    interpolation_time,
-    settings_for,
-)
-from drivers.travel import position_limits
+from drivers.cia402.object_dictionary import heartbeat_consumers, interpolation_time, settings_for
+from drivers.plausibility import position_limits
+from model.errors import BadInput
+from model.kinematics import cable_lengths
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig
+from model.winches import WinchMap
 
 
 def final_values(rig: Rig, drive: int) -> dict[tuple[int, int], int]:
@@ -32,20 +28,24 @@ def test_stops_end_in_holding_and_time_outs_are_armed(rig: Rig) -> None:
     assert values[0x6060, 0] == 8  # cyclic synchronous position
     assert (values[0x60C2, 1], values[0x60C2, 2]) == (10, -3)
     assert values[0x1006, 0] == 10_000
-    assert values[0x1400, 5] == 30
+    assert values[0x1400, 5] == 0, "off: it would stop a drive that the next frame enables again"
     assert 0 < values[0x1017, 0] <= 30
     assert values[0x6072, 0] == 1200  # 100 N at rated torque, 100 N allowed, a fifth in reserve
     window_mm = values[0x6065, 0] / rig.winches[2].counts_per_metre * 1000.0
     assert window_mm == pytest.approx(rig.document.motion.following_error_mm, abs=0.01)
 
 
-def test_process_data_are_eight_bytes_at_each_sync(rig: Rig) -> None:
+def test_set_points_are_six_bytes_and_replies_eight_at_each_sync(rig: Rig) -> None:
     values = final_values(rig, 2)
-    for parameters, mapping, identifier in ((0x1400, 0x1600, 0x203), (0x1800, 0x1A00, 0x183)):
+    for parameters, mapping, identifier, size in (
+        (0x1400, 0x1600, 0x203, 48),
+        (0x1800, 0x1A00, 0x183, 64),
+    ):
         assert values[parameters, 1] & 0xBFFFFFFF == identifier
         assert values[parameters, 2] == 1
-        bits = sum(values[mapping, sub] & 0xFF for sub in (1, 2, 3))
-        assert bits == 64
+        count = values[mapping, 0]
+        assert sum(values[mapping, sub] & 0xFF for sub in range(1, count + 1)) == size
+    assert values[0x1800, 3] == 0  # no inhibit time
 
 
 def test_master_is_watched_first_then_the_peers_as_far_as_there_is_room(rig: Rig) -> None:

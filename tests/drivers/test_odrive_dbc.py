@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput
 from drivers.odrive.dbc import OWN_DBC, Layout, Layouts, read_layouts
 from drivers.odrive.messages import (
     AxisError,
@@ -21,6 +20,7 @@ from drivers.odrive.messages import (
     state_text,
     status_word,
 )
+from model.errors import BadInput
 
 TEXT = OWN_DBC.read_text()
 
@@ -98,6 +98,9 @@ def test_messages_lie_where_the_named_file_says(tmp_path: Path) -> None:
             "Vel_Estimate is no number of whole bytes in order",
         ),
         (TEXT.replace("Axis_State : 32|8", "Axis_State : 33|7"), "Axis_State is no number"),
+        (TEXT.replace("Axis0_Get_Torques: 8", "Axis0_Get_Torques: 4"), "its signals need 8"),
+        (TEXT.replace("(0.001,0)", f"({'9' * 399},0)"), "has steps of 999"),
+        (TEXT.replace("(0.001,0)", "(0,0)"), "has steps of 0"),
     ],
 )
 def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, words: str) -> None:
@@ -110,7 +113,7 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, words: s
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="cannot be read"):
+    with pytest.raises(BadInput, match="no such file"):
         read_layouts(tmp_path / "none.dbc")
 
 

@@ -10,12 +10,13 @@ import can
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput, Fault, HardwareMissing, Refused
-from cdpr.rig import Rig, rig_from_document
-from drivers.drive_group import GroupCommand, GroupState, drive_states, look_at_drives
+from drivers.drive_group import GroupCommand, GroupState
+from drivers.factory import drive_states, read_drives
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
 from drivers.odrive.messages import AxisError, AxisState, can_id, node_and_command
+from model.errors import BadInput, Fault, HardwareMissing, Refused
+from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
 SET_AXIS_STATE, SET_INPUT_POS = 0x07, 0x0C
@@ -337,12 +338,26 @@ def test_endpoints_of_another_firmware_are_refused(tmp_path: Path) -> None:
             bench.group.configure()
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"fw_version": "0.6.11", "endpoints": {}}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        '{"fw_version": "0.6.11", "endpoints": {}}',
+        '{"fw_version": "9e99.6.11", "endpoints": {}}',
+        '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout": 3}}',
+        *(
+            '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout":'
+            f' {{"id": {number}, "type": "float"}}}}}}'
+            for number in ("1e400", "-1", "1.5", "9" * 30, '"x"', "70000")
+        ),
+    ],
+)
 def test_a_file_that_holds_no_endpoints_is_refused(tmp_path: Path, text: str) -> None:
     document: Any = odrive_rig().document.drives
     path = tmp_path / "endpoints.json"
     path.write_text(text)
-    with pytest.raises(BadInput, match="not the endpoints that are needed"):
+    with pytest.raises(BadInput, match=r"not the endpoints that are needed|not valid JSON|finite"):
         read_endpoints(path, document)
 
 
@@ -394,7 +409,7 @@ def test_counts_that_a_float_cannot_tell_apart_are_refused() -> None:
 
 
 def test_who_only_looks_sends_nothing(bench: OdriveBench) -> None:
-    seen = look_at_drives(bench.rig, bench.group._bus, bench.rehearsal.pump)
+    seen = read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump)
     assert seen.positions.tolist() == [round(drive.motor.position) for drive in bench.drives]
     assert not seen.torques.any(), "their brakes hold"
     assert seen.restarted == ()
@@ -418,5 +433,5 @@ def test_who_only_looks_believes_no_count_that_may_have_begun_anew() -> None:
     counting = [winch.model_copy(update={"encoder": "incremental"}) for winch in document.winches]
     rig = rig_from_document(document.model_copy(update={"winches": counting}))
     with odrive_bench(rig) as bench:
-        seen = look_at_drives(rig, bench.group._bus, bench.rehearsal.pump)
+        seen = read_drives(rig, bench.group._bus, bench.rehearsal.pump)
         assert seen.restarted == bench.group.restarted == tuple(range(1, 9))

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.sequence import Goal, next_words
-from drivers.cia402.states import ControlWord, DriveState
+from drivers.cia402.state_machine import ControlWord, DriveState, Goal, next_words
 
 STATES = st.sampled_from(DriveState)
 READY = {
@@ -116,3 +115,22 @@ def test_only_faulted_drives_get_a_reset() -> None:
 def test_unknown_drives_are_told_to_stop() -> None:
     """A drive not heard yet may be holding the platform from an earlier run."""
     assert next_words(Goal.IDLE, [DriveState.NOT_READY], [False]) == (ControlWord.QUICK_STOP,)
+
+
+ENABLING = {
+    (DriveState.NOT_READY, DriveState.SWITCHED_ON): "QUICK_STOP SHUTDOWN",
+    (DriveState.SWITCH_ON_DISABLED, DriveState.SWITCHED_ON): "SHUTDOWN SHUTDOWN",
+    (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON): "SHUTDOWN SHUTDOWN",
+    (DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON): "SWITCH_ON SWITCH_ON",
+    (DriveState.READY_TO_SWITCH_ON, DriveState.OPERATION_ENABLED): "SWITCH_ON QUICK_STOP",
+    (DriveState.SWITCHED_ON, DriveState.SWITCHED_ON): "ENABLE_OPERATION ENABLE_OPERATION",
+    (DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED): "ENABLE_OPERATION ENABLE_OPERATION",
+}
+
+
+@pytest.mark.parametrize("states", ENABLING)
+def test_each_step_towards_enabled_is_that_of_the_drive_furthest_behind(
+    states: tuple[DriveState, ...],
+) -> None:
+    words = next_words(Goal.ENABLE, states, [False] * len(states))
+    assert " ".join(word.name for word in words) == ENABLING[states]

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from drivers.cia402.states import ControlWord, DriveState, state_of
+from drivers.cia402.state_machine import FAULTED, TORQUE_ON, ControlWord, DriveState, state_of
 
 # Bits 6..0 as the standard prints them; x is any.
 STANDARD = {
@@ -31,9 +31,9 @@ def standard_state(word: int) -> DriveState | None:
 
 
 def test_every_status_word_means_what_the_standard_says() -> None:
+    expected = [standard_state(word) or DriveState.NOT_READY for word in range(0x80)]
     for word in range(0x10000):
-        expected = standard_state(word) or DriveState.NOT_READY
-        assert state_of(word) is expected, hex(word)
+        assert state_of(word) is expected[word & 0x7F], hex(word)
 
 
 @pytest.mark.parametrize(
@@ -48,6 +48,23 @@ def test_every_status_word_means_what_the_standard_says() -> None:
 )
 def test_status_words_seen_on_drives(word: int, state: DriveState) -> None:
     assert state_of(word) is state
+
+
+def test_control_words_are_those_of_the_standard() -> None:
+    """CiA 402-2, table "command coding", written out."""
+    assert {word.name: int(word) for word in ControlWord} == {
+        "SHUTDOWN": 0x06,
+        "SWITCH_ON": 0x07,
+        "ENABLE_OPERATION": 0x0F,
+        "QUICK_STOP": 0x02,
+        "RESET_FAULT": 0x86,
+    }
+
+
+def test_which_states_hold_a_cable_and_which_are_a_fault() -> None:
+    names = {"OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE"}
+    assert {state.name for state in TORQUE_ON} == names
+    assert {state.name for state in FAULTED} == {"FAULT_REACTION_ACTIVE", "FAULT"}
 
 
 def test_no_control_word_is_disable_voltage() -> None:

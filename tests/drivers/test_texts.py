@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.texts import abort_text, emergency_text
+from drivers.cia402.error_codes import abort_text, emergency_text
 
 
 def test_known_codes() -> None:

@@ -10,22 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.cables import cables_to
-from cdpr.clearance import ClearanceModel
-from cdpr.document_types import PoseDocument
-from cdpr.plan import Plan, plan_from_document, sealed
-from cdpr.plan_file import PlanDocument
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene
-from cdpr.statics.working import working_tensions
-from executor.clearance_table import ClearanceTable
-from executor.cycle_table import CycleTable
-from executor.fused_table import fused_table
-from executor.mcap_log import write_mcap
-from executor.pose_table import PoseTable
-from executor.run_folder import RunEvent, RunFolder
-from executor.summary import RunContext, summarize
+from executor.recording.clearance import ClearanceTable
+from executor.recording.fused import fused_table
+from executor.recording.mcap import write_mcap
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.summary import RunContext, summarize
+from executor.recording.tables import CycleTable, PoseTable
+from model.clearance import ClearanceModel
+from model.files.documents import PoseDocument
+from model.files.plan_file import PlanDocument
+from model.kinematics import cables_to
+from model.plan import Plan, plan_from_document, sealed
+from model.pose import Array, Pose
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene
+from model.statics.gravity import working_tensions
 
 ROOT = Path(__file__).parents[2]
 CORNERS_MM = [

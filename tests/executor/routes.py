@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cdpr.poses import Pose
-from cdpr.rig import Motion
+from model.pose import Pose
+from model.rig import Motion
 
 Array = NDArray[np.float64]
 WEIGHT = 0.11
@@ -18,6 +18,8 @@ GACHON = Motion(
     blend_tolerance=0.001,
     following_error=0.002,
     start_tolerance=0.001,
+    stuck_travel=0.00007,
+    stuck_speed=0.002,
 )
 HALL = Motion(
     speed=0.1,
@@ -26,6 +28,8 @@ HALL = Motion(
     blend_tolerance=0.005,
     following_error=0.005,
     start_tolerance=0.003,
+    stuck_travel=0.00007,
+    stuck_speed=0.002,
 )
 
 

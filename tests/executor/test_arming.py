@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from cdpr.errors import Refused
 from drivers.drive_group import Capabilities
-from executor.arming import require_capabilities
+from executor.control.preconditions import require_capabilities
+from model.errors import Refused
 
 CYCLE = 0.01
 SYNCED = Capabilities(
@@ -18,6 +18,8 @@ SYNCED = Capabilities(
     has_brake=False,
     max_hz=250.0,
     watchdog_ms=None,
+    sync_timeout=3.0,
+    master_timeout=0.1,
 )
 BRAKED = Capabilities(
     sync=False,
@@ -26,6 +28,8 @@ BRAKED = Capabilities(
     has_brake=True,
     max_hz=250.0,
     watchdog_ms=100.0,
+    sync_timeout=None,
+    master_timeout=0.0,
 )
 
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cdpr.poses import Pose, interpolate
-from executor.blending import HALVINGS, LONGEST_SHARE, rounded
-from executor.path import Path, poses_of
+from executor.trajectory.blending import HALVINGS, LONGEST_SHARE, rounded
+from executor.trajectory.path import Path, poses_of
+from model.pose import Pose, interpolate
 from tests.executor.routes import WEIGHT, always, at_mm, random_route
 
 seeds = st.integers(0, 2**32 - 1)

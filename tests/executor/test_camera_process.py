@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from executor.camera_process import _serve
+from executor.cameras.process import _serve
 
 
 class _Camera:

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.camera_sight import BLIND_PICTURES, SILENCE, CameraSight
+from executor.cameras.client import BLIND_PICTURES, SILENCE, CameraHealth
 
 
 def looked(seen: list[bool]) -> list[str]:
     """What is told after each picture, ten a second, each answered at once."""
-    sight, told = CameraSight(), []
+    sight, told = CameraHealth(), []
     for frame, pose in enumerate(seen):
         sight.ask(frame / 10)
         sight.answer(pose)
@@ -34,7 +34,7 @@ def test_a_camera_that_saw_once_and_then_loses_the_tags_is_told() -> None:
 
 @pytest.mark.parametrize("blind", [False, True])
 def test_a_camera_that_hangs_is_told_until_it_answers(blind: bool) -> None:
-    sight = CameraSight()
+    sight = CameraHealth()
     for _ in range(BLIND_PICTURES):
         sight.answer(not blind)
     sight.ask(100.0)

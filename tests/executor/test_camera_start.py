@@ -6,10 +6,10 @@ from typing import cast
 
 import pytest
 
-from cdpr.errors import Fault, HardwareMissing, StoppedByOperator
-from executor import camera_start
-from executor.camera_process import CameraProcess
-from executor.camera_start import HEARING, wait_until_ready
+from executor.cameras import client as camera_start
+from executor.cameras.client import HEARING, wait_until_ready
+from executor.cameras.process import CameraProcess
+from model.errors import Fault, HardwareMissing, StoppedByOperator
 
 
 class Opening:

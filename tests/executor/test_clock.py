@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor import clock
-from executor.clock import RealClock, SimulatedClock
+from executor.realtime import clock
+from executor.realtime.clock import RealClock, SimulatedClock
 
 CYCLE = 0.01
 CYCLE_NS = 10_000_000

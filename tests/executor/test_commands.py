@@ -16,12 +16,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput, Fault
-from executor.command_client import ask_all, last_word, no_answer, the_one
-from executor.command_server import LONGEST_QUESTION, MOST_CLIENTS, serving
-from executor.commands import NotACommand, answer_to, make_line, parse_command
-from executor.running import Reached, announced, reached_runs
-from executor.wishes import OwnBoard, Wishes
+from executor.operator_requests import LocalRequests, OperatorRequests
+from executor.remote.client import ask_all, last_word, no_answer, the_one
+from executor.remote.protocol import NotACommand, answer_to, make_line, parse_command
+from executor.remote.registry import Reached, announced, find_runs
+from executor.remote.server import LONGEST_QUESTION, MOST_CLIENTS, serving
+from model.errors import BadInput, Fault
 
 
 class _Status:
@@ -34,20 +34,20 @@ class _Status:
 STATUS: Any = _Status()
 
 
-def _answer(line: bytes, board: OwnBoard | None = None) -> dict[str, Any]:
-    return json.loads(answer_to(line, board or OwnBoard(), STATUS))
+def _answer(line: bytes, board: LocalRequests | None = None) -> dict[str, Any]:
+    return json.loads(answer_to(line, board or LocalRequests(), STATUS))
 
 
 def test_each_command_puts_up_its_wish_and_leaves_the_others():
-    board = OwnBoard()
+    board = LocalRequests()
     assert _answer(make_line("status"), board) == {"ok": True, "status": {"state": "moving"}}
-    assert board.read() == Wishes()
+    assert board.read() == OperatorRequests()
     for command, percent, wishes in (
-        ("speed", 40, Wishes(speed=0.4)),
-        ("hold", None, Wishes(speed=0.4, hold=True)),
-        ("resume", None, Wishes(speed=0.4)),
-        ("stop", None, Wishes(speed=0.4, stop=True)),
-        ("resume", None, Wishes(speed=0.4, stop=True)),
+        ("speed", 40, OperatorRequests(speed=0.4)),
+        ("hold", None, OperatorRequests(speed=0.4, hold=True)),
+        ("resume", None, OperatorRequests(speed=0.4)),
+        ("stop", None, OperatorRequests(speed=0.4, stop=True)),
+        ("resume", None, OperatorRequests(speed=0.4, stop=True)),
     ):
         assert _answer(make_line(command, percent), board)["ok"] is True
         assert board.read() == wishes
@@ -72,19 +72,19 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
     ],
 )
 def test_what_is_no_command_changes_nothing_and_is_told(line):
-    board = OwnBoard()
+    board = LocalRequests()
     answer = _answer(line, board)
     assert answer["ok"] is False
     assert answer["what"].startswith("not a command: ")
-    assert board.read() == Wishes()
+    assert board.read() == OperatorRequests()
 
 
 @given(line=st.binary(max_size=200))
 def test_no_bytes_do_anything_but_a_command(line):
-    board = OwnBoard()
+    board = LocalRequests()
     answer = _answer(line, board)
     if not answer["ok"]:
-        assert board.read() == Wishes()
+        assert board.read() == OperatorRequests()
 
 
 @given(percent=st.integers(1, 100))
@@ -100,27 +100,27 @@ def test_a_speed_that_is_none_is_no_command(percent):
 
 
 @pytest.fixture
-def board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[OwnBoard]:
+def board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[LocalRequests]:
     """Of a run that answers."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
-    board = OwnBoard()
+    board = LocalRequests()
     with announced() as listeners, serving(listeners, board, STATUS):
         yield board
 
 
 def test_a_run_hears_and_answers(board):
-    with reached_runs() as runs:
+    with find_runs() as runs:
         (answer,) = ask_all(runs, "speed", 30)
         assert answer.status == {"state": "moving"}
         (answer,) = ask_all(runs, "hold")
         assert answer.status == {"state": "moving"}
-    assert board.read() == Wishes(hold=True, speed=0.3)
+    assert board.read() == OperatorRequests(hold=True, speed=0.3)
 
 
 def _connected() -> socket.socket:
-    with reached_runs() as runs:
+    with find_runs() as runs:
         link = runs[0].link.dup()
     link.settimeout(5.0)
     return link
@@ -133,7 +133,7 @@ def test_several_lines_at_once_and_a_line_in_pieces_are_understood(board):
         link.sendall(b'"percent": 7}\nnonsense\n')
         assert json.loads(answers.readline())["ok"] is True
         assert json.loads(answers.readline())["ok"] is False
-    assert board.read() == Wishes(hold=True, speed=0.07)
+    assert board.read() == OperatorRequests(hold=True, speed=0.07)
 
 
 def test_a_line_without_end_is_cut_off(board):
@@ -151,7 +151,7 @@ def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
                 deaf.send(make_line("status") * 20)
         idle = [_connected() for _ in range(MOST_CLIENTS + 5)]
         try:
-            with reached_runs() as runs:
+            with find_runs() as runs:
                 (answer,) = ask_all(runs, "stop")
             assert answer.status is not None
             assert board.read().stop
@@ -161,7 +161,7 @@ def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
 
 
 def test_a_run_that_ends_is_told_apart_from_one_that_hangs(monkeypatch):
-    monkeypatch.setattr("executor.command_client.ANSWER_TIMEOUT", 0.05)
+    monkeypatch.setattr("executor.remote.client.ANSWER_TIMEOUT", 0.05)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         (hanging,) = ask_all([Reached(7, ours)], "stop")
@@ -203,11 +203,11 @@ def test_a_command_counts_although_the_run_cannot_tell_how_it_stands():
         def as_dict(self) -> dict[str, Any]:
             raise RuntimeError("half a status")
 
-    board = OwnBoard()
+    board = LocalRequests()
     answer = json.loads(answer_to(make_line("hold"), board, Broken()))
     assert answer["ok"] is False
     assert "half a status" in answer["what"]
-    assert board.read() == Wishes(hold=True)
+    assert board.read() == OperatorRequests(hold=True)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -215,8 +215,8 @@ def test_a_run_that_could_not_be_stopped_from_elsewhere_any_more_is_stopped(monk
     def break_down(*_: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr("executor.command_server.answer_to", break_down)
-    with reached_runs() as runs:
+    monkeypatch.setattr("executor.remote.server.answer_to", break_down)
+    with find_runs() as runs:
         assert ask_all(runs, "status")[0].ended
     assert board.read().stop
 
@@ -246,8 +246,8 @@ def test_a_run_that_ends_says_once_more_how_it_stands(
     now = {"state": "moving"}
     status: Any = SimpleNamespace(as_dict=lambda: now)
     with ExitStack() as watching:
-        with announced() as listeners, serving(listeners, OwnBoard(), status):
-            runs = watching.enter_context(reached_runs())
+        with announced() as listeners, serving(listeners, LocalRequests(), status):
+            runs = watching.enter_context(find_runs())
             for _ in range(1 + asked):
                 assert ask_all(runs, "status")[0].status == {"state": "moving"}
             now = {"state": "latched", "cause": "cable 6 is slack"}

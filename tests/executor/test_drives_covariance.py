@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.kinematics import cable_lengths, forward_kinematics
-from cdpr.poses import Array, Pose, rotation_vector_from_matrix
-from cdpr.rig import Rig, load_rig, rig_from_document
-from cdpr.statics.working import working_tensions
-from cdpr.winches import WinchMap
-from executor.drives_covariance import covariance_by_drives, tension_noise
+from executor.recording.clearance import covariance_by_drives, tension_noise
+from model.kinematics import cable_lengths, forward_kinematics
+from model.pose import Array, Pose, rotation_vector_from_matrix
+from model.rig import Rig, load_rig, rig_from_document
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
 from tests.cli.plans import RIG
 
 

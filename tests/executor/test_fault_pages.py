@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from html import unescape
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
-from drivers.bus_faults import BusFault
-from executor.fault_pages import ORDINARY, page_of, pages_of
+from drivers.can_errors import BusFault
+from executor.recording.verdict import ORDINARY, fault_codes, faults_among, page_of, page_text
+from executor.report.run_data import markdown
+from model.files.scene_file import StopDocument
+from tests.cli.program import call, one_message
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "faults"
@@ -17,7 +22,7 @@ HEADINGS = ["## What it means", "## Likely cause", "## State of the machine", "#
 #: Which argument of a call is the code of an event.
 PLACES = {
     "CameraNews": 0,
-    "Finding": 1,
+    "Alarm": 1,
     "LoopEvent": 2,
     "RunEvent": 1,
     "StopReason": 0,
@@ -76,6 +81,32 @@ def test_there_is_no_page_about_nothing() -> None:
     assert sorted(path.stem for path in PAGES.glob("*.md") if path.stem != "index") == CODES
 
 
-def test_pages_are_named_once_and_only_for_faults() -> None:
+def test_faults_are_named_once_and_nothing_else_is() -> None:
     codes = ["enabled", "moving", "slack", "late", "slack", "held"]
-    assert pages_of(codes) == ["docs/faults/slack.md", "docs/faults/late.md"]
+    assert faults_among(codes) == ["slack", "late"]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [*sorted(ORDINARY), *get_args(StopDocument.model_fields["kind"].annotation), "unheard_of"],
+)
+def test_an_event_that_is_no_fault_points_to_no_page(code: str) -> None:
+    assert page_of(code) == ""
+
+
+def test_every_page_is_explained_and_a_wrong_code_is_told_the_right_ones() -> None:
+    for code in fault_codes():
+        answer = call("explain", code)
+        assert answer.code == 0
+        assert answer.out.strip() == page_text(code).strip()
+        assert "](" not in answer.out
+    listed = call("explain")
+    assert [line.split()[0] for line in listed.out.splitlines()] == fault_codes()
+    one_message(call("explain", "drive_silnet"), 2, "drive_silent", "drive_silnet")
+
+
+def test_the_text_of_a_page_is_in_the_report_without_its_markup() -> None:
+    for code in fault_codes():
+        html = markdown(page_text(code).split("\n", 1)[1])
+        assert "<h3>Next step</h3>" in html
+        assert not set("`#*") & set(unescape(html)), html

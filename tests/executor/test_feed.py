@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.rig import Motion
-from executor.feed import Feed, targets_at
+from executor.control.feed import Feed, targets_at
+from executor.trajectory.time_scaling import speed_change
+from model.rig import Motion
 from tests.executor.routes import GACHON, HALL
 
 CYCLE = 0.01
@@ -109,7 +110,7 @@ def test_a_stop_that_reaches_the_last_row_ends_there():
 
 
 def test_a_stop_harder_than_one_cycle_can_show_is_at_rest_at_once():
-    fierce = Motion(0.02, 1e6, 1e12, 0.001, 0.002, 0.001)
+    fierce = Motion(0.02, 1e6, 1e12, 0.001, 0.002, 0.001, 0.00007, 0.002)
     places = _stopped(100, 10, fierce)
     assert len(places) <= 3
     assert places[-1] <= 11.0
@@ -224,3 +225,29 @@ def test_targets_between_rows_lie_between_them(rows, share):
     assert (targets <= high).all()
     exact = table[row] + share * (table[row + 1].astype(float) - table[row])
     assert targets == pytest.approx(exact, abs=0.5 + 1e-6)
+
+
+@given(
+    speed=st.floats(0.0, 1.0),
+    share=st.floats(-1.0, 1.0),
+    end=st.floats(0.0, 1.0),
+    acceleration=st.floats(1e-3, 1.0),
+    jerk=st.floats(1e-5, 1.0),
+)
+def test_a_change_of_speed_keeps_its_limits_and_ends_without_acceleration(
+    speed: float, share: float, end: float, acceleration: float, jerk: float
+) -> None:
+    change = speed_change((speed, share * acceleration), end, acceleration, jerk)
+    before = change.at(0.0)
+    assert before[1:] == (speed, share * acceleration)
+    step = max(change.duration, 1.0) / 200
+    for k in range(1, 201):
+        travelled, now, slope = change.at(k * step)
+        assert abs(slope) <= acceleration * (1.0 + 1e-9)
+        assert abs(slope - before[2]) <= jerk * step * (1.0 + 1e-9) + 1e-12
+        assert now - before[1] == pytest.approx((slope + before[2]) / 2 * step, abs=jerk * step**2)
+        mean = (now + before[1]) / 2 * step
+        assert travelled - before[0] == pytest.approx(mean, abs=acceleration * step**2 + 1e-12)
+        before = travelled, now, slope
+    assert change.at(change.duration)[1:] == (end, 0.0)
+    assert change.at(change.duration * (1.0 - 1e-12))[1] == pytest.approx(end, abs=1e-6)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.machine import Event, ForbiddenTransition, Machine, State
+from executor.state_machine import Event, ForbiddenTransition, Machine, State
 
 #: The shortest way to every state.
 WAYS = {

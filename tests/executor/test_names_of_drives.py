@@ -8,13 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cdpr.rig import load_rig
-from drivers.cia402.frames import EMCY_BASE
-from drivers.cia402.watch import DriveWatch
+from drivers.cia402.monitor import DriveMonitor
+from drivers.cia402.pdo import EMCY_BASE
 from drivers.drive_group import WHOLE_BUS, GroupState
-from executor.course import Course, fingerprint
-from executor.exchange import Exchange
+from executor.control.cycle import Cycle
+from executor.control.sync_master import SyncMaster
+from executor.realtime.clock import SimulatedClock
 from executor.safety.gate import Purpose
+from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
+from model.rig import load_rig
 
 #: Its ten winches have the node ids 11 to 20.
 HALL = load_rig(Path(__file__).parents[2] / "configs" / "hall_10_6.yaml")
@@ -25,11 +27,12 @@ class _Group:
     """Drives of which the fifth does not answer, one is faulty and the bus as well."""
 
     state = GroupState.CONFIGURED
+    capabilities = SimpleNamespace(sync_timeout=3.0)
 
     def __init__(self, faults: Sequence[tuple[int, str]]) -> None:
         self.faults = tuple(faults)
 
-    def send_cycle(self, targets: Sequence[int]) -> None:
+    def send_cycle(self, _targets: Sequence[int], _may_enable: object) -> None:
         """Nobody listens."""
 
     def receive(self, _timeout: float) -> SimpleNamespace:
@@ -40,17 +43,17 @@ class _Group:
             torques=np.zeros(10, dtype=int),
             missing=np.arange(10) == 4,
             faults=self.faults,
+            warnings=(),
             state=self.state,
         )
 
 
 def test_a_drive_has_one_name_whoever_speaks_of_it():
-    watch = DriveWatch(HALL.drive_names, [1e9] * 10)
+    watch = DriveMonitor(HALL.drive_names, [1e9] * 10)
     watch.take(EMCY_BASE + 13, bytes.fromhex("1023000000000000"))
     group = _Group([*watch.news(), (WHOLE_BUS, "bus-off")])
-    course = Course(HALL, 0.01, HOME, fingerprint(0.01, HOME))
-    clock = SimpleNamespace(next_cycle=lambda: 0.0, time_left=lambda: 0.0)
-    exchange = Exchange(course, group, clock)
+    course = CheckedSetpoints(HALL, 0.01, HOME, fingerprint(0.01, HOME))
+    exchange = Cycle(course, SyncMaster(HALL, group, SimulatedClock(0.01)))
     exchange.actual = tuple(HOME[0].tolist())
     done = exchange.cycle(Purpose.HOLD, exchange.actual, at_rest=True)
     told = {(finding.drive, finding.text.split(":")[0]) for finding in done.findings}

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from executor import real_time_process
-from executor.machine import State
-from executor.real_time_job import Armed, Ended
-from executor.shared_board import SharedBoard
+from executor.realtime import process as real_time_process
+from executor.realtime.job import Armed, Ended
+from executor.realtime.shared_memory import SharedRequests
+from executor.state_machine import State
 
 
 class Still:
@@ -38,7 +38,7 @@ def test_a_motion_that_is_over_leaves_no_stop_behind_on_the_board(
 ) -> None:
     """The last pictures are waited for then, and shortly only if the operator stopped."""
     monkeypatch.setattr(real_time_process, "serve", arms_and_ends)
-    board, nobody_listens = SharedBoard(), SimpleNamespace()
+    board, nobody_listens = SharedRequests(), SimpleNamespace()
     motion_on_board: Any = (Still(), print, board)
     try:
         with real_time_process.real_time_process(*motion_on_board, need_real_time=False) as process:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from executor.realtime import CAP_IPC_LOCK, CAP_SYS_NICE
+from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE
 
 ROOT = Path(__file__).parents[2]
 #: Gives a privilege up for good, then tells whether it is still there.
 TELL = """
 import ctypes, sys
-from executor.realtime import has_capability
+from executor.realtime.scheduling import has_capability
 data = (ctypes.c_uint32 * 6)()
 header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # _LINUX_CAPABILITY_VERSION_3
 libc = ctypes.CDLL(None, use_errno=True)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from cdpr.errors import Refused
-from cdpr.rig import Rig, load_rig, rig_from_document
-from executor.arming import require_still_referenced
-from executor.custody import Custody
-from executor.machine import State
-from executor.reference import ReferenceDocument, reference_at
+from executor.control.preconditions import require_still_referenced
+from executor.interlock.interlock import MotionInterlock
+from executor.interlock.reference import HomingReference, reference_at
+from executor.state_machine import State
+from model.errors import Refused
+from model.rig import Rig, load_rig, rig_from_document
 from tests.cli.plans import RIG
 
 
@@ -31,7 +29,7 @@ def rig_with(encoder: str, **winch: object) -> Rig:
     return rig_from_document(document.model_copy(update={"winches": winches, "bus": bus}))
 
 
-def reference_of(rig: Rig, shift: int = 1000) -> ReferenceDocument:
+def reference_of(rig: Rig, shift: int = 1000) -> HomingReference:
     counts = np.full(rig.cable_count, float(shift))
     return reference_at(rig, rig.home, counts, np.full(rig.cable_count, 20.0), "stated", 0.0)
 
@@ -39,8 +37,8 @@ def reference_of(rig: Rig, shift: int = 1000) -> ReferenceDocument:
 def test_it_takes_the_place_of_the_rig_files_counts() -> None:
     rig = rig_with("incremental")
     document = reference_of(rig)
-    Custody(rig).file.write(document)
-    found = Custody(rig).referenced_rig()
+    MotionInterlock(rig).file.write(document)
+    found = MotionInterlock(rig).referenced_rig()
     assert [w.home_counts for w in found.winches] == document.home_counts
     assert found.plan_hash == rig.plan_hash
     # Stretched by 20 N instead of the working tensions at home, micrometres apart.
@@ -49,9 +47,9 @@ def test_it_takes_the_place_of_the_rig_files_counts() -> None:
 
 
 def test_without_one_only_absolute_encoders_move() -> None:
-    assert Custody(rig_with("absolute")).reference() is None
-    Custody(rig_with("absolute")).require_ready()
-    for ask in (Custody(rig_with("incremental")).reference, Custody(
+    assert MotionInterlock(rig_with("absolute")).reference() is None
+    MotionInterlock(rig_with("absolute")).require_ready()
+    for ask in (MotionInterlock(rig_with("incremental")).reference, MotionInterlock(
         rig_with("incremental")).require_ready):  # fmt: skip
         with pytest.raises(Refused, match=r"referenced: cable 1 \(drive 1\), cable 2 ") as caught:
             ask()
@@ -60,20 +58,20 @@ def test_without_one_only_absolute_encoders_move() -> None:
 
 def test_it_counts_for_its_rig_file_alone() -> None:
     rig = rig_with("incremental")
-    Custody(rig).file.write(reference_of(rig))
+    MotionInterlock(rig).file.write(reference_of(rig))
     with pytest.raises(Refused, match="another rig file"):
-        Custody(rig_with("incremental", drum_mm_per_rev=200.0)).reference()
+        MotionInterlock(rig_with("incremental", drum_mm_per_rev=200.0)).reference()
     with pytest.raises(Refused, match="another reference"):
-        Custody(rig).require_ready()
-    Custody(Custody(rig).referenced_rig()).require_ready()
+        MotionInterlock(rig).require_ready()
+    MotionInterlock(MotionInterlock(rig).referenced_rig()).require_ready()
 
 
 @pytest.mark.parametrize("encoder", ["absolute", "incremental"])
 def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
     rig = rig_with(encoder)
     if encoder == "incremental":
-        Custody(rig).file.write(reference_of(rig))
-    custody = Custody(rig)
+        MotionInterlock(rig).file.write(reference_of(rig))
+    custody = MotionInterlock(rig)
     custody.begin(Path("run"), None)
     custody.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
     custody.prevented()  # as a reset releases the latch
@@ -81,13 +79,13 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
         with pytest.raises(Refused, match="no more referenced") as caught:
             ask()
         assert "emergency stop" in caught.value.why
-    Custody(rig).file.write(reference_of(rig))
+    MotionInterlock(rig).file.write(reference_of(rig))
     assert custody.reference() is not None
 
 
 def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None:
     rig = rig_with("incremental")
-    custody = Custody(rig)
+    custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
     custody.begin(Path("run"), reference_of(rig))
     custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
@@ -102,7 +100,7 @@ def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None
 def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
     """`jog --cable` needs no reference; it must not write the evidence over either."""
     rig = rig_with("incremental")
-    custody, left = Custody(rig), reference_of(rig)
+    custody, left = MotionInterlock(rig), reference_of(rig)
     custody.file.write(left)
     moved = [*left.stands_at[:-1], left.stands_at[-1] + 10**6]
     assert custody.still_counts(left.stands_at) == left
@@ -110,14 +108,14 @@ def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
     custody.begin(Path("run"), custody.still_counts(moved))
     custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=moved)
     assert custody.kept_reference() == left
-    absolute = Custody(rig_with("absolute"))
+    absolute = MotionInterlock(rig_with("absolute"))
     assert absolute.still_counts(moved) == left, "it cannot lose count"
 
 
 def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     """Setting them up wipes out what tells of it, so the next opening sees nothing any more."""
     rig = rig_with("incremental")
-    custody = Custody(rig)
+    custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
     custody.found_restarted(())
     assert custody.reference() is not None
@@ -133,7 +131,7 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
     custody.found_held(range(8))
     assert custody.kept_reference() == found, "no motion and no reset brings it back"
-    absolute = Custody(rig_with("absolute"))
+    absolute = MotionInterlock(rig_with("absolute"))
     absolute.file.write(reference_of(rig))
     absolute.found_restarted((4,))
     assert absolute.kept_reference() == reference_of(rig)
@@ -142,7 +140,7 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
 @pytest.mark.parametrize("ended", [State.STOPPED, State.LATCHED])
 def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) -> None:
     rig = rig_with("incremental")
-    custody = Custody(rig)
+    custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
     custody.begin(Path("run"), reference_of(rig), anew=True)
     custody.end(ended, "stopped", Path("run"), holding=True, stands_at=range(8))
@@ -156,7 +154,7 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = rig_with("incremental")
-    custody = Custody(rig)
+    custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
     custody.begin(Path("run"), reference_of(rig))
 
@@ -172,7 +170,7 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
 
 def test_drives_that_held_after_a_killed_program_still_count() -> None:
     rig = rig_with("incremental")
-    custody = Custody(rig)
+    custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
     custody.found_held(range(8))
     kept = custody.kept_reference()
@@ -183,7 +181,7 @@ def test_drives_that_held_after_a_killed_program_still_count() -> None:
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema_version": 2}', "\x00"])
 def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     rig = rig_with("absolute")
-    custody = Custody(rig)
+    custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
     custody.file.path.write_text(content)
     with pytest.raises(Refused, match="cannot be read"):
@@ -197,22 +195,20 @@ def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     assert custody.reference() is not None
 
 
-def group_at(rig: Rig, restarted: tuple[int, ...] = (), off_mm: float = 0.0) -> Any:
-    stands = np.full(rig.cable_count, 1000)
-    stands[3] += round(off_mm / 1000.0 * rig.winches[3].counts_per_metre)
-    return SimpleNamespace(
-        restarted=restarted, read_positions=lambda: SimpleNamespace(positions=stands)
-    )
+def positions_at(rig: Rig, off_mm: float = 0.0) -> list[int]:
+    positions = [1000] * rig.cable_count
+    positions[3] += round(off_mm / 1000.0 * rig.winches[3].counts_per_metre)
+    return positions
 
 
 def test_a_drive_that_was_switched_on_again_or_moved_by_hand_is_found_out() -> None:
     rig = rig_with("incremental")
     reference = reference_of(rig)
-    require_still_referenced(rig, reference, group_at(rig, off_mm=0.9))
+    require_still_referenced(rig, reference, (), positions_at(rig, 0.9))
     with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it stands 1\.1 mm"):
-        require_still_referenced(rig, reference, group_at(rig, off_mm=1.1))
+        require_still_referenced(rig, reference, (), positions_at(rig, 1.1))
     with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it was switched on"):
-        require_still_referenced(rig, reference, group_at(rig, restarted=(4,)))
+        require_still_referenced(rig, reference, (4,), positions_at(rig))
     absolute = rig_with("absolute")
-    require_still_referenced(absolute, reference, group_at(absolute, (4,), 50.0))
-    require_still_referenced(rig, None, group_at(rig, (4,), 50.0))
+    require_still_referenced(absolute, reference, (4,), positions_at(absolute, 50.0))
+    require_still_referenced(rig, None, (4,), positions_at(rig, 50.0))

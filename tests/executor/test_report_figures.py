@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cdpr.poses import Pose
-from cdpr.shapes import (
+from model.geometry.shapes import (
     Box,
     Capsule,
     Cylinder,
@@ -20,9 +19,10 @@ from cdpr.shapes import (
     convex_hull,
     shape_points,
 )
-from executor.report.figure_style import spread, thinned, with_gaps
-from executor.report.scene_picture import Eye
-from executor.solids import Solid, solid_of
+from model.geometry.solids import Solid, solid_of
+from model.pages.charts import spread, thinned, with_gaps
+from model.pages.scene import Eye
+from model.pose import Pose
 
 SHAPES: dict[str, Shape] = {
     "box": Box(np.array([0.1, 0.2, 0.3])),

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from cdpr.errors import Fault
-from executor.fused_table import fused_table
-from executor.mcap_log import write_mcap
-from executor.mcap_schemas import CHANNELS
-from executor.run_folder import RunFolder
+from executor.recording.fused import fused_table
+from executor.recording.mcap import write_mcap
+from executor.recording.mcap_channels import CHANNELS
+from executor.recording.run_folder import RunFolder
+from model.errors import Fault
 from tests.executor import fake_run
 
 Messages = dict[str, list[tuple[int, dict[str, Any]]]]

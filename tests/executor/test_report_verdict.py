@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from executor.clearance_table import ClearanceTable, no_clearance
-from executor.cycle_table import CycleTable
-from executor.pose_table import no_poses
-from executor.run_folder import RunEvent
-from executor.verdict import distances, following, replies, tensions
+from executor.evaluation import _context_of
+from executor.recording.clearance import ClearanceTable, no_clearance
+from executor.recording.run_course import RunCourse
+from executor.recording.run_folder import RunEvent
+from executor.recording.summary import summarize
+from executor.recording.tables import CycleTable, no_poses
+from executor.recording.verdict import distances, following, replies, tensions
+from executor.report.tiles import chips
 from tests.executor import fake_run
 
 
@@ -141,6 +144,24 @@ def test_no_drive_position_at_all_is_no_pass(run: fake_run.FakeRun) -> None:
     assert not following(unknown, 0.002).passed
 
 
+def test_positions_that_were_received_are_not_denied(run: fake_run.FakeRun) -> None:
+    """Drives that were never enabled report positions all the same; there is no error to judge."""
+    unknown = np.full(len(run.cycles), np.nan)
+    asked = len(run.cycles) * run.cycles.cable_count
+    for lost, expected in (
+        (0, f"{asked} of {asked} replies"),
+        (1, f"{asked - 1} of {asked} replies"),
+        (asked, "No drive position was ever received."),
+    ):
+        missing = np.zeros(len(run.cycles), dtype=int)
+        missing[: lost // 8] = 8
+        missing[-1] += lost % 8
+        check = following(replace(run.cycles, following_error=unknown, missing=missing), 0.002)
+        assert not check.passed
+        assert expected in check.text
+        assert ("No drive position" in check.text) is (lost == asked)
+
+
 @pytest.mark.parametrize(("simulated", "passed"), [(True, False), (False, True)])
 def test_lost_replies_fail_simulated_drives_and_are_told_on_a_bus(
     run: fake_run.FakeRun, simulated: bool, passed: bool
@@ -208,7 +229,7 @@ def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
     )
     check = distances(both, 0.010)[0]
     assert not check.passed
-    assert "9.9 mm, surely at most 9.9" in check.text or "at most 10.0 mm" in check.text
+    assert "9.9 mm, upper bound 9.9" in check.text or "upper bound 10.0 mm" in check.text
 
 
 def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRun) -> None:
@@ -221,3 +242,16 @@ def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRu
     made = replace(run, poses=blind).summary
     assert made["verdict"] == "FAILED"
     assert f"None of {count} pictures gave a pose: no tags in the picture." in made["reasons"]
+
+
+def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:
+    """They may lose replies there as real ones do: the bus is a real one."""
+    run = fake_run.make(rate_hz=1.0, every=100, camera=False)
+    course = RunCourse(run.context.started, "udp_multicast", False, False, "finished")
+    for events, simulated in (((), False), ((RunEvent(0.0, "simulated", ""),), True)):
+        context = _context_of(run.context.plan, run.context.rig, course, run.cycles, events)
+        cycles = replace(run.cycles, missing=run.cycles.missing + (run.cycles.path_index == 0))
+        told = summarize(context, cycles, run.poses, run.clearance)
+        assert told["simulated"] is simulated
+        assert told["verdict"] == "PASSED"
+        assert ("simulated drives" in chips(told)) is simulated

@@ -14,22 +14,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.clearance import ClearanceModel
-from cdpr.cli.camera_line import camera_line
-from cdpr.errors import BadInput, Fault
-from cdpr.poses import Pose
-from cdpr.rig import load_rig
-from executor import camera_process, run_cameras
-from executor.camera_eye import CameraEye
-from executor.camera_process import CameraProcess
-from executor.camera_sight import BLIND_PICTURES
-from executor.camera_start import wait_until_ready
-from executor.observer import Look, Trigger
-from executor.run_cameras import HURRY, PATIENCE, ROUND, RunCameras
+from cdpr.cli.facts import camera_line
+from executor.cameras import multi_camera as run_cameras
+from executor.cameras import process as camera_process
+from executor.cameras.client import BLIND_PICTURES, CameraClient, wait_until_ready
+from executor.cameras.multi_camera import HURRY, PATIENCE, ROUND, RunCameras
+from executor.cameras.process import CameraProcess
+from executor.cameras.worker import CameraSample, FrameRequest
+from model.clearance import ClearanceModel
+from model.errors import BadInput, Fault
+from model.pose import Pose
+from model.rig import load_rig
 from tests.cli.plans import RIG, free_scene
-from tracking.measured_clearance import MeasuredClearance, clearance_of
+from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
-from tracking.pace import Pace
+from tracking.track import FrameRate
 
 RATE = 10.0
 HERE = Pose.level([0.0, 0.0, 0.445])
@@ -39,13 +38,13 @@ MODEL = ClearanceModel(_RIG, _SCENE)
 
 
 def seen_at(
-    trigger: Trigger, shift: float = 0.0, deviation: float = 1e-4, late: float = 0.0
-) -> Look:
+    trigger: FrameRequest, shift: float = 0.0, deviation: float = 1e-4, late: float = 0.0
+) -> CameraSample:
     """A look that finds the platform, so far off along x [m], so much later [s]."""
     covariance = np.diag([deviation**2] * 3 + [1e-6] * 3)
     pose = Pose(HERE.position + np.array([shift, 0.0, 0.0]), HERE.rotation)
     found = PoseMeasurement(trigger.time + late, pose, covariance, (301, 303), 0.1, "tracked")
-    return Look(trigger.frame, found, seconds=0.005)
+    return CameraSample(trigger.frame, found, seconds=0.005)
 
 
 class Scripted:
@@ -58,21 +57,21 @@ class Scripted:
         self._delays, self._left = list(delays), 0
         self.waited = 0.0
 
-    unanswered: Trigger | None
+    unanswered: FrameRequest | None
 
-    def ask(self, trigger: Trigger) -> None:
+    def ask(self, trigger: FrameRequest) -> None:
         self._left = self._delays[trigger.frame % len(self._delays)]
         if self._left == -2:
             raise Fault(f"the process of camera {self.name} ended without an answer")
         self.unanswered = trigger
 
-    def answer(self) -> Look | None:
+    def answer(self) -> CameraSample | None:
         if self.unanswered is None or self._left:
             self._left -= self._left > 0
             return None
         return self.answer_within(0.0)
 
-    def answer_within(self, patience: float) -> Look | None:
+    def answer_within(self, patience: float) -> CameraSample | None:
         self.waited += patience
         if self.unanswered is None or self._left < 0:
             return None
@@ -87,7 +86,7 @@ def never() -> bool:
 
 def run_of(moments: int, *cameras: Any) -> tuple[RunCameras, list[str]]:
     """Cameras after so many moments, and what was told."""
-    eyes = [CameraEye(camera, "here") for camera in cameras]
+    eyes = [CameraClient(camera, "here") for camera in cameras]
     run, told = RunCameras(eyes, MODEL, _SCENE.obstacle_clearance, RATE), []
     for k in range(moments):
         run.trigger(k / RATE, 100.0 + k / RATE, None, None)
@@ -118,7 +117,7 @@ def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     """Too little clearance is seen by the fast camera: the stop must not wait for the slow one."""
     cameras: list[Any] = [Scripted("front", [0]), Scripted("side", [late])]
     limit = 10.0  # everything is too near
-    run = RunCameras([CameraEye(camera, "here") for camera in cameras], MODEL, limit, RATE)
+    run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(5):
         run.trigger(k / RATE, k / RATE, None, None)
     assert "the scene asks for 10000 mm" in run.near
@@ -144,7 +143,7 @@ def test_cameras_that_disagree_are_told_once_and_clearance_is_not_measured() -> 
 
 
 def nearest_at(shift: float) -> MeasuredClearance:
-    found = seen_at(Trigger(0, 0.0, 0.0, None), shift).found
+    found = seen_at(FrameRequest(0, 0.0, 0.0, None), shift).found
     assert isinstance(found, PoseMeasurement)
     clearance = clearance_of(MODEL, found)
     assert clearance is not None
@@ -159,7 +158,7 @@ def test_of_cameras_that_disagree_one_that_sees_too_little_clearance_is_enough(w
     limit = sum(at_most.values()) / 2.0
     assert abs(at_most["front"] - at_most["side"]) > 0.002
     sees = min(at_most, key=lambda name: at_most[name])
-    eyes = [CameraEye(Scripted(n, [0], shift), "here") for n, shift in shifts.items()]  # type: ignore[arg-type]
+    eyes = [CameraClient(Scripted(n, [0], shift), "here") for n, shift in shifts.items()]  # type: ignore[arg-type]
     run, told = RunCameras(eyes, MODEL, limit, RATE), []
     for k in range(4):
         run.trigger(k / RATE, k / RATE, None, None)
@@ -226,7 +225,7 @@ def test_live_figures_are_those_of_the_newest_pictures() -> None:
 
 
 def test_the_pace_of_a_source_is_that_of_its_newest_pictures() -> None:
-    pace = Pace()
+    pace = FrameRate()
     assert (pace.pictures_per_second, pace.measuring_ms) == (None, None)
     for k in range(30):
         pace.take(5.0 + k / 20, 1.0 if k < 20 else 0.004)
@@ -247,7 +246,7 @@ class Quick:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def look(self, trigger: Trigger) -> Look:
+    def look(self, trigger: FrameRequest) -> CameraSample:
         while self._silent and trigger.frame > 2:
             signal.pause()
         return seen_at(trigger)
@@ -272,7 +271,7 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
     processes = [CameraProcess(name, make[name], may_wait=False) for name in make]  # type: ignore[arg-type]
     try:
         wait_until_ready(processes, lambda: None)
-        eyes = [CameraEye(process, "here") for process in processes]
+        eyes = [CameraClient(process, "here") for process in processes]
         run, told, now = RunCameras(eyes, MODEL, 0.01, RATE), [], 0.0
         while not told:
             now += 1.0 / RATE
@@ -309,7 +308,7 @@ def wait_for_answers(processes: Sequence[CameraProcess]) -> None:
 
 
 def test_the_names_of_the_pictures_tell_the_camera(tmp_path: Path) -> None:
-    from executor.run_folder import RunFolder
+    from executor.recording.run_folder import RunFolder
 
     folder = RunFolder.create(tmp_path / "run")
     image = np.zeros((8, 8), np.uint8)

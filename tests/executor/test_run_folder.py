@@ -15,11 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cdpr.errors import BadInput
-from executor.clearance_table import ClearanceTable, no_clearance
-from executor.cycle_table import CycleTable, quaternions_of
-from executor.pose_table import PoseTable, no_poses
-from executor.run_folder import NEEDED, RunEvent, RunFolder
+from executor.recording.clearance import ClearanceTable, no_clearance
+from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
+from executor.recording.tables import CycleTable, PoseTable, no_poses, quaternions_of
+from model.errors import BadInput
 from tests.executor import fake_run
 from tracking.pose_log import POSE_COLUMNS
 
@@ -64,11 +63,15 @@ def test_an_existing_path_is_never_written_into(tmp_path: Path, kind: str) -> No
     assert kind != "folder" or not list(path.iterdir())
 
 
-@pytest.mark.parametrize("parent", ["missing", "file"])
-def test_a_place_that_cannot_hold_a_folder_is_bad_input(tmp_path: Path, parent: str) -> None:
+def test_folders_above_a_run_are_made(tmp_path: Path) -> None:
+    RunFolder.create(tmp_path / "runs" / "today" / "first")
+    assert (tmp_path / "runs" / "today" / "first").is_dir()
+
+
+def test_a_file_that_cannot_hold_a_folder_is_bad_input(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(BadInput, match="cannot be made"):
-        RunFolder.create(tmp_path / parent / "run")
+        RunFolder.create(tmp_path / "file" / "run")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
@@ -79,7 +82,7 @@ def test_nothing_half_made_is_left_when_the_disk_is_full(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "touch", full)
-    with pytest.raises(BadInput, match="cannot be written to"):
+    with pytest.raises(BadInput, match="cannot be made"):
         RunFolder.create(tmp_path / "run")
     assert not list(tmp_path.iterdir())
 

@@ -15,16 +15,18 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.errors import Refused
-from executor.running import STOP_SIGNALS, announced, reached_runs, stop_requests
-from executor.wishes import OwnBoard
+from cdpr.cli.supervision import STOP_SIGNALS, stop_requests
+from executor.operator_requests import LocalRequests
+from executor.remote.registry import announced, find_runs
+from model.errors import Refused
 
 #: A run as the command line makes one: tells that it is announced, ends when it was asked to.
 RUN = """
 import signal
-from executor.running import announced, stop_requests
-from executor.wishes import OwnBoard
-board = OwnBoard()
+from cdpr.cli.supervision import stop_requests
+from executor.remote.registry import announced
+from executor.operator_requests import LocalRequests
+board = LocalRequests()
 with stop_requests(board), announced() as listeners:
     print("announced", flush=True)
     while not board.read().stop:
@@ -66,7 +68,7 @@ def _run() -> Iterator[subprocess.Popen[str]]:
 
 
 def _reached() -> list[int]:
-    with reached_runs() as runs:
+    with find_runs() as runs:
         return [run.process for run in runs]
 
 
@@ -117,7 +119,7 @@ NOBODY = 65534
 FOREIGN = RUN.replace("board = ", f"import os\nos.setgid({NOBODY})\nos.setuid({NOBODY})\nboard = ")
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may act for two users")
+@pytest.mark.root
 def test_root_reaches_the_runs_of_other_users(monkeypatch):
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.setattr(sys.modules[__name__], "RUN", FOREIGN)
@@ -129,7 +131,7 @@ def test_root_reaches_the_runs_of_other_users(monkeypatch):
             assert _reached() == [process.pid]
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may act for two users")
+@pytest.mark.root
 def test_a_user_is_not_reached_through_a_folder_of_another(folders):
     with announced():
         for folder in folders:
@@ -229,13 +231,13 @@ def test_a_listener_of_another_user_is_not_spoken_to(folders, monkeypatch):
         real = os.getuid()
         other = os.stat(folders[0]).st_uid
         assert other == real
-        monkeypatch.setattr("executor.running.struct.unpack", lambda *_: (1, real + 1, 0))
+        monkeypatch.setattr("executor.remote.registry.struct.unpack", lambda *_: (1, real + 1, 0))
         assert _reached() == []
 
 
 def test_handlers_are_put_back(folders):
     before = [signal.getsignal(number) for number in STOP_SIGNALS]
-    board = OwnBoard()
+    board = LocalRequests()
     with stop_requests(board):
         assert board.read().stop is False
         os.kill(os.getpid(), signal.SIGINT)
@@ -245,7 +247,7 @@ def test_handlers_are_put_back(folders):
 
 def test_a_run_under_nohup_outlives_its_terminal():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    board = OwnBoard()
+    board = LocalRequests()
     try:
         with stop_requests(board):
             os.kill(os.getpid(), signal.SIGHUP)

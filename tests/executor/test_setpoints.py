@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from cdpr.errors import Refused
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene
-from cdpr.statics.working import working_tensions
-from executor.blending import rounded
-from executor.setpoints import SetpointTable, build_table, check_table
-from executor.timing import time_law
+from executor.trajectory.blending import rounded
+from executor.trajectory.setpoints import CheckedTrajectory, Trajectory, build_table, check_table
+from executor.trajectory.time_scaling import time_law
+from model.errors import Refused
+from model.pose import Pose
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
+from planner.check_report import CheckReport
 from tests.executor.routes import WEIGHT, always
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -30,7 +32,7 @@ names = pytest.mark.parametrize("name", list(RIGS))
 
 
 @lru_cache(maxsize=4)
-def _made(name: str) -> tuple[Rig, Scene, SetpointTable]:
+def _made(name: str) -> tuple[Rig, Scene, Trajectory]:
     """A short way with one corner, its ends the scene's."""
     scene_name, corners = RIGS[name]
     rig = load_rig(CONFIGS / f"{name}.yaml")
@@ -149,6 +151,24 @@ def test_a_good_table_passes_and_carries_its_proof(name):
     assert checked.report.passed
 
 
+@pytest.mark.parametrize("proof", [None, object(), True])
+def test_a_table_that_was_not_checked_cannot_be_called_checked(proof: object) -> None:
+    rig, _, table = _made("gachon_8_6")
+    report, winches = CheckReport.__new__(CheckReport), WinchMap(rig)
+    with pytest.raises(TypeError, match="comes only from"):
+        CheckedTrajectory(table, rig, table.hash, report, winches, proof)
+
+
+def test_a_checked_table_of_another_path_needs_a_check_of_its_own() -> None:
+    """Not even what was checked may be changed afterwards without its proof."""
+    rig, scene, table = _made("gachon_8_6")
+    checked = check_table(rig, scene, table)
+    with pytest.raises(TypeError, match="comes only from"):
+        replace(checked, proof=None)
+    with pytest.raises(FrozenInstanceError):
+        checked.table = table  # type: ignore[misc]
+
+
 @names
 def test_arrays_cannot_be_written_to(name):
     table = _made(name)[2]
@@ -183,14 +203,14 @@ def test_the_hash_is_computed_anew_so_that_it_tells_a_change_in_place():
     assert table.hash != before
 
 
-def _spoilt(name: str, field: str, row: int, column: int, value: float) -> SetpointTable:
+def _spoilt(name: str, field: str, row: int, column: int, value: float) -> Trajectory:
     table = _made(name)[2]
     values = getattr(table, field).copy()
     values.reshape(len(table), -1)[row, column] += value
     return replace(table, **{field: values})
 
 
-def _refused(name: str, table: SetpointTable) -> str:
+def _refused(name: str, table: Trajectory) -> str:
     rig, scene, _ = _made(name)
     with pytest.raises(Refused) as caught:
         check_table(rig, scene, table)

@@ -13,15 +13,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.poses import Pose
-from executor import shared_board
-from executor.machine import State
-from executor.records import CycleRecord, LoopEvent
-from executor.ring import Ring
-from executor.shared_board import SILENCE, SharedBoard, Supervised
-from executor.shared_memory import SharedMemory
-from executor.wire import RecordWire, pack_event, unpack_event
-from executor.wishes import StopReason, Wishes
+from executor.operator_requests import OperatorRequests, StopReason
+from executor.realtime import shared_memory as shared_board
+from executor.realtime.shared_memory import (
+    SILENCE,
+    CycleRecordCodec,
+    Ring,
+    SharedMemory,
+    SharedRequests,
+    Supervised,
+    pack_event,
+    unpack_event,
+)
+from executor.state_machine import CycleRecord, LoopEvent, State
+from model.pose import Pose
 
 SLOTS, CONTENT = 8, 40
 
@@ -123,7 +128,7 @@ def test_a_record_comes_back_as_it_was(state, counts, numbers, error, turned):
         following_error=error,
         lateness=numbers[3],
     )
-    wire = RecordWire(2)
+    wire = CycleRecordCodec(2)
     pose = Pose(np.array([0.1, -0.2, 0.3]), np.diag([1.0, -1.0, -1.0])) if turned else None
     content = wire.pack(record, pose)
     assert len(content) == wire.size
@@ -165,21 +170,21 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> _Clock:
 
 
 @pytest.fixture
-def board() -> Iterator[SharedBoard]:
-    made = SharedBoard()
+def board() -> Iterator[SharedRequests]:
+    made = SharedRequests()
     yield made
     made.memory.close()
 
 
 def test_wishes_reach_the_other_side_and_stay(board, clock):
     other = Supervised(board.memory, os.getppid())
-    assert other.read() == board.read() == Wishes()
+    assert other.read() == board.read() == OperatorRequests()
     board.ask_speed(30)
     board.ask_hold(True)
-    assert other.read() == board.read() == Wishes(hold=True, speed=0.3)
+    assert other.read() == board.read() == OperatorRequests(hold=True, speed=0.3)
     board.ask_hold(False)
     board.ask_stop()
-    assert other.read() == board.read() == Wishes(stop=True, speed=0.3)
+    assert other.read() == board.read() == OperatorRequests(stop=True, speed=0.3)
 
 
 @pytest.mark.parametrize("text", ["platform to post: 6.0 ± 1.0 mm", "ü" * 1000])
@@ -198,7 +203,7 @@ def test_what_a_stop_is_for_reaches_the_other_side(board, clock, text):
 def test_a_stop_that_was_wished_before_was_for_nothing_else(board, clock):
     board.ask_stop()
     board.ask_stop(StopReason("camera", "all cameras failed"))
-    assert board.read() == Wishes(stop=True)
+    assert board.read() == OperatorRequests(stop=True)
 
 
 def test_a_process_that_is_asked_to_end_stops(board, clock):

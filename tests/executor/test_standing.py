@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.cables import cables_to
-from cdpr.errors import Refused
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Load, Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from cdpr.statics.working import working_tensions
-from executor.announcing import announcements, load_changes
-from executor.blending import rounded
-from executor.setpoints import SetpointTable, build_table, check_table
-from executor.standing import Stand, legs_at
-from executor.timing import time_law
+from executor.trajectory.blending import rounded
+from executor.trajectory.dwell import Dwell, legs_at
+from executor.trajectory.schedule import load_changes, stop_events
+from executor.trajectory.setpoints import Trajectory, build_table, check_table
+from executor.trajectory.time_scaling import time_law
+from model.errors import Refused
+from model.files.scene_file import SceneDocument
+from model.kinematics import cables_to
+from model.pose import Pose
+from model.rig import Rig, load_rig
+from model.scene import Load, Scene, scene_from_document
+from model.statics.gravity import working_tensions
 from tests.executor.routes import WEIGHT, always
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -34,7 +34,7 @@ PICKED = {"kind": "pick", "dwell_s": 0.5, "mass_kg": 2.0, "mass_centre_mm": [0, 
 
 
 @lru_cache(maxsize=1)
-def _made() -> tuple[Rig, Scene, SetpointTable]:
+def _made() -> tuple[Rig, Scene, Trajectory]:
     """A pick, a way-pose, a place at the way-pose, and back; the third leg has no length."""
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     scene = scene_from_document(
@@ -66,7 +66,7 @@ def _made() -> tuple[Rig, Scene, SetpointTable]:
     return rig, scene, build_table(rig, scene, legs, 0.010)
 
 
-def _refused(table: SetpointTable, scene: Scene | None = None) -> str:
+def _refused(table: Trajectory, scene: Scene | None = None) -> str:
     rig, own, _ = _made()
     with pytest.raises(Refused) as caught:
         check_table(rig, scene or own, table)
@@ -123,7 +123,7 @@ def test_during_a_dwell_tensions_go_evenly_from_one_load_to_the_other() -> None:
 
 
 def test_legs_are_counted_by_the_stops_that_were_left() -> None:
-    stands = [Stand(10, 20), Stand(30, 30)]
+    stands = [Dwell(10, 20), Dwell(30, 30)]
     places = np.array([0.0, 10.0, 19.9, 20.0, 29.5, 30.0, 40.0])
     assert legs_at(stands, places).tolist() == [1, 1, 1, 2, 2, 3, 3]
     assert legs_at([], places).tolist() == [1] * 7
@@ -168,18 +168,18 @@ def test_a_dwell_that_is_too_short_is_refused() -> None:
     ("stands", "words"),
     [
         ((), "stands at 0 stops, the scene has 3"),
-        ((Stand(60, 50), Stand(90, 90), Stand(90, 95)), "in no order"),
-        ((Stand(20, 50), Stand(40, 90), Stand(90, 95)), "in no order"),
-        ((Stand(20, 50), Stand(60, 90), Stand(90, 10**6)), "in no order"),
+        ((Dwell(60, 50), Dwell(90, 90), Dwell(90, 95)), "in no order"),
+        ((Dwell(20, 50), Dwell(40, 90), Dwell(90, 95)), "in no order"),
+        ((Dwell(20, 50), Dwell(60, 90), Dwell(90, 10**6)), "in no order"),
     ],
 )
-def test_stands_that_are_none_are_refused(stands: tuple[Stand, ...], words: str) -> None:
+def test_stands_that_are_none_are_refused(stands: tuple[Dwell, ...], words: str) -> None:
     assert words in _refused(replace(_made()[2], stands=stands))
 
 
 def test_stops_are_announced_once_when_they_are_reached_and_left() -> None:
     _, scene, table = _made()
-    told, take = announcements(scene, table.stands), table.stands[0]
+    told, take = stop_events(scene, table.stands), table.stands[0]
     assert told.due(take.first - 0.5) == []
     text = "at stop 'take', standing still for 0.5 s while 2 kg is picked up"
     assert told.due(float(take.first)) == [("pick", text)]

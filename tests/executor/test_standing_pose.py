@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.cables import cables_at
-from cdpr.errors import CdprError
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import load_from_document
-from cdpr.scene_file import LoadDocument
-from cdpr.statics.working import working_tensions
-from cdpr.winches import WinchMap
-from executor.standing_pose import standing_pose
+from executor.current_pose import standing_pose
+from model.errors import CdprError
+from model.files.scene_file import LoadDocument
+from model.kinematics import cables_at
+from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.rig import Rig, load_rig
+from model.scene import load_from_document
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
 from tests.cli.plans import HALL, RIG
 
 LOAD = load_from_document(LoadDocument())

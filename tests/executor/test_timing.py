@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.errors import Fault
-from cdpr.poses import Pose
-from cdpr.rig import Motion
-from executor.blending import rounded
-from executor.path import Path, polyline
-from executor.s_curve import length_to_change, s_curve
-from executor.timing import TimeLaw, time_law
+from executor.trajectory.blending import rounded
+from executor.trajectory.path import Path, polyline
+from executor.trajectory.time_scaling import TimeLaw, length_to_change, s_curve, time_law
+from model.errors import Fault
+from model.pose import Pose
+from model.rig import Motion
 from tests.executor.routes import GACHON, HALL, WEIGHT, always, at_mm, random_route
 
 seeds = st.integers(0, 2**32 - 1)

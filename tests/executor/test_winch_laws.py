@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.rig import load_rig
-from executor.safety.watch import Reaction
-from executor.winch_laws import CableStep, TakeUp, wind_in_speed
+from executor.control.winch_laws import CableStep, PretensionLaw, wind_in_speed
+from executor.safety.monitor import StopReaction
+from model.rig import load_rig
 from tests.cli.plans import HALL, RIG
 
 RIGS = [load_rig(RIG), load_rig(HALL)]
@@ -29,7 +29,7 @@ def test_winding_in_never_pays_out_and_stays_in_its_reach(rig, seed, paces):
     random = np.random.default_rng(seed)
     begin = random.integers(-(10**6), 10**6, rig.cable_count).tolist()
     target, limit = 2.0 * rig.min_tension, 0.5 * rig.max_tension
-    law = TakeUp(rig, begin, target=target, limit=limit, reach=1e-4, speed=0.002)
+    law = PretensionLaw(rig, begin, target=target, limit=limit, reach=1e-4, speed=0.002)
     most = wind_in_speed(rig, target, limit, 0.002) * 0.01
     before = np.array(begin, dtype=np.float64)
     for pace in paces:
@@ -46,7 +46,7 @@ def test_winding_in_never_pays_out_and_stays_in_its_reach(rig, seed, paces):
 
 def test_a_taut_cable_is_wound_in_no_further_and_all_must_stay_taut():
     rig = RIGS[0]
-    law = TakeUp(rig, [0] * 8, target=10.0, limit=60.0, reach=0.01, speed=0.002)
+    law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.01, speed=0.002)
     slack = [12.0] * 8
     slack[3] = 0.0
     first, _ = law.next(1.0, slack)
@@ -65,7 +65,7 @@ def test_a_taut_cable_is_wound_in_no_further_and_all_must_stay_taut():
 def test_a_step_raises_no_tension_beyond_what_is_left_before_it_is_seen():
     for rig in RIGS:
         target, limit = 2.0 * rig.min_tension, 0.5 * rig.max_tension
-        from cdpr.winches import WinchMap
+        from model.winches import WinchMap
 
         stiffness = rig.cable_stiffness / WinchMap(rig).home_unstrained
         step = wind_in_speed(rig, target, limit, 1.0) * 0.01
@@ -76,7 +76,7 @@ def test_a_step_raises_no_tension_beyond_what_is_left_before_it_is_seen():
 def test_beyond_the_limit_no_winch_goes_on(wrong):
     rig = RIGS[0]
     for law in (
-        TakeUp(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002),
+        PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002),
         CableStep(rig, [0] * 8, cable=1, way=-0.02, limit=60.0, speed=0.005),
     ):
         for _ in range(200):
@@ -89,14 +89,14 @@ def test_beyond_the_limit_no_winch_goes_on(wrong):
         targets, found = law.next(1.0, [0.0] * 7 + [wrong])
         assert targets == begun
         assert [(f.code, f.drive, f.reaction) for f in found] == [
-            ("over_tension", 8, Reaction.PATH_STOP)
+            ("over_tension", 8, StopReaction.PATH_STOP)
         ]
 
 
 def test_near_the_limit_all_go_on_more_slowly():
     rig, ways = RIGS[0], []
     for tension in (10.0, 35.0, 59.9):
-        law = TakeUp(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002)
+        law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002)
         targets, _ = law.next(1.0, [0.0] * 7 + [tension])
         for _ in range(99):
             targets, _ = law.next(1.0, [0.0] * 7 + [tension])
@@ -107,12 +107,16 @@ def test_near_the_limit_all_go_on_more_slowly():
 
 def test_a_cable_that_stays_slack_is_told():
     rig = RIGS[0]
-    law = TakeUp(rig, [0] * 8, target=10.0, limit=60.0, reach=1e-5, speed=0.002)
+    law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=1e-5, speed=0.002)
     found = ()
     for _ in range(10):
         _, found = law.next(1.0, [12.0] * 7 + [0.3])
     (finding,) = found
-    assert (finding.code, finding.reaction, finding.drive) == ("not_taut", Reaction.PATH_STOP, 8)
+    assert (finding.code, finding.reaction, finding.drive) == (
+        "not_taut",
+        StopReaction.PATH_STOP,
+        8,
+    )
     assert "0.3 N" in finding.text
 
 

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.errors import BadInput
-from executor.machine import State
-from executor.records import CycleRecord, LoopEvent
-from executor.winch_record import recording
+from executor.control.winch_motion import recording
+from executor.state_machine import CycleRecord, LoopEvent, State
+from model.errors import BadInput
 
 
 def record(cycle: int) -> CycleRecord:

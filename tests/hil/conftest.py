@@ -21,10 +21,11 @@ import can
 import pytest
 
 from cdpr.cli import main
-from drivers.bus import BusSettings, open_bus
-from drivers.cia402.frames import SYNC_ID
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.pdo import SYNC_ID
 from drivers.cia402.sdo import SetupNetwork
-from drivers.cia402.states import DriveState, state_of
+from drivers.cia402.state_machine import DriveState, state_of
+from executor.kernels import ready_to_simulate
 from tests.cli.plans import RIG, write_short_plan
 
 NODES = range(1, 9)
@@ -32,18 +33,19 @@ NODES = range(1, 9)
 # What the programs import inside their functions: once here, before they are forked, since an
 # import takes long where instructions are counted.
 for module in (
-    *(
-        "cdpr.cli.carry_out",
-        "cdpr.cli.run_motion",
-        "cdpr.cli.run_summary",
-        "cdpr.cli.sim",
-        "executor.prepare",
-    ),
-    *("executor.run", "executor.report.page", "simulation.rehearsal", "matplotlib.figure"),
-    *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_agg", "cv2", "mcap.writer"),
-    *("scipy.optimize", "drivers.cia402.group"),
+    "cdpr.cli.run",
+    "cdpr.cli.sim",
+    "cv2",
+    "drivers.cia402.group",
+    "executor.report.page",
+    "executor.runner",
+    "executor.trajectory.prepare",
+    "mcap.writer",
+    "scipy.optimize",
+    "simulation.drives.cia402_rig",
 ):
     import_module(module)
+ready_to_simulate()
 ENDS_WITHIN_S = 400.0
 AHEAD_OF_ALL = 80
 TRACE_BUFFER_BYTES = 2**27  # candump waits behind the programs that it listens to

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.plan import load_plan
-from cdpr.rig import load_rig
-from drivers.bus import BusSettings
-from executor.prepare import PreparedRun, prepare
+from drivers.can_bus import BusSettings
+from executor.trajectory.prepare import PreparedRun, prepare
+from model.plan import load_plan
+from model.rig import load_rig
 from planner.check import verify
 from tests.cli.plans import RIG
 from tests.scenarios.faults.bench import live
 from tests.scenarios.faults.cases import TABLE, complaints, held_up, row
+from tests.scenarios.faults.drive_cases import ROWS
 from tests.scenarios.faults.masters import ForkedMasters
 
 BLUR_S = 0.010  # executor and drives share one slow processor
@@ -25,6 +26,12 @@ SOON = (
     "F7 a drive falls silent",
 )
 """In the subset, too."""
+OF_DRIVES = (
+    "D a lost heartbeat is a fault",
+    "D SDO answers take 300 ms",
+    "D no optional object",
+)
+"""Of the rows about drives, those in which the bus could make a difference."""
 
 pytestmark = pytest.mark.hil
 
@@ -43,8 +50,8 @@ def masters(prepared: PreparedRun) -> Iterator[ForkedMasters]:
 
 def cases() -> Iterator[object]:
     """What can be done to an executor in another process."""
-    for name, fault in TABLE.items():
-        if fault.live:
+    for name in (*TABLE, *OF_DRIVES):
+        if ROWS[name].live:
             yield pytest.param(name, marks=[] if name in SOON else [pytest.mark.slow])
 
 
@@ -57,14 +64,15 @@ def test_a_fault(
     tmp_path: Path,
     name: str,
 ) -> None:
-    fault, settings = TABLE[name], BusSettings("socketcan", channel)
-    with live(prepared, tmp_path / "run", fault.script(), settings, masters) as bench:
+    fault, settings = ROWS[name], BusSettings("socketcan", channel)
+    run, behaviour = tmp_path / "run", fault.drives()
+    with live(prepared, run, fault.script(), settings, masters, behaviour=behaviour) as bench:
         bench.blur = BLUR_S
         ended = bench.run()
         cause = str(bench.outcome.get("cause", ""))
         assert not held_up(fault, bench, cause), cause
         found = complaints(fault, bench, ended, cause, prepared.checked.table.cycle)
-        line = row(name, "vcan", bench, ended, cause, found)
+        line = row(name, fault, "vcan", bench, ended, cause, found)
     with (artefacts / "faults.json").open("a") as file:
         file.write(json.dumps(line, ensure_ascii=False) + "\n")
     assert found == []

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpr.rig import load_rig
-from drivers.cia402.frames import EMCY_BASE, RPDO1_BASE, SYNC_ID, TPDO1_BASE, parse_reply
-from drivers.cia402.states import ControlWord, DriveState
-from executor.run_folder import RunFolder
+from drivers.cia402.pdo import EMCY_BASE, RPDO1_BASE, SYNC_ID, TPDO1_BASE, parse_reply
+from drivers.cia402.state_machine import ControlWord, DriveState
+from executor.recording.run_folder import RunFolder
+from model.rig import load_rig
 from tests.cli.plans import RIG
 from tests.hil.conftest import NODES, Program, Rig
 from tests.hil.trace import Frame, read_trace

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.bus import BusSettings, open_bus
-from drivers.cia402.states import DriveState
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.state_machine import DriveState
 from tests.cli.plans import RIG
 from tests.hil.conftest import LISTENS_FOR_S, Program, Rig, stopped_programs
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import canopen
 
 import simulation
-from drivers.cia402.frames import SDO_REQUEST_BASE
+from drivers.cia402.pdo import SDO_REQUEST_BASE
 
-EDS = Path(simulation.__file__).parent / "cia402_drive.eds"
+EDS = Path(simulation.__file__).parent / "drives" / "eds" / "cia402.eds"
 _LINE = re.compile(r"\((\d+\.\d+)\) \S+ ([0-9A-F]{3})#([0-9A-F]*)( [RT])?$")
 _DOWNLOADS = {0x2F: 1, 0x2B: 2, 0x23: 4}  # expedited SDO download: bytes
 

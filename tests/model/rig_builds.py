@@ -10,11 +10,11 @@ import numpy as np
 import yaml
 from hypothesis import strategies as st
 
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig, rig_from_document
-from cdpr.rig_file import RigDocument
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
+from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig, rig_from_document
+from model.scene import Scene, scene_from_document
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

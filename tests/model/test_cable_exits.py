@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.cables import NoCable, cables_at, cables_to
-from cdpr.kinematics import cable_lengths, structure_matrix
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig
+from model.kinematics import NoCable, cable_lengths, cables_at, cables_to, structure_matrix
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig
 from tests.model.rig_builds import hall_rig, paper_rig, paper_rig_with_pulleys, poses_of
 
 PAPER, PULLEYS, HALL = paper_rig(), paper_rig_with_pulleys(13.0), hall_rig()

@@ -11,16 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cdpr.cables import cables_at
-from cdpr.clearance import ClearanceModel
-from cdpr.convex import box_body, convex_bodies, segment_body, separation
-from cdpr.poses import Pose, interpolate
-from cdpr.rig import load_rig, rig_from_document
-from cdpr.scene import load_scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from cdpr.segments import segment_box_points, segment_pair_points
-from cdpr.self_clearance import SelfModel
-from cdpr.shapes import Box, Capsule, Cylinder, Sphere, TriangleMesh, convex_hull
+from model.clearance import ClearanceModel, SelfModel
+from model.files.scene_file import SceneDocument
+from model.geometry.convex import box_body, convex_bodies, segment_body, separation
+from model.geometry.segments import segment_box_points, segment_pair_points
+from model.geometry.shapes import Box, Capsule, Cylinder, Sphere, TriangleMesh, convex_hull
+from model.kinematics import cables_at
+from model.pose import Pose, interpolate
+from model.rig import load_rig, rig_from_document
+from model.scene import load_scene, scene_from_document
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.documents import content_hash, write_atomic
-from cdpr.errors import BadInput
+from model.errors import BadInput
+from model.files.documents import content_hash, write_atomic
 
 json_values = st.recursive(
     st.one_of(
@@ -104,10 +104,11 @@ def test_an_interrupted_write_leaves_no_temporary_file(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_text_that_cannot_be_encoded_leaves_no_temporary_file(tmp_path: Path) -> None:
-    with pytest.raises(UnicodeEncodeError):
-        write_atomic(tmp_path / "file.json", "\ud800")
-    assert list(tmp_path.iterdir()) == []
+def test_text_that_cannot_be_encoded_is_written_as_its_escape(tmp_path: Path) -> None:
+    """Such as the name of a file that is no UTF-8."""
+    write_atomic(tmp_path / "file.json", "a \ud800")
+    assert (tmp_path / "file.json").read_text() == "a \\ud800"
+    assert [path.name for path in tmp_path.iterdir()] == ["file.json"]
 
 
 def test_a_folder_that_may_not_be_written_is_told(

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput, Fault
-from cdpr.kinematics import cable_lengths, forward_kinematics, poses_near
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig
+from model.errors import BadInput, Fault
+from model.kinematics import cable_lengths, forward_kinematics, poses_near
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig
 from tests.model.rig_builds import hall_rig, ipanema, paper_rig, paper_rig_with_pulleys, poses_of
 
 RIGS = {

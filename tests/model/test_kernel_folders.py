@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cdpr import compiled
-from cdpr.kernel_folders import UNUSED, throw_away_unused, use_folder
+from model import jit as compiled
+from model.jit import UNUSED, throw_away_unused, use_folder
 
 NOW = 1.8e9
 OLD, RECENT = NOW - UNUSED - 1.0, NOW - UNUSED + 1.0

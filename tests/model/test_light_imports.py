@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-HEAVY = ("scipy", "cv2", "fcl", "numba", "matplotlib", "ruckig", "can", "canopen", "daqp", "mcap")
+HEAVY = ("scipy", "cv2", "fcl", "numba", "matplotlib", "can", "canopen", "daqp", "mcap")
 
 
 def loaded_by(code: str) -> set[str]:
@@ -32,16 +32,28 @@ def loaded_by(code: str) -> set[str]:
 @pytest.mark.parametrize(
     "module",
     [
-        "cdpr.rig",
-        "cdpr.scene",
-        "cdpr.plan",
-        "cdpr.kinematics",
-        "cdpr.schema",
+        "model.rig",
+        "model.scene",
+        "model.plan",
+        "model.kinematics",
+        "model.files.schema",
         "cdpr.cli.app",
+        "cdpr",
+        "calibration",
+        "executor",
+        "simulation",
+        "planner",
+        "drivers",
+        "tracking",
     ],
 )
 def test_an_import_of_the_model_or_the_command_line_is_light(module: str) -> None:
     assert loaded_by(f"import {module}") == set()
+
+
+def test_the_public_api_loads_nothing_before_it_is_used() -> None:
+    code = "import cdpr, sys; assert not {'numpy', 'pydantic', 'model.rig'} & set(sys.modules)"
+    assert loaded_by(code) == set()
 
 
 def test_the_help_of_the_command_line_is_light() -> None:
@@ -53,10 +65,44 @@ def test_the_help_of_the_command_line_is_light() -> None:
     assert loaded_by(code) == set()
 
 
+@pytest.mark.parametrize("words", ["cdpr ", "cdpr pl", "cdpr calibrate ca"])
+def test_completion_of_a_verb_imports_no_verb(words: str) -> None:
+    result = subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", "from cdpr.cli import main; main()"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=ROOT,
+        env={
+            **os.environ,
+            "PYTHONPATH": str(ROOT),
+            "_CDPR_COMPLETE": "complete_bash",
+            "_TYPER_COMPLETE_ARGS": words,
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(len(words.split(" ")) - 1),
+        },
+    )
+    loaded = {line.rsplit("|", 1)[-1].strip() for line in result.stderr.splitlines()}
+    assert "cdpr.cli.verbs" in loaded
+    assert {name for name in loaded if name.startswith("cdpr.cli.")} <= {
+        "cdpr.cli.app",
+        "cdpr.cli.arguments",
+        "cdpr.cli.verbs",
+    }
+    assert loaded.isdisjoint({"numpy", *HEAVY})
+
+
 def test_reading_the_ready_files_is_light() -> None:
     code = (
-        "from pathlib import Path; from cdpr.rig import load_rig;"
-        " from cdpr.scene import load_scene;"
+        "from pathlib import Path; from model.rig import load_rig;"
+        " from model.scene import load_scene;"
         " load_rig(Path('configs/gachon_8_6.yaml')); load_scene(Path('configs/environment_3.yaml'))"
     )
     assert loaded_by(code) == set()
+
+
+def test_the_real_time_process_of_a_real_bus_loads_no_compiler_and_no_camera() -> None:
+    """What it loads it loads before the drives are set up, while the operator waits."""
+    code = "import executor.realtime.child, executor.control.path_job, executor.drives"
+    assert not loaded_by(code) & {"numba", "cv2", "matplotlib", "mcap"}

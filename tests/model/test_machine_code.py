@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from cdpr import machine_code
-from cdpr.machine_code import Task
+from model import jit as machine_code
+from model.jit import KernelSet
 
 
 @pytest.fixture
@@ -22,8 +22,8 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def task(kernels: Path, name: str) -> Task:
-    return Task(name, (kernels,))
+def task(kernels: Path, name: str) -> KernelSet:
+    return KernelSet(name, (kernels,))
 
 
 def test_a_task_is_compiled_once_it_was_done_and_the_others_are_not(cache: Path) -> None:

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.document_types import PoseDocument
-from cdpr.errors import BadInput, CdprError, InvalidFile
-from cdpr.plan import load_plan, plan_from_document, save_plan, sealed
-from cdpr.plan_file import PlanDocument
+from model.errors import BadInput, CdprError, InvalidFile
+from model.files.documents import PoseDocument
+from model.files.plan_file import PlanDocument
+from model.plan import load_plan, plan_from_document, save_plan, sealed
 from tests.model.rig_builds import paper_data, rig_of, scene_data, scene_of
 
 

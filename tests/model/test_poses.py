@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cdpr.document_types import PoseDocument
-from cdpr.poses import (
+from model.files.documents import PoseDocument
+from model.pose import (
     Pose,
     interpolate,
     matrix_from_quaternion,

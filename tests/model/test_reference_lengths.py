@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpr.kinematics import cable_lengths
-from cdpr.poses import Pose
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
+from model.kinematics import cable_lengths
+from model.pose import Pose
+from model.rig import load_rig
+from model.scene import load_scene
 from tests.model.rig_builds import CONFIGS, ipanema
 
 PRINTED_MM = {

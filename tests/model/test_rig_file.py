@@ -13,9 +13,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput, CdprError, InvalidFile
-from cdpr.rig import load_rig, rig_from_document
-from cdpr.rig_file import RigDocument
+from model.errors import BadInput, CdprError, InvalidFile
+from model.files.rig_file import RigDocument
+from model.rig import load_rig, rig_from_document
 from tests.model.rig_builds import CONFIGS, hall_data, paper_data, rig_of
 
 PAPER = (CONFIGS / "gachon_8_6.yaml").read_text(encoding="utf-8")

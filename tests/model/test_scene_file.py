@@ -11,10 +11,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput, InvalidFile
-from cdpr.poses import Pose
-from cdpr.scene import load_scene
-from cdpr.shapes import (
+from model.errors import BadInput, InvalidFile
+from model.geometry.shapes import (
     Box,
     Capsule,
     ConvexHull,
@@ -24,6 +22,8 @@ from cdpr.shapes import (
     convex_hull,
     shape_points,
 )
+from model.pose import Pose
+from model.scene import load_scene
 from tests.model.rig_builds import CONFIGS, scene_data, scene_of
 
 TETRAHEDRON = [[0, 0, 0], [100, 0, 0], [0, 100, 0], [0, 0, 100]]
@@ -102,6 +102,23 @@ def test_a_wrong_obstacle_is_told_by_key(
     [(told, what)] = problems_with([{"name": "o", **obstacle}], tmp_path)
     assert told == key
     assert sentence in what
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"box": {"size_mm": [1e8, 1e8, 10]}},
+        {"sphere": {"radius_mm": 10}, "position_mm": [0, -2e6, 0]},
+        {"mesh": {"points_mm": [[0, 0, 0], [1e7, 0, 0], [0, 1, 0]], "triangles": [[0, 1, 2]]}},
+    ],
+)
+def test_an_obstacle_larger_than_distances_are_proved_for_is_refused(
+    parts: dict[str, Any], tmp_path: Path
+) -> None:
+    [(told, what)] = problems_with([{"name": "floor", **parts}], tmp_path)
+    assert told == "obstacles[0]"
+    assert "'floor' reaches" in what
+    assert "make it as large as the room" in what
 
 
 def test_two_obstacles_of_one_name_are_told_beside_other_problems(tmp_path: Path) -> None:

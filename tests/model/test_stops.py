@@ -11,12 +11,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput, InvalidFile
-from cdpr.legs import legs_of
-from cdpr.payload import Payload
-from cdpr.plan import load_plan, sealed
-from cdpr.scene import load_scene
-from cdpr.scene_stops import StopDocument, payloads
+from model.errors import BadInput, InvalidFile
+from model.files.scene_file import Payload, StopDocument, payloads
+from model.plan import load_plan, sealed
+from model.scene import legs_of, load_scene
 from tests.model.rig_builds import CONFIGS, scene_data, scene_of
 from tests.model.test_plan_file import DOCUMENT
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.kinematics import cable_lengths, structure_matrix
-from cdpr.poses import Pose
-from cdpr.rig import Rig
-from cdpr.statics.working import weight_wrench, working_tensions
-from cdpr.winches import WinchMap
+from model.kinematics import cable_lengths, structure_matrix
+from model.pose import Pose
+from model.rig import Rig
+from model.statics.gravity import weight_wrench, working_tensions
+from model.winches import WinchMap
 from tests.model.rig_builds import hall_data, paper_data, poses_of, rig_of
 
 
@@ -116,7 +116,7 @@ def test_working_tensions_hold_the_weight_within_the_limits(name: str, data: st.
 
 def test_the_weight_of_a_payload_off_the_middle_turns_the_platform() -> None:
     """A payload on +x pulls down: a moment about +y, whatever the position."""
-    from cdpr.scene import Load
+    from model.scene import Load
 
     rig = RIGS["paper"]
     load = Load(2.0, np.array([0.1, 0.0, 0.0]), np.zeros(3), np.zeros(3))

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene, scene_from_document
-from cdpr.scene_file import SceneDocument
+from model.files.scene_file import SceneDocument
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene, scene_from_document
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -23,6 +23,11 @@ def gachon() -> Rig:
 @pytest.fixture(scope="session")
 def hall() -> Rig:
     return load_rig(CONFIGS / "hall_10_6.yaml")
+
+
+@pytest.fixture(scope="session")
+def open_frame() -> Rig:
+    return load_rig(CONFIGS / "open_frame_8_6.yaml")
 
 
 @pytest.fixture(scope="session")

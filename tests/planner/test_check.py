@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpr.clearance import ClearanceModel
-from cdpr.errors import Refused
-from cdpr.kinematics import structure_matrix
-from cdpr.plan import plan_from_document, sealed
-from cdpr.poses import Pose, interpolate
-from cdpr.rig import rig_from_document
+from model.clearance import ClearanceModel
+from model.errors import Refused
+from model.kinematics import structure_matrix
+from model.plan import plan_from_document, sealed
+from model.pose import Pose, interpolate
+from model.rig import rig_from_document
 from planner.check import _Check, check_path, verify
 from planner.check_report import VerifiedPlan
-from planner.feasibility import capacity_margins
-from planner.plan import make_plan
+from planner.costs import capacity_margins
+from planner.planning import make_plan
+from planner.pose_path import PosePath
 from planner.settings import PlannerSettings
-from planner.track import Track
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +198,7 @@ def test_margin_and_self_clearance_change_no_faster_than_their_slopes(
             Rotation.from_rotvec(rng.uniform(-turn, turn, 3)).as_matrix(),
         )
         ends = [Pose.level(position), near]
-        check = _Check(rig, scene, Track(rig, ends))
+        check = _Check(rig, scene, PosePath(rig, ends))
         motion = check.track.marks[-1]
         margins = [capacity_margins(rig, scene, p.position[None], p.rotation)[0] for p in ends]
         assert abs(margins[1] - margins[0]) <= check._margin_slope() * motion

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpr.kinematics import structure_matrix
-from cdpr.poses import Pose
-from cdpr.statics.dexterity import condition_number, rms_anchor_radius
-from cdpr.statics.wrench_set import force_volume
-from planner.cost import KinematicCost, LengthCost
-from planner.lattice import Lattice, corners_and_weights
+from model.kinematics import structure_matrix
+from model.pose import Pose
+from model.statics.dexterity import condition_number, rms_anchor_radius
+from model.statics.wrench_sets import force_volume
+from planner import array_cache as stored
+from planner.costs import KinematicCost, LengthCost
+from planner.space import Lattice, corners_and_weights
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +31,28 @@ def test_integrals_from_the_lattice_are_within_two_percent_of_exact_ones(
         values = cost.at(points)
         mean = np.mean((values[1:] + values[:-1]) / 2)
         assert cost.edge(start, end) == pytest.approx(mean * np.linalg.norm(end - start), rel=0.02)
+
+
+def test_the_lattice_is_computed_once_for_a_rig_and_an_orientation(
+    gachon, monkeypatch, tmp_path
+) -> None:
+    monkeypatch.setattr(stored, "cache_folder", lambda *_: tmp_path)
+    first = KinematicCost(gachon, np.eye(3))
+
+    def refuse(_self: KinematicCost) -> np.ndarray:
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr(KinematicCost, "_on_lattice", refuse)
+    again = KinematicCost(gachon, np.eye(3))
+    assert np.array_equal(first.values, again.values)
+    assert first.extremes == again.extremes
+    with pytest.raises(AssertionError, match="computed again"):
+        KinematicCost(
+            gachon, Pose.from_quaternion(np.zeros(3), np.array([0.8, 0, 0, 0.6])).rotation
+        )
+    monkeypatch.setattr("planner.costs._version", lambda: "another state of the code")
+    with pytest.raises(AssertionError, match="computed again"):
+        KinematicCost(gachon, np.eye(3))
 
 
 def test_both_indices_are_scaled_by_their_extremes_over_the_workspace(gachon, cost) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput, NoSolution
-from cdpr.plan import plan_from_document
-from cdpr.poses import Pose
+from model.errors import BadInput, NoSolution
+from model.plan import plan_from_document
+from model.pose import Pose
 from planner.check import verify
-from planner.plan import make_plan
+from planner.planning import make_plan
 from planner.settings import PlannerSettings
 
 QUICK = PlannerSettings(mode="paper")
@@ -140,6 +140,13 @@ def test_a_start_that_cannot_be_used_names_what_and_by_how_much(
     mirrored = scene.changed(goal=Pose.level(np.array(start_mm) / 1000))
     with pytest.raises(BadInput, match="goal"):
         make_plan(gachon, mirrored, QUICK)
+
+
+def test_a_start_that_barely_touches_is_not_told_to_be_zero_inside(gachon, ready_scene) -> None:
+    bad = ready_scene("environment_1").changed(start=Pose.level([-0.045 - 1e-12, 0.0, 0.3]))
+    with pytest.raises(BadInput, match="platform touches obstacle_1") as refusal:
+        make_plan(gachon, bad, QUICK)
+    assert "inside" not in str(refusal.value)
 
 
 def test_a_start_nearer_than_the_clearance_asked_for_tells_both_figures(

@@ -10,9 +10,9 @@ import pytest
 from benchmarks.random_robots import random_robot, random_scene
 from benchmarks.random_scenes import PLANNED, main, repeated
 from benchmarks.second_opinion import second_opinion
-from cdpr.clearance import ClearanceModel
-from cdpr.poses import Pose
-from cdpr.scene import scene_from_document
+from model.clearance import ClearanceModel
+from model.pose import Pose
+from model.scene import scene_from_document
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner.cost import LengthCost
+from planner.costs import LengthCost
 from planner.shortcut import cheapest_through, drawn_tight
 
 COST = LengthCost()

@@ -8,17 +8,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput, NoSolution
-from cdpr.payload import Payload
-from cdpr.plan import load_plan, plan_from_document, save_plan
-from cdpr.poses import Pose, interpolate
-from cdpr.scene import Load
-from cdpr.scene_stops import StopDocument
-from cdpr.statics.working import working_tensions
+from model.errors import BadInput, NoSolution
+from model.files.scene_file import Payload, StopDocument
+from model.plan import load_plan, plan_from_document, save_plan
+from model.pose import Pose, interpolate
+from model.scene import Load
+from model.statics.gravity import working_tensions
 from planner.check import check_path, verify
-from planner.optimal.settings import OptimalSettings
-from planner.plan import make_plan
-from planner.settings import PlannerSettings
+from planner.planning import make_plan
+from planner.settings import OptimalSettings, PlannerSettings
 
 OPTIMAL = OptimalSettings(rounds=20)
 SETTINGS = [OPTIMAL, PlannerSettings(mode="paper"), PlannerSettings(cost="length")]

@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.clearance import ClearanceModel, RobotBodies, ShiftedBodies
-from cdpr.errors import Fault
-from cdpr.poses import Pose, interpolate
-from planner.bounds import smallest_along
-from planner.stretches import smallest_over_stretches
-from planner.track import Track
+from model.clearance import ClearanceModel, RobotBodies, ShiftedBodies
+from model.errors import Fault
+from model.pose import Pose, interpolate
+from planner.bounds import smallest_along, smallest_over_stretches
+from planner.pose_path import PosePath
 
 TOLERANCE = 0.1e-3
 SHAPES = (
@@ -35,7 +34,7 @@ def random_case(gachon, scene_with, seed):
     corners = random.uniform([-200, -200, 200], [200, 200, 600], (int(random.integers(2, 5)), 3))
     rotation = np.array(gachon.home.rotation)
     poses = [Pose(corner / 1e3, rotation) for corner in corners]
-    return ClearanceModel(gachon, scene_with(*obstacles)), Track(gachon, poses), poses
+    return ClearanceModel(gachon, scene_with(*obstacles)), PosePath(gachon, poses), poses
 
 
 @settings(max_examples=30, deadline=None)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from shutil import which
 from typing import get_args
 
 import pytest
 from pydantic import BaseModel
 
-from cdpr.plan_file import PlanDocument
-from cdpr.rig_file import RigDocument
-from cdpr.scene_file import SceneDocument
+from model.files.plan_file import PlanDocument
+from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = re.compile(r"^\s*(https?:)?//", re.IGNORECASE)
@@ -40,20 +42,51 @@ def fetched_outside(html: str) -> list[str]:
     return parser.outside
 
 
-@pytest.mark.slow
-def test_the_documentation_builds_without_a_warning_and_asks_no_other_host(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path / "site")]
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The documentation, built without a warning."""
+    folder = tmp_path_factory.mktemp("docs") / "site"
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)]
     build = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert build.returncode == 0, build.stderr
-    pages = list((tmp_path / "site").rglob("*.html"))
+    return folder
+
+
+@pytest.mark.slow
+def test_the_documentation_builds_without_a_warning_and_asks_no_other_host(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
     assert len(pages) > 10
     styles = re.compile(r"""(?:url\(|@import)\s*['"]?\s*((?:https?:)?//[^'")]*)""", re.IGNORECASE)
     outside = {page.name: fetched_outside(page.read_text()) for page in pages}
-    outside |= {
-        sheet.name: styles.findall(sheet.read_text())
-        for sheet in (tmp_path / "site").rglob("*.css")
-    }
+    outside |= {sheet.name: styles.findall(sheet.read_text()) for sheet in site.rglob("*.css")}
     assert not {name: found for name, found in outside.items() if found}
+
+
+@pytest.mark.slow
+def test_the_search_needs_no_server(site: Path) -> None:
+    """From a folder a browser loads scripts only: no JSON, and no worker."""
+    index = (site / "search" / "search_index.js").read_text()
+    assert index.startswith("var __index = {")
+    documents = json.loads(index.removeprefix("var __index = "))["docs"]
+    assert any("following_error" in document["text"] for document in documents)
+    for page, script in (
+        ("index.html", "javascripts/iframe-worker.js"),
+        ("faults/index.html", "../javascripts/iframe-worker.js"),
+    ):
+        assert f'src="{script}"' in (site / page).read_text()
+    assert (site / "javascripts" / "iframe-worker.js").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(which("chromium") is None, reason="there is no Chromium here")
+def test_a_browser_finds_a_word_in_the_pages_of_a_folder(site: Path, tmp_path: Path) -> None:
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    command += ["--virtual-time-budget=20000", f"--user-data-dir={tmp_path}"]
+    address = f"{(site / 'index.html').as_uri()}?q=following+error"
+    shown = subprocess.run([*command, address], capture_output=True, text=True, check=False)
+    found = re.search(r'md-search-result__meta">(\d+) matching documents', shown.stdout)
+    assert found is not None
+    assert int(found.group(1)) > 5
 
 
 def test_the_search_for_outside_addresses_sees_them() -> None:

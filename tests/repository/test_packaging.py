@@ -12,9 +12,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
+
+from tests.cli.program import call
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -87,6 +90,26 @@ def test_the_import_contracts_are_kept() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_the_version_is_the_same_wherever_it_is_written() -> None:
+    version = PROJECT["project"]["version"]
+    assert call("--version").out == f"cdpr {version}\n"
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
+    headings = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    released = [Version(heading) for heading in headings if heading != "Unreleased"]
+    assert headings[0] == "Unreleased" or released[0] == Version(version)
+    assert all(Version(version) >= earlier for earlier in released)
+    assert released == sorted(released, reverse=True)
+
+
+def test_the_citation_names_the_software_and_the_paper() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert citation["authors"] == PROJECT["project"]["authors"]
+    assert citation["license"] == PROJECT["project"]["license"]
+    (paper,) = citation["references"]
+    assert [author["family-names"] for author in paper["authors"]] == ["Xu", "Park"]
+
+
 @pytest.mark.slow
 def test_a_wheel_holds_every_package_its_type_marker_and_the_ready_rigs(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
@@ -99,5 +122,15 @@ def test_a_wheel_holds_every_package_its_type_marker_and_the_ready_rigs(tmp_path
     configs = {f"cdpr/configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml")}
     assert configs
     assert configs <= names
+    sessions = {
+        f"cdpr/{path.relative_to(ROOT)}"
+        for path in (ROOT / "examples").rglob("*")
+        if path.is_file()
+    }
+    assert sessions
+    assert sessions <= names
+    faults = {f"executor/faults/{path.name}" for path in (ROOT / "docs/faults").glob("*.md")}
+    assert faults
+    assert faults <= names
     tops = {name.split("/")[0] for name in names}
     assert tops == {*packages, f"cdpr-{PROJECT['project']['version']}.dist-info"}

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from executor.doctor import PACKAGES
+
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("cdpr", "planner", "executor", "drivers", "tracking", "calibration", "simulation")
 
 FORBIDDEN = {
     "an index address": r"--(extra-)?index-url|--find-links|--trusted-host|https?://[^\s\"'<>]*/simple\b",

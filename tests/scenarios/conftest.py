@@ -7,14 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.document_types import millimetres
-from cdpr.plan import load_plan, save_plan
-from cdpr.poses import Pose
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
-from executor.prepare import PreparedRun, prepare
+from executor.trajectory.prepare import PreparedRun, prepare
+from model.files.documents import millimetres
+from model.plan import load_plan, save_plan
+from model.pose import Pose
+from model.rig import load_rig
+from model.scene import load_scene
 from planner.check import verify
-from tests.cli.plans import CONFIGS, HALL, RIG, straight_plan, write_short_plan
+from tests.cli.plans import (
+    CONFIGS,
+    HALL,
+    RIG,
+    rig_with_long_cycles,
+    straight_plan,
+    write_short_plan,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -39,6 +46,18 @@ def short_plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def prepared(short_plan: Path) -> PreparedRun:
     """The same, checked and with its set-points."""
     return prepare(verify(load_plan(short_plan)), load_rig(RIG))
+
+
+@pytest.fixture(scope="session")
+def slow_rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The paper's rig for tests in real time, which a busy host must not spoil."""
+    return rig_with_long_cycles(tmp_path_factory.mktemp("slow"))
+
+
+@pytest.fixture(scope="session")
+def slow_run(short_plan: Path, slow_rig: Path) -> PreparedRun:
+    """The short plan on that rig."""
+    return prepare(verify(load_plan(short_plan)), load_rig(slow_rig))
 
 
 @pytest.fixture(scope="session")

@@ -7,21 +7,26 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from cdpr.poses import Array, Pose
-from drivers.bus import BusSettings, open_bus
-from drivers.cia402.states import DriveState
-from drivers.drive_group import DriveGroup, make_drive_group
-from executor.execution import Outcome, run_here
-from executor.prepare import PreparedRun
-from executor.recorder import Recorder, Trigger
-from executor.run_folder import RunEvent, RunFolder
-from executor.status import RunStatus
-from executor.wishes import OwnBoard
-from simulation.drive import SimulatedDrive
-from simulation.rehearsal import Rehearsal
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.state_machine import DriveState
+from drivers.drive_group import DriveGroup
+from drivers.factory import make_drive_group
+from executor.cameras.multi_camera import CameraRecords
+from executor.control.path_runs import Outcome, run_in_process
+from executor.evaluation import evaluate, write_end
+from executor.operator_requests import LocalRequests
+from executor.recording.recorder import FrameTrigger, Recorder
+from executor.recording.run_course import RunCourse
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.remote.status import RunStatus
+from executor.trajectory.prepare import PreparedRun
+from model.pose import Array, Pose
+from simulation.drives.cia402 import SimulatedDrive
+from simulation.drives.cia402_rig import SimulatedCia402Rig
 
 _CHANNELS = itertools.count()
 
@@ -40,25 +45,33 @@ class Stage:
         board: What the executor sees as the operator's wishes.
         status: What it tells those who ask.
         lateness: What the clock tells, in cycles.
+        now: Its time with all lateness so far, [s].
+        armed: The positions were read; from here on cycles count.
     """
 
     prepared: PreparedRun
-    rehearsal: Rehearsal
+    rehearsal: SimulatedCia402Rig
     group: DriveGroup
     folder: RunFolder
     script: Callable[[Stage], None]
     cycle: int = -1
-    board: OwnBoard = field(default_factory=OwnBoard)
+    board: LocalRequests = field(default_factory=LocalRequests)
     lateness: float = 0.0
+    now: float = 0.0
+    armed: bool = False
     status: RunStatus | None = None
     drive_states: list[tuple[DriveState, ...]] = field(default_factory=list)
 
     def next_cycle(self) -> float:
-        """The next cycle begins; what the script has for it happens."""
+        """The next cycle begins; what the script has for it happens. Arming is before the first."""
+        if not self.armed:
+            self.now += self.prepared.checked.table.cycle
+            return 0.0
         self.cycle += 1
         self.drive_states.append(tuple(drive.state for drive in self.drives))
         self.script(self)
         late, self.lateness = self.lateness, 0.0
+        self.now += (1.0 + late) * self.prepared.checked.table.cycle
         return late
 
     def time_left(self) -> float:
@@ -76,11 +89,16 @@ class Stage:
 
     def run(
         self,
-        trigger: Trigger | None = None,
+        trigger: FrameTrigger | None = None,
         progress: Callable[[float], None] = lambda _row: None,
         before_motion: Callable[[], None] = lambda: None,
     ) -> Outcome:
         """Arms and does the whole motion."""
+
+        def on_armed() -> None:
+            self.armed = True
+            before_motion()
+
         self.status = RunStatus(self.prepared, self.folder.path, self.board, simulated_time=True)
         recorder = Recorder(
             self.prepared,
@@ -91,7 +109,7 @@ class Stage:
             progress=progress,
             announce=lambda _text: None,
         )
-        return run_here(
+        return run_in_process(
             self.prepared,
             self.group,
             self,
@@ -99,11 +117,23 @@ class Stage:
             recorder,
             true_pose=None,
             carry=self.rehearsal.carry,
-            before_motion=before_motion,
+            before_motion=on_armed,
         )
 
     def events(self) -> list[RunEvent]:
         return self.folder.events()
+
+
+def concluded(stage: Stage, outcome: Outcome) -> dict[str, Any]:
+    """The summary of a run whose folder is written as the program writes it."""
+    prepared, folder = stage.prepared, stage.folder
+    folder.write_plan(prepared.plan.plan.document)
+    folder.write_rig(prepared.rig.document)
+    state, cause = outcome.state.value, outcome.cause
+    course = RunCourse(outcome.started, "virtual", True, True, state, cause)
+    result = evaluate(prepared, outcome, CameraRecords(), course)
+    assert write_end(folder, course, result, outcome.log.events) == {}
+    return result.summary
 
 
 @contextmanager
@@ -113,7 +143,9 @@ def staged(
     """Drives on a virtual bus of their own, configured; the platform stands at the start."""
     settings = BusSettings("virtual", f"scenario-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
-        rehearsal = Rehearsal(prepared.rig, far, start or prepared.scene.start, prepared.scene.load)
+        rehearsal = SimulatedCia402Rig(
+            prepared.rig, far, start or prepared.scene.start, prepared.scene.load
+        )
         group = make_drive_group(prepared.rig, near, rehearsal.pump)
         group.configure()
         yield Stage(prepared, rehearsal, group, RunFolder.create(path), script)

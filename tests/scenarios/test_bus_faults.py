@@ -8,9 +8,9 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.cia402.states import DriveState
-from executor.machine import State
-from executor.prepare import PreparedRun
+from drivers.cia402.state_machine import DriveState
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
 from tests.scenarios.stage import Stage, at, staged
 
 CRUISING = 150

@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 import yaml
 
-from cdpr.clearance import ClearanceModel
-from cdpr.kinematics import cable_lengths
-from cdpr.plan import load_plan, save_plan
-from cdpr.poses import Pose
-from cdpr.rig import load_rig
-from cdpr.scene import scene_from_document
-from cdpr.scene_file import SceneDocument
-from executor.machine import State
-from executor.near_watch import NearWatch
-from executor.observer import Observer, Trigger
-from executor.prepare import PreparedRun
-from executor.run_folder import RunFolder
-from executor.wishes import StopReason
-from simulation.camera import SyntheticCamera
+from executor.cameras.multi_camera import ClearanceMonitor
+from executor.cameras.worker import CameraWorker, FrameRequest
+from executor.operator_requests import StopReason
+from executor.recording.run_folder import RunFolder
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from model.clearance import ClearanceModel
+from model.files.scene_file import SceneDocument
+from model.kinematics import cable_lengths
+from model.plan import load_plan, save_plan
+from model.pose import Pose
+from model.rig import load_rig
+from model.scene import scene_from_document
+from simulation.camera.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, straight_plan
 from tests.cli.program import call
 from tests.scenarios.stage import at, staged
-from tracking.measured_clearance import clearance_of
+from tracking.clearance import clearance_of
 from tracking.measurement import PoseMeasurement
 
 #: The platform truly stands so far towards the block, [m].
@@ -104,7 +104,7 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     (low,) = (event["text"] for event in summary["events"] if event["code"] == "clearance_low")
     assert re.search(r"to block \[/left\]: \d+\.\d ± \d\.\d mm; the scene asks for 10 mm", low)
     assert "to block [/left]: " in answer.said
-    assert "docs/faults/clearance_low.md" in answer.out + answer.said
+    assert "more about it: cdpr explain clearance_low" in answer.said
 
 
 def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
@@ -153,7 +153,7 @@ class Rendered:
     def __init__(self, camera: SyntheticCamera) -> None:
         self._camera = camera
 
-    def picture(self, trigger: Trigger) -> tuple[np.ndarray, float]:
+    def picture(self, trigger: FrameRequest) -> tuple[np.ndarray, float]:
         assert trigger.true_pose is not None
         return self._camera.render(trigger.true_pose, trigger.frame), 0.0
 
@@ -167,11 +167,11 @@ def test_one_picture_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path
     near, far = Pose.level([-0.008, 0.02, 0.48]), Pose.level([0.05, 0.02, 0.48])
     assert min(n.distance for n in ClearanceModel(rig, scene).obstacles(near)) < 0.005
     folder = RunFolder.create(tmp_path / "run")
-    watch, model = NearWatch(scene.obstacle_clearance), ClearanceModel(rig, scene)
-    with Observer(rig, rig.cameras[0], Rendered(eye), folder, 1000, named=False) as observer:
+    watch, model = ClearanceMonitor(scene.obstacle_clearance), ClearanceModel(rig, scene)
+    with CameraWorker(rig, rig.cameras[0], Rendered(eye), folder, 1000, named=False) as observer:
         told = []
         for frame, pose in enumerate([near, far, near, near, far]):
-            found = observer.look(Trigger(frame, frame * 0.1, 0.0, pose)).found
+            found = observer.look(FrameRequest(frame, frame * 0.1, 0.0, pose)).found
             assert isinstance(found, PoseMeasurement)
             told.append(bool(watch.take(clearance_of(model, found))))
     assert told == [False, False, False, True, False]

@@ -12,19 +12,20 @@ import can
 import numpy as np
 import pytest
 
-from cdpr.errors import Fault
-from drivers.cia402.states import DriveState
-from executor import run as run_module
-from executor.clock import SimulatedClock
-from executor.machine import State
-from executor.prepare import PreparedRun
-from executor.run import conclude
-from executor.run_cameras import Seen
-from executor.run_folder import NEEDED, RunEvent, RunFolder
-from executor.setpoints import SetpointTable
+from drivers.cia402.state_machine import DriveState
+from executor import evaluation as run_module
+from executor.realtime.clock import SimulatedClock
+from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import Trajectory
+from model.errors import Fault, Refused
+from model.files.drive_profile_file import ProfileDocument
+from model.files.rig_file import RigDocument
+from model.rig import rig_from_document
 from tests.cli.plans import RIG
 from tests.cli.program import call
-from tests.scenarios.stage import Stage, at, staged
+from tests.scenarios.stage import Stage, at, concluded, staged
 
 CRUISING = 150
 
@@ -75,7 +76,7 @@ def overload(stage: Stage) -> None:
 
 
 def late(stage: Stage) -> None:
-    stage.lateness = 2.9
+    stage.lateness = 1.4
 
 
 def far_too_late(stage: Stage) -> None:
@@ -84,7 +85,7 @@ def far_too_late(stage: Stage) -> None:
 
 def jump_in_table(stage: Stage) -> None:
     """As if memory had been written to after the check."""
-    table: SetpointTable = stage.prepared.checked.table
+    table: Trajectory = stage.prepared.checked.table
     table.setpoints.setflags(write=True)
     table.setpoints[CRUISING + 5 :, 3] += 4000
 
@@ -105,6 +106,12 @@ CASES = {
     "a drive reports an emergency": Case(
         lambda stage: stage.drives[2].fail(0x2310), "drive_fault", ("drive 3",), lost=(2,)
     ),
+    "a drive reports an emergency and goes on": Case(
+        lambda stage: stage.drives[2]._emergency(0x4310),
+        "drive_warning",
+        ("(drive 3)", "temperature", "stopped along"),
+        within=40,
+    ),
     "a drive starts anew": Case(
         lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
     ),
@@ -112,7 +119,7 @@ CASES = {
     "a winch slips": Case(slip, "following_error", ("cable 2", "allowed 2.00 mm"), lost=(1,)),
     "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "torn"), within=5),
     "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "102.0 N"), within=60),
-    "the loop is late": Case(late, "late", ("2.9 cycles late; stopped along",), within=40),
+    "the loop is late": Case(late, "late", ("1.4 cycles late; stopped along",), within=40),
     "the loop hung": Case(far_too_late, "late", ("1371.9 cycles late; quick stop",)),
     "the table was changed": Case(jump_in_table, "gate_denied", ("cable 4", "step"), within=30),
     "a drive is silent while enabling": Case(
@@ -157,21 +164,6 @@ def table_restored(prepared: PreparedRun) -> Iterator[None]:
         setpoints.setflags(write=False)
 
 
-def concluded(stage: Stage, outcome: Any) -> dict[str, Any]:
-    """The summary of a run that was written as the program writes it."""
-    stage.folder.write_plan(stage.prepared.plan.plan.document)
-    stage.folder.write_rig(stage.prepared.rig.document)
-    return conclude(
-        stage.prepared,
-        outcome,
-        stage.folder,
-        Seen(),
-        interface="virtual",
-        simulated=True,
-        fast=True,
-    )
-
-
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.usefixtures("no_pictures", "table_restored")
 def test_a_fault_is_latched_told_held_and_recorded(
@@ -202,6 +194,37 @@ def test_a_fault_is_latched_told_held_and_recorded(
     assert all((folder.path / file).is_file() for file in NEEDED)
     assert folder.mcap.is_file()
     assert len(folder.cycles()) == summary["cycles"] == len(outcome.log)
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_mere_warning_of_a_drive_ends_no_run(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each is told once, however often it comes; the drive says that it goes on."""
+    monkeypatch.setattr(ProfileDocument, "is_warning", lambda _profile, code: code == 0x3280)
+
+    def warn(stage: Stage) -> None:
+        stage.drives[2]._emergency(0x3280)
+
+    with staged(prepared, tmp_path / "run", at(CRUISING, warn)) as stage:
+        outcome = stage.run()
+        assert outcome.state is State.FINISHED
+        told = [event.text for event in stage.events() if event.code == "drive_warning"]
+    assert len(told) == 1
+    assert "3280h" in told[0]
+
+
+def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """Drives that hardly slow down go on for 319 mm; the path keeps 284 mm."""
+    profile = tmp_path / "lab.yaml"
+    gentle = 'ranges: {"6085h:00": {low: 1, high: 2000}}'
+    profile.write_text(f"name: Gentle\nsources: [this test]\n{gentle}\n")
+    document = prepared.rig.document.model_dump()
+    document["drives"]["profile"] = str(profile)
+    with pytest.raises(Refused, match="without the master the platform goes on for up to 31"):
+        prepare(prepared.plan, rig_from_document(RigDocument.model_validate(document)))
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -274,7 +297,7 @@ def test_the_first_of_several_causes_is_the_one_that_is_told(
     assert codes.index("late") < codes.index("drive_silent")
 
 
-@pytest.mark.parametrize("lateness", [3.0, 1371.9])
+@pytest.mark.parametrize("lateness", [1.5, 2.0, 3.0, 1371.9])
 @pytest.mark.usefixtures("no_pictures")
 def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lateness: float
@@ -286,9 +309,9 @@ def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
         sent: list[tuple[int, tuple[int, ...]]] = []
         send = stage.group.send_cycle
 
-        def noted(targets: tuple[int, ...]) -> None:
+        def noted(targets: tuple[int, ...], *may_enable: Callable[[], bool]) -> None:
             sent.append((stage.cycle, tuple(targets)))
-            send(targets)
+            send(targets, *may_enable)
 
         monkeypatch.setattr(stage.group, "send_cycle", noted)
         outcome = stage.run()
@@ -350,8 +373,8 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
     short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cycle: int
 ) -> None:
     """Through the real program with its real camera process, killed as the system would."""
-    from executor.camera_process import CameraProcess
-    from executor.run_cameras import ROUND
+    from executor.cameras.multi_camera import ROUND
+    from executor.cameras.process import CameraProcess
 
     cycles, real = 0, SimulatedClock.next_cycle
     answer_within = CameraProcess.answer_within

@@ -11,24 +11,22 @@ import numpy as np
 import pytest
 import yaml
 
-from cdpr.kinematics import cable_lengths
-from cdpr.payload import Payload
-from cdpr.plan import load_plan, plan_from_document
-from cdpr.poses import Pose
-from cdpr.rig import load_rig
-from cdpr.scene import Scene, load_scene
-from executor.machine import State
-from executor.prepare import PreparedRun, prepare
-from executor.run import conclude
-from executor.run_cameras import Seen
-from executor.run_end import continued, run_end
-from executor.run_folder import RunFolder
+from executor.recording.resume import continued, run_end
+from executor.recording.run_folder import RunFolder
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun, prepare
+from model.files.scene_file import Payload
+from model.kinematics import cable_lengths
+from model.plan import load_plan, plan_from_document
+from model.pose import Pose
+from model.rig import load_rig
+from model.scene import Scene, load_scene
 from planner.check import verify
-from planner.optimal.settings import OptimalSettings
-from planner.plan import make_plan
+from planner.planning import make_plan
+from planner.settings import OptimalSettings
 from tests.cli.plans import RIG
 from tests.cli.program import call, nothing_written, one_message
-from tests.scenarios.stage import Stage, staged
+from tests.scenarios.stage import Stage, concluded, staged
 
 SCENE = {
     "schema_version": 1,
@@ -80,11 +78,7 @@ def ended(
 
     with staged(prepared, path, script, start) as stage:
         outcome = stage.run()
-        stage.folder.write_plan(prepared.plan.plan.document)
-        stage.folder.write_rig(prepared.rig.document)
-        conclude(
-            prepared, outcome, stage.folder, Seen(), interface="virtual", simulated=True, fast=True
-        )
+        concluded(stage, outcome)
         return Ended(stage.folder, outcome.state, stage.rehearsal.pose)
 
 
@@ -274,10 +268,11 @@ def test_way_poses_of_the_command_line_are_met_before_the_scenes_stops(
 ) -> None:
     plan = tmp_path / "plan.json"
     arguments = ("plan", RIG, scene_file, "-o", plan, "--rounds", "3")
-    answer = call(*arguments, "--via-mm", "5,-5,450", "--via-mm", "0,0,460")
+    answer = call(*arguments, "--via-mm", "5", "-5", "450", "--via-mm", "0", "0", "460")
     assert answer.code == 0, answer
     made = load_plan(plan)
     assert [stop.name for stop in made.scene.stops] == ["via 1", "via 2", "take", "by", "leave"]
     np.testing.assert_allclose(made.waypoints[made.stops[0]].position, [0.005, -0.005, 0.45])
-    for wrong in ("1,2", "1,2,x", "1,2,nan"):
-        one_message(call(*arguments, "--force", "--via-mm", wrong), 2, f"--via-mm {wrong}: needs")
+    for wrong in ("1 2", "1 2 x", "1 2 nan"):
+        told = call(*arguments, "--force", "--via-mm", *wrong.split())
+        one_message(told, 2, f"--via-mm {wrong}: needs")

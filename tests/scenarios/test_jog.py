@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.rig import load_rig
-from drivers.cia402.states import DriveState
-from executor.prepare import PreparedRun
-from executor.run_folder import RunFolder
+from drivers.cia402.state_machine import DriveState
+from executor.recording.run_folder import RunFolder
+from executor.trajectory.prepare import PreparedRun
+from model.rig import load_rig
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
 from tests.scenarios.test_real_time import drives_on
@@ -41,7 +41,7 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: P
     [
         (("--by-mm", "30", "30", "30", "--no-scene"), 3, "longer than 50 mm"),
         (("--by-mm", "0", "0", "0", "--no-scene"), 2, "no way to go"),
-        (("--by-mm", "nan", "0", "0", "--no-scene"), 2, "no way to go"),
+        (("--by-mm", "nan", "0", "0", "--no-scene"), 2, "must be a finite number"),
         (WAY, 2, "say what is in the way"),
         ((*WAY, "--no-scene", "--scene", "scene.yaml"), 2, "say what is in the way"),
         ((*WAY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
@@ -69,7 +69,7 @@ ONE = ("--cable", "3", "--mm", "1")
         (("--mm", "3"), 2, "together"),
         (("--cable", "9", "--mm", "1"), 2, "no cable 9"),
         (("--cable", "3", "--mm", "0"), 2, "no way to go"),
-        (("--cable", "3", "--mm", "nan"), 2, "no way to go"),
+        (("--cable", "3", "--mm", "nan"), 2, "must be a finite number"),
         (("--cable", "3", "--mm", "51"), 3, "more than 50 mm"),
         ((*ONE, "--limit-n", "101"), 3, "limit of 101 N"),
         ((*ONE, *WAY), 2, "no effect here: --by-mm"),
@@ -103,15 +103,15 @@ def test_a_jog_into_an_obstacle_is_denied(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_on_a_bus_it_begins_where_the_drives_stand_and_is_not_home(
-    prepared: PreparedRun, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.24:{20000 + (os.getpid() * 13) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
-    with drives_on(channel, prepared) as rehearsal:
+    with drives_on(channel, slow_run) as rehearsal:
         for number in (1, 2):
             before = rehearsal.pose.position
             run = tmp_path / f"jog-{number}"
-            answer = call("jog", RIG, "--by-mm", "5", "0", "0", "--no-scene", *bus, "-o", run)
+            answer = call("jog", slow_rig, "--by-mm", "5", "0", "0", "--no-scene", *bus, "-o", run)
             assert answer.code == 0, answer
             moved = rehearsal.pose.position - before
             assert moved == pytest.approx([0.005, 0.0, 0.0], abs=5e-5)

@@ -10,17 +10,22 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.errors import Refused
-from drivers.bus import BusSettings
-from drivers.cia402.states import DriveState
-from executor.command_client import ask_all
-from executor.latch import Latch
-from executor.machine import State
-from executor.prepare import PreparedRun
-from executor.running import reached_runs
+from drivers.can_bus import BusSettings
+from drivers.cia402.state_machine import DriveState
+from executor.interlock.fault_latch import FaultLatch
+from executor.remote.client import ask_all
+from executor.remote.registry import find_runs
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from model.errors import Refused
 from tests.cli.plans import RIG
 from tests.cli.program import call
-from tests.scenarios.test_real_time import drives_on, moving_over_udp, wait_until_gone
+from tests.scenarios.test_real_time import (
+    drives_on,
+    moving_over_udp,
+    wait_until_all_hold,
+    wait_until_gone,
+)
 from tests.scenarios.test_real_time import real_time_process as process_of
 
 BUS = BusSettings("socketcan", "can0")
@@ -29,7 +34,7 @@ BUS = BusSettings("socketcan", "can0")
 def wait_until_beyond(path_mm: float) -> None:
     """Until the run has come so far along its path, or ended."""
     while True:
-        with reached_runs() as runs:
+        with find_runs() as runs:
             (answer,) = ask_all(runs, "status")
         assert answer.status is not None
         if (answer.status["path_mm"] or 0.0) > path_mm:
@@ -38,66 +43,66 @@ def wait_until_beyond(path_mm: float) -> None:
 
 
 def test_a_run_engages_it_and_only_a_good_end_disengages_it(tmp_path: Path) -> None:
-    latch = Latch(BUS)
+    latch = FaultLatch(BUS)
     latch.require_disengaged()
     for state in (State.FINISHED, State.STOPPED):
         latch.engage("rig", tmp_path)
-        assert Latch(BUS).read() is not None
+        assert FaultLatch(BUS).read() is not None
         latch.settle("rig", state, "", tmp_path)
         latch.require_disengaged()
     latch.engage("rig", tmp_path)
     latch.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
     with pytest.raises(Refused, match="cable 6 is slack") as caught:
-        Latch(BUS).require_disengaged()
+        FaultLatch(BUS).require_disengaged()
     assert "cdpr reset" in caught.value.next_step
     with pytest.raises(Refused, match="cable 6 is slack"):
-        Latch(BUS).engage("rig", tmp_path)
-    Latch(BUS).disengage()
+        FaultLatch(BUS).engage("rig", tmp_path)
+    FaultLatch(BUS).disengage()
     latch.require_disengaged()
 
 
 def test_a_run_that_never_came_to_its_end_is_a_fault(tmp_path: Path) -> None:
-    Latch(BUS).engage("rig", tmp_path)
+    FaultLatch(BUS).engage("rig", tmp_path)
     with pytest.raises(Refused, match="did not come to its end"):
-        Latch(BUS).require_disengaged()
+        FaultLatch(BUS).require_disengaged()
 
 
 def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
     """To every user of the folder, who may not reach the other's run; and only until it ends."""
-    running = Latch(BUS)
+    running = FaultLatch(BUS)
     running.engage("rig", tmp_path)
-    for ask in (Latch(BUS).require_disengaged, Latch(BUS).require_no_run):
+    for ask in (FaultLatch(BUS).require_disengaged, FaultLatch(BUS).require_no_run):
         with pytest.raises(Refused, match=f"process {os.getpid()}.*under way"):
             ask()
     running.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
-    Latch(BUS).require_no_run()
+    FaultLatch(BUS).require_no_run()
     with pytest.raises(Refused, match="cable 6 is slack"):
-        Latch(BUS).require_disengaged()
+        FaultLatch(BUS).require_disengaged()
 
 
 def test_nobody_sees_a_latch_that_does_not_say_its_cause_yet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen, hold = [], Latch._hold
+    seen, hold = [], FaultLatch._hold
 
-    def looked_at(latch: Latch) -> None:
+    def looked_at(latch: FaultLatch) -> None:
         hold(latch)
-        seen.append(Latch(BUS).read())
+        seen.append(FaultLatch(BUS).read())
 
-    monkeypatch.setattr(Latch, "_hold", looked_at)
-    Latch(BUS).engage("rig", tmp_path)
+    monkeypatch.setattr(FaultLatch, "_hold", looked_at)
+    FaultLatch(BUS).engage("rig", tmp_path)
     assert seen == [None]
 
 
 def test_of_two_that_begin_at_once_one_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("executor.latch.LOOKS_WITHIN", 0.05)
-    first = Latch(BUS)
+    monkeypatch.setattr("executor.interlock.fault_latch.LOOKS_WITHIN", 0.05)
+    first = FaultLatch(BUS)
     first.path.parent.mkdir(parents=True)
     first._hold()  # it is about to write why
     with pytest.raises(Refused, match="under way"):
-        Latch(BUS).engage("rig", tmp_path)
+        FaultLatch(BUS).engage("rig", tmp_path)
     assert first.read() is None
     first.engage("rig", tmp_path)
 
@@ -109,20 +114,20 @@ def test_a_program_that_was_killed_runs_no_more(tmp_path: Path) -> None:
     killed.start()
     killed.join()
     assert killed.exitcode == -signal.SIGKILL
-    Latch(BUS).require_no_run()
+    FaultLatch(BUS).require_no_run()
     with pytest.raises(Refused, match="did not come to its end"):
-        Latch(BUS).require_disengaged()
+        FaultLatch(BUS).require_disengaged()
 
 
 def _engaged_and_killed(folder: Path) -> None:
-    latch = Latch(BUS)
+    latch = FaultLatch(BUS)
     latch.engage("rig", folder)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_each_bus_has_its_own(tmp_path: Path) -> None:
-    Latch(BUS).engage("rig", tmp_path)
-    Latch(BusSettings("socketcan", "can1")).require_disengaged()
+    FaultLatch(BUS).engage("rig", tmp_path)
+    FaultLatch(BusSettings("socketcan", "can1")).require_disengaged()
 
 
 def test_all_users_share_it_where_an_administrator_made_a_folder_for_it(
@@ -130,20 +135,20 @@ def test_all_users_share_it_where_an_administrator_made_a_folder_for_it(
 ) -> None:
     shared = tmp_path / "shared"
     shared.mkdir()
-    monkeypatch.setattr("executor.state_folder.SHARED", shared)
-    Latch(BUS).engage("rig", tmp_path)
+    monkeypatch.setattr("executor.interlock.locks.SHARED", shared)
+    FaultLatch(BUS).engage("rig", tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
     with pytest.raises(Refused, match="did not come to its end"):
-        Latch(BUS).require_disengaged()
-    assert Latch(BUS).path.parent == shared
+        FaultLatch(BUS).require_disengaged()
+    assert FaultLatch(BUS).path.parent == shared
 
 
 def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
     tmp_path: Path,
 ) -> None:
-    latch = Latch(BUS)
+    latch = FaultLatch(BUS)
     with pytest.raises(Refused, match=r"reset .*under way"), latch.held_for_reset("rig", None):
-        Latch(BUS).engage("rig", tmp_path)
+        FaultLatch(BUS).engage("rig", tmp_path)
     latch.require_disengaged()
     latch.engage("rig", tmp_path, "cable 3 is slack")
     shown = latch.read()
@@ -159,7 +164,7 @@ def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"bus": 1}', "\x00"])
 def test_a_latch_file_that_cannot_be_read_counts_as_engaged(tmp_path: Path, content: str) -> None:
-    latch = Latch(BUS)
+    latch = FaultLatch(BUS)
     latch.engage("rig", tmp_path)
     latch.path.write_text(content)
     with pytest.raises(Refused, match="cannot be read"):
@@ -172,12 +177,12 @@ def test_without_a_place_for_the_latch_nothing_moves(
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     with pytest.raises(Refused, match="latch cannot be"):
-        Latch(BUS).engage("rig", tmp_path)
+        FaultLatch(BUS).engage("rig", tmp_path)
 
 
 def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41999")
-    Latch(BusSettings("udp_multicast", "239.74.163.23:41999")).engage("rig", tmp_path)
+    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41999")).engage("rig", tmp_path)
     run = tmp_path / "run"
     answer = call("run", short_plan, "--rig", RIG, "-o", run, *bus, "--no-camera", "--yes")
     assert answer.code == 3
@@ -187,8 +192,8 @@ def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Pat
 
 def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41998")
-    Latch(BusSettings("udp_multicast", "239.74.163.23:41998")).engage("rig", tmp_path)
-    latch = Latch(BusSettings("udp_multicast", "239.74.163.23:41998"))
+    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41998")).engage("rig", tmp_path)
+    latch = FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41998"))
     for answers, code in (("n\n", 130), ("", 2)):
         assert call("reset", RIG, *bus, answers=answers).code == code
         assert latch.read() is not None
@@ -197,25 +202,25 @@ def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
 
 def test_reset_of_drives_that_do_not_answer_leaves_it_engaged(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41997")
-    Latch(BusSettings("udp_multicast", "239.74.163.23:41997")).engage("rig", tmp_path)
-    latch = Latch(BusSettings("udp_multicast", "239.74.163.23:41997"))
+    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41997")).engage("rig", tmp_path)
+    latch = FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41997"))
     assert call("reset", RIG, *bus, "--yes").code == 4
     assert latch.read() is not None
 
 
 @pytest.mark.slow
 def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
-    prepared: PreparedRun, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.23:{20000 + (os.getpid() * 11) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
-    Latch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
-    latch = Latch(BusSettings("udp_multicast", channel))
-    with drives_on(channel, prepared) as rehearsal:
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
+    latch = FaultLatch(BusSettings("udp_multicast", channel))
+    with drives_on(channel, slow_run) as rehearsal:
         stood = [drive.motor.position for drive in rehearsal.drives]
         rehearsal.drives[2].fail(0x2310)
         assert rehearsal.drives[2].state is DriveState.FAULT
-        answer = call("reset", RIG, *bus, "--yes", "--json")
+        answer = call("reset", slow_rig, *bus, "--yes", "--json")
         assert answer.code == 0, answer
         told = json.loads(answer.out)
         assert told["was_latched"] is True
@@ -227,12 +232,12 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
 
 @pytest.mark.slow
 def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
-    prepared: PreparedRun, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.23:{20000 + (os.getpid() * 17) % 20000}"
-    Latch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
-    latch = Latch(BusSettings("udp_multicast", channel))
-    with drives_on(channel, prepared) as rehearsal:
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
+    latch = FaultLatch(BusSettings("udp_multicast", channel))
+    with drives_on(channel, slow_run) as rehearsal:
         answered = rehearsal.drives[4].on_sync
 
         def falls_silent() -> None:
@@ -241,7 +246,7 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
 
         rehearsal.drives[4].on_sync = falls_silent  # type: ignore[method-assign]
         bus = ("--interface", "udp_multicast", "--channel", channel)
-        answer = call("reset", RIG, *bus, "--yes")
+        answer = call("reset", slow_rig, *bus, "--yes")
     assert answer.code == 4, answer
     assert "(drive 5) fell silent" in answer.err
     assert latch.read() is not None
@@ -249,9 +254,12 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
 
 @pytest.mark.slow
 def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_stands(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
-    with moving_over_udp(prepared, short_plan, tmp_path / "run", 5) as (process, rehearsal):
+    with moving_over_udp(slow_run, slow_rig, short_plan, tmp_path / "run", 5) as (
+        process,
+        rehearsal,
+    ):
         arguments = list(map(str, process.args))  # type: ignore[union-attr, arg-type]
         channel = arguments[arguments.index("--channel") + 1]
         child = process_of(process.pid)
@@ -259,17 +267,18 @@ def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_sta
         process.kill()
         process.wait()
         wait_until_gone(child)
+        wait_until_all_hold(rehearsal)
         stood = [drive.motor.position for drive in rehearsal.drives]
         bus = ("--interface", "udp_multicast", "--channel", channel)
         rest = ("--no-camera", "--yes", "--without-real-time")
-        again = call("run", short_plan, "--rig", RIG, "-o", tmp_path / "again", *bus, *rest)
+        again = call("run", short_plan, "--rig", slow_rig, "-o", tmp_path / "again", *bus, *rest)
         assert again.code == 3
         assert "did not come to its end" in again.err
-        answer = call("reset", RIG, *bus, "--yes")
+        answer = call("reset", slow_rig, *bus, "--yes")
         assert answer.code == 0, answer
         assert "did not come to its end" in answer.out
         assert {drive.state for drive in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
-        again = call("run", short_plan, "--rig", RIG, "-o", tmp_path / "again", *bus, *rest)
+        again = call("run", short_plan, "--rig", slow_rig, "-o", tmp_path / "again", *bus, *rest)
         assert again.code == 3
         assert "not at the start of the plan" in again.err
         assert [drive.motor.position for drive in rehearsal.drives] == stood

@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.cia402.states import DriveState
-from executor.clock import SimulatedClock
-from executor.machine import State
-from executor.prepare import PreparedRun
-from executor.run import Outcome
-from simulation.rehearsal import Rehearsal
+from drivers.cia402.state_machine import DriveState
+from executor.control.path_runs import Outcome
+from executor.realtime.clock import SimulatedClock
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from simulation.drives.cia402_rig import SimulatedCia402Rig
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written
 from tests.scenarios.stage import Stage, at, path_indices, staged
@@ -117,13 +118,13 @@ def test_ctrl_c_in_the_program_stops_along_the_path_and_exits_130(
 def test_ctrl_c_before_anything_moves_leaves_no_run_folder(
     short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    switch_on = Rehearsal.__init__
+    switch_on = SimulatedCia402Rig.__init__
 
-    def interrupted(rehearsal: Rehearsal, *arguments: object) -> None:
-        switch_on(rehearsal, *arguments)  # type: ignore[arg-type]
+    def interrupted(rehearsal: SimulatedCia402Rig, *arguments: Any, **options: Any) -> None:
+        switch_on(rehearsal, *arguments, **options)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Rehearsal, "__init__", interrupted)
+    monkeypatch.setattr(SimulatedCia402Rig, "__init__", interrupted)
     with nothing_written(tmp_path):
         answer = call(
             *("run", short_plan, "--rig", RIG, "-o", tmp_path / "run", "--fast", "--no-camera")
@@ -139,7 +140,7 @@ def test_ctrl_c_while_planning_ends_with_130_and_writes_nothing(
     def planning(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("planner.plan.make_plan", planning)
+    monkeypatch.setattr("planner.planning.make_plan", planning)
     scene = CONFIGS / "environment_1.yaml"
     rest = (
         [RIG, scene, "-o", tmp_path / "plan.json"] if verb == "plan" else ["-o", tmp_path / "run"]

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.cia402.states import DriveState
-from executor.execution import Outcome
-from executor.machine import State
-from executor.prepare import PreparedRun
+from drivers.cia402.state_machine import DriveState
+from executor.control.path_runs import Outcome
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
 from tests.scenarios.stage import Stage, path_indices, staged
 
 Does = Callable[[Stage], object]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.plan import load_plan
-from cdpr.rig import load_rig
-from executor.run_folder import RunFolder
+from executor.recording.run_folder import RunFolder
+from model.plan import load_plan
+from model.rig import load_rig
 from tests.cli.plans import CONFIGS, rig_with_two_pictures_a_second
 from tests.cli.program import call
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.poses import Pose
-from executor.prepare import PreparedRun
+from executor.trajectory.prepare import PreparedRun
+from model.pose import Pose
 from tests.scenarios.stage import staged
 
 

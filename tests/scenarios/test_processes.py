@@ -15,14 +15,14 @@ from typing import Any
 
 import pytest
 
-from cdpr.rig import load_rig
-from executor.run_folder import RunFolder
-from tests.cli.plans import RIG
+from executor.recording.run_folder import RunFolder
+from executor.remote.client import ask_all
+from executor.remote.registry import find_runs
+from model.rig import load_rig
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cdpr.cli import main; main()"
 ENDS_WITHIN_S = 90.0
-CYCLE_MS = 10.0
 
 pytestmark = pytest.mark.slow
 
@@ -56,10 +56,10 @@ def finished(*arguments: str | Path) -> tuple[int, str, str]:
         return process.returncode, out, err
 
 
-def over_udp(plan: Path, run: Path, port: int) -> tuple[int, dict[str, Any], str]:
+def over_udp(rig: Path, plan: Path, run: Path, port: int) -> tuple[int, dict[str, Any], str]:
     """One run with the drives in another process; exit code, summary, last words of the drives."""
     bus = ("--interface", "udp_multicast", "--channel", f"239.74.163.21:{port}")
-    with program("sim", RIG, *bus, "--plan", plan) as drives:
+    with program("sim", rig, *bus, "--plan", plan) as drives:
         assert drives.stdout is not None
         greeting = drives.stdout.readline()
         assert "8 simulated drives of gachon_8_6" in greeting, drives.communicate()
@@ -68,7 +68,7 @@ def over_udp(plan: Path, run: Path, port: int) -> tuple[int, dict[str, Any], str
                 "run",
                 plan,
                 "--rig",
-                RIG,
+                rig,
                 "-o",
                 run,
                 *bus,
@@ -85,34 +85,25 @@ def over_udp(plan: Path, run: Path, port: int) -> tuple[int, dict[str, Any], str
     return code, json.loads(out), last
 
 
-def host_was_late(summary: dict[str, Any]) -> bool:
-    """The summary itself says that a cycle began more than a whole cycle late.
-
-    The drives give up when SYNC is away for 30 ms; a machine that does something else for that long
-    is not what this test is about, and the program tells it apart.
-    """
-    return summary["lateness_ms"]["max"] > CYCLE_MS
-
-
 def test_a_run_with_the_drives_in_another_process_loses_no_frame(
-    short_plan: Path, tmp_path: Path
+    slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
-    port = 40000 + os.getpid() % 20000
-    code, summary, last = over_udp(short_plan, tmp_path / "first", port)
-    if not summary["passed"] and host_was_late(summary):
-        code, summary, last = over_udp(short_plan, tmp_path / "second", port + 1)
+    code, summary, last = over_udp(
+        slow_rig, short_plan, tmp_path / "run", 40000 + os.getpid() % 20000
+    )
+    cycle_ms = load_rig(slow_rig).document.bus.cycle_ms
     assert code == 0, summary
     assert summary["verdict"] == "PASSED"
     assert summary["lost_replies"] == 0
-    assert summary["simulated"] is False
+    said = any(event["code"] == "simulated" for event in summary["events"])
+    assert summary["simulated"] is said
     assert summary["fast"] is False
     assert summary["following_error_mm"]["max"] <= 0.1
-    assert summary["lateness_ms"]["p50"] < CYCLE_MS
+    assert summary["lateness_ms"]["p50"] < cycle_ms
     # On a clock of its own, beside the number of the cycle: late cycles make it longer.
-    nominal = summary["cycles"] * CYCLE_MS / 1000.0
-    assert nominal - CYCLE_MS / 1000.0 <= summary["duration_s"] <= 2.0 * nominal
+    nominal = summary["cycles"] * cycle_ms / 1000.0
+    assert nominal - cycle_ms / 1000.0 <= summary["duration_s"] <= 2.0 * nominal
     assert last == "the simulated drives are gone\n"
-    assert load_rig(RIG).document.bus.cycle_ms == CYCLE_MS
 
 
 def waited_for(events: Path, code: str, process: subprocess.Popen[str]) -> None:
@@ -124,12 +115,20 @@ def waited_for(events: Path, code: str, process: subprocess.Popen[str]) -> None:
     pytest.fail(f"the run ended before {code!r}: {process.communicate()}")
 
 
+def told(command: str, percent: int | None = None) -> None:
+    """Said to the run from here: another terminal takes longer to start than the path lasts."""
+    with find_runs() as runs:
+        (answer,) = ask_all(runs, command, percent)
+    assert answer.status is not None
+
+
 def test_stop_from_another_terminal_ends_a_run_along_its_path(
-    short_plan: Path, tmp_path: Path
+    slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    with program("run", short_plan, "--rig", RIG, "-o", run, "--no-camera") as moving:
+    with program("run", short_plan, "--rig", slow_rig, "-o", run, "--no-camera") as moving:
         waited_for(run / "events.jsonl", "moving", moving)
+        told("speed", 1)
         code, out, err = finished("stop", "--json")
         assert (code, err) == (0, "")
         assert json.loads(out) == {"stopped_processes": [moving.pid], "silent_processes": []}
@@ -145,9 +144,11 @@ def test_stop_from_another_terminal_ends_a_run_along_its_path(
     assert json.loads(out) == {"stopped_processes": [], "silent_processes": []}
 
 
-def test_a_terminal_that_is_closed_is_a_stop_too(short_plan: Path, tmp_path: Path) -> None:
+def test_a_terminal_that_is_closed_is_a_stop_too(
+    slow_rig: Path, short_plan: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
-    with program("run", short_plan, "--rig", RIG, "-o", run, "--no-camera") as moving:
+    with program("run", short_plan, "--rig", slow_rig, "-o", run, "--no-camera") as moving:
         waited_for(run / "events.jsonl", "moving", moving)
         moving.send_signal(signal.SIGHUP)
         moving.communicate()

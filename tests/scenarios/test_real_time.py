@@ -10,25 +10,25 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, TypeVar
 
 import pytest
 
-from cdpr.rig import rig_from_document
-from drivers.bus import BusSettings, open_bus
-from drivers.cia402.states import DriveState
-from executor.command_client import ask_all
-from executor.latch import Latch
-from executor.prepare import PreparedRun
-from executor.run_folder import RunFolder
-from executor.running import reached_runs
-from simulation.power_loss import PowerLoss
-from simulation.rehearsal import Rehearsal
-from tests.cli.plans import RIG
-from tests.scenarios.test_processes import finished, program, waited_for
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.state_machine import DriveState
+from executor.interlock.fault_latch import FaultLatch
+from executor.recording.run_folder import RunFolder
+from executor.trajectory.prepare import PreparedRun
+from model.rig import rig_from_document
+from simulation.drives.cia402_rig import SimulatedCia402Rig
+from simulation.ground_truth import PowerLoss
+from tests.scenarios.test_processes import finished, program, told, waited_for
 
 pytestmark = pytest.mark.slow
 
 AWAY_S = 20.0
+
+Drives = TypeVar("Drives", bound=SimulatedCia402Rig)
 
 
 def real_time_process(supervisor: int) -> int:
@@ -59,15 +59,20 @@ def wait_until_gone(process: int) -> None:
 
 
 @contextmanager
-def drives_on(channel: str, prepared: PreparedRun) -> Iterator[Rehearsal]:
+def drives_on(
+    channel: str,
+    prepared: PreparedRun,
+    kind: type[Drives] = SimulatedCia402Rig,  # type: ignore[assignment]
+    interface: str = "udp_multicast",
+) -> Iterator[Drives]:
     """Simulated drives on a bus between processes, in a thread of this one."""
     bus_document = prepared.rig.document.bus.model_copy(
-        update={"interface": "udp_multicast", "channel": channel}
+        update={"interface": interface, "channel": channel}
     )
     rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": bus_document}))
     over = threading.Event()
     with open_bus(BusSettings.of(rig)) as bus:
-        rehearsal = Rehearsal(rig, bus, prepared.scene.start, prepared.scene.load)
+        rehearsal = kind(rig, bus, prepared.scene.start, prepared.scene.load)
         thread = threading.Thread(target=_serve, args=(rehearsal, over))
         thread.start()
         try:
@@ -77,7 +82,7 @@ def drives_on(channel: str, prepared: PreparedRun) -> Iterator[Rehearsal]:
             thread.join()
 
 
-def _serve(rehearsal: Rehearsal, over: threading.Event) -> None:
+def _serve(rehearsal: SimulatedCia402Rig, over: threading.Event) -> None:
     """Answers in time also on a busy host, where the host allows it: a real drive would."""
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))  # of this thread alone
@@ -86,72 +91,74 @@ def _serve(rehearsal: Rehearsal, over: threading.Event) -> None:
 
 @contextmanager
 def moving_over_udp(
-    prepared: PreparedRun, plan: Path, run: Path, number: int
-) -> Iterator[tuple[subprocess.Popen[str], Rehearsal]]:
+    slow_run: PreparedRun, slow_rig: Path, plan: Path, run: Path, number: int
+) -> Iterator[tuple[subprocess.Popen[str], SimulatedCia402Rig]]:
     """A run whose drives are in this process; it is under way."""
     channel = f"239.74.163.22:{20000 + (os.getpid() * 7 + number) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     rest = ("-o", run, *bus, "--no-camera", "--yes", "--without-real-time")
     with (
-        drives_on(channel, prepared) as rehearsal,
-        program("run", plan, "--rig", RIG, *rest) as process,
+        drives_on(channel, slow_run) as rehearsal,
+        program("run", plan, "--rig", slow_rig, *rest) as process,
     ):
         waited_for(run / "events.jsonl", "moving", process)
         yield process, rehearsal
 
 
-def told(command: str, percent: int | None = None) -> None:
-    """Said to the run from here: another terminal takes longer to start than the path lasts."""
-    with reached_runs() as runs:
-        (answer,) = ask_all(runs, command, percent)
-    assert answer.status is not None
-
-
-def all_hold(rehearsal: Rehearsal) -> bool:
-    return {drive.state for drive in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
+def wait_until_all_hold(rehearsal: SimulatedCia402Rig) -> None:
+    """Drives that hear no more from their master stop when their own time-out is over."""
+    for _ in range(round(AWAY_S / 0.01)):
+        states = {drive.state for drive in rehearsal.drives}
+        if states == {DriveState.QUICK_STOP_ACTIVE}:
+            return
+        signal.sigtimedwait([], 0.01)
+    raise AssertionError(f"not all drives hold: {states}")
 
 
 def test_the_death_of_the_supervisor_ends_in_a_stop_by_the_real_time_process(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
-    with moving_over_udp(prepared, short_plan, tmp_path / "run", 1) as (process, rehearsal):
+    with moving_over_udp(slow_run, slow_rig, short_plan, tmp_path / "run", 1) as (
+        process,
+        rehearsal,
+    ):
         child = real_time_process(process.pid)
         process.kill()
         process.wait()
         wait_until_gone(child)
-        assert all_hold(rehearsal)
+        wait_until_all_hold(rehearsal)
 
 
 def test_the_death_of_the_real_time_process_is_told_and_the_drives_stop_by_themselves(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    with moving_over_udp(prepared, short_plan, run, 2) as (process, rehearsal):
+    with moving_over_udp(slow_run, slow_rig, short_plan, run, 2) as (process, rehearsal):
         os.kill(real_time_process(process.pid), signal.SIGKILL)
         out, err = process.communicate()
         assert process.returncode == 1, (out, err)
-        assert all_hold(rehearsal)
+        wait_until_all_hold(rehearsal)
     assert "FAILED" in out
     folder = RunFolder.open(run)
     summary = folder.summary()
     assert summary["final_state"] == "latched"
     assert any("killed by signal 9" in reason for reason in summary["reasons"])
     assert [event["code"] for event in summary["events"]][-1] == "real_time_lost"
-    assert len(folder.cycles()) == summary["cycles"] > 10
+    assert len(folder.cycles()) == summary["cycles"] > 0
 
 
 def test_a_real_time_process_that_hangs_is_ended_and_told(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     """Suspended for good, it would otherwise be waited for without end."""
     run = tmp_path / "run"
-    with moving_over_udp(prepared, short_plan, run, 4) as (process, rehearsal):
+    with moving_over_udp(slow_run, slow_rig, short_plan, run, 4) as (process, rehearsal):
         child = real_time_process(process.pid)
         os.kill(child, signal.SIGSTOP)
         out, err = process.communicate()
         assert process.returncode == 1, (out, err)
         assert gone(child)
-        assert all_hold(rehearsal)
+        wait_until_all_hold(rehearsal)
     summary = RunFolder.open(run).summary()
     assert summary["final_state"] == "latched"
     assert any("hung and was ended" in reason for reason in summary["reasons"])
@@ -159,15 +166,15 @@ def test_a_real_time_process_that_hangs_is_ended_and_told(
 
 
 def test_a_supervisor_that_hangs_is_noticed(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    with moving_over_udp(prepared, short_plan, run, 3) as (process, rehearsal):
+    with moving_over_udp(slow_run, slow_rig, short_plan, run, 3) as (process, rehearsal):
         child = real_time_process(process.pid)
         told("speed", 5)
         process.send_signal(signal.SIGSTOP)
         wait_until_gone(child)
-        assert all_hold(rehearsal)
+        wait_until_all_hold(rehearsal)
         code, out, _ = finished("stop", "--json")
         assert code == 1
         assert json.loads(out) == {"stopped_processes": [], "silent_processes": [process.pid]}
@@ -183,11 +190,16 @@ def test_a_supervisor_that_hangs_is_noticed(
     assert any(cause in reason for reason in summary["reasons"] for cause in causes)
 
 
+def codes(told: dict[str, Any]) -> list[str]:
+    """Of its events; that a user may be without real-time rights is beside the question."""
+    return [event["code"] for event in told["events"] if event["code"] != "no_real_time"]
+
+
 def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
-    short_plan: Path, tmp_path: Path
+    slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    with program("run", short_plan, "--rig", RIG, "-o", run, "--no-camera") as moving:
+    with program("run", short_plan, "--rig", slow_rig, "-o", run, "--no-camera") as moving:
         waited_for(run / "events.jsonl", "moving", moving)
         told("hold")
         waited_for(run / "events.jsonl", "hold", moving)
@@ -196,7 +208,7 @@ def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
         assert (code, err) == (0, "")
         assert status["state"] == "holding"
         assert status["process"] == moving.pid
-        assert [event["code"] for event in status["events"]] == ["enabled", "moving", "hold"]
+        assert codes(status) == ["enabled", "moving", "hold"]
         assert {d["state"] for d in status["drives"]} == {"operation enabled"}
         code, out, err = finished("hold", "--json")
         assert (code, err) == (0, "")
@@ -214,21 +226,20 @@ def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
         assert moving.returncode == 0
     summary = RunFolder.open(run).summary()
     assert summary["verdict"] == "PASSED"
-    codes = [event["code"] for event in summary["events"]]
-    assert codes == ["enabled", "moving", "hold", "resume", "held"]
+    assert codes(summary) == ["enabled", "moving", "hold", "resume", "held"]
 
 
 def test_winches_without_a_path_are_moved_by_the_real_time_process_too(
-    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its death is a fault that is told and latched, and the drives hold by themselves."""
     channel = f"239.74.163.28:{20000 + (os.getpid() * 17) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
     monkeypatch.chdir(tmp_path)
-    with drives_on(channel, prepared) as rehearsal:
-        loss = PowerLoss.drawn(prepared.rig, 4, 0.010, on_a_stand=True)
-        loss.happen_to(prepared.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
-        with program("home", RIG, "--at-home", "--speed-mm-s", "0.05", *bus) as homing:
+    with drives_on(channel, slow_run) as rehearsal:
+        loss = PowerLoss.drawn(slow_run.rig, 4, 0.010, on_a_stand=True)
+        loss.happen_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+        with program("home", slow_rig, "--at-home", "--speed-mm-s", "0.05", *bus) as homing:
             events = tmp_path / "runs/home/events.jsonl"
             waited_for(events, "moving", homing)
             child = real_time_process(homing.pid)
@@ -236,17 +247,19 @@ def test_winches_without_a_path_are_moved_by_the_real_time_process_too(
             os.kill(child, signal.SIGKILL)
             out, err = homing.communicate()
             assert homing.returncode == 1, (out, err)
-        assert all_hold(rehearsal)
+        wait_until_all_hold(rehearsal)
     assert "killed by signal 9" in err.replace("\n", " ")
     assert json.loads(events.read_text().splitlines()[-1])["code"] == "real_time_lost"
-    latched = Latch(BusSettings("udp_multicast", channel)).read()
+    latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
     assert "killed by signal 9" in latched.cause
 
 
-def test_the_real_time_process_has_one_thread(short_plan: Path, tmp_path: Path) -> None:
+def test_the_real_time_process_has_one_thread(
+    slow_rig: Path, short_plan: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
-    with program("run", short_plan, "--rig", RIG, "-o", run, "--no-camera") as moving:
+    with program("run", short_plan, "--rig", slow_rig, "-o", run, "--no-camera") as moving:
         waited_for(run / "events.jsonl", "moving", moving)
         child = real_time_process(moving.pid)
         assert len(list(Path(f"/proc/{child}/task").iterdir())) == 1

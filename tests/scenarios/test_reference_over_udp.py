@@ -10,36 +10,39 @@ from typing import Any
 
 import pytest
 
-from cdpr.errors import Refused
-from cdpr.rig import rig_from_document
-from drivers.bus import BusSettings
-from executor.custody import Custody
-from executor.latch import Latch
-from executor.path_in_real_time import run_in_real_time
-from executor.prepare import PreparedRun, prepare
-from simulation.power_loss import PowerLoss
-from tests.cli.plans import RIG
+from drivers.can_bus import BusSettings
+from executor.control.path_runs import run_in_real_time
+from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.interlock import MotionInterlock
+from executor.trajectory.prepare import PreparedRun, prepare
+from model.errors import Refused
+from model.rig import rig_from_document
+from simulation.ground_truth import PowerLoss
 from tests.cli.program import call
 from tests.scenarios.test_real_time import drives_on
 
 
 @pytest.mark.slow
 def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    slow_run: PreparedRun,
+    slow_rig: Path,
+    short_plan: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     rig = tmp_path / "rig.yaml"
-    rig.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
+    rig.write_text(slow_rig.read_text().replace("encoder: absolute, ", ""))
     channel = f"239.74.163.26:{20000 + (os.getpid() * 19) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
     run = ("run", short_plan, "--rig", rig, "--no-camera", *bus)
-    with drives_on(channel, prepared) as rehearsal:
-        loss = PowerLoss.drawn(prepared.rig, 4, 0.002, on_a_stand=True)
-        loss.happen_to(prepared.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+    with drives_on(channel, slow_run) as rehearsal:
+        loss = PowerLoss.drawn(slow_run.rig, 4, 0.002, on_a_stand=True)
+        loss.happen_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         first = call(*run, "-o", tmp_path / "first")
         assert first.code == 3
         assert "never referenced" in first.err
-        start = [f"{x:.6f}" for x in prepared.scene.start.position * 1000.0]
+        start = [f"{x:.6f}" for x in slow_run.scene.start.position * 1000.0]
         homed = call("home", rig, "--pose-mm", *start, *bus, "--json")
         assert homed.code == 0, homed
         told = json.loads(homed.out)
@@ -55,7 +58,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         second = call(*run, "-o", tmp_path / "second")
         assert second.code == 0, second
         assert told["file"] in second.out.replace("\n", "").replace("  ", "")
-        assert rehearsal.pose.distance_to(prepared.scene.goal) < 0.1e-3
+        assert rehearsal.pose.distance_to(slow_run.scene.goal) < 0.1e-3
         stood = [drive.motor.position for drive in rehearsal.drives]
         # A program that was killed noted nothing; a reset does, where all drives held.
         kept = json.loads(Path(told["file"]).read_text())
@@ -92,17 +95,21 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
 
 @pytest.mark.slow
 def test_a_run_whose_end_cannot_be_kept_leaves_its_whole_record(
-    prepared: PreparedRun, short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    slow_run: PreparedRun,
+    slow_rig: Path,
+    short_plan: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def full(*_args: object, **_more: object) -> None:
         raise Refused("the latch cannot be written", where="latched.json", why="disk full")
 
-    monkeypatch.setattr(Custody, "end", full)
+    monkeypatch.setattr(MotionInterlock, "end", full)
     channel = f"239.74.163.27:{20000 + (os.getpid() * 19) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
     folder = tmp_path / "run"
-    with drives_on(channel, prepared):
-        answer = call("run", short_plan, "--rig", RIG, "--no-camera", *bus, "-o", folder)
+    with drives_on(channel, slow_run):
+        answer = call("run", short_plan, "--rig", slow_rig, "--no-camera", *bus, "-o", folder)
     assert answer.code == 1, answer
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["passed"] is False
@@ -118,7 +125,7 @@ def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_pa
     )
     rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": document}))
     on_bus = prepare(prepared.plan, rig)
-    Latch(settings).engage("rig", tmp_path, "cable 4 is slack")
+    FaultLatch(settings).engage("rig", tmp_path, "cable 4 is slack")
     nothing: Any = None
     with pytest.raises(Refused, match="cable 4 is slack"):
         run_in_real_time(

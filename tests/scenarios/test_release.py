@@ -10,17 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.cli.named_bus import rig_on_bus
-from cdpr.rig import Rig
-from drivers.bus import BusSettings
-from drivers.cia402.states import DriveState
-from executor.custody import Custody
-from executor.latch import Latch
-from executor.prepare import PreparedRun
-from executor.reference import as_in_the_file
-from simulation.drive import SimulatedDrive
-from simulation.power_loss import PowerLoss
-from tests.cli.plans import RIG
+from cdpr.cli.options import rig_on_bus
+from drivers.can_bus import BusSettings
+from drivers.cia402.state_machine import DriveState
+from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.interlock import MotionInterlock
+from executor.interlock.reference import as_in_the_file
+from executor.trajectory.prepare import PreparedRun
+from model.rig import Rig
+from simulation.drives.cia402 import SimulatedDrive
+from simulation.ground_truth import PowerLoss
 from tests.cli.program import call
 from tests.scenarios.test_processes import program
 from tests.scenarios.test_real_time import drives_on
@@ -41,23 +40,24 @@ def watched(drives: tuple[SimulatedDrive, ...], words: list[int]) -> None:
 def hold(drives: tuple[SimulatedDrive, ...]) -> None:
     """As after a run."""
     for drive in drives:
+        drive.objects[0x605A, 0] = 6  # else it lets go at the end of its ramp
         drive.state = DriveState.QUICK_STOP_ACTIVE
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("braked", [True, False])
 def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
-    prepared: PreparedRun, tmp_path: Path, braked: bool
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path, braked: bool
 ) -> None:
     channel = f"239.74.163.30:{20000 + (os.getpid() * 29 + braked) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     rig = tmp_path / "rig.yaml"
-    text = RIG.read_text()
+    text = slow_rig.read_text()
     rig.write_text(text.replace("encoder: absolute", "encoder: absolute, brake: true"))
-    file = rig if braked else RIG
-    with drives_on(channel, prepared) as rehearsal:
+    file = rig if braked else slow_rig
+    with drives_on(channel, slow_run) as rehearsal:
         stood = [round(drive.motor.position) for drive in rehearsal.drives]
-        custody = Custody(_on(channel, file))
+        custody = MotionInterlock(_on(channel, file))
         custody.file.write(
             as_in_the_file(_on(channel, file)).model_copy(update={"stands_at": stood})
         )
@@ -76,20 +76,20 @@ def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
         assert told["reference"]["counts"] is braked
         if not braked:
             assert "released by the operator" in told["reference"]["why_not"]
-    Latch(BusSettings("udp_multicast", channel)).require_disengaged()
+    FaultLatch(BusSettings("udp_multicast", channel)).require_disengaged()
 
 
 @pytest.mark.slow
 def test_drives_that_count_from_anywhere_stay_where_they_are(
-    prepared: PreparedRun, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.33:{20000 + (os.getpid() * 29) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     rig = tmp_path / "rig.yaml"
-    rig.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
-    with drives_on(channel, prepared) as rehearsal:
-        loss = PowerLoss.drawn(prepared.rig, 3, 0.0, on_a_stand=True)
-        loss.happen_to(prepared.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+    rig.write_text(slow_rig.read_text().replace("encoder: absolute, ", ""))
+    with drives_on(channel, slow_run) as rehearsal:
+        loss = PowerLoss.drawn(slow_run.rig, 3, 0.0, on_a_stand=True)
+        loss.happen_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         hold(rehearsal.drives)
         stood = [round(drive.motor.position) for drive in rehearsal.drives]
         reset = call("reset", rig, *bus, "--yes", "--json")
@@ -123,32 +123,34 @@ def _on(channel: str, file: Path) -> Rig:
 
 @pytest.mark.slow
 def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
-    prepared: PreparedRun, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.31:{20000 + (os.getpid() * 29) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
-    with drives_on(channel, prepared) as rehearsal:
+    with drives_on(channel, slow_run) as rehearsal:
         hold(rehearsal.drives)
         stuck = rehearsal.drives[3]
         stuck._command_shutdown = lambda: None  # type: ignore[method-assign]
-        answer = call("release", RIG, *bus, "--yes", "--without-real-time")
+        answer = call("release", slow_rig, *bus, "--yes", "--without-real-time")
     assert answer.code == 1
     assert "cable 4 (drive 4) stays in" in answer.err
-    latched = Latch(BusSettings("udp_multicast", channel)).read()
+    latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
     assert "being released" in latched.cause
 
 
 @pytest.mark.slow
-def test_ctrl_c_on_the_way_stops_all_and_says_what_is_left(prepared: PreparedRun) -> None:
+def test_ctrl_c_on_the_way_stops_all_and_says_what_is_left(
+    slow_run: PreparedRun, slow_rig: Path
+) -> None:
     channel = f"239.74.163.34:{20000 + (os.getpid() * 29) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
-    with drives_on(channel, prepared) as rehearsal:
+    with drives_on(channel, slow_run) as rehearsal:
         hold(rehearsal.drives)
         for drive in rehearsal.drives:
             drive._command_shutdown = lambda: None  # type: ignore[method-assign]
         first = rehearsal.drives[0]
-        with program("release", RIG, *bus, "--yes", "--without-real-time") as process:
+        with program("release", slow_rig, *bus, "--yes", "--without-real-time") as process:
             enable = first._command_enable
 
             def interrupted() -> None:
@@ -162,7 +164,7 @@ def test_ctrl_c_on_the_way_stops_all_and_says_what_is_left(prepared: PreparedRun
     assert "a fault is latched, and the drives have to be referenced again" in err.replace(
         "\n", " "
     )
-    latched = Latch(BusSettings("udp_multicast", channel)).read()
+    latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
     assert "stopped while the torque was being taken off" in latched.cause
     assert "next:" not in latched.cause

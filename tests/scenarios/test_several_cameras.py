@@ -15,16 +15,18 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
-from cdpr.cli.calibrate_extrinsics import _poses_of_run
-from cdpr.cli.camera_choice import choose_cameras
-from cdpr.errors import BadInput
-from cdpr.plan import save_plan
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import load_rig
-from executor import camera_process, camera_sight, run_cameras
-from executor import run as run_module
-from executor.clock import SimulatedClock
-from executor.run_folder import RunFolder
+from calibration.run_data import poses_of_run
+from executor import evaluation as run_module
+from executor.cameras import client as camera_sight
+from executor.cameras import multi_camera as run_cameras
+from executor.cameras import process as camera_process
+from executor.cameras.sources import choose_cameras
+from executor.realtime.clock import SimulatedClock
+from executor.recording.run_folder import RunFolder
+from model.errors import BadInput
+from model.plan import save_plan
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import load_rig
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
 from tests.cli.program import Answer, call, nothing_written, one_message
 
@@ -122,10 +124,10 @@ def test_the_kept_pictures_of_each_camera_have_the_drives_poses(
     """With these `cdpr calibrate extrinsics --camera side --poses RUNDIR` finds its place."""
     _, folder = answer_and_folder
     kept = [Path(name).name for name in folder.poses_by_camera()["side"].picture if name]
-    poses = _poses_of_run(folder.path, "side")
+    poses = poses_of_run(folder.path, "side")
     assert set(kept[1:-1]) <= poses.keys() <= set(kept)
     with pytest.raises(BadInput, match="camera 'back' took no pictures") as told:
-        _poses_of_run(folder.path, "back")
+        poses_of_run(folder.path, "back")
     assert "front, side" in told.value.next_step
 
 

@@ -10,35 +10,34 @@ from typing import Any
 
 import pytest
 
-from cdpr.errors import Refused
-from drivers.bus import BusSettings
-from executor import set_up_lock
-from executor.latch import Latch
-from executor.machine import State
-from executor.prepare import PreparedRun
-from executor.set_up_lock import SetUpLock
-from executor.state_folder import state_file
-from simulation.drive import SimulatedDrive
+from drivers.can_bus import BusSettings
+from executor.interlock import locks as set_up_lock
+from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.locks import SetUpLock, state_file
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from model.errors import Refused
+from simulation.drives.cia402 import SimulatedDrive
 from tests.cli.plans import RIG
 from tests.cli.program import call
 from tests.scenarios.test_real_time import drives_on
 
 
-def kept(drive: SimulatedDrive) -> dict[Any, int]:
+def kept(drive: SimulatedDrive) -> dict[Any, Any]:
     """Everything in a drive that can be written."""
-    return {key: entry.value for key, entry in drive.objects._entries.items()}
+    return drive.objects.values()
 
 
 @pytest.mark.slow
 def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
-    prepared: PreparedRun, tmp_path: Path
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.28:{20000 + (os.getpid() * 23) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     settings = BusSettings("udp_multicast", channel)
-    with drives_on(channel, prepared) as rehearsal:
+    with drives_on(channel, slow_run) as rehearsal:
         before = [kept(drive) for drive in rehearsal.drives]
-        answer = call("status", RIG, *bus, "--json")
+        answer = call("status", slow_rig, *bus, "--json")
         assert answer.code == 0, answer
         told = json.loads(answer.out)
         assert told["latched"] is told["run"] is None
@@ -48,14 +47,14 @@ def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
         assert [d["position_counts"] for d in told["drives"]] == [
             round(drive.motor.position) for drive in rehearsal.drives
         ]
-        start = (prepared.scene.start.position * 1e3).tolist()
+        start = (slow_run.scene.start.position * 1e3).tolist()
         assert told["pose"]["position_mm"] == pytest.approx(start, abs=0.5)
         assert [kept(drive) for drive in rehearsal.drives] == before
         assert not state_file("latched", settings).parent.exists()
 
         counting = tmp_path / "rig.yaml"
-        counting.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
-        running = Latch(settings)
+        counting.write_text(slow_rig.read_text().replace("encoder: absolute, ", ""))
+        running = FaultLatch(settings)
         running.engage("rig", tmp_path)
         answer = call("status", counting, *bus)
         assert answer.code == 0, answer
@@ -65,30 +64,30 @@ def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
 
 
 @pytest.mark.slow
-def test_what_is_on_file_is_told_although_no_drive_answers(tmp_path: Path) -> None:
+def test_what_is_on_file_is_told_although_no_drive_answers(slow_rig: Path, tmp_path: Path) -> None:
     channel = f"239.74.163.29:{20000 + (os.getpid() * 23) % 20000}"
-    latch = Latch(BusSettings("udp_multicast", channel))
+    latch = FaultLatch(BusSettings("udp_multicast", channel))
     latch.engage("rig", tmp_path)
     latch.settle("rig", State.LATCHED, "cable 4 is slack", tmp_path)
-    answer = call("status", RIG, "--interface", "udp_multicast", "--channel", channel)
+    answer = call("status", slow_rig, "--interface", "udp_multicast", "--channel", channel)
     assert answer.code == 4
     assert "cable 4 is slack" in answer.out
-    assert "does not answer" in answer.err
+    assert "do not answer" in answer.err
 
 
 @pytest.mark.slow
-def test_drives_that_somebody_sets_up_are_not_asked(prepared: PreparedRun) -> None:
+def test_drives_that_somebody_sets_up_are_not_asked(slow_run: PreparedRun, slow_rig: Path) -> None:
     channel = f"239.74.163.27:{20000 + (os.getpid() * 23) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     with (
-        drives_on(channel, prepared) as rehearsal,
+        drives_on(channel, slow_run) as rehearsal,
         SetUpLock(BusSettings("udp_multicast", channel)).held(),
     ):
-        answer = call("status", RIG, *bus, "--json")
+        answer = call("status", slow_rig, *bus, "--json")
         assert answer.code == 0, answer
         told = json.loads(answer.out)
         assert (told["being_set_up"], told["drives"], told["run"]) == (True, None, None)
-        assert "a motion is being prepared" in call("status", RIG, *bus).out.replace("\n", " ")
+        assert "a motion is being prepared" in call("status", slow_rig, *bus).out.replace("\n", " ")
         assert rehearsal.cycles == 0
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.plan import load_plan
-from executor.run_folder import RunFolder
+from executor.recording.run_folder import RunFolder
+from model.plan import load_plan
 from tests.cli.plans import CONFIGS, rig_with_two_pictures_a_second
 from tests.cli.program import Answer, call
 

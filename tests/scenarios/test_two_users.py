@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.errors import Refused
-from drivers.bus import BusSettings
-from executor import state_folder
-from executor.latch import Latch
+from drivers.can_bus import BusSettings
+from executor.interlock import locks as state_folder
+from executor.interlock.fault_latch import FaultLatch
+from model.errors import Refused
 
 BUS = BusSettings("socketcan", "can0")
 ANN, BEN, GROUP = 60001, 60002, 60000
 
-pytestmark = pytest.mark.skipif(os.getuid() != 0, reason="only root becomes two other users")
+pytestmark = pytest.mark.root
 
 
 class User:
@@ -32,7 +32,7 @@ class User:
         self.process = context.Process(target=_serve, args=(number, far_end))
         self.process.start()
 
-    def does(self, what: Callable[[Latch], object]) -> str:
+    def does(self, what: Callable[[FaultLatch], object]) -> str:
         """What it says: nothing when all went well."""
         self._link.send(what)
         return str(self._link.recv())
@@ -51,7 +51,7 @@ def _serve(number: int, link: Connection) -> None:
     os.setgroups([])
     os.setgid(GROUP)
     os.setuid(number)
-    latch = Latch(BUS)
+    latch = FaultLatch(BUS)
     while True:
         what = link.recv()
         try:
@@ -61,19 +61,19 @@ def _serve(number: int, link: Connection) -> None:
             link.send(f"{error.what} | {error.next_step}")
 
 
-def moves(latch: Latch) -> None:
+def moves(latch: FaultLatch) -> None:
     latch.engage("rig", latch.path.parent)
 
 
-def would_move(latch: Latch) -> None:
+def would_move(latch: FaultLatch) -> None:
     latch.require_disengaged()
 
 
-def would_reset(latch: Latch) -> None:
+def would_reset(latch: FaultLatch) -> None:
     latch.require_no_run()
 
 
-def resets(latch: Latch) -> None:
+def resets(latch: FaultLatch) -> None:
     with latch.held_for_reset("rig", latch.read()):
         pass
 

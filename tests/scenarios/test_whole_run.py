@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from cdpr.cables import cables_to
-from cdpr.plan import load_plan
-from cdpr.rig import Rig, load_rig
-from cdpr.winches import WinchMap
-from executor.run_folder import RunFolder
+from executor.recording.run_folder import RunFolder
+from model.kinematics import cables_to
+from model.plan import load_plan
+from model.rig import Rig, load_rig
+from model.winches import WinchMap
 from tests.cli.plans import HALL, RIG
 from tests.cli.program import Answer, call
 
@@ -72,6 +72,7 @@ def test_every_file_of_the_run_folder_is_there_and_no_other(folder: RunFolder) -
         "fused.csv",
         "report.html",
         "rig.json",
+        "run.json",
         "run.mcap",
         "summary.json",
     }

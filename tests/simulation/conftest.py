@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.rig import Rig, load_rig
+from model.rig import Rig, load_rig
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

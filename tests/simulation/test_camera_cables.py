@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.cables import Cables
-from cdpr.poses import Pose
-from simulation.camera_cables import HIDDEN, NEAR, draw_cables
-from simulation.camera_canvas import Image8, pixels_of
+from model.kinematics import Cables
+from model.pose import Pose
+from simulation.camera.cables import HIDDEN, NEAR, draw_cables
+from simulation.camera.rendering import Image8, pixels_of
 from tests.tracking.tag_pictures import small_camera
 
 HERE = Pose.level(np.zeros(3))

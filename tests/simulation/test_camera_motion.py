@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
-from cdpr.rig import Camera, Rig, load_rig
-from cdpr.scene import Scene, nothing_in_the_way
-from simulation.as_built import camera_as_built
-from simulation.camera import SyntheticCamera
-from simulation.motion import Film, Motion
-from simulation.optics import Optics
+from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.rig import Camera, Rig, load_rig
+from model.scene import Scene, nothing_in_the_way
+from simulation.camera.camera import Film, PlatformMotion, SyntheticCamera
+from simulation.ground_truth import Optics, camera_as_built
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 DISTANCE, FOCAL = 0.4, 900.0
@@ -69,7 +67,9 @@ def test_a_smear_is_as_long_as_the_way_while_exposed(
     camera = SyntheticCamera(rig, scene, facing, optics=optics)
     right = facing.world_from_camera.rotation[:, 0]
     sharp = edge_profile(camera.render(rig.home), rig)
-    smeared = edge_profile(camera.render(rig.home, motion=Motion(speed * right, np.zeros(3))), rig)
+    smeared = edge_profile(
+        camera.render(rig.home, motion=PlatformMotion(speed * right, np.zeros(3))), rig
+    )
     length = np.sqrt(12.0 * (variance(*smeared) - variance(*sharp)))
     assert length == pytest.approx(abs(speed) * exposure * FOCAL / DISTANCE, rel=0.05)
     middle = smeared[0] @ smeared[1] - sharp[0] @ sharp[1]
@@ -80,7 +80,10 @@ def test_turning_smears_and_no_exposure_or_no_motion_does_not(
     rig: Rig, scene: Scene, facing: Camera
 ) -> None:
     out = facing.world_from_camera.rotation[:, 2]
-    still, turning = Motion(np.zeros(3), np.zeros(3)), Motion(np.zeros(3), 2.0 * out)
+    still, turning = (
+        PlatformMotion(np.zeros(3), np.zeros(3)),
+        PlatformMotion(np.zeros(3), 2.0 * out),
+    )
     quick, slow = (
         SyntheticCamera(rig, scene, facing, optics=Optics(noise=0.0, exposure=time))
         for time in (0.0, 0.02)
@@ -104,7 +107,7 @@ def test_a_film_smears_by_the_velocity_since_the_picture_before(
     before = Pose(rig.home.position - [0.02, 0.0, 0.01], matrix_from_rotation_vector([0, 0, -0.05]))
     film = Film(camera)
     assert np.array_equal(film.picture(0.0, before, 0), camera.render(before, 0))
-    motion = Motion(np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.0, 0.5]))
+    motion = PlatformMotion(np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.0, 0.5]))
     assert np.array_equal(film.picture(0.1, rig.home, 1), camera.render(rig.home, 1, motion))
     again = film.picture(0.1, before, 2)  # at the same time: told anew, not moved
     assert np.array_equal(again, camera.render(before, 2))
@@ -125,7 +128,7 @@ def test_a_short_smear_is_as_bright_as_what_it_is_the_mean_of(
     """The mean of two pictures lies between two grey levels half the time."""
     exposure = 0.005
     camera = SyntheticCamera(rig, scene, facing, optics=Optics(noise=0.0, exposure=exposure))
-    motion = Motion(np.array([0.02, 0.0, 0.0]), np.zeros(3))
+    motion = PlatformMotion(np.array([0.02, 0.0, 0.0]), np.zeros(3))
     parts = [
         camera.render(motion.moved(rig.home, share * exposure)).astype(float)
         for share in (-0.25, 0.25)

@@ -1,4 +1,4 @@
-"""The EDS file of the simulated drives says exactly what they hold when they are switched on."""
+"""Simulated drives are built from an EDS file: objects, access, types, ranges, defaults, units."""
 
 from __future__ import annotations
 
@@ -8,15 +8,68 @@ from pathlib import Path
 import canopen
 import pytest
 
-import simulation
-from simulation.drive_objects import READ_ONLY, DriveObjects
+from model.errors import BadInput
+from simulation.drives.eds_file import EDS_FOLDER, profile_path, read_eds
+from simulation.drives.motion import counts_in
+from simulation.drives.object_dictionary import READ_ONLY, Abort, DriveObjects
+from tests.simulation.drive_line import Line
 
-EDS = Path(simulation.__file__).parent / "cia402_drive.eds"
-LENGTHS = {2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}  # CANopen type: bytes
+EDS = EDS_FOLDER / "cia402.eds"
+LENGTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}  # CANopen type: bytes
+
+MAKERS = """[FileInfo]
+FileName=maker.eds
+Description=100 % of a maker's habits
+[DummyUsage]
+Dummy0005=1
+[1400]
+ParameterName=RPDO 1
+ObjectType=0x9
+SubNumber=3
+[1400SUB1]
+DataType=0x0007
+AccessType=rw
+DefaultValue=0x80000200 + $NodeID
+[1400sub2]
+DataType=0x0005
+AccessType=rw
+DefaultValue=
+[1016]
+ObjectType=0x8
+CompactSubObj=2
+DataType=0x0007
+AccessType=rw
+[6085]
+ParameterName=Quick stop deceleration
+DataType=0x0007
+AccessType=rw
+DefaultValue=6000
+[60AA]
+DataType=0x0007
+AccessType=rw
+DefaultValue=0x00C00300
+[60C2sub2]
+DataType=0x0002
+AccessType=rw
+LowLimit=0xFD
+HighLimit=-3
+DefaultValue=0xFD
+[2000]
+DataType=0x0006
+AccessType=wo
+[607A]
+DataType=0x0004
+AccessType=rww
+PDOMapping=1
+[6064]
+DataType=0x0004
+AccessType=ro
+PDOMapping=1
+"""
 
 
 def described(node: int) -> dict[tuple[int, int], canopen.objectdictionary.ODVariable]:
-    """Every object of the file by index and sub-index."""
+    """Every object of the file by index and sub-index, as canopen reads it."""
     dictionary = canopen.import_od(str(EDS), node)
     found = {}
     for index, entry in dictionary.items():
@@ -28,32 +81,124 @@ def described(node: int) -> dict[tuple[int, int], canopen.objectdictionary.ODVar
 
 
 @pytest.mark.parametrize("node", [1, 8, 126])
-def test_the_file_has_the_objects_of_the_drive_with_their_first_values(node: int) -> None:
-    drive, objects = DriveObjects(node), described(node)
+def test_the_drive_has_the_objects_of_the_file_with_their_defaults(node: int) -> None:
+    drive, objects = DriveObjects(read_eds(EDS), node), described(node)
+    assert drive.values().keys() == objects.keys()
     for (index, sub), entry in objects.items():
         data = drive.get_data(index, sub)
-        assert len(data) == LENGTHS[entry.data_type], f"{index:04X}h:{sub:02X}"
+        if entry.data_type in LENGTHS:
+            assert len(data) == LENGTHS[entry.data_type], f"{index:04X}h:{sub:02X}"
         assert entry.encode_raw(entry.default) == data, f"{index:04X}h:{sub:02X}"
-    # Nothing is in the drive that the file does not tell.
-    for index in (*range(0x1000, 0x1B00), *range(0x6000, 0x6600)):
-        for sub in range(10):
-            try:
-                drive.get_data(index, sub)
-            except canopen.SdoAbortedError:
-                continue
-            assert (index, sub) in objects, f"{index:04X}h:{sub:02X}"
 
 
 def test_what_the_file_calls_writable_is_so() -> None:
-    drive = DriveObjects(1)
+    drive = DriveObjects(read_eds(EDS), 1)
     for (index, sub), entry in described(1).items():
         try:
             drive.set_data(index, sub, drive.get_data(index, sub))
-        except canopen.SdoAbortedError as error:
-            read_only = error.code == READ_ONLY
+        except Abort as abort:
+            read_only = abort.code == READ_ONLY
         else:
             read_only = False
-        assert read_only == (entry.access_type == "ro"), f"{index:04X}h:{sub:02X}"
+        assert read_only == (entry.access_type in ("ro", "const")), f"{index:04X}h:{sub:02X}"
+
+
+@pytest.mark.parametrize("path", sorted(EDS_FOLDER.glob("*.eds")), ids=lambda path: path.stem)
+def test_a_drive_of_every_profile_answers(path: Path) -> None:
+    line = Line(eds=read_eds(path))
+    assert line.read(0x1000, 0) & 0xFFFF == 402
+    assert line.sdo(0x40, 0x6041, 0)[0] == 0x4B
+    line.drive.on_nmt(1, 5)
+    line.drive.advance(0.01)
+    line.drive.on_sync()
+
+
+def test_a_makers_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
+    path = tmp_path / "maker.eds"
+    path.write_bytes(b"\xef\xbb\xbf" + MAKERS.replace("\n", "\r\n").encode())
+    line = Line(eds=read_eds(path), counts_per_turn=4000.0)
+    assert line.read(0x1400, 1) == 0x80000205
+    assert line.read(0x1400, 2) == 0
+    assert line.read(0x1016, 0) == 2
+    assert line.abort(0x1016, 3, "<I", 0) == 0x06090011
+    assert line.abort(0x6072, 0, "<H", 0) == 0x06020000
+    assert line.abort(0x60C2, 2, "<b", -4) == 0x06090030
+    assert line.abort(0x60C2, 2, "<b", -3) == 0
+    assert line.sdo(0x40, 0x2000, 0)[4:] == struct.pack("<I", 0x06010001)
+    # 6000 rpm/s of 4000 counts a turn
+    assert line.drive._deceleration == pytest.approx(400_000.0)
+    eds = read_eds(path)
+    assert (eds.objects[0x607A, 0].to_rpdo, eds.objects[0x607A, 0].to_tpdo) == (True, False)
+    assert (eds.objects[0x6064, 0].to_rpdo, eds.objects[0x6064, 0].to_tpdo) == (False, True)
+    assert eds.dummies == {5}
+
+
+@pytest.mark.parametrize(
+    ("unit", "counts"),
+    [
+        (0, 1.0),
+        (0x00B50000, 1.0),
+        (0x00B44700, 4000 / 60),  # rpm
+        (0xFDB44700, 4 / 60),  # 1/1000 rpm
+        (0x00C00300, 4000 / 60),  # rpm/s
+        (0x00B40300, 4000.0),  # rev/s
+        (0x00B55700, 1.0),  # counts/s²
+        (0x00410000, None),  # degrees
+    ],
+)
+def test_units(unit: int, counts: float | None) -> None:
+    found = counts_in(unit, 4000.0)
+    assert found == (None if counts is None else pytest.approx(counts))
+
+
+def test_a_unit_that_is_not_known_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "unit.eds"
+    path.write_text(MAKERS)
+    line = Line(eds=read_eds(path), counts_per_turn=4000.0)
+    assert line.abort(0x60AA, 0, "<I", 0x00410300) == 0x06090030
+    assert line.abort(0x60AA, 0, "<I", 0x00B55700) == 0
+    assert line.drive._deceleration == pytest.approx(6000.0)
+
+
+def test_it_says_that_it_is_simulated_whatever_the_file_says(tmp_path: Path) -> None:
+    path = tmp_path / "named.eds"
+    path.write_text(MAKERS + "[1008]\nDataType=0x0009\nAccessType=const\nDefaultValue=EPOS4\n")
+    line = Line(eds=read_eds(path))
+    head = line.sdo(0x40, 0x1008, 0)
+    assert head == b"\x41\x08\x10\x00\x14\x00\x00\x00"
+    text, toggle = b"", 0
+    while True:
+        part = line.sdo(0x60 | toggle, 0, 0)
+        assert part[0] & 0x10 == toggle
+        text += part[1 : 8 - (part[0] >> 1 & 7)]
+        toggle ^= 0x10
+        if part[0] & 1:
+            break
+    assert text == b"cdpr simulated drive"
+    assert line.sdo(0x40, 0x1009, 0) == b"\x43\x09\x10\x00none"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("no section", "cannot be read"),
+        ("[1000]\nDataType=0x7\nAccessType=ro\n", "no object of a drive profile"),
+        ("[6040]\nDataType=0x6\nAccessType=never\n", "access type"),
+        ("[6040]\nDataType=0x6\nDefaultValue=many\n", "not a number"),
+        ("[6040]\nDataType=sixteen\n", "not a number"),
+    ],
+)
+def test_a_file_that_cannot_be_used_says_why(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "bad.eds"
+    path.write_text(text)
+    with pytest.raises(BadInput, match=says) as caught:
+        read_eds(path)
+    assert "bad.eds" in str(caught.value)
+
+
+def test_a_profile_without_a_file_names_those_that_have_one() -> None:
+    with pytest.raises(BadInput, match="cia402"):
+        profile_path("epos9")
 
 
 def test_a_status_word_decodes_by_name() -> None:

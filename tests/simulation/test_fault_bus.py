@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.bus import BusSettings, open_bus
-from drivers.bus_load import frame_bits
+from drivers.can_bus import BusSettings, open_bus
+from drivers.can_load import frame_bits
 from simulation.fault_bus import FaultBus, delay, lose, lose_next, repeat, spoil
 
 _CHANNELS = itertools.count()

@@ -13,20 +13,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput
-from cdpr.kinematics import cable_lengths, forward_kinematics
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig, rig_from_document
-from cdpr.rig_file import RigDocument
-from cdpr.scene import Scene, load_scene
-from cdpr.statics.working import working_tensions
-from drivers.bus import BusSettings, open_bus
-from drivers.drive_group import GroupCommand, make_drive_group
-from simulation.as_built import camera_as_built, rig_as_built
+from drivers.can_bus import BusSettings, open_bus
+from drivers.drive_group import GroupCommand
+from drivers.factory import make_drive_group
+from model.errors import BadInput
+from model.files.rig_file import RigDocument
+from model.kinematics import cable_lengths, forward_kinematics
+from model.pose import Pose
+from model.rig import Rig, load_rig, rig_from_document
+from model.scene import Scene, load_scene
+from model.statics.gravity import working_tensions
+from simulation.drive_train import Transmission
+from simulation.drives.cia402_rig import SimulatedCia402Rig
+from simulation.factory import make_synthetic_camera
+from simulation.ground_truth import camera_as_built, rig_as_built
 from simulation.plant import Plant
-from simulation.rehearsal import Rehearsal
-from simulation.simulate import make_synthetic_camera
-from simulation.transmission import Transmission
 
 ROOT = Path(__file__).resolve().parents[2]
 _CHANNELS = itertools.count()
@@ -48,10 +49,10 @@ def as_told(rig: Rig) -> dict[str, Any]:
     }
 
 
-def rehearsal_of(rig: Rig, pose: Pose) -> Rehearsal:
+def rehearsal_of(rig: Rig, pose: Pose) -> SimulatedCia402Rig:
     bus = open_bus(BusSettings("virtual", f"imperfect-{next(_CHANNELS)}"))
     try:
-        return Rehearsal(rig, bus, pose)
+        return SimulatedCia402Rig(rig, bus, pose)
     finally:
         bus.shutdown()
 
@@ -131,7 +132,7 @@ def told_torques(robot: Rig) -> list[list[float]]:
     """Torques that the drives tell in some cycles, switched on and still."""
     settings = BusSettings("virtual", f"noisy-{next(_CHANNELS)}")
     with open_bus(settings) as far_end, open_bus(settings) as bus:
-        rehearsal = Rehearsal(robot, far_end, robot.home)
+        rehearsal = SimulatedCia402Rig(robot, far_end, robot.home)
         group = make_drive_group(robot, bus, rehearsal.pump)
         group.configure()
         start = [int(p) for p in group.read_positions().positions]

@@ -8,15 +8,19 @@ from hypothesis import given, reject
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from cdpr.errors import Fault
-from cdpr.kinematics import cable_lengths, structure_matrix
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig, rig_from_document
-from cdpr.rig_file import RigDocument
-from cdpr.scene import Load
-from cdpr.statics.tension_solution import TensionInfeasible
-from cdpr.statics.working import weight_wrench, working_tensions
-from simulation.plant import Plant
+from model.errors import Fault
+from model.files.rig_file import RigDocument
+from model.kinematics import cable_lengths, structure_matrix
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig, rig_from_document
+from model.scene import Load
+from model.statics.gravity import weight_wrench, working_tensions
+from model.statics.tension_distribution import TensionInfeasible
+from model.winches import WinchMap
+from simulation import plant as plant_module
+from simulation.equilibrium.hanging import Strained, bend, slope, strain
+from simulation.equilibrium.newton import is_positive, solve
+from simulation.plant import Plant, Suspension
 
 WEIGHT = 0.4 * 9.80665
 
@@ -194,3 +198,92 @@ def test_absurd_drum_positions_are_a_fault_that_says_so(rig: Rig, bad: float) ->
     counts[0] = bad
     with pytest.raises(Fault, match="platform is lost"):
         plant.settle_counts(counts)
+
+
+@given(
+    place=st.tuples(share, share, share),
+    rotation=st.tuples(turn, turn, turn),
+    winding=st.lists(st.floats(-1e-3, 3e-3), min_size=10, max_size=10),
+)
+@pytest.mark.parametrize("pulleys", [False, True])
+def test_compiled_forces_and_stiffness_are_those_of_the_readable_code(
+    rig: Rig,
+    pulley_rig: Rig,
+    pulleys: bool,
+    place: tuple[float, ...],
+    rotation: tuple[float, ...],
+    winding: list[float],
+) -> None:
+    """Cables taut and slack, over pulleys and through points: the same numbers to rounding."""
+    robot = pulley_rig if pulleys else rig
+    pose, count = pose_in(robot, place, rotation), robot.cable_count
+    winches = WinchMap(robot)
+    whole = winches.unstrained(cable_lengths(robot, pose), np.zeros(count))
+    hung = Suspension.wound(robot, winches, whole / (1.0 + np.array(winding[:count])), None)
+    cables, strains = hung.strained(pose)
+    tensions = hung.axial * np.maximum(strains, 0.0)
+    rates = hung.rates(strains > 0.0)
+    turned = np.array(pose.rotation)
+    seen = Strained(np.empty((count, 3)), np.empty((count, 6)), np.empty(count), np.empty(count))
+    gradient, stiffness = np.empty(6), np.empty((6, 6))
+    assert strain(hung.hanging, hung.unstrained, np.array(pose.position), turned, seen)
+    slope(hung.hanging, turned, seen, tensions, gradient)
+    bend(hung.hanging, turned, seen, rates, tensions, stiffness)
+    assert seen.strains == pytest.approx(strains, abs=1e-13)
+    wanted = hung.gradient(pose, cables, tensions)
+    assert gradient == pytest.approx(wanted, rel=1e-10, abs=1e-9)
+    whole_matrix = hung.stiffness(pose, cables, rates, tensions)
+    assert stiffness == pytest.approx(whole_matrix, rel=1e-10, abs=1e-10 * hung.axial.max())
+
+
+@pytest.mark.parametrize("pulleys", [False, True])
+def test_the_quick_search_and_the_descent_find_the_same_platform(
+    rig: Rig, pulley_rig: Rig, pulleys: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two independent searches, one compiled and one down the energy, drum step by drum step."""
+    robot = pulley_rig if pulleys else rig
+    dice = np.random.default_rng(7)
+    quick, slow = Plant(robot, robot.home), Plant(robot, robot.home)
+    counts = quick.counts_for(robot.home, quick.tensions)
+    per_metre = np.array([w.counts_per_metre for w in robot.winches])
+    slack = False
+    for _ in range(40):
+        counts = counts + dice.uniform(-1e-3, 1.5e-3, robot.cable_count) * per_metre
+        quick.settle_counts(counts)
+        with monkeypatch.context() as patch:
+            patch.setattr(plant_module, "QUICK_STEPS", 0)
+            slow.settle_counts(counts)
+        slack = slack or bool((quick.tensions == 0.0).any())
+        assert quick.pose.distance_to(slow.pose) < 1e-8
+        assert quick.pose.angle_to(slow.pose) < 1e-7
+        assert quick.tensions == pytest.approx(slow.tensions, abs=1e-4)
+    assert slack
+
+
+@given(shifts=st.lists(st.floats(-0.01, 0.02), min_size=8, max_size=8))
+def test_a_slack_cable_carries_nothing_and_a_taut_one_what_its_stretch_asks(
+    rig: Rig, shifts: list[float]
+) -> None:
+    """Tensions by Hooke's law from lengths that the kinematics gives."""
+    plant = Plant(rig, rig.home)
+    counts = plant.counts_for(rig.home, plant.tensions)
+    counts = counts + np.array(shifts) * [w.counts_per_metre for w in rig.winches]
+    plant.settle_counts(counts)
+    unstrained = plant.winch_map.unstrained_from_counts(counts)
+    whole = cable_lengths(rig, plant.pose) + plant.winch_map.behind_outlet
+    pull = rig.cable_stiffness * (whole / unstrained - 1.0)
+    assert plant.tensions == pytest.approx(np.maximum(pull, 0.0), abs=1e-6)
+
+
+def test_a_matrix_that_is_not_positive_or_singular_is_seen() -> None:
+    """The platform would tip, or Newton's step is not defined."""
+    assert is_positive(np.eye(6))
+    assert not is_positive(np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-9]))
+    assert not is_positive(np.full((6, 6), np.nan))
+    assert not solve(np.zeros((6, 6)), np.ones(6))
+    dice = np.random.default_rng(3)
+    for _ in range(20):
+        matrix, vector = dice.normal(size=(6, 6)), dice.normal(size=6)
+        found = vector.copy()
+        assert solve(matrix.copy(), found)
+        assert matrix @ found == pytest.approx(vector, abs=1e-9)

@@ -11,15 +11,16 @@ import can
 import numpy as np
 import pytest
 
-from cdpr.kinematics import cable_lengths
-from cdpr.poses import Pose
-from cdpr.rig import Rig
-from cdpr.statics.working import working_tensions
-from drivers.bus import BusSettings, open_bus
-from drivers.cia402.states import DriveState
-from drivers.drive_group import DriveGroup, GroupCommand, GroupState, make_drive_group
-from simulation.rehearsal import Rehearsal
-from simulation.simulated_rig import RehearsalStatus
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.state_machine import DriveState
+from drivers.drive_group import DriveGroup, GroupCommand, GroupState
+from drivers.factory import make_drive_group
+from model.kinematics import cable_lengths
+from model.pose import Pose
+from model.rig import Rig
+from model.statics.gravity import working_tensions
+from simulation.drives.cia402_rig import SimulatedCia402Rig
+from simulation.rig import RehearsalStatus
 
 _CHANNELS = itertools.count()
 
@@ -29,14 +30,14 @@ def channel() -> BusSettings:
     return BusSettings("virtual", f"rehearsal-{next(_CHANNELS)}")
 
 
-def targets_for(robot: Rig, rehearsal: Rehearsal, pose: Pose) -> list[int]:
+def targets_for(robot: Rig, rehearsal: SimulatedCia402Rig, pose: Pose) -> list[int]:
     winch_map = rehearsal.plant.winch_map
     tensions = working_tensions(robot, pose).tensions
     unstrained = winch_map.unstrained(cable_lengths(robot, pose), tensions)
     return [int(count) for count in np.rint(winch_map.counts(unstrained))]
 
 
-def enabled(robot: Rig, group: DriveGroup, rehearsal: Rehearsal) -> list[int]:
+def enabled(robot: Rig, group: DriveGroup, rehearsal: SimulatedCia402Rig) -> list[int]:
     """Enables; returns where the drives stand."""
     group.configure()
     start = [int(p) for p in group.read_positions().positions]
@@ -62,7 +63,7 @@ def test_platform_is_where_the_set_points_of_the_cycle_before_put_it(
 ) -> None:
     robot: Rig = request.getfixturevalue(which)
     with open_bus(channel) as master, open_bus(channel) as bus:
-        rehearsal = Rehearsal(robot, bus, robot.home)
+        rehearsal = SimulatedCia402Rig(robot, bus, robot.home)
         group = make_drive_group(robot, master, rehearsal.pump)
         enabled(robot, group, rehearsal)
         before, felt = robot.home, rehearsal.tensions
@@ -86,7 +87,7 @@ def test_two_rehearsals_are_the_same_to_the_last_bit(rig: Rig) -> None:
     for _ in range(2):
         settings = BusSettings("virtual", f"rehearsal-{next(_CHANNELS)}")
         with open_bus(settings) as master, open_bus(settings) as bus:
-            rehearsal = Rehearsal(rig, bus, rig.home)
+            rehearsal = SimulatedCia402Rig(rig, bus, rig.home)
             group = make_drive_group(rig, master, rehearsal.pump)
             enabled(rig, group, rehearsal)
             for pose in circle(rig, 60):
@@ -99,7 +100,7 @@ def test_two_rehearsals_are_the_same_to_the_last_bit(rig: Rig) -> None:
 def test_a_start_away_from_home_is_where_the_drives_say(rig: Rig, channel: BusSettings) -> None:
     start = Pose.level(rig.home.position + np.array([0.1, -0.05, 0.08]))
     with open_bus(channel) as master, open_bus(channel) as bus:
-        rehearsal = Rehearsal(rig, bus, start)
+        rehearsal = SimulatedCia402Rig(rig, bus, start)
         group = make_drive_group(rig, master, rehearsal.pump)
         group.configure()
         read = group.read_positions().positions.tolist()
@@ -109,7 +110,7 @@ def test_a_start_away_from_home_is_where_the_drives_say(rig: Rig, channel: BusSe
 
 def test_without_torque_the_brakes_hold_the_platform(rig: Rig, channel: BusSettings) -> None:
     with open_bus(channel) as master, open_bus(channel) as bus:
-        rehearsal = Rehearsal(rig, bus, rig.home)
+        rehearsal = SimulatedCia402Rig(rig, bus, rig.home)
         group = make_drive_group(rig, master, rehearsal.pump)
         start = enabled(rig, group, rehearsal)
         before = rehearsal.pose
@@ -142,7 +143,7 @@ def test_served_drives_stop_by_themselves_when_the_master_is_gone(
     """No frame comes any more; the time-outs run on the clock alone."""
     stop, told = threading.Event(), list[RehearsalStatus]()
     with open_bus(channel) as master, open_bus(channel) as bus:
-        rehearsal = Rehearsal(rig, bus, rig.home)
+        rehearsal = SimulatedCia402Rig(rig, bus, rig.home)
         group = make_drive_group(rig, master, rehearsal.pump)
         enabled(rig, group, rehearsal)
         clock = ManualTime(stop, readings=20, step=0.005)
@@ -159,7 +160,7 @@ def test_other_frames_on_the_bus_do_not_hold_the_time_outs_up(
     """A tool that reads objects all the time must not keep a dead master's drives moving."""
     stop = threading.Event()
     with open_bus(channel) as master, open_bus(channel) as bus:
-        rehearsal = Rehearsal(rig, bus, rig.home)
+        rehearsal = SimulatedCia402Rig(rig, bus, rig.home)
         group = make_drive_group(rig, master, rehearsal.pump)
         enabled(rig, group, rehearsal)
         for _ in range(100):  # the bus is never idle
@@ -178,7 +179,7 @@ def test_an_interface_that_goes_down_is_silence_to_served_drives(
 
     stop = threading.Event()
     with open_bus(channel) as master, open_bus(channel) as bus:
-        rehearsal = Rehearsal(rig, bus, rig.home)
+        rehearsal = SimulatedCia402Rig(rig, bus, rig.home)
         group = make_drive_group(rig, master, rehearsal.pump)
         enabled(rig, group, rehearsal)
         monkeypatch.setattr(bus, "recv" if happens == "hearing" else "send", down)
@@ -193,4 +194,4 @@ def test_serving_ends_quietly_on_an_interrupt_from_the_keyboard(
         raise KeyboardInterrupt
 
     with open_bus(channel) as bus:
-        Rehearsal(rig, bus, rig.home).serve(threading.Event().is_set, clock=interrupted)
+        SimulatedCia402Rig(rig, bus, rig.home).serve(threading.Event().is_set, clock=interrupted)

@@ -6,93 +6,18 @@ import struct
 
 import pytest
 
-from drivers.cia402.frames import make_set_point, parse_emergency, parse_reply
-from simulation.drive import SimulatedDrive
-
-NODE = 5
-CYCLE = 0.01
-SPEED = 100_000.0  # counts/s
-
-# Status word, bits 6, 5, 3..0, by state; CiA 402-2.
-MASK = 0x6F
-DISABLED, READY, ON, ENABLED, STOPPED, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
-
-
-class Line:
-    """One drive and everything it sends."""
-
-    def __init__(self) -> None:
-        self.sent: list[tuple[int, bytes]] = []
-        self.drive = SimulatedDrive(
-            NODE, 1000.0, SPEED, lambda i, d: self.sent.append((i, bytes(d)))
-        )
-        self.target = 1000
-
-    def take(self, can_id: int) -> list[bytes]:
-        found = [data for i, data in self.sent if i == can_id]
-        self.sent = [(i, data) for i, data in self.sent if i != can_id]
-        return found
-
-    def sdo(self, command: int, index: int, sub: int, data: bytes = b"") -> bytes:
-        request = struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0")
-        self.drive.on_sdo(bytearray(request))
-        (reply,) = self.take(0x580 + NODE)
-        return reply
-
-    def write(self, index: int, sub: int, form: str, value: int) -> bytes:
-        data = struct.pack(form, value)
-        return self.sdo(0x23 | (4 - len(data)) << 2, index, sub, data)
-
-    def set_up(self, **options: int) -> None:
-        values = {"abort_option": 3, "stop_option": 6, "period_us": 10_000} | options
-        for off in (True, False):
-            bit = 1 << 31 if off else 0
-            for base, cob in ((0x1400, 0x200), (0x1800, 0x180)):
-                self.write(base, 1, "<I", bit | cob + NODE)
-                self.write(base, 2, "<B", 1)
-            if off:
-                for mapping, objects in (
-                    (0x1600, (0x60400010, 0x607A0020, 0x60B20010)),
-                    (0x1A00, (0x60410010, 0x60640020, 0x60770010)),
-                ):
-                    self.write(mapping, 0, "<B", 0)
-                    for sub, entry in enumerate(objects, start=1):
-                        self.write(mapping, sub, "<I", entry)
-                    self.write(mapping, 0, "<B", 3)
-        self.write(0x6060, 0, "<b", 8)
-        self.write(0x60C2, 1, "<B", 10)
-        self.write(0x6007, 0, "<h", values["abort_option"])
-        self.write(0x605A, 0, "<h", values["stop_option"])
-        self.write(0x1006, 0, "<I", values["period_us"])
-        self.write(0x6065, 0, "<I", 500)
-        self.write(0x6066, 0, "<H", 20)
-        self.drive.on_nmt(0x01, NODE)
-
-    def sync(self, word: int | None, target: int | None = None) -> int | None:
-        """One cycle; the status word's state bits that the SYNC after it tells."""
-        if target is not None:
-            self.target = target
-        if word is not None:
-            self.drive.on_set_point(make_set_point(word, self.target))
-        self.drive.advance(CYCLE)
-        self.drive.on_sync()
-        replies = self.take(0x180 + NODE)
-        reply = parse_reply(replies[-1]) if replies else None
-        self.position = reply.position if reply else None
-        return reply.status_word & MASK if reply else None
-
-    def state_after(self, word: int) -> int | None:
-        self.sync(word)
-        return self.sync(None)
-
-    def enable(self) -> None:
-        for word in (0x06, 0x07, 0x0F):
-            self.sync(word)
-        assert self.state_after(0x0F) == ENABLED
-
-    def emergencies(self) -> list[int]:
-        parsed = [parse_emergency(data) for data in self.take(0x80 + NODE)]
-        return [message.code for message in parsed if message is not None]
+from tests.simulation.drive_line import (
+    CYCLE,
+    DISABLED,
+    ENABLED,
+    FAULT,
+    NODE,
+    ON,
+    READY,
+    SPEED,
+    STOPPED,
+    Line,
+)
 
 
 @pytest.fixture
@@ -128,6 +53,7 @@ def test_a_drive_that_is_switched_on_says_so_and_sends_no_process_data() -> None
         ([0x06, 0x07, 0x0F, 0x02, 0x06], STOPPED),  # no transition
         ([0x07], DISABLED),  # no transition
         ([0x0F], DISABLED),  # no transition
+        ([0x06, 0x0F], ENABLED),  # 3 and 4 at once
         ([0x80], DISABLED),  # a reset without a fault
     ],
 )
@@ -139,7 +65,7 @@ def test_transitions_of_the_standard(line: Line, words: list[int], state: int) -
 
 def test_a_fault_needs_a_rising_edge_to_be_reset(line: Line) -> None:
     line.enable()
-    line.drive.on_set_point(make_set_point(0x8F, line.target))  # the bit is set already
+    line.set_point(0x8F)  # the bit is set already
     line.sync(None)
     line.drive.fail(0x2310)
     assert line.emergencies() == [0x2310]
@@ -151,7 +77,7 @@ def test_a_fault_needs_a_rising_edge_to_be_reset(line: Line) -> None:
 
 def test_a_set_point_acts_at_the_next_sync_and_is_reached_one_cycle_later(line: Line) -> None:
     line.enable()
-    line.drive.on_set_point(make_set_point(0x0F, 1100))
+    line.set_point(0x0F, 1100)
     line.drive.advance(CYCLE)
     assert line.drive.motor.position == 1000  # not before SYNC
     line.drive.on_sync()
@@ -170,19 +96,21 @@ def test_missing_sync_stops_the_drive_by_itself_and_it_holds(line: Line) -> None
     line.enable()
     line.sync(0x0F, 1100)
     line.drive.advance(0.031)
-    assert line.sync(None) == STOPPED
     assert line.emergencies() == [0x8700]
+    assert line.sync(None) == STOPPED
+    assert line.emergencies() == [0x0000]  # SYNC is back
     assert line.drive.torque_on
     assert line.sync(None) == STOPPED
 
 
-def test_a_late_enable_does_not_move_a_drive_that_stopped_by_itself(line: Line) -> None:
+def test_a_late_enable_moves_a_drive_that_stopped_by_itself(line: Line) -> None:
+    """Transition 16 is by level: the master must not send 0Fh to a drive that may have stopped."""
     line.enable()
     line.drive.advance(0.031)
-    for _ in range(5):
-        assert line.sync(0x0F, 5000) == STOPPED
-    assert line.state_after(0x02) == STOPPED
-    assert line.state_after(0x0F) == ENABLED
+    assert line.sync(0x0F, 1050) == STOPPED
+    assert line.sync(None) == ENABLED
+    line.drive.advance(CYCLE)
+    assert line.drive.motor.position == 1050
 
 
 def test_missing_set_points_stop_the_drive_although_sync_goes_on(line: Line) -> None:
@@ -225,8 +153,11 @@ def test_a_lost_master_heartbeat_stops_the_drive(line: Line) -> None:
     line.drive.advance(0.09)
     assert line.sync(None) == ENABLED
     line.drive.advance(0.02)
-    assert line.sync(None) == STOPPED
     assert line.emergencies() == [0x8130]
+    assert line.drive.state.value == "quick stop active"
+    assert line.sync(None) is None  # 1029h:01 is 0: pre-operational
+    line.drive.on_heartbeat(127, b"\x05")
+    assert line.emergencies() == [0x0000]
 
 
 def test_own_heartbeat_is_produced(line: Line) -> None:
@@ -310,7 +241,7 @@ def test_software_limits_hold(line: Line) -> None:
 
 def test_a_short_set_point_is_ignored_and_told(line: Line) -> None:
     line.enable()
-    line.drive.on_set_point(make_set_point(0x00, 0)[:6])
+    line.drive.on_set_point(b"\0" * 6)
     assert line.sync(None) == ENABLED
     assert line.emergencies() == [0x8210]
 
@@ -330,7 +261,7 @@ def test_unknown_objects_are_refused(line: Line, index: int, sub: int, abort: in
     [
         (0x6041, 0, "<H", 0, 0x06010002),
         (0x6007, 0, "<i", 3, 0x06070010),
-        (0x1600, 1, "<I", 0, 0x06010000),
+        (0x1600, 1, "<I", 0, 0x08000022),
         (0x60C2, 1, "<B", 0, 0x06090030),
     ],
 )

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from cdpr.errors import BadInput
-from cdpr.statics.closure import closure_margin, wrench_closure
+from model.errors import BadInput
+from model.statics.wrench_closure import closure_margin, wrench_closure
 from tests.statics.robots import PAPER_LENGTH, flat_matrix, paper_matrix, random_matrix
 
 

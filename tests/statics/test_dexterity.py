@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput
-from cdpr.statics.dexterity import condition_number, rms_anchor_radius
+from model.errors import BadInput
+from model.statics.dexterity import condition_number, rms_anchor_radius
 from tests.statics.robots import (
     PAPER_ANCHORS,
     PAPER_LENGTH,

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from cdpr.errors import BadInput
-from cdpr.statics.feasibility import WrenchBox, capacity_margin, wrench_feasible
-from cdpr.statics.wrench_facets import wrench_facets
+from model.errors import BadInput
+from model.statics.feasibility import WrenchBox, capacity_margin, wrench_feasible
+from model.statics.wrench_sets import wrench_facets
 from tests.statics.robots import (
     PAPER_LENGTH,
     PAPER_WEIGHT,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, Delaunay
 
-from cdpr.statics.feasible_polygon import (
+from model.statics.tension_distribution import (
     area_centroid,
     clipped,
     corner_mean,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput
-from cdpr.statics.gravity import STANDARD_GRAVITY, gravity_wrench
+from model.errors import BadInput
+from model.statics.gravity import STANDARD_GRAVITY, gravity_wrench
 
 metres = st.floats(-1.0, 1.0)
 offsets = st.tuples(metres, metres, metres)

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from cdpr.errors import BadInput, CdprError
-from cdpr.statics.feasibility import WrenchBox, capacity_margin
-from cdpr.statics.tension import solve_tensions
-from cdpr.statics.tension_solution import TensionInfeasible
+from model.errors import BadInput, CdprError
+from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.tension_distribution import TensionInfeasible, solve_tensions
 from tests.statics.robots import (
     PAPER_LENGTH,
     PAPER_WEIGHT,

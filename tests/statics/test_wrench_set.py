@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from cdpr.errors import BadInput
-from cdpr.statics.wrench_set import force_volume, wrench_volume, zonotope_volume
+from model.errors import BadInput
+from model.statics.wrench_sets import force_volume, wrench_volume, zonotope_volume
 from tests.statics.robots import (
     PAPER_LENGTH,
     flat_matrix,

@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from cdpr.rig import Camera, Rig, load_rig
-from cdpr.scene import Scene, load_scene
-from simulation.camera import SyntheticCamera
+from model.rig import Camera, Rig, load_rig
+from model.scene import Scene, load_scene
+from simulation.camera.camera import SyntheticCamera
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 cv2.setNumThreads(1)

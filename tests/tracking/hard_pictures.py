@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
-from cdpr.rig import Camera, Tag
-from simulation.camera_background import draw_tag
-from simulation.camera_canvas import Canvas, sample_rays
+from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.rig import Camera, Tag
+from simulation.camera.rendering import Canvas, draw_tag, sample_rays
 from tests.tracking.tag_pictures import SIZE, small_camera
-from tracking.marks import tag_corners
-from tracking.projection import pixels_of
+from tracking.camera_model import pixels_of
+from tracking.detection.tags import tag_corners
 
 WALL = 120.0
 

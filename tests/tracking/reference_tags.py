@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.poses import Array
+from model.pose import Array
 
 
 def tags_found_by_apriltag(listing: Path) -> list[Array]:

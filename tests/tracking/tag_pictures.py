@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector
-from cdpr.rig import Camera, Tag
-from simulation.camera_background import draw_tag
-from simulation.camera_canvas import Canvas, sample_rays
-from tracking.marks import tag_corners
-from tracking.projection import ideal_of
+from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.rig import Camera, Tag
+from simulation.camera.rendering import Canvas, draw_tag, sample_rays
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import tag_corners
 
 FAMILY = "tag36h11"
 SIZE = 0.096
@@ -52,7 +51,7 @@ class TagPrinter:
         pixels = canvas.pixels()
         pixels = pixels + noise * rng.standard_normal(pixels.shape)
         image = np.clip(np.round(pixels), 0, 255).astype(np.uint8)
-        corners = ideal_of(self.camera, camera_from_tag.apply(tag_corners(tag)))
+        corners = project_undistorted(self.camera, camera_from_tag.apply(tag_corners(tag)))
         return TagPicture(image, tag, camera_from_tag, corners)
 
 

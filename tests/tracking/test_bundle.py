@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpr.poses import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from cdpr.rig import Camera, Rig, Tag
+from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.rig import Camera, Rig, Tag
 from tests.tracking.tag_pictures import small_camera
-from tracking.bundle import TagView, _Squares, moved, polish_bundle, solve_bundle
-from tracking.edges import RefinedTag
-from tracking.marks import tag_corners
-from tracking.projection import ideal_from_pixels, ideal_of, pixels_from_ideal
+from tracking.camera_model import ideal_from_pixels, pixels_from_ideal, project_undistorted
+from tracking.detection.tags import tag_corners
+from tracking.edges.refine import RefinedTag
+from tracking.pnp import TagView, _Squares, moved, refine_pnp, solve_pnp
 
 LINE_DEVIATION = (0.02, 0.001)  # offset [px] and tilt [rad] of an edge
 
@@ -20,7 +20,7 @@ def view_of(
     camera: Camera, tag: Tag, camera_from_body: Pose, rng: np.random.Generator | None
 ) -> TagView:
     """A tag as ideal edges would show it, with errors of known size."""
-    corners = ideal_of(camera, camera_from_body.apply(tag_corners(tag)))
+    corners = project_undistorted(camera, camera_from_body.apply(tag_corners(tag)))
     whitening = np.zeros((8, 8))
     for edge in range(4):
         other = (edge + 1) % 4
@@ -57,7 +57,7 @@ def test_exact_edges_give_the_exact_pose_from_no_guess(rig: Rig) -> None:
     for _ in range(30):
         truth = some_pose(rng)
         views = [view_of(camera, tag, truth, None) for tag in visible(rig, truth)]
-        found = solve_bundle(camera, views)
+        found = solve_pnp(camera, views)
         assert found is not None
         assert found.camera_from_body.distance_to(truth) < 1e-6
         assert found.camera_from_body.angle_to(truth) < 1e-5
@@ -71,7 +71,7 @@ def test_several_tags_never_end_in_a_mirror_pose(rig: Rig) -> None:
         tags = visible(rig, truth)
         if len(tags) < 2:
             continue
-        found = solve_bundle(camera, [view_of(camera, tag, truth, rng) for tag in tags])
+        found = solve_pnp(camera, [view_of(camera, tag, truth, rng) for tag in tags])
         assert found is not None
         assert found.camera_from_body.angle_to(truth) < 0.03
 
@@ -82,7 +82,7 @@ def test_covariance_agrees_with_the_scatter_of_repeated_measurements(rig: Rig) -
     normalised, errors, stated = [], [], []
     for _ in range(150):
         views = [view_of(camera, tag, truth, rng) for tag in visible(rig, truth)]
-        found = solve_bundle(camera, views)
+        found = solve_pnp(camera, views)
         assert found is not None
         turn = found.camera_from_body.rotation @ truth.rotation.T
         shift = found.camera_from_body.position - truth.position
@@ -99,11 +99,11 @@ def test_a_tag_with_a_wrong_edge_hardly_moves_the_pose(rig: Rig) -> None:
     truth = Pose(np.array([0.0, 0.0, 1.0]), matrix_from_rotation_vector([0.6, 0.5, 0.1]))
     views = [view_of(camera, tag, truth, rng) for tag in visible(rig, truth)]
     assert len(views) >= 3
-    clean = solve_bundle(camera, views)
+    clean = solve_pnp(camera, views)
     target = views[0].seen.target.copy()
     target[0] += 100.0  # two pixels
     bad = RefinedTag(views[0].seen.corners, views[0].seen.whitening, target, views[0].seen.edges)
-    spoilt = solve_bundle(camera, [TagView(views[0].tag, bad), *views[1:]])
+    spoilt = solve_pnp(camera, [TagView(views[0].tag, bad), *views[1:]])
     assert clean is not None
     assert spoilt is not None
     assert spoilt.camera_from_body.distance_to(clean.camera_from_body) < 3e-3
@@ -115,7 +115,7 @@ def test_a_single_tag_knows_its_rival(rig: Rig) -> None:
     tag = rig.platform_tags[0]
     upright = Pose(np.zeros(3), np.diag([1.0, -1.0, -1.0])).compose(tag.pose.inverse())
     lean = Pose(np.array([0.0, 0.0, 2.2]), matrix_from_rotation_vector([0.5, 0.0, 0.0]))
-    found = solve_bundle(camera, [view_of(camera, tag, lean.compose(upright), rng)])
+    found = solve_pnp(camera, [view_of(camera, tag, lean.compose(upright), rng)])
     assert found is not None
     assert found.cost < found.rival_cost < np.inf
 
@@ -136,7 +136,7 @@ def test_jacobian_matches_finite_differences(rig: Rig) -> None:
 def test_a_start_behind_the_camera_gives_no_pose(rig: Rig) -> None:
     camera, truth = small_camera(), Pose.level([0.0, 0.0, 1.0])
     views = [view_of(camera, tag, truth, None) for tag in visible(rig, truth)]
-    assert polish_bundle(camera, views, Pose.level([0.0, 0.0, -1.0])) is None
+    assert refine_pnp(camera, views, Pose.level([0.0, 0.0, -1.0])) is None
 
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.001, -0.001, 0.01)])

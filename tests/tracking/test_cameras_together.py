@@ -10,14 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Camera, Rig
-from cdpr.scene import Scene
-from simulation.camera import Optics, SyntheticCamera
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Camera, Rig
+from model.scene import Scene
+from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.cameras_together import CommonPose, together
-from tracking.measurement import NoPose, PoseMeasurement
-from tracking.prediction import carried_on
+from tracking.measurement import NoPose, PoseMeasurement, extrapolate
+from tracking.multi_camera import MultiCameraFusion, together
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.05, 0.05, 0.4])
@@ -104,7 +103,7 @@ def test_cameras_that_look_a_little_apart_in_time_agree_on_a_platform_that_moves
         pose = Pose.level(np.array([0.0, 0.0, 0.4]) + time * np.array(speed))
         return PoseMeasurement(time, pose, covariance, (301,), 0.1, "tracked")
 
-    common = CommonPose(0.05)
+    common = MultiCameraFusion(0.05)
     for k in range(3):
         now = k * period
         found = common.of({"front": seen(now, 1e-4), "side": seen(now + late, 2e-4)})
@@ -123,7 +122,7 @@ def test_what_carrying_on_costs_is_in_the_covariance() -> None:
             replace(measured((np.array([0, 0, 0.4]) + n).tolist(), [1e-4] * 3), time=time)
             for n, time in zip(noise, (0.0, 0.1), strict=True)
         )
-        later = carried_on(two, one, 0.15)
+        later = extrapolate(two, one, 0.15)
         assert later is not None
         error = later.pose.position - [0, 0, 0.4]
         errors.append(error @ np.linalg.solve(later.covariance[:3, :3], error))
@@ -134,7 +133,7 @@ def test_what_carrying_on_costs_is_in_the_covariance() -> None:
 def test_pictures_too_far_apart_in_time_are_not_taken_together() -> None:
     front = measured([0.0, 0.0, 0.4], [1e-4] * 3)
     side = replace(measured([0.02, 0.0, 0.4], [1e-4] * 3), time=0.11)
-    common = CommonPose(0.05)
+    common = MultiCameraFusion(0.05)
     assert common.of({"front": front, "side": side}) is side
     assert common.of({"side": side, "front": front}) is side
     assert common.apart == 2
@@ -145,7 +144,7 @@ def test_the_camera_that_is_named_first_does_not_decide_which_pictures_count(fir
     good = [measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([1e-4, 0.0, 0.4], [1e-4] * 3)]
     late = replace(measured([0.02, 0.0, 0.4], [1e-4] * 3), time=0.09)
     seen = {"late": late, "a": good[0], "b": good[1]}
-    common = CommonPose(0.05)
+    common = MultiCameraFusion(0.05)
     found = common.of({first: seen[first], **seen})
     assert isinstance(found, PoseMeasurement)
     assert found.pose.distance_to(Pose.level([5e-5, 0.0, 0.4])) < 1e-9
@@ -155,7 +154,7 @@ def test_the_camera_that_is_named_first_does_not_decide_which_pictures_count(fir
 @pytest.mark.parametrize("late", [0.0, 0.07, 0.099])
 def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) -> None:
     """Asked every 0.1 s, each answers with a picture of its own time: up to a period apart."""
-    front, common = measured([0.0, 0.0, 0.4], [1e-4] * 3), CommonPose(0.05)
+    front, common = measured([0.0, 0.0, 0.4], [1e-4] * 3), MultiCameraFusion(0.05)
     for now in (0.0, 0.1):
         seen = {"front": replace(front, time=now), "side": replace(front, time=now + late)}
         found = common.of({**seen, "dark": NoPose(5.0, "dark")})
@@ -177,7 +176,7 @@ def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
         one = measured([speed * time, 0.0, 0.4], [deviation] * 3)
         return replace(one, time=time)
 
-    common = CommonPose(0.05)
+    common = MultiCameraFusion(0.05)
     for now in (0.0, pause):
         found = common.of({"front": seen(now, 2e-5), "side": seen(now + late, 1e-4)})
         assert isinstance(found, PoseMeasurement)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tracking.detector import TagDetector
-from tracking.marks import CORNER_SIGNS, official_modules
+from tracking.detection.detector import TagDetector
+from tracking.detection.tags import CORNER_SIGNS, official_modules
 
 # First code of each family, most significant bit at the top left, row after row (AprilTag 2).
 FIRST_CODES = {"tag16h5": (4, 0x231B), "tag25h9": (5, 0x155CBF1), "tag36h11": (6, 0xD5D628584)}

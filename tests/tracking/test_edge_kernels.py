@@ -11,26 +11,37 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import norm, uniform
 
-from cdpr.poses import Array
-from tracking.edge_kernels.band import ACROSS, PLACE, VALUE, read_band
-from tracking.edge_kernels.belief import KIND, KIND_DEVIATION
-from tracking.edge_kernels.columns import (
+from model.pose import Array
+from tracking.edges.coarse import find_edges
+from tracking.edges.fit import (
+    KIND,
+    KIND_DEVIATION,
+    REACH,
+    REACH_SPREADS,
+    SETTLED,
+    factored,
+    fit_edges,
+    ranked,
+    solved,
+)
+from tracking.edges.sampling import (
+    ACROSS,
     BOXED,
     COLUMNS,
     HALF,
     MIDDLE,
     OFFSET,
     OFFSET_VARIANCE,
+    PLACE,
     SHARE,
     SPREAD,
     TILT,
+    VALUE,
+    beside,
+    plane_of,
+    read_band,
+    rise,
 )
-from tracking.edge_kernels.fit import REACH, REACH_SPREADS, SETTLED, fit_edges
-from tracking.edge_kernels.ranked import ranked
-from tracking.edge_kernels.rise import rise
-from tracking.edge_kernels.rough import find_edges
-from tracking.edge_kernels.solving import factored, solved
-from tracking.edge_kernels.square import beside, plane_of
 
 SQUARE = np.array([[50.3, 41.2], [98.7, 55.1], [86.2, 104.9], [36.4, 90.0]])
 NO_BOW = np.zeros((1, 4, 2))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpr.poses import Array
+from model.pose import Array
 from tests.tracking.tag_pictures import FAMILY, SIZE, TagPrinter, facing, small_camera
-from tracking.detector import TagDetector
-from tracking.edges import RefinedTag, refine
-from tracking.marks import modules_across
+from tracking.detection.detector import TagDetector
+from tracking.detection.tags import modules_across
+from tracking.edges.refine import RefinedTag, refine
 
 MODULES = modules_across(FAMILY)
 

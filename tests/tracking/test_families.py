@@ -9,19 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput
-from cdpr.poses import Pose
-from cdpr.rig import Camera, Rig, rig_from_document
-from cdpr.scene import Scene
-from cdpr.tag_families import FAMILIES, opencv_dictionary, tags_in
-from simulation.camera import SyntheticCamera
+from model.errors import BadInput
+from model.files.rig_file import FAMILIES, opencv_dictionary, tags_in
+from model.pose import Pose
+from model.rig import Camera, Rig, rig_from_document
+from model.scene import Scene
+from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_pictures import Condition, HardPrinter
 from tests.tracking.tag_pictures import FAMILY
-from tracking.detectors import make_detector
-from tracking.edges import refine
-from tracking.marks import modules_across
+from tracking.camera_model import pixels_from_ideal
+from tracking.detection.libraries import make_detector
+from tracking.detection.tags import modules_across
+from tracking.edges.refine import refine
 from tracking.measurement import PoseMeasurement
-from tracking.projection import pixels_from_ideal
 from tracking.tracker import Tracker
 
 

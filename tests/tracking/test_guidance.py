@@ -11,15 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cdpr.kinematics import cable_lengths, forward_kinematics
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Camera, Rig, Tag
-from cdpr.scene import Scene
-from simulation.camera import Optics, SyntheticCamera
+from model.kinematics import cable_lengths, forward_kinematics
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Camera, Rig, Tag
+from model.scene import Scene
+from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.guidance import MEMORY, DrivesAhead, Guidance
 from tracking.measurement import NoPose, PoseMeasurement
-from tracking.tracker import Tracker
+from tracking.tracker import MEMORY, DrivesAhead, EncoderPrior, Tracker
 
 Image = NDArray[np.uint8]
 
@@ -60,7 +59,7 @@ def place(k: int) -> Pose:
 def test_the_drives_motion_leads_on_from_where_the_camera_saw_the_platform(
     measured: Pose, drives: Pose, later: Pose
 ) -> None:
-    guidance = Guidance()
+    guidance = EncoderPrior()
     assert guidance.expected(drives).distance_to(drives) < 1e-12
     guidance.learn(measured, drives)
     assert guidance.expected(drives).distance_to(measured) < 1e-12

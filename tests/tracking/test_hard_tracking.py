@@ -8,15 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Camera, Rig, Tag
-from cdpr.scene import Scene
-from simulation.camera import Optics, SyntheticCamera
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Camera, Rig, Tag
+from model.scene import Scene
+from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.bundle import TagView
 from tracking.consensus import agreeing
-from tracking.measurement import NoPose, PoseMeasurement
-from tracking.prediction import predicted
+from tracking.measurement import NoPose, PoseMeasurement, predicted
+from tracking.pnp import TagView
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.1, 0.1, 0.4])

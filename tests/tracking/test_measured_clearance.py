@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.clearance import ClearanceModel
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Rig
-from cdpr.scene import Scene, load_scene
-from tracking.measured_clearance import ALLOWANCE, DEVIATIONS, MeasuredClearance, clearance_of
+from model.clearance import ClearanceModel
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig
+from model.scene import Scene, load_scene
+from tracking.clearance import ALLOWANCE, DEVIATIONS, MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
 
 CONFIGS = Path(__file__).parents[2] / "configs"

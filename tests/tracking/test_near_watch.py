@@ -11,11 +11,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cdpr.clearance import Nearest
-from executor.measured import ClearanceRow, clearance_table
-from executor.near_watch import NEAR_PICTURES, NearWatch
-from executor.verdict import distances
-from tracking.measured_clearance import MeasuredClearance
+from executor.cameras.multi_camera import NEAR_PICTURES, ClearanceMonitor
+from executor.recording.clearance import ClearanceRow, clearance_table
+from executor.recording.verdict import distances
+from model.clearance import Nearest
+from tracking.clearance import MeasuredClearance
 
 #: The scene asks for so much, [mm].
 LIMIT_MM = 20.0
@@ -49,7 +49,7 @@ def surely_too_near(obstacles_mm: list[tuple[float, float]]) -> bool:
 def test_the_run_stops_exactly_when_one_obstacle_is_surely_too_near(
     obstacles_mm: list[tuple[float, float]],
 ) -> None:
-    watch = NearWatch(LIMIT_MM / 1e3)
+    watch = ClearanceMonitor(LIMIT_MM / 1e3)
     told = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_PICTURES)]
     assert not any(told[:-1])
     assert bool(told[-1]) is surely_too_near(obstacles_mm)
@@ -73,11 +73,11 @@ def test_nearer_than_planned_counts_the_upper_side_too() -> None:
     row = ClearanceRow.at(1.0, "tag", found, nearest([35.0, 50.0]))
     _, against_plan = distances(clearance_table(("post 0", "post 1"), [row]), LIMIT_MM / 1e3)
     assert not against_plan.passed
-    assert "at most 31.00 mm" in against_plan.text
+    assert "upper bound 31.00 mm" in against_plan.text
 
 
 def test_what_is_told_names_the_obstacle_that_is_surely_too_near() -> None:
-    watch = NearWatch(LIMIT_MM / 1e3)
+    watch = ClearanceMonitor(LIMIT_MM / 1e3)
     told = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
     assert told == "platform to post 1: 12.0 ± 1.0 mm; the scene asks for 20 mm"
 

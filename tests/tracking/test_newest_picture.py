@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import drivers.cameras
-from cdpr.errors import BadInput, Fault, HardwareMissing
-from cdpr.rig import Camera
-from drivers.cameras import LiveCamera
-from drivers.newest_picture import LOST_PICTURES
+import drivers.cameras.live
+from drivers.cameras.live import LOST_PICTURES, LiveCamera
+from model.errors import BadInput, Fault, HardwareMissing
+from model.rig import Camera
 
 
 class Queue:
@@ -75,7 +74,7 @@ class Queue:
 @pytest.fixture
 def queue(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
     made = Queue(camera)
-    monkeypatch.setattr(drivers.cameras, "_opened", lambda _: made)
+    monkeypatch.setattr(drivers.cameras.live, "_opened", lambda _: made)
     yield made
     made.unplug()
 

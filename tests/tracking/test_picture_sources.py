@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput, HardwareMissing
-from cdpr.poses import Pose
-from cdpr.rig import Camera, Rig
-from drivers.cameras import Frame, LiveCamera, VideoFile
-from drivers.picture_folder import ImageFolder
-from simulation.camera import SyntheticCamera
+from drivers.cameras.files import ImageFolder
+from drivers.cameras.live import Frame, LiveCamera, VideoFile
+from model.errors import BadInput, HardwareMissing
+from model.pose import Pose
+from model.rig import Camera, Rig
+from simulation.camera.camera import SyntheticCamera
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.pose_log import POSE_COLUMNS, pose_row, write_pose_log
 from tracking.track import NoPlatformSeen, TrackCount, track

@@ -9,11 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import Camera, Rig
-from cdpr.scene import Scene
-from cdpr.shapes import (
+from model.errors import BadInput
+from model.geometry.shapes import (
     Box,
     Capsule,
     Cylinder,
@@ -24,9 +21,11 @@ from cdpr.shapes import (
     convex_hull,
     shape_points,
 )
-from simulation.camera import Optics, SyntheticCamera
-from simulation.camera_canvas import Canvas, draw_triangles, sample_rays
-from simulation.camera_meshes import surface_of
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Camera, Rig
+from model.scene import Scene
+from simulation.camera.camera import Optics, SyntheticCamera
+from simulation.camera.rendering import Canvas, draw_triangles, sample_rays, surface_of
 from tests.tracking.tag_pictures import TagPrinter, small_camera
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.1
@@ -151,10 +150,9 @@ def test_tags_lie_where_dense_sampling_puts_them() -> None:
 
 def _sampled(camera: Camera, pose: Pose, number: int, samples: int) -> np.ndarray:
     """A tag's picture by plain sampling; NaN outside of the black square's inside."""
-    from simulation.camera_background import shade
-    from simulation.camera_prints import INK, PAPER
+    from simulation.camera.rendering import INK, PAPER, shade
     from tests.tracking.tag_pictures import FAMILY, SIZE
-    from tracking.marks import official_modules
+    from tracking.detection.tags import official_modules
 
     modules = official_modules(FAMILY, number)
     light = float(shade(pose.rotation[:, 2]))

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cdpr.poses import Array
+from model.pose import Array
 from tests.tracking.reference_tags import nearest_gap, tags_found_by_apriltag
-from tracking.detector import TagDetector
+from tracking.detection.detector import TagDetector
 
 PHOTOGRAPHS = sorted((Path(__file__).parent / "photographs").glob("*.jpg"))
 FAMILY = "tag36h11"

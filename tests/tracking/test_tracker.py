@@ -9,17 +9,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput
-from cdpr.poses import (
+from model.errors import BadInput
+from model.pose import (
     Array,
     Pose,
     interpolate,
     matrix_from_rotation_vector,
     rotation_vector_from_matrix,
 )
-from cdpr.rig import Camera, Rig
-from cdpr.scene import Scene
-from simulation.camera import Optics, SyntheticCamera
+from model.rig import Camera, Rig
+from model.scene import Scene
+from simulation.camera.camera import Optics, SyntheticCamera
 from tracking.camera_check import CameraMoved
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.settings import TrackerSettings

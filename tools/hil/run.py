@@ -1,61 +1,91 @@
 """Runs the tests marked `hil` on a virtual CAN bus: of this machine, else of a virtual one.
 
-    python tools/hil/run.py [--artefacts DIR] [--limit-s S] [pytest's arguments]
+    python tools/hil/run.py [--part runs|table|makers] [--artefacts DIR] [--limit-s S]
+        [pytest's arguments]
     python tools/hil/run.py --missing
 
 The exit status is pytest's; 125 when there is no bus to run them on. With --missing it only names
 the Debian packages that must be installed before, in one line; needs no environment of its own.
+Parts may run at once: in machines of their own, or in turn on the bus of this one.
 """
 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import shlex
 import shutil
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from kernel import BUSYBOX, VmFailed
+from kernel import BUSYBOX, VmFailed, boot_files
 from vm import QEMU, run_in_vm
 
 ROOT = Path(__file__).resolve().parents[2]
 CHANNEL = "vcan0"
 NO_BUS = 125
-TESTS = ("-m", "pytest", "-p", "no:cacheprovider", "tests/hil")
+PYTEST = ("-m", "pytest", "-p", "no:cacheprovider")
+TABLE = "tests/hil/test_fault_table_on_vcan.py"
+MAKERS = "tests/hil/test_makers_on_vcan.py"
+PARTS = {
+    "": ("tests/hil",),
+    "runs": ("tests/hil", f"--ignore={TABLE}", f"--ignore={MAKERS}"),
+    "table": (TABLE,),
+    "makers": (MAKERS,),
+}
+"""What a part runs; without a name, all."""
 NEEDED = {"ip": "iproute2", "candump": "can-utils"}
 NEEDED_BY_VM = {QEMU: "qemu-system-x86", str(BUSYBOX): "busybox-static"}
-COMPILED = ("cdpr", "drivers", "executor", "planner", "simulation", "tests", "tracking")
+KERNELS = "from executor.kernels import ready_to_simulate; ready_to_simulate()"
+COMPILED = (
+    "calibration",
+    "cdpr",
+    "drivers",
+    "executor",
+    "model",
+    "planner",
+    "simulation",
+    "tests",
+    "tracking",
+)
 
 
 def main() -> int:
     """Chooses where, and runs there."""
     parser = argparse.ArgumentParser(description="run the hardware-in-the-loop tests on vcan")
-    parser.add_argument("--artefacts", type=Path, default=_cache() / "last")
+    parser.add_argument("--part", choices=[name for name in PARTS if name], default="")
+    parser.add_argument("--artefacts", type=Path)
     parser.add_argument("--limit-s", type=float, default=1800.0)
     parser.add_argument("--missing", action="store_true")
     options, rest = parser.parse_known_args()
     if options.missing:
         print(*_missing())
         return 0
-    artefacts = options.artefacts.resolve()
+    own = _cache() / "last" / options.part
+    artefacts = (options.artefacts or own).resolve()
     if artefacts.is_relative_to(ROOT):
         parser.error(f"--artefacts {artefacts} is inside the repository; name another folder")
-    if artefacts == _cache() / "last":
+    if artefacts == own.resolve():
         shutil.rmtree(artefacts, ignore_errors=True)
     elif artefacts.exists() and any(artefacts.iterdir()):
         parser.error(f"--artefacts {artefacts} holds something already; name an empty folder")
     artefacts.mkdir(parents=True, exist_ok=True)
-    tests = [*TESTS, *(rest or ["-m", "hil"])]
+    tests = [*PYTEST, *PARTS[options.part], *(rest or ["-m", "hil"])]
     try:
         _require_tools()
         if _host_has_can():
             print(f"hil: on this machine's {CHANNEL}; traces in {artefacts}", flush=True)
-            return _on_host(tests, artefacts)
+            with _alone():
+                return _on_host(tests, artefacts)
         print(f"hil: no AF_CAN here, so in a virtual machine; traces in {artefacts}", flush=True)
-        _compile()
+        with _alone():
+            _compile()
+            boot_files(_cache())
         return run_in_vm(_job(tests), artefacts, _cache(), options.limit_s)
     except VmFailed as error:
         print(f"hil: {error}", file=sys.stderr)
@@ -65,6 +95,15 @@ def main() -> int:
 def _cache() -> Path:
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "cdpr" / "hil"
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Another part waits meanwhile: for the bus, or for what both need."""
+    _cache().mkdir(parents=True, exist_ok=True)
+    with (_cache() / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def _require_tools() -> None:
@@ -109,15 +148,27 @@ def _environment(artefacts: Path) -> dict[str, str]:
 
 
 def _compile() -> None:
-    """To bytecode, here: it takes twenty times as long where instructions are counted."""
+    """What the programs run, here: it takes twenty times as long where instructions are counted.
+
+    To bytecode, and the simulated platform to machine code that both processors understand.
+    """
     command = [sys.executable, "-m", "compileall", "-q", *COMPILED]
     subprocess.run(command, cwd=ROOT, check=False)  # a folder that is read-only costs time alone
+    environment = {**os.environ, **_for_any_processor()}
+    subprocess.run([sys.executable, "-c", KERNELS], cwd=ROOT, env=environment, check=True)
+
+
+def _for_any_processor() -> dict[str, str]:
+    """Numba keeps machine code by processor, and the virtual one is not this one."""
+    kept = str(_cache() / "kernels")
+    return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": kept}
 
 
 def _job(tests: list[str]) -> str:
     """What the virtual machine runs, with this Python and in this folder."""
     passed = {name: value for name, value in os.environ.items() if name.startswith("CDPR_HIL_")}
-    environment = {**passed, **_environment(Path("/mnt/job")), "HOME": "/root", "COLUMNS": "100"}
+    own = {"HOME": "/root", "COLUMNS": "100"}
+    environment = {**passed, **_environment(Path("/mnt/job")), **_for_any_processor(), **own}
     exports = [f"export {name}={shlex.quote(value)}" for name, value in environment.items()]
     command = shlex.join([sys.executable, *tests])
     return "\n".join([*exports, _bring_up(), f"cd {shlex.quote(str(ROOT))}", f"exec {command}", ""])

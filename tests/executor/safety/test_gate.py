@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.safety.gate import ALLOWED, Limits, Purpose, Request, Verdict, examine
+from executor.safety.gate import ALLOWED, GateDecision, Limits, Purpose, Request, examine
 
 LIMITS = Limits(
     lowest=(-1000, 0, 2000),
@@ -52,7 +52,7 @@ def _denied(request: Request) -> str:
 
 
 def test_a_move_that_keeps_everything_is_allowed():
-    assert examine(LIMITS, MOVE) == ALLOWED == Verdict(True, "")
+    assert examine(LIMITS, MOVE) == ALLOWED == GateDecision(True, "")
 
 
 @each_drive

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpr.rig import load_rig
-from executor.safety.limits import gate_limits, least_steps, tension_limits, watch_limits
-from executor.safety.watch import Observation, Watch
+from executor.safety.limits import gate_limits, stuck_limits, tension_limits, watch_limits
+from executor.safety.monitor import Monitor, Observation
+from executor.safety.stall import StuckLimits
+from executor.safety.sync_age import SyncAge
+from model.rig import load_rig, rig_from_document
 from tests.cli.plans import HALL, RIG
 
 PER_MM = 131072 / 206.06
@@ -20,17 +22,23 @@ def test_tensions_of_the_papers_rig():
 
 def test_the_watch_judges_by_the_rig_file():
     rig = load_rig(RIG)
-    limits = watch_limits(rig)
+    limits = watch_limits(rig, SyncAge())
     assert limits.following_error == rig.motion.following_error == pytest.approx(0.002)
     assert (limits.min_tension, limits.max_tension) == tension_limits(rig)
     assert limits.no_tension == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize(("timeout", "gone"), [(3.0, 1.5), (1.5, 0.25), (2.0, 0.5), (5.0, 3.5)])
+def test_lateness_counts_from_one_period_after_the_last_sync(timeout, gone):
+    """A cycle that begins L periods late finds a SYNC that is 1 + L periods old."""
+    assert watch_limits(load_rig(RIG), SyncAge(timeout)).gone_periods == pytest.approx(gone)
+
+
 def test_where_cables_may_hang_slack_the_watch_says_nothing_of_it():
     rig = load_rig(RIG)
-    limits = watch_limits(rig, slack_counts=False)
+    limits = watch_limits(rig, SyncAge(), slack_counts=False)
     assert limits.max_tension == tension_limits(rig)[1]
-    watch = Watch.fresh(limits, ["a", "b"])
+    watch = Monitor.fresh(limits, ["a", "b"])
 
     def found(tension: float) -> set[str]:
         now = watch
@@ -44,21 +52,35 @@ def test_where_cables_may_hang_slack_the_watch_says_nothing_of_it():
     assert "cable_loose" in found(float("nan"))
 
 
-def test_a_step_that_counts_is_a_hundredth_of_the_following_error():
-    assert least_steps(load_rig(RIG)) == (13,) * 8
-    assert np.ceil(0.02 * PER_MM) == 13
+def test_how_long_a_drive_may_stand_still_is_in_the_rig_file():
+    rig = load_rig(RIG)
+    assert np.ceil([0.02 * PER_MM, 0.07 * PER_MM]).tolist() == [13, 45]
+    assert stuck_limits(rig, 0.01) == (StuckLimits(least=13, travel=45),) * 8
+    assert stuck_limits(rig, 0.02) == (StuckLimits(least=26, travel=45),) * 8
+    motion = rig.document.motion.model_copy(
+        update={"stuck_travel_mm": 0.43, "stuck_speed_mm_s": 3.0}
+    )
+    noisy = rig_from_document(rig.document.model_copy(update={"motion": motion}))
+    assert stuck_limits(noisy, 0.01) == (StuckLimits(least=20, travel=274),) * 8
 
 
-def test_one_count_is_never_a_step():
+def test_counts_that_fall_when_cable_is_paid_out_have_the_same_limits():
+    rig = load_rig(RIG)
+    winches = [w.model_copy(update={"direction": -w.direction}) for w in rig.document.winches]
+    mirrored = rig_from_document(rig.document.model_copy(update={"winches": winches}))
+    rows = np.array([[0] * 8, [1000] * 8], dtype=np.int32)
+    assert stuck_limits(mirrored, 0.01) == stuck_limits(rig, 0.01)
+    assert gate_limits(mirrored, rows, 0.01) == gate_limits(rig, rows, 0.01)
+
+
+def test_rounding_to_counts_is_never_a_drive_that_stands_still():
     rig = load_rig(RIG)
     coarse = rig.document.model_copy(
         update={
             "winches": [w.model_copy(update={"counts_per_rev": 100}) for w in rig.document.winches]
         }
     )
-    from cdpr.rig import rig_from_document
-
-    assert least_steps(rig_from_document(coarse)) == (2,) * 8
+    assert stuck_limits(rig_from_document(coarse), 0.01) == (StuckLimits(2, 3),) * 8
 
 
 def test_the_gate_of_the_papers_rig():
@@ -83,4 +105,4 @@ def test_rows_at_the_ends_of_32_bits_do_not_wrap():
 
 def test_every_drive_has_limits_of_its_own_winch():
     rig = load_rig(HALL)
-    assert len(least_steps(rig)) == len(rig.winches) == 10
+    assert len(stuck_limits(rig, 0.01)) == len(rig.winches) == 10

@@ -1,4 +1,4 @@
-"""Drives that stand still while their set-points go on: one cycle is counted, two in a row stop."""
+"""Drives that stand still while their set-points go on, told apart from noise."""
 
 from __future__ import annotations
 
@@ -6,31 +6,42 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.safety.stuck import StuckWatch
-from executor.safety.watch import Finding, Reaction
+from executor.safety.monitor import Alarm, StopReaction
+from executor.safety.stall import Drive, StuckLimits, StuckWatch
 
 HERE = (True, (0, 0), (0, 0), (False, False))
 NAMES = ("cable 1 (drive 11)", "cable 2 (drive 9)")
 NOTE = "{} stood still for 1 cycle while its set-points went on"
 STOP = "{} stood still for {} cycles while its set-points went on"
+LIMITS = StuckLimits(least=10, travel=100)
 
 
-def look(cycles, least=(10, 10)):
+def look(cycles, limits=LIMITS):
     """What is found in the last of some cycles."""
-    watch, found = StuckWatch.fresh(least, NAMES), ()
+    watch, found = StuckWatch.fresh((limits, limits), NAMES), ()
     for cycle in cycles:
         watch, found = watch.look(*cycle)
     return found
 
 
 def steps(positions, demands, drive=0, missing=(), following=True):
-    """One drive at these places; the other one rests."""
+    """One drive at these positions; the other one rests."""
     for k, (position, demand) in enumerate(zip(positions, demands, strict=True)):
         places, wanted = [7, 7], [7, 7]
         places[drive], wanted[drive] = position, demand
         lost = [False, False]
         lost[drive] = k in missing
         yield following, places, wanted, lost
+
+
+def first_found(positions, demands, limits=LIMITS):
+    """The cycle of the first stop, and its text; None where there is none."""
+    watch = StuckWatch.fresh((limits,), NAMES[:1])
+    for k, (position, demand) in enumerate(zip(positions, demands, strict=True)):
+        watch, found = watch.look(True, (position,), (demand,), (False,))
+        if any(each.code == "drive_stuck" for each in found):
+            return k
+    return None
 
 
 @pytest.mark.parametrize("drive", [0, 1])
@@ -41,64 +52,137 @@ def test_one_cycle_is_noted_and_two_in_a_row_stop(drive, sign):
     number = drive + 1
     assert look(list(steps(stuck, demands, drive))[:3]) == ()
     assert look(list(steps(stuck, demands, drive))[:4]) == (
-        Finding(Reaction.NOTE, "set_point_missed", NOTE.format(NAMES[drive]), number),
+        Alarm(StopReaction.NOTE, "set_point_missed", NOTE.format(NAMES[drive]), number),
     )
     for cycles in (2, 3):
         assert look(list(steps(stuck, demands, drive))[: 3 + cycles]) == (
-            Finding(Reaction.QUICK_STOP, "drive_stuck", STOP.format(NAMES[drive], cycles), number),
+            Alarm(StopReaction.QUICK_STOP, "drive_stuck", STOP.format(NAMES[drive], 2), number),
         )
 
 
+def test_a_slow_drive_is_judged_over_the_whole_travel():
+    """Ten cycles of ten counts; it is found when its set-points went on by 100 without it."""
+    demands = [10 * k for k in range(40)]
+    positions = [min(demand, 200) for demand in demands]
+    # A stretch of which less than a quarter was made: 80 of 100 counts without it.
+    assert first_found(positions, demands) == 28
+    assert look(list(steps(positions, demands))[:29])[0].text == STOP.format(NAMES[0], 10)
+
+
+@pytest.mark.parametrize(("travel", "found"), [(200, 4), (201, 5), (300, 5), (301, 6)])
+def test_the_travel_decides_how_long_a_drive_may_stand_still(travel, found):
+    demands = [100 * k for k in range(10)]
+    positions = [0, 100, 200, 300, 400, *[400] * 5]
+    at = first_found(positions, demands, StuckLimits(10, travel))
+    assert at == found + 2
+
+
+@pytest.mark.parametrize(("travel", "noted"), [(100, 1), (101, 0)])
+def test_a_single_step_is_noted_only_where_it_is_larger_than_noise(travel, noted):
+    cycles = steps([0, 100, 200, 300, 300], [0, 100, 200, 300, 400])
+    assert len(look(cycles, StuckLimits(10, travel))) == noted
+
+
 @pytest.mark.parametrize(("least", "found"), [(100, 1), (101, 0)])
-def test_small_steps_of_set_points_say_nothing(least, found):
-    cycles = steps([0, 100, 100], [0, 100, 200])
-    assert len(look(cycles, (least, least))) == found
+def test_slow_set_points_say_nothing(least, found):
+    cycles = steps([0, 100, 200, 200], [0, 100, 200, 300])
+    assert len(look(cycles, StuckLimits(least, 100))) == found
 
 
-def test_a_small_step_ends_the_count():
-    assert look(steps([0, 100, 100, 100, 100], [0, 100, 200, 205, 305])) == ()
+def test_a_slow_step_ends_the_stretch():
+    slow = [0, 100, 200, 200, 200, 200, 200, 200]
+    assert look(steps(slow, [0, 100, 200, 300, 309, 409, 509, 609])) == ()
+    assert look(steps(slow, [0, 100, 200, 300, 310, 410, 510, 610])) != ()
 
 
-@pytest.mark.parametrize(("moved", "found"), [(24, 1), (25, 0), (-24, 1), (-25, 0)])
-def test_a_quarter_of_the_step_is_not_standing_still(moved, found):
-    assert len(look(steps([0, 100, 100 + moved], [0, 100, 200]))) == found
+def test_set_points_that_turn_round_end_the_stretch():
+    """They return to where the drive is, and it is not known yet whether it follows this way."""
+    assert look(steps([0, 100, 200, 200, 200, 200], [0, 100, 200, 300, 200, 100])) == ()
+    turned = [0, 100, 200, 300, 200, 100, 100, 100]
+    (stop,) = look(steps(turned, [0, 100, 200, 300, 200, 100, 0, -100]))
+    assert stop.code == "drive_stuck"
+
+
+def test_turning_round_by_a_single_count_ends_the_stretch():
+    drive = Drive(StuckLimits(least=1, travel=10)).seen(0, 0).seen(1, 1)
+    assert drive.seen(0, 0).replies == ((0, 0),)
+    assert drive.seen(2, 2).replies == ((0, 0), (1, 1), (2, 2))
+
+
+@pytest.mark.parametrize("off", [-5000, 5000])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_drive_that_is_behind_or_ahead_is_judged_by_its_motion_alone(off, sign):
+    demands = [sign * 100 * k for k in range(10)]
+    assert first_found([demand + off for demand in demands], demands) is None
+    jammed = [sign * 100 * min(k, 4) + off for k in range(10)]
+    assert first_found(jammed, demands) == 6
+
+
+@pytest.mark.parametrize(("moved", "found"), [(49, 1), (50, 0), (0, 1), (-25, 1), (-200, 1)])
+def test_a_quarter_of_the_travel_is_not_standing_still(moved, found):
+    cycles = [*steps([0, 100, 200, 200 + moved // 2, 200 + moved], [0, 100, 200, 300, 400])]
+    assert [f.code for f in look(cycles)] == ["drive_stuck"] * found
+
+
+@pytest.mark.parametrize(("moved", "noted"), [(24, 1), (25, 0), (-24, 1)])
+def test_a_quarter_of_a_step_is_not_missing_it(moved, noted):
+    cycles = steps([0, 100, 200, 300, 300 + moved], [0, 100, 200, 300, 400])
+    assert len(look(cycles)) == noted
 
 
 @pytest.mark.parametrize(("moved", "found"), [(49, 0), (50, 1), (-100, 0)])
 def test_only_a_drive_that_followed_is_judged(moved, found):
     """At the begin of a motion a servo lags; against friction it may not move at all."""
-    assert len(look(steps([0, moved, moved], [0, 100, 200]))) == found
-    assert look(steps([0, 0, 0, 0], [0, 100, 200, 300])) == ()
+    begun = [0, moved, 2 * moved, 2 * moved, 2 * moved]
+    assert len(look(steps(begun, [0, 100, 200, 300, 400]))) == found
+    assert look(steps([0, 0, 0, 0, 0], [0, 100, 200, 300, 400])) == ()
+
+
+def test_one_step_alone_does_not_show_that_a_drive_follows():
+    assert look(steps([0, 100, 100, 100], [0, 100, 200, 300])) == (
+        Alarm(StopReaction.QUICK_STOP, "drive_stuck", STOP.format(NAMES[0], 2), 1),
+    )
+    assert look(steps([0, 99, 99, 99], [0, 100, 200, 300])) == ()
+
+
+def test_before_the_whole_travel_it_is_not_known_whether_a_drive_follows():
+    drive = Drive(StuckLimits(least=1, travel=100))
+    for place in range(0, 100, 10):
+        drive = drive.seen(place, place)
+        assert (drive.followed, drive.standing) == (False, 0)
+    assert drive.seen(100, 100).followed
 
 
 def test_a_drive_that_follows_again_is_forgiven():
-    assert look(steps([0, 100, 100, 300], [0, 100, 200, 300])) == ()
-    (note,) = look(steps([0, 100, 100, 300, 300], [0, 100, 200, 300, 400]))
+    assert look(steps([0, 100, 200, 200, 400], [0, 100, 200, 300, 400])) == ()
+    (note,) = look(steps([0, 100, 200, 200, 400, 400], [0, 100, 200, 300, 400, 500]))
     assert note.code == "set_point_missed"
 
 
-def test_a_drive_that_crawls_on_is_no_longer_judged():
-    assert look(steps([0, 100, 130, 130], [0, 100, 200, 300])) == ()
+def test_a_drive_that_crawls_and_then_stands_still_is_found():
+    crawling = [0, 100, 200, 230, 260, 260, 260]
+    assert first_found(crawling, [0, 100, 200, 300, 400, 500, 600]) == 5
 
 
 def test_a_reply_that_is_missing_says_nothing_new():
-    positions, demands = [0, 100, 100, 100, 100], [0, 100, 200, 300, 400]
-    assert look(list(steps(positions, demands, missing={3}))[:4]) == ()
-    (stop,) = look(steps(positions, demands, missing={3}))
+    positions, demands = [0, 100, 200, 200, 200, 200], [0, 100, 200, 300, 400, 500]
+    assert look(list(steps(positions, demands, missing={4}))[:5]) == ()
+    (stop,) = look(steps(positions, demands, missing={4}))
     assert stop.text == STOP.format(NAMES[0], 2)
-    late = [0, 100, 100, 300]
-    assert look(steps(late, demands[:4], missing={2})) == (), "two steps in one"
+    late = [0, 100, 200, 200, 400]
+    assert look(steps(late, demands[:5], missing={3})) == (), "two steps in one"
 
 
 def test_drives_that_follow_nothing_are_not_judged():
-    cycles = list(steps([0, 100, 100], [0, 100, 200]))
-    resting = list(steps([100], [200], following=False))
-    assert look([*cycles[:2], *resting, *cycles[2:]]) == ()
-    assert look([*cycles[:2], *resting]) == (), "it would be standing still if it were to follow"
+    cycles = list(steps([0, 100, 200, 200], [0, 100, 200, 300]))
+    resting = list(steps([200], [300], following=False))
+    assert look([*cycles[:3], *resting, *cycles[3:]]) == ()
+    assert look([*cycles[:3], *resting]) == (), "it would be standing still if it were to follow"
+    assert Drive(LIMITS, ((0, 0), (1, 1)), True, 3).forgotten() == Drive(LIMITS)
 
 
 def test_an_entry_is_needed_for_every_drive():
-    watch = StuckWatch.fresh((10, 10), NAMES)
+    watch = StuckWatch.fresh((LIMITS, LIMITS), NAMES)
     for place in (1, 2, 3):
         short = list(HERE)
         short[place] = short[place][:1]
@@ -106,10 +190,52 @@ def test_an_entry_is_needed_for_every_drive():
             watch.look(*short)
 
 
-@given(st.lists(st.integers(-200, 200), max_size=30))
-def test_a_drive_that_does_what_it_is_told_is_never_found(changes):
-    places = [sum(changes[:k]) for k in range(len(changes) + 1)]
-    watch = StuckWatch.fresh((10,), NAMES[:1])
-    for place in places:
-        watch, found = watch.look(True, (place,), (place,), (False,))
-        assert found == ()
+def test_no_more_replies_are_kept_than_are_needed():
+    drive = Drive(StuckLimits(least=1, travel=10))
+    for place in range(100):
+        drive = drive.seen(place, place)
+    assert len(drive.replies) == 11
+    fast = Drive(StuckLimits(least=1, travel=10))
+    for place in range(0, 1000, 50):
+        fast = fast.seen(place, place)
+    assert fast.replies == ((850, 850), (900, 900), (950, 950))
+
+
+NOISE_SHARE = 3 / 8
+runs = st.lists(st.tuples(st.integers(-300, 300), st.integers(1, 12)), max_size=6)
+demanded = runs.map(lambda found: [step for step, count in found for _ in range(count)])
+"""Steps of set-points that go on for a while."""
+
+
+@given(demanded, st.randoms(use_true_random=False), st.integers(3, 400))
+def test_noise_within_three_eighths_of_the_travel_is_never_a_drive_that_stands_still(
+    changes, dice, travel
+):
+    """Whatever the set-points do, and however the noise falls."""
+    noise = int(NOISE_SHARE * travel)
+    demands = [sum(changes[:k]) for k in range(len(changes) + 1)]
+    positions = [demand + dice.choice((-noise, noise)) for demand in demands]
+    assert first_found(positions, demands, StuckLimits(2, travel)) is None
+
+
+@given(
+    st.integers(2, 300),
+    st.integers(3, 400),
+    st.sampled_from([-1, 1]),
+    st.randoms(use_true_random=False),
+    st.integers(0, 30),
+)
+def test_a_drive_that_jams_is_found_within_the_travel_whatever_the_noise(
+    step, travel, sign, dice, more
+):
+    """Noise below an eighth of the travel; by the first reply that shows travel and two cycles."""
+    noise = (travel - 1) // 8
+    patience = max(2, -(-travel // step))
+    jammed = patience + 2 + more
+    demands = [sign * step * k for k in range(jammed + patience + 1)]
+    positions = [
+        sign * step * min(k, jammed) + dice.choice((-noise, 0, noise)) for k in range(len(demands))
+    ]
+    found = first_found(positions, demands, StuckLimits(2, travel))
+    assert found is not None
+    assert jammed < found <= jammed + patience

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.safety.watch import Finding, Observation, Reaction, Watch, WatchLimits
+from executor.safety.monitor import Alarm, Monitor, Observation, StopReaction, WatchLimits
 
 NAN = float("nan")
 LIMITS = WatchLimits(following_error=0.002, min_tension=5.0, max_tension=100.0, no_tension=0.5)
@@ -28,15 +28,15 @@ def _put(values: tuple[object, ...], drive: int, value: object) -> tuple[object,
     return (*values[:drive], value, *values[drive + 1 :])
 
 
-def _look(*cycles: Observation) -> tuple[Finding, ...]:
+def _look(*cycles: Observation) -> tuple[Alarm, ...]:
     """What is found in the last of some cycles."""
-    watch, found = Watch.fresh(LIMITS, NAMES), ()
+    watch, found = Monitor.fresh(LIMITS, NAMES), ()
     for seen in cycles:
         watch, found = watch.look(seen)
     return found
 
 
-def _codes(*cycles: Observation) -> list[tuple[str, Reaction]]:
+def _codes(*cycles: Observation) -> list[tuple[str, StopReaction]]:
     return [(finding.code, finding.reaction) for finding in _look(*cycles)]
 
 
@@ -49,24 +49,26 @@ def test_nothing_is_found_while_all_is_well():
 
 
 def test_the_larger_reaction_has_the_larger_number():
-    assert [Reaction.NOTE, Reaction.PATH_STOP, Reaction.QUICK_STOP] == [0, 1, 2]
+    assert [StopReaction.NOTE, StopReaction.PATH_STOP, StopReaction.QUICK_STOP] == [0, 1, 2]
 
 
 def test_limits_have_the_values_of_the_stop_rules():
-    assert (LIMITS.slack_cycles, LIMITS.missing_cycles, LIMITS.late_periods) == (5, 2, 2.0)
-    assert LIMITS.gone_periods == 3.0
+    assert (LIMITS.slack_cycles, LIMITS.missing_cycles, LIMITS.late_periods) == (5, 2, 1.0)
+    assert LIMITS.gone_periods == 1.5
     assert LIMITS.loose_cycles == 3
 
 
 def test_one_lost_reply_is_noted_and_two_in_a_row_stop():
     lost = _with("missing", 1, True)
     (note,) = _look(lost)
-    assert note == Finding(Reaction.NOTE, "reply_lost", f"{NAMES[1]} did not answer for 1 cycle", 2)
-    (stop,) = _look(lost, lost)
-    assert stop == Finding(
-        Reaction.QUICK_STOP, "drive_silent", f"{NAMES[1]} did not answer for 2 cycles", 2
+    assert note == Alarm(
+        StopReaction.NOTE, "reply_lost", f"{NAMES[1]} did not answer for 1 cycle", 2
     )
-    assert _codes(lost, FINE, lost) == [("reply_lost", Reaction.NOTE)]
+    (stop,) = _look(lost, lost)
+    assert stop == Alarm(
+        StopReaction.QUICK_STOP, "drive_silent", f"{NAMES[1]} did not answer for 2 cycles", 2
+    )
+    assert _codes(lost, FINE, lost) == [("reply_lost", StopReaction.NOTE)]
     assert _codes(lost, FINE) == []
     assert "3 cycles" in _look(lost, lost, lost)[0].text
 
@@ -75,27 +77,27 @@ def test_one_lost_reply_is_noted_and_two_in_a_row_stop():
 def test_replies_are_counted_for_each_drive_alone(drive):
     others = [d for d in range(3) if d != drive]
     assert _codes(_with("missing", others[0], True), _with("missing", drive, True)) == [
-        ("reply_lost", Reaction.NOTE)
+        ("reply_lost", StopReaction.NOTE)
     ]
     assert f"{NAMES[drive]} " in _look(_with("missing", drive, True))[0].text
 
 
 def test_a_watch_may_be_told_to_wait_longer_for_replies():
     patient = replace(LIMITS, missing_cycles=4)
-    watch, lost = Watch.fresh(patient, NAMES), _with("missing", 0, True)
+    watch, lost = Monitor.fresh(patient, NAMES), _with("missing", 0, True)
     found = []
     for _ in range(5):
         watch, (finding,) = watch.look(lost)
         found.append(finding)
-    assert [f.reaction for f in found] == [Reaction.NOTE] * 3 + [Reaction.QUICK_STOP] * 2
+    assert [f.reaction for f in found] == [StopReaction.NOTE] * 3 + [StopReaction.QUICK_STOP] * 2
     assert [f.text.split(" for ")[1] for f in found[:2]] == ["1 cycle", "2 cycles"]
 
 
 def test_every_fault_that_drives_report_stops_at_once():
     seen = replace(FINE, following=False, faults=((3, "over-current"), (0, "bus-off")))
     assert _look(seen) == (
-        Finding(Reaction.QUICK_STOP, "drive_fault", "over-current", 3),
-        Finding(Reaction.QUICK_STOP, "drive_fault", "bus-off", 0),
+        Alarm(StopReaction.QUICK_STOP, "drive_fault", "over-current", 3),
+        Alarm(StopReaction.QUICK_STOP, "drive_fault", "bus-off", 0),
     )
 
 
@@ -104,14 +106,14 @@ def test_every_fault_that_drives_report_stops_at_once():
 def test_a_following_error_may_be_the_limit_and_not_more(drive, sign):
     assert _look(_with("following_errors", drive, sign * 0.002)) == ()
     (found,) = _look(_with("following_errors", drive, sign * 0.00201))
-    assert (found.reaction, found.code) == (Reaction.QUICK_STOP, "following_error")
+    assert (found.reaction, found.code) == (StopReaction.QUICK_STOP, "following_error")
     assert found.text == (
         f"cable {drive + 1} is {sign * 2.01:.2f} mm from its set-point, allowed 2.00 mm"
     )
 
 
 def test_a_following_error_is_told_in_millimetres():
-    wide = Watch.fresh(replace(LIMITS, following_error=0.5), NAMES)
+    wide = Monitor.fresh(replace(LIMITS, following_error=0.5), NAMES)
     (found,) = wide.look(_with("following_errors", 0, 2.5))[1]
     assert found.text == "cable 1 is 2500.00 mm from its set-point, allowed 500.00 mm"
 
@@ -120,7 +122,7 @@ def test_a_following_error_is_told_in_millimetres():
 @pytest.mark.parametrize("value", [NAN, float("inf"), -float("inf")])
 def test_a_following_error_that_is_no_number_stops(drive, value):
     assert _codes(_with("following_errors", drive, value)) == [
-        ("following_error", Reaction.QUICK_STOP)
+        ("following_error", StopReaction.QUICK_STOP)
     ]
 
 
@@ -129,10 +131,10 @@ def test_a_drive_that_did_not_answer_is_not_judged_by_its_old_position(drive):
     """One lost reply is a note; the others are judged all the same."""
     seen = _with("missing", drive, True)
     old = replace(seen, following_errors=_put(FINE.following_errors, drive, NAN))
-    assert _codes(old) == [("reply_lost", Reaction.NOTE)]
+    assert _codes(old) == [("reply_lost", StopReaction.NOTE)]
     other = (drive + 1) % 3
     both = replace(old, following_errors=_put(old.following_errors, other, 0.1))
-    assert _codes(both)[1] == ("following_error", Reaction.QUICK_STOP)
+    assert _codes(both)[1] == ("following_error", StopReaction.QUICK_STOP)
 
 
 @each_drive
@@ -143,8 +145,8 @@ def test_a_drive_that_did_not_answer_is_not_judged_by_its_old_position(drive):
 def test_five_cycles_of_wrong_tension_in_a_row_stop_along_the_path(drive, tension, code):
     wrong = _with("tensions", drive, tension)
     assert _codes(*[wrong] * 4) == []
-    assert _codes(*[wrong] * 5) == [(code, Reaction.PATH_STOP)]
-    assert _codes(*[wrong] * 6) == [(code, Reaction.PATH_STOP)]
+    assert _codes(*[wrong] * 5) == [(code, StopReaction.PATH_STOP)]
+    assert _codes(*[wrong] * 6) == [(code, StopReaction.PATH_STOP)]
     assert _codes(*[wrong] * 4, FINE, *[wrong] * 4) == []
     (found,) = _look(*[wrong] * 5)
     assert found.drive == drive + 1
@@ -161,8 +163,8 @@ def test_five_cycles_of_wrong_tension_in_a_row_stop_along_the_path(drive, tensio
 def test_three_cycles_without_tension_in_a_row_are_a_quick_stop(drive, tension):
     none = _with("tensions", drive, tension)
     assert _codes(*[none] * 2) == []
-    assert _codes(*[none] * 3) == [("cable_loose", Reaction.QUICK_STOP)]
-    assert _codes(*[none] * 9) == [("cable_loose", Reaction.QUICK_STOP)]
+    assert _codes(*[none] * 3) == [("cable_loose", StopReaction.QUICK_STOP)]
+    assert _codes(*[none] * 9) == [("cable_loose", StopReaction.QUICK_STOP)]
     assert _codes(*[none] * 2, FINE, *[none] * 2) == []
     (found,) = _look(*[none] * 3)
     assert found.drive == drive + 1
@@ -180,8 +182,8 @@ def test_the_limits_of_tension_themselves_are_allowed(drive, tension):
 @each_drive
 def test_a_tension_that_is_no_number_is_none_and_too_much(drive):
     assert _codes(*[_with("tensions", drive, NAN)] * 5) == [
-        ("cable_loose", Reaction.QUICK_STOP),
-        ("over_tension", Reaction.PATH_STOP),
+        ("cable_loose", StopReaction.QUICK_STOP),
+        ("over_tension", StopReaction.PATH_STOP),
     ]
 
 
@@ -203,12 +205,12 @@ def test_a_silent_drive_neither_resets_nor_adds_to_its_count_of_slack():
     silent_fine = replace(FINE, missing=(False, True, False))
     assert [c for c, _ in _codes(*[low] * 4, silent_low)] == ["reply_lost"]
     assert [c for c, _ in _codes(*[low] * 4, silent_fine)] == ["reply_lost"]
-    assert _codes(*[low] * 4, silent_fine, low) == [("slack", Reaction.PATH_STOP)]
+    assert _codes(*[low] * 4, silent_fine, low) == [("slack", StopReaction.PATH_STOP)]
     high = _with("tensions", 1, 200.0)
-    assert _codes(*[high] * 4, silent_fine, high) == [("over_tension", Reaction.PATH_STOP)]
+    assert _codes(*[high] * 4, silent_fine, high) == [("over_tension", StopReaction.PATH_STOP)]
     none = _with("tensions", 1, 0.0)
     assert [c for c, _ in _codes(*[none] * 2, silent_fine)] == ["reply_lost"]
-    assert _codes(*[none] * 2, silent_fine, none) == [("cable_loose", Reaction.QUICK_STOP)]
+    assert _codes(*[none] * 2, silent_fine, none) == [("cable_loose", StopReaction.QUICK_STOP)]
 
 
 @pytest.mark.parametrize("field", ["following_errors", "tensions"])
@@ -217,7 +219,7 @@ def test_drives_that_do_not_follow_are_not_judged_by_errors_and_tensions(field):
     assert _look(*[seen] * 9) == ()
     assert [c for c, _ in _codes(*[seen] * 9, replace(seen, faults=((0, "x"),)))] == ["drive_fault"]
     lost = replace(seen, missing=(True, False, False))
-    assert _codes(lost, lost) == [("drive_silent", Reaction.QUICK_STOP)]
+    assert _codes(lost, lost) == [("drive_silent", StopReaction.QUICK_STOP)]
 
 
 def test_slack_before_the_drives_follow_does_not_count():
@@ -231,21 +233,19 @@ def test_slack_before_the_drives_follow_does_not_count():
     [
         (0.0, None),
         (0.999, None),
-        (1.0, Reaction.NOTE),
-        (1.999, Reaction.NOTE),
-        (2.0, Reaction.PATH_STOP),
-        (2.999, Reaction.PATH_STOP),
-        (3.0, Reaction.QUICK_STOP),
-        (1e9, Reaction.QUICK_STOP),
-        (NAN, Reaction.QUICK_STOP),
+        (1.0, StopReaction.PATH_STOP),
+        (1.499, StopReaction.PATH_STOP),
+        (1.5, StopReaction.QUICK_STOP),
+        (1e9, StopReaction.QUICK_STOP),
+        (NAN, StopReaction.QUICK_STOP),
     ],
 )
-def test_a_late_cycle_is_noted_and_a_very_late_one_stops(lateness, reaction):
+def test_a_late_cycle_stops_along_the_path_and_a_very_late_one_at_once(lateness, reaction):
     found = _look(replace(FINE, lateness=lateness))
     if reaction is None:
         assert found == ()
         return
-    assert found == (Finding(reaction, "late", f"a cycle began {lateness:.1f} cycles late", 0),)
+    assert found == (Alarm(reaction, "late", f"a cycle began {lateness:.1f} cycles late", 0),)
     assert found[0].drive == 0, "all of them"
 
 
@@ -278,7 +278,7 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
     """A row that is too short would hide the last drive."""
     values = (getattr(FINE, field) * 2)[:count]
     with pytest.raises(ValueError, match="entries for 3 drives"):
-        Watch.fresh(LIMITS, NAMES).look(replace(FINE, **{field: values}))
+        Monitor.fresh(LIMITS, NAMES).look(replace(FINE, **{field: values}))
 
 
 @given(
@@ -289,7 +289,7 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
 )
 def test_counts_are_runs_of_what_was_seen(cycles):
     """Against counting by hand, for one drive."""
-    watch = Watch.fresh(LIMITS, NAMES[:1])
+    watch = Monitor.fresh(LIMITS, NAMES[:1])
     missing = slack = loose = over = 0
     for following, tension, lost in cycles:
         seen = Observation(following, (0.0,), (tension,), (lost,), (), 0.0)
@@ -312,6 +312,15 @@ def test_counts_are_runs_of_what_was_seen(cycles):
 
 
 def test_looking_leaves_the_watch_before_unchanged():
-    watch = Watch.fresh(LIMITS, NAMES)
+    watch = Monitor.fresh(LIMITS, NAMES)
     watch.look(_with("missing", 0, True))
-    assert watch == Watch.fresh(LIMITS, NAMES)
+    assert watch == Monitor.fresh(LIMITS, NAMES)
+
+
+def test_a_warning_changes_nothing_and_another_emergency_stops_the_path() -> None:
+    seen = replace(FINE, warnings=[(1, "mild", False), (3, "hot", True)])
+    _, findings = Monitor.fresh(LIMITS, ("one", "two", "three")).look(seen)
+    assert findings == (
+        Alarm(StopReaction.NOTE, "drive_warning", "mild", 1),
+        Alarm(StopReaction.PATH_STOP, "drive_warning", "hot", 3),
+    )

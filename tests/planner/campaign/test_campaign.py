@@ -16,19 +16,17 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from planner.campaign.boxes import OWN, SHARES, WIDE, box_text, with_box
+from planner.campaign.cases import OWN, SHARES, WIDE, box_text, with_box
 from planner.campaign.claims import Finding, findings
 from planner.campaign.figures import save_figures
 from planner.campaign.page import page
-from planner.campaign.results import Results
-from planner.campaign.running import run_all
-from planner.campaign.statistics import Change, change_of_means, summary
-from planner.campaign.studies import FIGURE_9, all_readings, batches, figure_9_arm
+from planner.campaign.results import Change, Results, change_of_means, summary
+from planner.campaign.studies import FIGURE_9, all_readings, batches, figure_9_arm, run_all
 from planner.campaign.tables import findings_json, summary_csv, trials_csv
 from planner.campaign.trial import Batch, Case, PathFigures, Trial, run_batch
 from planner.check import check_path
-from planner.cost import KinematicCost
-from planner.paper.search import PaperPlanner
+from planner.costs import KinematicCost
+from planner.rrt.search import PaperPlanner
 from planner.settings import CLEARANCE_RESERVE, PlannerSettings
 
 ENVIRONMENTS = ("environment_1", "environment_2", "environment_3")
@@ -142,7 +140,7 @@ def test_a_trial_reports_what_its_search_and_the_independent_routes_find(
 def test_random_ends_are_as_far_apart_as_the_scenes_and_do_not_see_each_other(
     gachon, ready_scene
 ) -> None:
-    from planner.campaign.ends import random_ends
+    from planner.campaign.cases import random_ends
 
     scene = ready_scene("environment_2")
     planner = PaperPlanner(gachon, scene, PlannerSettings(cost="length"), CLEARANCE_RESERVE)
@@ -269,7 +267,7 @@ import sys
 from dataclasses import replace
 from pickle import load
 from distributed import Client, LocalCluster
-from planner.campaign.running import run_all
+from planner.campaign.studies import run_all
 
 if __name__ == "__main__":
     batches = load(sys.stdin.buffer)

@@ -8,12 +8,12 @@ import coal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpr.cables import cables_at
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, rig_from_document
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from cdpr.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
+from model.files.scene_file import SceneDocument
+from model.geometry.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
+from model.kinematics import cables_at
+from model.pose import Array, Pose
+from model.rig import Rig, rig_from_document
+from model.scene import Scene, scene_from_document
 
 KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull", "convex mesh", "mesh")
 
@@ -63,8 +63,8 @@ def _shape(rng: np.random.Generator, kind: str, scale: float) -> dict[str, objec
 
 def changed_rig(rig: Rig, **changes: object) -> Rig:
     """A rig with some top-level keys of its file replaced."""
-    document = rig.document.model_copy(update=changes)
-    return rig_from_document(type(document).model_validate(document.model_dump()))
+    document = rig.document.model_dump(mode="json") | changes
+    return rig_from_document(type(rig.document).model_validate(document))
 
 
 class CoalScene:

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.poses import Array, Pose
-from cdpr.rig import load_rig
-from planner.exact.edge import edge_free, edges_free
-from planner.exact.fields import World
-from planner.exact.world import build_world
+from model.pose import Array, Pose
+from model.rig import load_rig
+from planner.collision.edges import edge_free, edges_free
+from planner.collision.world import build_world
+from planner.kernels.scene_arrays import World
 from tests.planner.exact.sampled_oracle import CoalScene, random_scene
 
 GACHON = load_rig(Path(__file__).parents[3] / "configs" / "gachon_8_6.yaml")

@@ -9,16 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.poses import Array
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene
-from planner.exact.capacity import build_load, margins, orthogonal_vector
-from planner.exact.fields import World
-from planner.exact.holding import build_holding, edge_held, edges_held
-from planner.exact.structure import factored
-from planner.exact.tension_proof import tensions_prove
-from planner.exact.world import build_world
-from planner.feasibility import capacity_margins
+from model.pose import Array
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene
+from planner.collision.world import build_world
+from planner.costs import capacity_margins
+from planner.kernels.scene_arrays import World
+from planner.wrench.capacity import build_load, factored, margins, orthogonal_vector
+from planner.wrench.feasibility_proof import tensions_prove
+from planner.wrench.translation import build_holding, edge_held, edges_held
 from tests.planner.exact.sampled_oracle import changed_rig
 
 CONFIGS = Path(__file__).parents[3] / "configs"

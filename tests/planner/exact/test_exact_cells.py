@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.poses import Array
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
-from planner.exact.cells import CELLS, open_along
-from planner.exact.self_edge import build_robot, self_edges_free
-from planner.exact.world import build_world
+from model.pose import Array
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.collision.self_collision import build_robot, self_edges_free
+from planner.collision.self_collision_regions import CELLS, open_along
+from planner.collision.world import build_world
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")

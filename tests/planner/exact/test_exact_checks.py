@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
-from planner.exact.checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.edge_checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
 
 ROOT = Path(__file__).parents[3]
 GACHON = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
@@ -54,9 +54,11 @@ def test_turning_edges_tell_their_reason_too() -> None:
 
 def test_importing_the_checks_compiles_nothing() -> None:
     script = (
-        "import sys; import planner.exact; assert 'numba' not in sys.modules\n"
-        "from planner.exact import checks, edge, self_edge, holding, moving_edge\n"
-        "kernels = [v for m in (checks, edge, self_edge, holding, moving_edge)"
+        "import sys; import planner.collision; assert 'numba' not in sys.modules\n"
+        "from planner import edge_checks\n"
+        "from planner.collision import edges, rotating_edges, self_collision\n"
+        "from planner.wrench import translation\n"
+        "kernels = [v for m in (edge_checks, edges, self_collision, translation, rotating_edges)"
         " for v in vars(m).values() if hasattr(v, 'signatures')]\n"
         "assert len(kernels) > 20\n"
         "assert not any(k.signatures for k in kernels)"

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpr.poses import Array
-from cdpr.rig import load_rig
-from cdpr.scene import load_scene
-from planner.exact.edge import edge_clearance
-from planner.exact.pieces import pieces_of
-from planner.exact.segment_box import segment_box_definition
-from planner.exact.shadow_cores import cable_core, core_of
-from planner.exact.world import build_world
+from model.pose import Array
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.collision.edges import edge_clearance
+from planner.collision.separating_planes import cable_core, core_of
+from planner.collision.world import build_world
+from planner.kernels.primitives import segment_box_definition
+from planner.kernels.scene_arrays import pieces_of
 from tests.planner.exact.sampled_oracle import KINDS, random_scene
 
 CONFIGS = Path(__file__).parents[3] / "configs"

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpr.cables import cables_at
-from cdpr.errors import BadInput
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import load_scene
-from planner.exact.edge import edge_clearance, edge_free, edges_free, points_free
-from planner.exact.world import build_world
+from model.errors import BadInput
+from model.kinematics import cables_at
+from model.pose import Array, Pose
+from model.rig import Rig, load_rig
+from model.scene import load_scene
+from planner.collision.edges import edge_clearance, edge_free, edges_free, points_free
+from planner.collision.world import build_world
 from tests.planner.exact.sampled_oracle import KINDS, CoalScene, changed_rig, random_scene
 
 CONFIGS = Path(__file__).parents[3] / "configs"

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cdpr.cables import cables_to
-from cdpr.poses import Pose
-from cdpr.rig import Rig, load_rig
-from planner.exact.edge import edge_clearance, edge_free
-from planner.exact.exits import exit_point, exit_travel
-from planner.exact.moving_edge import turned_by, turning_edge_free
-from planner.exact.world import build_world
+from model.kinematics import cables_to
+from model.pose import Pose
+from model.rig import Rig, load_rig
+from planner.collision.edges import edge_clearance, edge_free
+from planner.collision.rotating_edges import turned_by, turning_edge_free
+from planner.collision.world import build_world
+from planner.kernels.exit_points import exit_point, exit_travel
 from tests.planner.exact.sampled_oracle import KINDS, CoalScene, random_scene
 
 CONFIGS = Path(__file__).parents[3] / "configs"

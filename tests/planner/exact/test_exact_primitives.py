@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from planner.exact.hulls import hulls_apart, hulls_definition, hulls_distance
-from planner.exact.segment_box import segment_box_definition, segment_box_squared
-from planner.exact.triangle_box import (
+from planner.kernels.gjk import hulls_apart, hulls_definition, hulls_distance
+from planner.kernels.primitives import (
+    segment_box_definition,
+    segment_box_squared,
     triangle_box_apart,
     triangle_box_definition,
     triangle_box_squared,
-)
-from planner.exact.triangle_point import triangle_point_definition, triangle_point_squared
-from planner.exact.triangle_segment import (
+    triangle_point_definition,
+    triangle_point_squared,
     triangle_segment_definition,
     triangle_segment_squared,
 )

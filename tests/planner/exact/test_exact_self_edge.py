@@ -10,20 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cdpr.cables import cables_to
-from cdpr.errors import BadInput
-from cdpr.poses import Array
-from cdpr.rig import Rig, load_rig
-from cdpr.segments import segment_pair_distance
-from cdpr.self_clearance import SelfModel
-from planner.exact.segment_pair import segment_pair_squared
-from planner.exact.self_edge import (
+from model.clearance import SelfModel
+from model.errors import BadInput
+from model.geometry.segments import segment_pair_distance
+from model.kinematics import cables_to
+from model.pose import Array
+from model.rig import Rig, load_rig
+from planner.collision.self_collision import (
     build_robot,
     self_edge_free,
     self_edges_free,
     self_turning_edge_free,
 )
-from planner.exact.world import build_world
+from planner.collision.world import build_world
+from planner.kernels.primitives import segment_pair_squared
 from tests.planner.exact.sampled_oracle import changed_rig, random_scene
 
 CONFIGS = Path(__file__).parents[3] / "configs"

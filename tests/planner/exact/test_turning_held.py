@@ -10,18 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cdpr.kinematics import structure_matrix
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene, scene_from_document
-from cdpr.statics.dexterity import rms_anchor_radius
-from cdpr.statics.feasibility import WrenchBox, capacity_margin
-from cdpr.statics.working import weight_wrench
-from planner.exact.capacity import Load, build_load, load_at, margin_at
-from planner.exact.fields import World
-from planner.exact.holding import build_holding, edge_held
-from planner.exact.turning_held import column_motion, turning_edge_held
-from planner.exact.world import build_world
+from model.kinematics import structure_matrix
+from model.pose import Array, Pose
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene, scene_from_document
+from model.statics.dexterity import rms_anchor_radius
+from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.gravity import weight_wrench
+from planner.collision.world import build_world
+from planner.kernels.scene_arrays import World
+from planner.wrench.capacity import LoadArrays, build_load, load_at, margin_at
+from planner.wrench.rotation import column_motion, turning_edge_held
+from planner.wrench.translation import build_holding, edge_held
 from tests.planner.exact.sampled_oracle import changed_rig
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -48,7 +48,7 @@ def loaded(rig: Rig, scene: Scene) -> tuple[Rig, Scene]:
     return changed_rig(rig, platform=platform), scene_from_document(document)
 
 
-def made(rig: Rig, scene: Scene) -> tuple[World, Load]:
+def made(rig: Rig, scene: Scene) -> tuple[World, LoadArrays]:
     return build_world(rig, scene, np.eye(3), 0.01), build_load(rig, scene, np.eye(3))
 
 

@@ -6,25 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from cdpr.errors import BadInput
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig
-from cdpr.scene import Scene
-from planner.cost import KinematicCost
+from model.errors import BadInput
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.scene import Scene
+from planner.anytime.local_search import Polyline
+from planner.anytime.prepare import problem_of
+from planner.anytime.problem import PathProblem
+from planner.anytime.rounds import advance
+from planner.anytime.state import BEST, AnytimeSearch, new_search
+from planner.costs import KinematicCost
 from planner.endpoints import require_usable_ends
-from planner.optimal.polyline import Polyline
-from planner.optimal.preparation import problem_of
-from planner.optimal.problem import Problem
-from planner.optimal.rounds import advance
-from planner.optimal.search import BEST, Search, new_search
-from planner.weights import Weights
+from planner.settings import Weights
 from tests.planner.exact.sampled_oracle import random_scene
 
 KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull")
 LENGTH = Weights(length=1.0)
 
 
-def problem(rig: Rig, scene: Scene, weights: Weights = LENGTH) -> Problem:
+def problem(rig: Rig, scene: Scene, weights: Weights = LENGTH) -> PathProblem:
     """A problem with the cost of the scene's orientation."""
     return problem_of(rig, scene, weights, KinematicCost(rig, scene.start.rotation))
 
@@ -34,14 +34,14 @@ def ends_of(scene: Scene) -> Array:
     return np.array([scene.start.position, scene.goal.position])
 
 
-def searched(asked: Problem, scene: Scene, rounds: int, seed: int = 0) -> Search:
+def searched(asked: PathProblem, scene: Scene, rounds: int, seed: int = 0) -> AnytimeSearch:
     """A search after so many rounds."""
     search = new_search(*ends_of(scene), seed)
     advance(asked, search, rounds)
     return search
 
 
-def best_points(search: Search) -> Array:
+def best_points(search: AnytimeSearch) -> Array:
     """The best path, shape (k, 3), [m]; k is 0 without one."""
     return search.points[BEST, : search.counts[BEST, 0]].copy()
 

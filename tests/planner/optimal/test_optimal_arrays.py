@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from planner.lattice import Lattice, corners_and_weights
-from planner.optimal.grid import interpolated
-from planner.optimal.heap import pop, push
-from planner.optimal.random import below, direction, seeded, uniform
+from planner.anytime.lattice_path import pop, push
+from planner.anytime.problem import interpolated
+from planner.anytime.random import below, direction, seeded, uniform
+from planner.space import Lattice, corners_and_weights
 
 KEYS = st.lists(st.one_of(st.none(), st.integers(-20, 20)), max_size=80)
 

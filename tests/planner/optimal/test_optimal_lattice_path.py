@@ -9,11 +9,10 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from planner.optimal.grid import interpolated
-from planner.optimal.lattice_path import lattice_path
-from planner.optimal.problem import edge_allowed
-from planner.optimal.random import seeded
-from planner.weights import OBJECTIVES
+from planner.anytime.lattice_path import lattice_path
+from planner.anytime.problem import edge_allowed, interpolated
+from planner.anytime.random import seeded
+from planner.settings import OBJECTIVES
 from tests.planner.optimal.scenes_of_the_search import ends_of, problem
 
 STRIDE = 4

@@ -8,14 +8,11 @@ from itertools import count, pairwise
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput
-from cdpr.plan import load_plan, plan_from_document, save_plan
-from planner.anytime import LEAST_ROUNDS
+from model.errors import BadInput
+from model.plan import load_plan, plan_from_document, save_plan
 from planner.check import verify
-from planner.optimal.settings import OptimalSettings
-from planner.plan import make_plan
-from planner.settings import CLEARANCE_RESERVE
-from planner.weights import OBJECTIVES, Weights
+from planner.planning import make_plan
+from planner.settings import CLEARANCE_RESERVE, LEAST_ROUNDS, OBJECTIVES, OptimalSettings, Weights
 
 SHORTEST = {1: 628.5, 2: 661.0, 3: 813.5}
 """Source: polished shortest lengths at 10 mm, [mm]."""
@@ -100,6 +97,12 @@ def test_pulleys_payload_and_disturbances_are_planned_and_checked(hall, ready_sc
     assert len(document.waypoints) > 2
 
 
+def test_a_platform_whose_cables_end_off_its_box_is_planned(open_frame, ready_scene) -> None:
+    document = planned(open_frame, ready_scene("environment_1"), rounds=12)
+    assert document.quality.length_mm < 640.0
+    assert document.quality.self_clearance.distance_mm >= 5.0
+
+
 def test_twenty_millimetres_are_kept_where_they_are_asked_for(gachon, ready_scene) -> None:
     scene = ready_scene("environment_3").changed(clearance=0.020)
     near = planned(gachon, scene, rounds=30).quality.obstacle_clearance.distance_mm
@@ -153,6 +156,15 @@ def test_a_limited_plan_is_found_again_by_its_rounds(gachon, ready_scene) -> Non
     by_time = make_plan(gachon, scene, settings, clock=lambda: 0.01 * next(ticks))
     again = planned(gachon, scene, "kinematic", by_time.planner.rounds[0], longest=0.72)
     assert again.waypoints == by_time.waypoints
+
+
+def test_a_longest_path_below_the_straight_way_is_refused_before_the_search(
+    gachon, ready_scene
+) -> None:
+    settings = OptimalSettings(longest=0.5, budget=3600.0)
+    with pytest.raises(BadInput, match=r"500\.0 mm .* straight way is 518\.8 mm") as refusal:
+        make_plan(gachon, ready_scene("environment_1"), settings)
+    assert "--longest-mm" in str(refusal.value)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner.cost import KinematicCost
-from planner.optimal.polish import polish
-from planner.optimal.polyline import Change, cost_of, measure, replace
-from planner.optimal.problem import CAPACITY, CLEARANCE, VERTEX, edge_allowed, edge_cost
-from planner.optimal.random import seeded
-from planner.weights import OBJECTIVES, Weights
+from planner.anytime.local_search import PathChange, cost_of, measure, polish, replace
+from planner.anytime.problem import CAPACITY, CLEARANCE, VERTEX, edge_allowed, edge_cost
+from planner.anytime.random import seeded
+from planner.costs import KinematicCost
+from planner.settings import OBJECTIVES, Weights
 from tests.planner.optimal.scenes_of_the_search import ends_of, polyline, problem, searched
 
 MIXED = Weights(length=1.0, kinematic=0.5, clearance=0.5, capacity=1e-3)
@@ -92,7 +91,7 @@ def test_a_change_is_made_when_it_saves_and_is_allowed_and_never_else(
     new = new + rng.normal(scale=rng.choice([0.0, 0.01, 0.1]), size=(number, 3))
     wanted = np.concatenate([points[: first + 1], new, points[last:]])
     one, two = [tuple(p) for p in [*new, *np.zeros((2, 3))][:2]]
-    done = replace(question, line, Change(first, last, number, one, two, False))
+    done = replace(question, line, PathChange(first, last, number, one, two, False))
     parts = np.concatenate([points[first : first + 1], new, points[last : last + 1]])
     allowed = all(edge_allowed(question, tuple(a), tuple(b)) for a, b in itertools.pairwise(parts))
     saved = before - np.linalg.norm(np.diff(wanted, axis=0), axis=1).sum()
@@ -107,5 +106,5 @@ def test_a_full_path_takes_no_more_vertices(asked) -> None:
     line = polyline(points)._replace(points=points.copy())
     measure(asked["length"], line)
     detour = tuple(points[0]), tuple(points[1])
-    assert not replace(asked["length"], line, Change(0, 1, 2, *detour, False))
+    assert not replace(asked["length"], line, PathChange(0, 1, 2, *detour, False))
     assert np.array_equal(line.points, points)

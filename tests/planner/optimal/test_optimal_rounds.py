@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.poses import Pose
-from cdpr.scene import scene_from_document
+from model.pose import Pose
+from model.scene import scene_from_document
+from planner.anytime.problem import ASK_PROOF, LEAST_MARGIN, NO_MARGIN
+from planner.anytime.rounds import advance
+from planner.anytime.state import BEST, KEPT, new_search
 from planner.check import check_path
-from planner.exact.checks import FREE, ExactChecks
-from planner.feasibility import capacity_margins
-from planner.optimal.problem import ASK_PROOF, LEAST_MARGIN, NO_MARGIN
-from planner.optimal.rounds import advance
-from planner.optimal.search import BEST, KEPT, new_search
-from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
-from planner.weights import OBJECTIVES
+from planner.costs import capacity_margins
+from planner.edge_checks import FREE, ExactChecks
+from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE, OBJECTIVES
 from tests.planner.exact.sampled_oracle import CoalScene
 from tests.planner.optimal.scenes_of_the_search import (
     best_points,
@@ -66,8 +65,8 @@ def test_rounds_one_by_one_are_the_same_as_all_at_once(asked) -> None:
 def test_another_process_finds_the_same_path(asked) -> None:
     code = (
         "from pathlib import Path;"
-        "from cdpr.rig import load_rig;"
-        "from cdpr.scene import load_scene;"
+        "from model.rig import load_rig;"
+        "from model.scene import load_scene;"
         "from tests.planner.optimal.scenes_of_the_search import best_points, problem, searched;"
         "rig = load_rig(Path('configs/gachon_8_6.yaml'));"
         "scene = load_scene(Path('configs/environment_3.yaml'));"

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdpr.errors import NoSolution
-from planner.optimal.separation import FINENESSES, flood_reaches, is_separated
-from planner.optimal.settings import OptimalSettings
-from planner.plan import make_plan
-from planner.weights import OBJECTIVES
+from model.errors import NoSolution
+from planner.anytime.infeasibility import FINENESSES, flood_reaches, is_separated
+from planner.planning import make_plan
+from planner.settings import OBJECTIVES, OptimalSettings
 from tests.planner.optimal.scenes_of_the_search import (
     best_points,
     ends_of,
@@ -91,7 +90,7 @@ def test_a_search_that_ends_too_early_says_that_nothing_is_proved(
     gachon, scene_with, monkeypatch
 ) -> None:
     """Every edge is refused, by a least margin that nothing has, but no obstacle separates."""
-    from planner.optimal import routing
+    from planner.anytime import path as routing
 
     def hopeless(*args):
         asked = problem(*args[:2])

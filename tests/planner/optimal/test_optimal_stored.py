@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
-from planner.optimal import stored
+from planner import array_cache as stored
 
 KEY = ["rig", {"mass": 0.4}]
 
@@ -24,7 +26,7 @@ def made():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored, "cache_folder", lambda _: tmp_path)
+    monkeypatch.setattr(stored, "cache_folder", lambda *_: tmp_path)
     return tmp_path
 
 
@@ -38,6 +40,19 @@ def test_an_array_is_computed_once_for_a_key(folder, made) -> None:
     take(made, key=["another rig"])
     assert made.times == 2
     assert len(list(folder.glob("margins-*.npy"))) == 2
+
+
+def test_only_so_many_arrays_are_kept_and_the_oldest_go(folder, made, monkeypatch) -> None:
+    monkeypatch.setattr(stored, "_MOST_FILES", 3)
+    for number in range(6):
+        take(made, key=[number])
+        for file in folder.glob("*.npy"):  # the clock of files is too coarse to tell them apart
+            os.utime(file, (0, file.stat().st_mtime - 1))
+    assert len(list(folder.glob("margins-*.npy"))) == 3
+    take(made, key=[5])
+    assert made.times == 6
+    take(made, key=[0])
+    assert made.times == 7
 
 
 @pytest.mark.parametrize("damage", ["cut off", "empty", "text", "pickled", "other shape"])
@@ -70,7 +85,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(folder, made, monkeypatc
 
 
 def test_without_a_folder_every_run_computes(made, monkeypatch) -> None:
-    monkeypatch.setattr(stored, "cache_folder", lambda _: None)
+    monkeypatch.setattr(stored, "cache_folder", lambda *_: None)
     take(made)
     take(made)
     assert made.times == 2

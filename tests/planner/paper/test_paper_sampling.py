@@ -7,16 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planner.paper.readings import FAILURE_RATES, FOCUSES
-from planner.paper.sampling import (
+from planner.rrt.sampling import (
     backward,
     direction_by_angles,
     direction_in_volume,
+    failure_rate,
+    focus_node,
     forward,
     goal_bias,
+    new_tallies,
+    tell,
 )
-from planner.paper.tallies import failure_rate, focus_node, new_tallies, tell
-from planner.paper.tree import add, new_tree
+from planner.rrt.tree import add, new_tree
+from planner.rrt.variants import FAILURE_RATES, FOCUSES
 
 START, GOAL = np.array([0.18, 0.18, 0.30]), np.array([-0.18, -0.18, 0.40])
 LOWER, UPPER = np.array([-0.25, -0.25, 0.15]), np.array([0.25, 0.25, 0.65])

@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput
-from planner.cost import KinematicCost
-from planner.paper.cost_field import edge_cost, kinematic_field, length_field
-from planner.paper.readings import Readings
-from planner.paper.search import PaperPlanner
+from model.errors import BadInput
+from planner.costs import KinematicCost
+from planner.rrt.cost_field import edge_cost, kinematic_field, length_field
+from planner.rrt.search import PaperPlanner
+from planner.rrt.variants import AlgorithmVariant
 from planner.settings import CLEARANCE_RESERVE, PlannerSettings
 
 PAPER = PlannerSettings(mode="paper", cost="length")
@@ -72,7 +72,7 @@ def test_full_steps_put_every_node_one_step_from_the_one_it_grew_from(searched) 
 
 
 def test_steps_to_the_sample_are_no_longer_than_a_step(searched) -> None:
-    _, result = searched(3, replace(PAPER, readings=Readings(steer="to-sample")))
+    _, result = searched(3, replace(PAPER, readings=AlgorithmVariant(steer="to-sample")))
     nodes = result.points[:-1]
     nearest = [np.linalg.norm(nodes[:k] - nodes[k], axis=1).min() for k in range(1, len(nodes))]
     assert max(nearest) <= STEP + 1e-12
@@ -81,18 +81,20 @@ def test_steps_to_the_sample_are_no_longer_than_a_step(searched) -> None:
 
 @pytest.mark.parametrize("sampler", ["adaptive", "goal-bias"])
 def test_with_a_spacing_no_two_nodes_are_nearer(searched, sampler) -> None:
-    readings = Readings(steer="to-sample", spacing=0.030)
+    readings = AlgorithmVariant(steer="to-sample", spacing=0.030)
     _, result = searched(3, replace(PAPER, sampler=sampler, readings=readings))
     nodes = result.points[:-1]  # the exact goal may be nearer to its parent
     apart = np.linalg.norm(nodes[:, None] - nodes, axis=-1)[np.triu_indices(len(nodes), 1)]
     assert apart.min() >= 0.030
-    _, free = searched(3, replace(PAPER, sampler=sampler, readings=Readings(steer="to-sample")))
+    _, free = searched(
+        3, replace(PAPER, sampler=sampler, readings=AlgorithmVariant(steer="to-sample"))
+    )
     close = np.linalg.norm(free.points[:, None] - free.points, axis=-1)
     assert close[np.triu_indices(len(close), 1)].min() < 0.030
 
 
 def test_goal_sight_joins_the_goal_from_the_first_node_that_sees_it(searched) -> None:
-    planner, result = searched(2, replace(PAPER, readings=Readings(goal_sight=True)))
+    planner, result = searched(2, replace(PAPER, readings=AlgorithmVariant(goal_sight=True)))
     goal = result.path[-1]
     seeing = [planner.edge(node, goal) for node in result.points[:-1]]
     assert seeing == [False] * (len(seeing) - 1) + [True]
@@ -203,4 +205,4 @@ def test_compiled_costs_are_those_of_the_plain_definition(cost) -> None:
 )
 def test_readings_that_do_not_exist_are_refused(wrong) -> None:
     with pytest.raises(BadInput):
-        Readings(**wrong)
+        AlgorithmVariant(**wrong)

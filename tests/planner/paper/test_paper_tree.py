@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planner.paper.tree import ROOT, Tree, add, move, nearest, new_tree, way_to, within
+from planner.rrt.tree import ROOT, Tree, add, move, nearest, new_tree, way_to, within
 
 
 def edge(tree: Tree, a: int, b: int) -> float:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpr.poses import Array, Pose, interpolate
-from cdpr.rig import Rig
-from cdpr.scene import Scene, scene_from_document
-from cdpr.scene_file import RotationLimitsDocument
-from planner.turning.moves import put_between
-from planner.turning.problem import Problem, move_allowed
+from model.files.scene_file import RotationLimitsDocument
+from model.pose import Array, Pose, interpolate
+from model.rig import Rig
+from model.scene import Scene, scene_from_document
+from planner.anytime_6d.moves import put_between
+from planner.anytime_6d.problem import RotatingProblem, move_allowed
 from tests.planner.exact.sampled_oracle import random_scene
 from tests.planner.turning.turning_scenes import GACHON, HALL, Judge, problem_of, random_pose, row
 
@@ -30,7 +30,7 @@ def with_limits(scene: Scene) -> Scene:
     return scene_from_document(scene.document.model_copy(update=update))
 
 
-def grazing(problem: Problem, start: Array, end: Array, tallies: Array) -> Array:
+def grazing(problem: RotatingProblem, start: Array, end: Array, tallies: Array) -> Array:
     """The start of a refused move, as far as it is allowed."""
     low, high, reached = 0.0, 1.0, start.copy()
     for _ in range(25):

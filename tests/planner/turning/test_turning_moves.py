@@ -8,12 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cdpr.poses import Pose, interpolate
-from cdpr.rig import Rig
-from cdpr.rotation_limits import RotationLimits, largest_rotations
-from planner.turning.limits import rotations_kept
-from planner.turning.moves import matrix_of, move_length, put_between, turn_between
-from planner.turning.problem import ROTATION, move_allowed
+from model.pose import Pose, interpolate
+from model.rig import Rig
+from model.rotation_limits import RotationLimits, largest_rotations
+from planner.anytime_6d.moves import (
+    matrix_of,
+    move_length,
+    put_between,
+    rotations_kept,
+    turn_between,
+)
+from planner.anytime_6d.problem import ROTATION, move_allowed
 from tests.planner.turning.turning_scenes import (
     GACHON,
     HALL,

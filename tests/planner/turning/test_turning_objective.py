@@ -7,22 +7,27 @@ import itertools
 import numpy as np
 import pytest
 
-from cdpr.clearance import ClearanceModel
-from cdpr.errors import BadInput, NoSolution
-from cdpr.plan import plan_from_document
-from cdpr.plan_file import PlanDocument
-from cdpr.poses import Array, Pose, interpolate
-from cdpr.rig import Rig
-from cdpr.scene import load_scene
+from model.clearance import ClearanceModel
+from model.errors import BadInput, NoSolution
+from model.files.plan_file import PlanDocument
+from model.plan import plan_from_document
+from model.pose import Array, Pose, interpolate
+from model.rig import Rig
+from model.scene import load_scene
+from planner.anytime_6d.local_search import (
+    copied,
+    line_cost,
+    line_length,
+    measure,
+    new_line,
+    replace,
+)
+from planner.anytime_6d.moves import move_length, pose_clearance
+from planner.anytime_6d.problem import move_lows, move_sum, pose_cost
 from planner.check import verify
-from planner.cost import KinematicCost
-from planner.plan import make_plan
-from planner.turning.clearance import pose_clearance
-from planner.turning.line import copied, line_cost, line_length, measure, new_line, replace
-from planner.turning.moves import move_length
-from planner.turning.objective import move_lows, move_sum, pose_cost
-from planner.turning.settings import TurningSettings
-from planner.weights import OBJECTIVES, Weights
+from planner.costs import KinematicCost
+from planner.planning import make_plan
+from planner.settings import OBJECTIVES, TurningSettings, Weights
 from tests.planner.turning.turning_scenes import (
     CONFIGS,
     GACHON,

@@ -9,27 +9,20 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from cdpr.cli.plan import sentences_of
-from cdpr.errors import BadInput, InvalidFile, NoSolution
-from cdpr.plan import load_plan, plan_from_document, save_plan
-from cdpr.plan_file import PlanDocument
-from cdpr.poses import Pose
-from cdpr.rig import Rig
-from cdpr.scene import Scene, load_scene
-from cdpr.statics.dexterity import rms_anchor_radius
+from cdpr.cli.plan_facts import sentences_of
+from model.errors import BadInput, InvalidFile, NoSolution
+from model.files.plan_file import PlanDocument
+from model.plan import load_plan, plan_from_document, save_plan
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Scene, load_scene
+from model.statics.dexterity import rms_anchor_radius
+from planner.anytime_6d.path import TurningRoute, turning_route
 from planner.check import check_path, verify
-from planner.cost import KinematicCost
-from planner.plan import make_plan
-from planner.turning.routing import TurningRoute, turning_route
-from planner.turning.settings import TurningSettings
-from tests.planner.turning.turning_scenes import (
-    CONFIGS,
-    GACHON,
-    HALL,
-    Judge,
-    quaternion,
-    turning,
-)
+from planner.costs import KinematicCost
+from planner.planning import make_plan
+from planner.settings import TurningSettings
+from tests.planner.turning.turning_scenes import CONFIGS, GACHON, HALL, Judge, quaternion, turning
 
 ROUNDS = TurningSettings(rounds=60)
 RAMP = load_scene(CONFIGS / "turn.yaml")
@@ -119,6 +112,11 @@ def test_a_stop_may_be_tilted_otherwise_than_start_and_goal() -> None:
     met = plan_from_document(document).waypoints[document.stops[0].waypoint]
     assert met.angle_to(scene.stops[0].pose) < 1e-6
     assert len(document.planner.rounds) == 2
+
+
+def test_a_platform_whose_cables_end_off_its_box_turns_on_its_way(open_frame) -> None:
+    document = proved(open_frame, RAMP, ROUNDS)
+    assert document.quality.self_clearance.distance_mm >= 5.0
 
 
 @pytest.mark.slow

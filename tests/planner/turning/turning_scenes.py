@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpr.clearance import ClearanceModel
-from cdpr.kinematics import structure_matrix
-from cdpr.poses import Array, Pose, interpolate
-from cdpr.rig import Rig, load_rig
-from cdpr.scene import Scene, load_scene, scene_from_document
-from cdpr.scene_file import SceneDocument
-from cdpr.statics.dexterity import rms_anchor_radius
-from cdpr.statics.feasibility import WrenchBox, capacity_margin
-from cdpr.statics.working import weight_wrench
-from planner.cost import KinematicCost
-from planner.turning.problem import Problem
-from planner.turning.routing import turning_problem
-from planner.weights import OBJECTIVES, Weights
+from model.clearance import ClearanceModel
+from model.files.scene_file import SceneDocument
+from model.kinematics import structure_matrix
+from model.pose import Array, Pose, interpolate
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene, scene_from_document
+from model.statics.dexterity import rms_anchor_radius
+from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.gravity import weight_wrench
+from planner.anytime_6d.path import turning_problem
+from planner.anytime_6d.problem import RotatingProblem
+from planner.costs import KinematicCost
+from planner.settings import OBJECTIVES, Weights
 from tests.planner.exact.sampled_oracle import CoalScene
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -37,7 +37,7 @@ def turning(name: str, tilt_deg: float, turn_deg: float, **parts: Any) -> Scene:
     )
 
 
-def problem_of(rig: Rig, scene: Scene, weights: Weights = OBJECTIVES["length"]) -> Problem:
+def problem_of(rig: Rig, scene: Scene, weights: Weights = OBJECTIVES["length"]) -> RotatingProblem:
     """What the search of a scene is given."""
     return turning_problem(rig, scene, weights, KinematicCost(rig, scene.start.rotation))
 

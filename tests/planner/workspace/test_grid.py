@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.errors import BadInput
+from model.errors import BadInput
 from planner.workspace.grid import frame_box, parsed_slice, slice_through, volume
 
 LOWER, UPPER = np.array([-0.25, -0.2, 0.15]), np.array([0.25, 0.2, 0.65])

@@ -8,17 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpr.clearance import ClearanceModel
-from cdpr.kinematics import structure_matrix
-from cdpr.poses import Pose, matrix_from_rotation_vector
-from cdpr.statics.closure import wrench_closure
-from planner.cost import KinematicCost
-from planner.feasibility import capacity_margins
-from planner.workspace import computing
-from planner.workspace.computing import compute
-from planner.workspace.costs import Extremes
+from model.clearance import ClearanceModel
+from model.kinematics import structure_matrix
+from model.pose import Pose, matrix_from_rotation_vector
+from model.statics.wrench_closure import wrench_closure
+from planner.costs import KinematicCost, capacity_margins
+from planner.workspace import compute as computing
+from planner.workspace.compute import compute
 from planner.workspace.grid import slice_through, volume
-from planner.workspace.maps import Question, values_at
+from planner.workspace.maps import Extremes, Question, values_at
 
 LEVEL = np.eye(3)
 

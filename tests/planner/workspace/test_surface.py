@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from planner.workspace.surface import enclosed_volume, zero_surface
+from planner.workspace.grid import enclosed_volume, zero_surface
 
 AXES = tuple(np.linspace(-1.0, 1.0, n) for n in (33, 41, 29))
 POINTS = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1)

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cdpr.cli.app import build_app
-from cdpr.errors import BadInput
+from model.errors import BadInput
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 RIG = str(CONFIGS / "gachon_8_6.yaml")
@@ -43,7 +43,7 @@ def test_a_slice_leaves_pictures_tables_and_a_page(folder):
 def test_the_page_shows_files_that_are_there_and_asks_nothing_of_the_network(folder):
     page = (folder / "index.html").read_text()
     named = re.findall(r'(?:src|href)="([^"]+)"', page)
-    assert len(named) == 8
+    assert len(named) == 12
     assert all((folder / name).is_file() for name in named)
     assert "://" not in page
 

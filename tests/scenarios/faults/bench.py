@@ -13,23 +13,28 @@ import os
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import can
 
-from cdpr.rig import Rig, rig_from_document
-from drivers.bus import BusSettings, open_bus
-from drivers.drive_group import make_drive_group
-from executor.machine import State
-from executor.prepare import PreparedRun
-from executor.recorder import Recorder
-from executor.run_folder import RunEvent, RunFolder
-from executor.status import RunStatus
-from executor.wishes import OwnBoard
-from simulation.drive import SimulatedDrive
+from drivers.can_bus import BusSettings, open_bus
+from drivers.factory import make_drive_group
+from executor.operator_requests import LocalRequests
+from executor.recording.recorder import Recorder
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.remote.status import RunStatus
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from model.files.rig_file import Cia402Document
+from model.rig import Rig, rig_from_document
+from simulation.drives.behaviour import STRICT, DriveBehaviour
+from simulation.drives.cia402 import SimulatedDrive
+from simulation.drives.eds_file import profile_path
 from simulation.fault_bus import FaultBus, lose
 from tests.scenarios.faults.masters import StartsMasters, gone
 from tests.scenarios.faults.samples import Limits, Stopped, WatchedRehearsal, stopped, violations
@@ -60,10 +65,12 @@ class Bench(ABC):
         fault_cycle: SYNCs from the beginning until the fault.
         lost: Drives that were broken on purpose, from 0.
         blur: What times are exact to, [s].
+        real_time: The executor's cycles may begin late by themselves.
         missed_start: See `samples.violations`.
     """
 
     blur = 1e-6
+    real_time = False
     prepared: PreparedRun
     rehearsal: WatchedRehearsal
     line: FaultBus
@@ -166,17 +173,38 @@ class SimulatedBench(Bench):
         return outcome.state
 
 
+def with_profile(prepared: PreparedRun, profile: Mapping[str, object], path: Path) -> PreparedRun:
+    """The same run of drives whose profile has other keys than ``cia402``; written to a file."""
+    if not profile:
+        return prepared
+    path.write_text(json.dumps({"name": "of a test", "sources": ["a test"], **profile}))
+    drives = Cia402Document(type="cia402", profile=str(path))
+    rig = rig_from_document(prepared.rig.document.model_copy(update={"drives": drives}))
+    return replace(prepared, rig=rig)
+
+
 @contextmanager
 def simulated(
-    prepared: PreparedRun, path: Path, script: Script, *, bitrate: float | None = None
+    prepared: PreparedRun,
+    path: Path,
+    script: Script,
+    *,
+    bitrate: float | None = None,
+    behaviour: DriveBehaviour = STRICT,
+    eds: Path | None = None,
+    profile: Mapping[str, object] = MappingProxyType({}),
 ) -> Iterator[SimulatedBench]:
     """A bench in simulated time; the script is asked at every cycle, from 0 after arming."""
+    prepared = with_profile(prepared, profile, path.with_suffix(".yaml"))
+    eds = eds or (profile_path("cia402") if profile else None)
     settings = BusSettings("virtual", f"fault-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
         now = 0.0
         with FaultBus(far, lambda: now, ahead=0.95 * prepared.checked.table.cycle) as line:
             scene = prepared.scene
-            rehearsal = WatchedRehearsal(prepared.rig, line, scene.start, scene.load)
+            rehearsal = WatchedRehearsal(
+                prepared.rig, line, scene.start, scene.load, behaviour=behaviour, eds=eds
+            )
             group = make_drive_group(prepared.rig, near, rehearsal.pump)
             group.configure()
             line.bitrate = bitrate
@@ -195,6 +223,7 @@ def simulated(
 class LiveBench(Bench):
     """The executor in a process of its own, the drives in a thread of this one; real time."""
 
+    real_time = True
     blur = 0.005  # the fault happens anywhere between two looks of a drive at its time-outs
 
     def __init__(
@@ -279,7 +308,14 @@ def _ahead_of_others() -> Iterator[None]:
 
 @contextmanager
 def live(
-    prepared: PreparedRun, path: Path, script: Script, settings: BusSettings, masters: StartsMasters
+    prepared: PreparedRun,
+    path: Path,
+    script: Script,
+    settings: BusSettings,
+    masters: StartsMasters,
+    *,
+    behaviour: DriveBehaviour = STRICT,
+    eds: Path | None = None,
 ) -> Iterator[LiveBench]:
     """A bench in real time; the script is asked at every SYNC."""
     document = prepared.rig.document.bus.model_copy(
@@ -287,7 +323,10 @@ def live(
     )
     rig: Rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": document}))
     with open_bus(settings) as bus, FaultBus(bus) as line:
-        rehearsal = WatchedRehearsal(rig, line, prepared.scene.start, prepared.scene.load)
+        scene = prepared.scene
+        rehearsal = WatchedRehearsal(
+            rig, line, scene.start, scene.load, behaviour=behaviour, eds=eds
+        )
         folder = RunFolder.create(path)
         bench = LiveBench(prepared, folder, settings, masters, line, rehearsal)
         rehearsal.on_cycle = lambda: _asked(script, bench)
@@ -312,7 +351,7 @@ def once(happens: Callable[[Any], object]) -> Script:
     return script
 
 
-def recorder_for(prepared: PreparedRun, folder: RunFolder, board: OwnBoard) -> Recorder:
+def recorder_for(prepared: PreparedRun, folder: RunFolder, board: LocalRequests) -> Recorder:
     """Writes events as they happen, and keeps the cycles."""
     return Recorder(
         prepared,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.cia402.frames import (
+from drivers.cia402.pdo import (
     HEARTBEAT_BASE,
     MASTER_NODE,
     RPDO1_BASE,
@@ -17,17 +17,14 @@ from drivers.cia402.frames import (
     make_set_point,
     parse_reply,
 )
-from drivers.cia402.states import ControlWord, DriveState
-from executor.machine import State
+from drivers.cia402.state_machine import ControlWord, DriveState
+from executor.safety.monitor import WatchLimits
+from executor.safety.stall import STUCK_CYCLES
+from executor.state_machine import State
+from simulation.drives.behaviour import STRICT, DriveBehaviour, behaviour_named
 from simulation.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
-from tests.scenarios.faults.bench import (
-    EVERY_ID,
-    Bench,
-    Script,
-    SimulatedBench,
-    a_message,
-    once,
-)
+from tests.scenarios.faults.bench import EVERY_ID, Bench, Script, SimulatedBench, a_message, once
+from tests.scenarios.faults.samples import emergencies, left_holding
 
 NODES = range(1, 9)
 REPLIES = frozenset(TPDO1_BASE + node for node in NODES)
@@ -43,6 +40,7 @@ class Fault:
         script: Makes what is done, new for every run.
         ends: How the run ends; None when its process is dead.
         within: Cycles from the fault until no drive follows set-points; None where it goes on.
+        late: Cycles more in real time, where the stop waits for a cycle that may begin late.
         words: In the cause that is told.
         spread: Cycles from the first drive that stops to the last one.
         mixed: Cycles in which some drives may be enabled and others not.
@@ -50,17 +48,26 @@ class Fault:
             drive, which stays where it was for so many cycles.
         live: It can also be done to an executor in another process, in real time.
         bitrate: Frames take their time on the wire, [bit/s].
+        behaviour: What the drives do, as for ``cdpr sim --drive-behaviour``.
+        profile: Keys of their drive profile that are not as in ``cia402``.
     """
 
     script: Callable[[], Script]
     ends: State | None = State.LATCHED
     within: float | None = 4.0
+    late: float = 0.0
     words: tuple[str, ...] = ()
     spread: float = 1.0
     mixed: float = 4.0
     rows: float = 1.0
     live: bool = True
     bitrate: float | None = None
+    behaviour: tuple[str, ...] = ()
+    profile: Mapping[str, object] = field(default_factory=dict)
+
+    def drives(self, base: DriveBehaviour = STRICT) -> DriveBehaviour:
+        """What the drives do in this row, beside what they do in all of them."""
+        return behaviour_named(self.behaviour, base)
 
 
 def then(happens: Callable[[Bench], object]) -> Callable[[], Script]:
@@ -252,21 +259,51 @@ PATH_STOP = 60.0
 """Cycles that slowing down along the path and settling take."""
 
 
+SEEN_TWICE = STUCK_CYCLES + 1.0
+"""Cycles from a fault at a SYNC whose reply still shows motion until a standstill stops the drives.
+
+The next `STUCK_CYCLES` replies each show the drive where it was; the quick stop goes out at the
+beginning of the cycle after the last of them, and the drives obey at its SYNC.
+"""
+
+TOLD_BY_DRIVE = 3.0
+"""Cycles: one until the error is over the window, one of time-out (6066h), one until the stop."""
+
+BELIEVED = 2.0
+"""Cycles after a jump that the reply at its SYNC shows: the next one confirms it, then the stop."""
+
+MAY_BE_LATE = WatchLimits(0.0, 0.0, 0.0, 0.0).late_periods
+"""A cycle that begins less late than this ends no run, and a stop that waits for it is as late."""
+
+
 def goes_on(script: Callable[[], Script], *, live: bool = True) -> Fault:
     """It is counted, and the run finishes."""
     return Fault(script, ends=State.FINISHED, within=None, live=live)
 
 
+def path_stop_for_lateness(cycles: float) -> Fault:
+    """The drives have not stopped yet, and do not before the next SYNC."""
+    words = (f"{cycles:.1f} cycles late",)
+    return Fault(late(cycles), within=PATH_STOP + cycles, words=words, live=False)
+
+
+def quick_stop_for_lateness(cycles: float) -> Fault:
+    """The drives have stopped, or may before the next SYNC reaches them."""
+    return Fault(late(cycles), words=(f"{cycles:.1f} cycles late",), live=False)
+
+
 TABLE: dict[str, Fault] = {
     "F1 kill -9": Fault(then(lambda bench: bench.kill()), ends=None, within=5.0),
     "F2 the executor hangs": Fault(then(hangs), words=("20.0 cycles late",), live=False),
-    "F4 a cycle late by 1 T": goes_on(late(1.0), live=False),
-    "F4 a cycle late by 2 T": Fault(
-        late(2.0), within=PATH_STOP, words=("2.0 cycles late",), live=False
-    ),
-    "F4 a cycle late by 3 T": Fault(late(3.0), words=("3.0 cycles late",), live=False),
-    "F4 a cycle late by 5 T": Fault(late(5.0), words=("5.0 cycles late",), live=False),
-    "F4 a cycle late by 10 T": Fault(late(10.0), words=("10.0 cycles late",), live=False),
+    "F4 a cycle late by 0.95 T": goes_on(late(0.95), live=False),
+    "F4 a cycle late by 1 T": path_stop_for_lateness(1.0),
+    "F4 a cycle late by 1.45 T": path_stop_for_lateness(1.45),
+    "F4 a cycle late by 1.5 T": quick_stop_for_lateness(1.5),
+    "F4 a cycle late by 2 T": quick_stop_for_lateness(2.0),
+    "F4 a cycle late by 2.5 T": quick_stop_for_lateness(2.5),
+    "F4 a cycle late by 3 T": quick_stop_for_lateness(3.0),
+    "F4 a cycle late by 5 T": quick_stop_for_lateness(5.0),
+    "F4 a cycle late by 10 T": quick_stop_for_lateness(10.0),
     "F5 one set-point lost": goes_on(incoming(lambda: lose_next(SET_POINT_4, 1))),
     "F5 three set-points lost": Fault(
         incoming(lambda: lose_next(SET_POINT_4, 3)), words=("drive 4",), rows=3.0
@@ -309,7 +346,9 @@ TABLE: dict[str, Fault] = {
         outgoing(lambda: spoil(REPLY_4, frozen())), words=("(drive 4) stood still",)
     ),
     "F12 a short set-point": Fault(
-        incoming(lambda: spoil(SET_POINT_4, lambda d: d[:7], 1)), words=("drive 4", "length")
+        incoming(lambda: spoil(SET_POINT_4, lambda d: d[:5], 1)),
+        within=PATH_STOP,
+        words=("drive 4", "length"),
     ),
     "F13 replies come twice": Fault(
         outgoing(lambda: repeat(REPLY_4)), words=("(drive 4) answers twice",), within=5.0
@@ -324,19 +363,33 @@ TABLE: dict[str, Fault] = {
     "F13 another master's heartbeat": Fault(
         then(comes(HEARTBEAT_BASE + MASTER_NODE, b"\x05")), words=("master's heartbeat",)
     ),
-    "F17 a winch jams": Fault(broken(1, by=jam), words=("(drive 2) stood still",)),
+    "F17 a winch jams": Fault(
+        broken(1, by=jam),
+        within=SEEN_TWICE,
+        late=MAY_BE_LATE,
+        words=("(drive 2) stood still",),
+    ),
     "F17 a winch jams, its drive tells": Fault(
-        broken(1, by=jam_seen_by_the_drive), words=("drive 2", "following error")
+        broken(1, by=jam_seen_by_the_drive),
+        within=TOLD_BY_DRIVE,
+        late=MAY_BE_LATE,
+        words=("drive 2", "following error"),
     ),
     "F17 a winch slips, its drive sleeps": Fault(
-        broken(1, by=slip), within=3.0, words=("cable 2", "allowed 2.00 mm")
+        broken(1, by=slip),
+        within=BELIEVED,
+        late=MAY_BE_LATE,
+        words=("cable 2", "allowed 2.00 mm"),
     ),
     "F18 a cable slackens": Fault(then(feels(0.05)), within=PATH_STOP, words=("cable 6", "slack")),
     "F18 a cable is overloaded": Fault(
         then(feels(6.0)), within=PATH_STOP, words=("cable 6", "more than 102.0 N")
     ),
     "F18 a winch at its torque limit": Fault(
-        broken(1, by=at_torque_limit), words=("(drive 2) stood still",)
+        broken(1, by=at_torque_limit),
+        within=SEEN_TWICE,
+        late=MAY_BE_LATE,
+        words=("(drive 2) stood still",),
     ),
     "F19 a cable breaks": Fault(then(feels(0.0)), within=5.0, words=("cable 6", "no tension")),
     "F20 the operator stops": Fault(
@@ -365,14 +418,24 @@ def complaints(
     if ended is not fault.ends:
         found.append(f"the run ended {ended}, not {fault.ends}")
     found += [f"{word!r} is not in {cause!r}" for word in fault.words if word not in cause]
+    found += _said_or_left(fault, bench)
     if fault.within is None or len(bench.lost) == len(bench.drives):
         return found
     stop = bench.stop()
-    if stop.time > fault.within * cycle + bench.blur:
+    within = fault.within + (fault.late if bench.real_time else 0.0)
+    if stop.time > within * cycle + bench.blur:
         found.append(f"the last drive stopped after {1e3 * stop.time:.1f} ms")
     if stop.spread > fault.spread * cycle + bench.blur:
         found.append(f"the drives stopped within {1e3 * stop.spread:.1f} ms of each other")
     return found
+
+
+def _said_or_left(fault: Fault, bench: Bench) -> list[str]:
+    """No EMCY before the fault, and none at all of a run that finishes; then all drives hold."""
+    finishes = fault.ends is State.FINISHED
+    until = float("inf") if finishes or bench.since is None else bench.since
+    found = emergencies(bench.rehearsal, until, bench.rehearsal.behaviour.warning)
+    return [*found, *left_holding(bench.rehearsal)] if finishes else found
 
 
 def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
@@ -382,10 +445,15 @@ def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
 
 
 def row(
-    name: str, transport: str, bench: Bench, ended: State | None, cause: str, found: list[str]
+    name: str,
+    fault: Fault,
+    transport: str,
+    bench: Bench,
+    ended: State | None,
+    cause: str,
+    found: list[str],
 ) -> dict[str, Any]:
     """One line of the measured table; drives that go on have no time to the stop."""
-    fault = TABLE[name]
     stop = bench.stop() if len(bench.lost) < len(bench.drives) else None
     stops = stop is not None and fault.within is not None
     return {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.bus import BusSettings
+from drivers.can_bus import BusSettings
 from tests.cli.plans import RIG
 from tests.scenarios.faults.masters import Masters
 

@@ -19,8 +19,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Protocol
 
-from drivers.bus import BusSettings
-from executor.prepare import PreparedRun
+from drivers.can_bus import BusSettings
+from executor.trajectory.prepare import PreparedRun
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = (
@@ -93,9 +93,9 @@ class Masters:
 
 def serve() -> None:
     """What the process does."""
-    from cdpr.plan import load_plan
-    from cdpr.rig import load_rig
-    from executor.prepare import prepare
+    from executor.trajectory.prepare import prepare
+    from model.plan import load_plan
+    from model.rig import load_rig
     from planner.check import verify
 
     plan, rig = map(Path, sys.argv[1:])

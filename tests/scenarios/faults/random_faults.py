@@ -6,8 +6,9 @@ import random
 from dataclasses import dataclass
 from pathlib import Path
 
-from executor.machine import State
-from executor.prepare import PreparedRun
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from simulation.drives.behaviour import STRICT, DriveBehaviour
 from tests.scenarios.faults.bench import Bench, simulated
 from tests.scenarios.faults.cases import TABLE
 
@@ -29,7 +30,9 @@ class RandomRun:
     violations: list[str]
 
 
-def random_run(prepared: PreparedRun, path: Path, seed: int) -> RandomRun:
+def random_run(
+    prepared: PreparedRun, path: Path, seed: int, behaviour: DriveBehaviour = STRICT
+) -> RandomRun:
     """One run in simulated time; the same for the same seed."""
     dice = random.Random(seed)
     names = tuple(dice.sample(NAMES, dice.choice((1, 1, 2))))
@@ -43,7 +46,7 @@ def random_run(prepared: PreparedRun, path: Path, seed: int) -> RandomRun:
             each(bench)
 
     bitrate = max((TABLE[name].bitrate or 0.0 for name in names), default=0.0) or None
-    with simulated(prepared, path, script, bitrate=bitrate) as bench:
+    with simulated(prepared, path, script, bitrate=bitrate, behaviour=behaviour) as bench:
         bench.missed_start = first < 20
         ended = bench.run()
         found = bench.violations(MIXED_CYCLES, ROWS)

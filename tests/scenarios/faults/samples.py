@@ -7,18 +7,20 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import can
 import numpy as np
 
-from cdpr.poses import Array, Pose
-from cdpr.rig import Rig
-from cdpr.scene import Load
-from drivers.cia402.frames import RPDO1_BASE, parse_set_point
-from drivers.cia402.states import TORQUE_ON, DriveState
-from executor.prepare import PreparedRun
-from simulation.drive import Frame
-from simulation.rehearsal import Rehearsal
+from drivers.cia402.pdo import EMCY_BASE, RPDO1_BASE, parse_emergency, parse_set_point
+from drivers.cia402.state_machine import TORQUE_ON, DriveState
+from executor.trajectory.prepare import PreparedRun
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.scene import Load
+from simulation.drives.behaviour import STRICT, DriveBehaviour
+from simulation.drives.cia402 import Frame
+from simulation.drives.cia402_rig import SimulatedCia402Rig
 
 ENABLED = DriveState.OPERATION_ENABLED
 DISABLE_VOLTAGE, FAULT_RESET = 0x02, 0x80
@@ -43,24 +45,35 @@ class Sample:
     positions: tuple[float, ...]
 
 
-class WatchedRehearsal(Rehearsal):
+class WatchedRehearsal(SimulatedCia402Rig):
     """Keeps a sample whenever a drive was given time or a SYNC.
 
     Attributes:
         samples: In order.
         words: Every control word that reached a drive: time, node, word.
+        emergencies: Every EMCY that a drive sent: time, node, error code.
         on_cycle: Called at every SYNC, before the drives hear it.
         deaf: Drives that do not hear the next SYNC (set from outside).
     """
 
-    def __init__(self, rig: Rig, bus: can.BusABC, start_pose: Pose, load: Load | None) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        bus: can.BusABC,
+        start_pose: Pose,
+        load: Load | None,
+        *,
+        behaviour: DriveBehaviour = STRICT,
+        eds: Path | None = None,
+    ) -> None:
         self.samples: list[Sample] = []
         self.words: list[tuple[float, int, int]] = []
+        self.emergencies: list[tuple[float, int, int]] = []
         self.on_cycle: Callable[[], None] = lambda: None
         self.deaf: set[int] = set()
         self.passed = 0.0
         self.real = False
-        super().__init__(rig, bus, start_pose, load)
+        super().__init__(rig, bus, start_pose, load, behaviour=behaviour, eds=eds)
 
     @property
     def now(self) -> float:
@@ -77,6 +90,11 @@ class WatchedRehearsal(Rehearsal):
         if 1 <= node <= 127 and (set_point := parse_set_point(message.data)) is not None:
             self.words.append((self.now, node, set_point[0]))
         super()._handle(message)
+
+    def _send(self, can_id: int, data: Frame) -> None:
+        if EMCY_BASE < can_id < EMCY_BASE + 128 and (told := parse_emergency(data)) is not None:
+            self.emergencies.append((self.now, can_id - EMCY_BASE, told.code))
+        super()._send(can_id, data)
 
     def _advance(self, elapsed: float) -> None:
         super()._advance(elapsed)
@@ -155,7 +173,7 @@ def violations(
     kept = [i for i in range(len(rehearsal.drives)) if i not in lost]
     return [
         *_step_violations(samples, limits, kept),
-        *_place_violations(samples, limits, kept),
+        *_place_violations(samples, limits, kept, rehearsal.behaviour.position_noise),
         *_mixture_violations(samples, limits, kept, missed_start),
         *_torque_violations(samples, kept),
         *_word_violations(rehearsal),
@@ -174,8 +192,13 @@ def _step_violations(samples: list[Sample], limits: Limits, kept: list[int]) -> 
     return found
 
 
-def _place_violations(samples: list[Sample], limits: Limits, kept: list[int]) -> list[str]:
-    """All targets are of one place of the table, give or take a row; from the first row on."""
+def _place_violations(
+    samples: list[Sample], limits: Limits, kept: list[int], noise: float
+) -> list[str]:
+    """All targets are of one place of the table, give or take a row; from the first row on.
+
+    A drive begins from a position that it told with noise, [counts]: 4 standard deviations.
+    """
     moving = [s for s in samples if all(s.states[i] is ENABLED for i in kept)]
     if not moving or not kept:
         return []
@@ -194,7 +217,7 @@ def _place_violations(samples: list[Sample], limits: Limits, kept: list[int]) ->
         place = np.clip(index + share * reach, 0.0, len(table) - 1.0)
         there = np.column_stack([np.interp(place, rows, column) for column in table.T])
         low, high = np.minimum(low, there), np.maximum(high, there)
-    off = np.maximum(low - targets, targets - high) - 1.5
+    off = np.maximum(low - targets, targets - high) - 1.5 - 4.0 * noise
     return [
         f"{moving[k].time:.3f} s: drive {kept[j] + 1} is {off[k, j]:.1f} counts off row"
         f" {index[k]:.1f}"
@@ -239,6 +262,32 @@ def _word_violations(rehearsal: WatchedRehearsal) -> list[str]:
         f"{at:.3f} s: control word {word:02X}h to node {node}"
         for at, node, word in rehearsal.words
         if not word & DISABLE_VOLTAGE or word & FAULT_RESET
+    ]
+
+
+def emergencies(
+    rehearsal: WatchedRehearsal, until: float = float("inf"), allowed: int = 0
+) -> list[str]:
+    """EMCY of any drive before a moment [s]; nothing that a master does may cause one.
+
+    Args:
+        rehearsal: After the run.
+        until: Of the drives' time.
+        allowed: A code that the drives send by themselves.
+    """
+    return [
+        f"{at:.3f} s: EMCY {code:04X}h from node {node}"
+        for at, node, code in rehearsal.emergencies
+        if at < until and code not in (0, allowed)
+    ]
+
+
+def left_holding(rehearsal: WatchedRehearsal) -> list[str]:
+    """Drives that do not hold by themselves after the program is gone."""
+    return [
+        f"drive {number} is in {drive.state.value} after the end"
+        for number, drive in enumerate(rehearsal.drives, start=1)
+        if drive.state is not DriveState.QUICK_STOP_ACTIVE
     ]
 
 

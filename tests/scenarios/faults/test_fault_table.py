@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.bus import BusSettings
-from executor.machine import State
-from executor.prepare import PreparedRun
+from drivers.can_bus import BusSettings
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
 from tests.scenarios.faults.bench import SimulatedBench, live, once, simulated
-from tests.scenarios.faults.cases import TABLE, complaints, held_up
+from tests.scenarios.faults.cases import complaints, held_up
+from tests.scenarios.faults.drive_cases import ROWS
 from tests.scenarios.faults.masters import Masters
 from tests.scenarios.faults.random_faults import random_run
 
@@ -26,14 +27,22 @@ BETWEEN_PROCESSES = (
     "F11 replies held up for 200 ms",
     "F19 a cable breaks",
     "F20 the operator stops",
+    "D a lost heartbeat is a fault",
 )
 ATTEMPTS = 10
 
 
-@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.parametrize("name", ROWS)
 def test_in_simulated_time(prepared: PreparedRun, tmp_path: Path, name: str) -> None:
-    fault = TABLE[name]
-    with simulated(prepared, tmp_path / "run", fault.script(), bitrate=fault.bitrate) as bench:
+    fault = ROWS[name]
+    with simulated(
+        prepared,
+        tmp_path / "run",
+        fault.script(),
+        bitrate=fault.bitrate,
+        behaviour=fault.drives(),
+        profile=fault.profile,
+    ) as bench:
         ended = bench.run()
         cycle = prepared.checked.table.cycle
         assert complaints(fault, bench, ended, bench.cause, cycle) == []
@@ -49,10 +58,13 @@ def test_between_processes_in_real_time(
     between_processes: BusSettings,
 ) -> None:
     """A computer that holds the drives up ends a run before its fault; then it is done again."""
-    fault = TABLE[name]
+    fault = ROWS[name]
     for attempt in range(ATTEMPTS):
         run = tmp_path / f"run {attempt}"
-        with live(prepared, run, fault.script(), between_processes, masters) as bench:
+        behaviour = fault.drives()
+        with live(
+            prepared, run, fault.script(), between_processes, masters, behaviour=behaviour
+        ) as bench:
             ended = bench.run()
             cause = str(bench.outcome.get("cause", ""))
             if held_up(fault, bench, cause):

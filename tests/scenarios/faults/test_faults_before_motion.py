@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpr.drives_file import Cia402Document
-from cdpr.errors import HardwareMissing, Refused
-from cdpr.rig import rig_from_document
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.objects import settings_for
-from drivers.cia402.states import DriveState
-from executor.machine import State
-from executor.prepare import PreparedRun
+from drivers.cia402.object_dictionary import settings_for
+from drivers.cia402.state_machine import DriveState
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from model.errors import HardwareMissing, Refused
+from model.files.rig_file import Cia402Document
+from model.rig import rig_from_document
+from simulation.drives.behaviour import behaviour_named
 from tests.scenarios.faults.bench import SimulatedBench, simulated
 
 ENABLED = DriveState.OPERATION_ENABLED
@@ -149,3 +150,26 @@ def test_f24_set_points_that_were_changed_after_their_check_are_not_armed(
         setpoints[200, 3] -= change
         setpoints.setflags(write=False)
     assert np.array_equal(setpoints, np.rint(prepared.checked.table.counts))
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("absent=6007", "6007h:00"),
+        ("absent=6085/06010000", "6085h:00"),
+        ("range=60C2:02/-6..-4", "60C2h:02"),
+        ("mode-when-enabled", "6061h:00"),
+        ("sdo-twice=0", "twice"),
+        ("sdo-delay=5000", "do not answer"),
+        ("sdo-lost=1", "do not answer"),
+        ("boot-late=60000", "do not answer"),
+    ],
+)
+def test_f14_drives_that_cannot_do_it_are_refused_and_sent_no_set_point(
+    prepared: PreparedRun, tmp_path: Path, name: str, told: str
+) -> None:
+    """Each a named behaviour of the simulated drives; those that can be lived with: drive_cases."""
+    bench = simulated(prepared, tmp_path / "run", nothing, behaviour=behaviour_named([name]))
+    with pytest.raises((Refused, HardwareMissing)) as caught, bench:
+        pass
+    assert told in str(caught.value)

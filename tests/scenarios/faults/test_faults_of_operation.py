@@ -13,13 +13,13 @@ import can
 import numpy as np
 import pytest
 
-from cdpr.errors import BadInput, Refused
-from drivers.bus import BusSettings
-from drivers.cia402.states import DriveState
-from drivers.drive_group import make_drive_group
-from executor.machine import State
-from executor.prepare import PreparedRun
-from executor.run_folder import RunEvent, RunFolder
+from drivers.can_bus import BusSettings
+from drivers.cia402.state_machine import DriveState
+from drivers.factory import make_drive_group
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from model.errors import BadInput, Refused
 from tests.scenarios.faults.bench import (
     Bench,
     LiveBench,

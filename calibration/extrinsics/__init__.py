@@ -1,0 +1,1 @@
+"""Finds where a camera is, from surveyed tags or from poses that the robot measured."""

@@ -1,0 +1,108 @@
+"""Where a camera stands, how sure that is, and what it is good for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from scipy.stats import t as student
+
+from calibration.statistics import CONFIDENCE
+from calibration.verdict import CalibrationVerdict, Issue
+from model.pose import Array, Pose, skew
+from model.rig import Camera, Rig
+
+SURE = 1.96
+"""Deviations of a normal error that hold 95 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExtrinsicCalibration:
+    """A camera's place in the world.
+
+    Attributes:
+        camera: The camera at its new place.
+        by: ``frame tags`` or ``rig motion``.
+        covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6).
+        half_widths: Of the 95 % intervals of the same, shape (6,).
+        points: Places in the world that matter, shape (n, 3), [m].
+        tag_errors: RMS corner error of each tag, by number, [px].
+        pictures: How many pictures it rests on.
+        unused: Why each of the others is not used, by name.
+        lacks: What it lacks, beside precision.
+        data_hash: Of what was seen.
+    """
+
+    camera: Camera
+    by: Literal["frame tags", "rig motion"]
+    covariance: Array
+    half_widths: Array
+    points: Array
+    tag_errors: Mapping[int, float]
+    pictures: int
+    unused: Mapping[str, str]
+    lacks: tuple[Issue, ...]
+    data_hash: str
+
+    @property
+    def world_from_camera(self) -> Pose:
+        """The pose."""
+        return self.camera.world_from_camera
+
+    @property
+    def error(self) -> float:
+        """How far off points of the work space are seen, 95 %, RMS, [m]."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        grown = self.covariance * np.outer(*2 * [self.half_widths / deviations])
+        arms = self.points - self.world_from_camera.position
+        slopes = [np.hstack([np.eye(3), -skew(arm)]) for arm in arms]
+        return float(np.sqrt(np.mean([np.trace(s @ grown @ s.T) for s in slopes])))
+
+
+def workspace_corners(rig: Rig) -> Array:
+    """Corners of the box that the platform's origin keeps to, shape (8, 3), [m]."""
+    ends = zip(rig.workspace_lower, rig.workspace_upper, strict=True)
+    return np.array(list(product(*ends)))
+
+
+def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> CalibrationVerdict:
+    """Judges a camera's place.
+
+    Args:
+        result: What was found.
+        wanted: What is good enough, in the work space, [m].
+    """
+    lacks, error = list(result.lacks), result.error
+    if not error <= wanted:
+        more = "survey more tags, all around what the camera sees"
+        if result.by == "rig motion":
+            more = "take pictures at more poses, far apart and turned up to 20° every way"
+        what = (
+            f"points of the work space are seen within {error * 1e3:.2g} mm,"
+            f" {wanted * 1e3:.2g} mm are wanted"
+        )
+        lacks.append(Issue(what, more))
+    return CalibrationVerdict.of(error, wanted, "in the work space", lacks)
+
+
+def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
+    """Half widths of 95 % intervals: by scatter, or by what leaving a part of the data out changes.
+
+    Args:
+        covariance: By the scatter, shape (k, k).
+        without: Changes of the k numbers when each part is left out (the jackknife over parts).
+
+    Returns:
+        The larger of both, shape (k,).
+    """
+    by_scatter = SURE * np.sqrt(np.diag(covariance))
+    count = len(without)
+    if count < 3:
+        return np.asarray(by_scatter)
+    spread = np.array(without) - np.mean(without, axis=0)
+    by_parts = np.sqrt((count - 1) / count * np.sum(spread**2, axis=0))
+    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
+    return np.asarray(np.maximum(by_scatter, quantile * by_parts))

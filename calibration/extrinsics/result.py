@@ -1,0 +1,188 @@
+"""The result file of a camera's place in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import date
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from calibration.extrinsics.quality import ExtrinsicCalibration
+from calibration.intrinsics.result import camera_named, with_camera
+from calibration.report import Section, page_of, table_of
+from calibration.results import ResultDocument, common_keys
+from calibration.statistics import Interval
+from calibration.verdict import CalibrationVerdict
+from model.files.documents import AnyNonNegative, PoseDocument, Vector
+from model.files.rig_file import RigDocument
+from model.pose import Array, Pose, rotation_vector_from_matrix
+
+AXES = ("x_mm", "y_mm", "z_mm", "turn_x_deg", "turn_y_deg", "turn_z_deg")
+"""Of a pose: its position, and turns about the outer frame's axes from the stated rotation."""
+SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
+
+
+class ExtrinsicsResult(ResultDocument):
+    """A camera's place, in the keys of the rig file's ``cameras`` section."""
+
+    order: ClassVar[int] = 2
+
+    kind: Literal["extrinsics"] = "extrinsics"
+    by: Literal["frame tags", "rig motion"]
+    world_from_camera: PoseDocument
+    points_mm: Annotated[list[Vector], Field(min_length=1)] = Field(
+        description="places in the world for which error_mm is stated"
+    )
+    tag_errors_px: dict[str, AnyNonNegative] = Field(description="RMS corner error of each tag")
+    pictures: int
+
+    def in_words(self) -> list[tuple[str, str]]:
+        """As of every result; turns are from the stated rotation, so that only doubt is told."""
+        return pose_rows(self.stated)
+
+    def changes_to(self, other: Self) -> dict[str, float]:
+        """How far the other camera stands off, and how it is turned about the world's axes."""
+        mine, theirs = self.world_from_camera.pose(), other.world_from_camera.pose()
+        turn = rotation_vector_from_matrix(theirs.rotation @ mine.rotation.T)
+        numbers = np.concatenate([theirs.position - mine.position, turn]) * SCALES
+        return dict(zip(AXES, numbers.tolist(), strict=True))
+
+    def apart_mm(self, other: Self) -> float:
+        """How far apart both put what is seen at `points_mm`, RMS, [mm]."""
+        points = np.array(self.points_mm) / 1e3
+        seen = self.world_from_camera.pose().inverse().apply(points)
+        gaps = other.world_from_camera.pose().apply(seen) - points
+        return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))) * 1e3
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with the camera at this place.
+
+        Raises:
+            BadInput: The rig has no such camera, or other tags or camera numbers.
+        """
+        camera = camera_named(rig, self.name)
+        self.require_basis(_basis(rig, self.name, self.by), f"numbers of the camera or {self.by}")
+        return with_camera(
+            rig, camera.model_copy(update={"world_from_camera": self.world_from_camera})
+        )
+
+
+def extrinsics_result(
+    result: ExtrinsicCalibration, verdict: CalibrationVerdict, rig: RigDocument, on: date
+) -> ExtrinsicsResult:
+    """The result with its quality.
+
+    Args:
+        result: What was found.
+        verdict: What it is good for.
+        rig: The rig file's content that it was found with.
+        on: The date.
+    """
+    name = result.camera.name
+    return ExtrinsicsResult(
+        **common_keys(
+            name,
+            on,
+            result.data_hash,
+            pose_intervals(result),
+            verdict,
+            result.unused,
+            _basis(rig, name, result.by),
+        ),
+        by=result.by,
+        world_from_camera=PoseDocument.of(result.world_from_camera),
+        points_mm=[[float(x) * 1e3 for x in point] for point in result.points],
+        tag_errors_px={str(k): float(v) for k, v in result.tag_errors.items()},
+        pictures=result.pictures,
+    )
+
+
+def pose_intervals(result: ExtrinsicCalibration) -> dict[str, Interval]:
+    """The pose's numbers; turns are about the world's axes, from the stated rotation."""
+    values = np.concatenate([result.world_from_camera.position, np.zeros(3)]) * SCALES
+    widths = result.half_widths * SCALES
+    return {
+        name: Interval(float(value), float(width))
+        for name, value, width in zip(AXES, values, widths, strict=True)
+    }
+
+
+def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
+    """Numbers of poses for people; turns from the stated rotation are 0 by their meaning."""
+    return [
+        (name, interval.doubt if "turn_" in name else str(interval))
+        for name, interval in stated.items()
+    ]
+
+
+def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
+    """What the result takes as known."""
+    camera = camera_named(rig, name).model_dump(mode="json")
+    of_camera = {k: v for k, v in camera.items() if k not in ("world_from_camera", "rate_hz")}
+    tags = rig.tags.model_dump(mode="json") if rig.tags else {}
+    which = "frame" if by == "frame tags" else "platform"
+    return {"camera": of_camera, "family": tags.get("family"), "tags": tags.get(which)}
+
+
+# The report of a camera's place.
+
+
+def extrinsics_page(
+    result: ExtrinsicCalibration,
+    document: ExtrinsicsResult,
+    verdict: CalibrationVerdict,
+    before: Pose,
+) -> str:
+    """The whole page.
+
+    Args:
+        result: What was found.
+        document: As it is written.
+        verdict: What it is good for.
+        before: ``world_from_camera`` of the rig file.
+    """
+    pose = document.world_from_camera
+    turn = "turns are about the world's axes, from the stated rotation"
+    quaternion = ", ".join(f"{q:.6f}" for q in pose.rotation_wxyz)
+    tags = [(f"tag {k}", f"{error:.3f} px") for k, error in result.tag_errors.items()]
+    return page_of(
+        f"Place of camera {document.name}",
+        f"{document.date}, by {result.by}, {result.pictures} pictures used",
+        verdict,
+        [
+            Section(
+                "Where the camera stands, with 95 % intervals",
+                table_of(
+                    [
+                        *document.in_words(),
+                        ("rotation_wxyz", quaternion),
+                        ("work space", f"seen within {verdict.error * 1e3:.2g} mm (95 %)"),
+                        ("data", document.data_sha256[:23]),
+                    ]
+                ),
+                turn,
+            ),
+            Section(
+                "Against the rig file",
+                table_of(moved_rows(before, result.world_from_camera)),
+            ),
+            Section("Tags", table_of(tags), "RMS error of their corners."),
+            Section("Not used", table_of(result.unused.items())),
+        ],
+    )
+
+
+def moved_rows(before: Pose, after: Pose) -> list[tuple[str, str]]:
+    """How far a pose is from another, for people."""
+    shift = (after.position - before.position) * 1e3
+    turn = np.degrees(rotation_vector_from_matrix(after.rotation @ before.rotation.T))
+    return [
+        ("moved", f"{before.distance_to(after) * 1e3:.2f} mm ({_listed(shift)})"),
+        ("turned", f"{np.degrees(before.angle_to(after)):.3f}° ({_listed(turn)})"),
+    ]
+
+
+def _listed(values: Array) -> str:
+    return ", ".join(f"{value:+.2f}" for value in values)

@@ -1,0 +1,279 @@
+"""A camera's place from surveyed tags on the frame.
+
+Each tag's mean corners are fitted with the covariance that the picture and the survey give them:
+the error of a survey is the same in every picture and does not average out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from calibration.extrinsics.quality import ExtrinsicCalibration, widths_of, workspace_corners
+from calibration.tag_map.observations import TagSights
+from calibration.verdict import Issue
+from model.errors import BadInput
+from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
+from model.rig import Camera, Rig, Tag
+from tracking.camera_check import change_of_inverse
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import tag_corners
+from tracking.edges.refine import RefinedTag
+from tracking.pnp import TagView, moved, solve_pnp
+
+# How far off the surveyed places of tags may be, and what that does to their pixels.
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """How well tags were surveyed, one standard deviation along or about any axis.
+
+    Attributes:
+        shift: Of each corner by itself, or, where ``turn`` is told, of each tag as a whole, [m].
+        turn: Of each tag's rotation, [rad]; 0 for tags that lie as they are told to. None where
+            every corner was surveyed by itself: then the corners tell how a tag is turned.
+    """
+
+    shift: float
+    turn: float | None = None
+
+    def slopes(self, tag: Tag) -> Array:
+        """How independent errors of size 1 shift a tag's corners, shape (12, k), [m]."""
+        if self.turn is None:
+            return self.shift * np.eye(12)
+        arms = tag_corners(tag) - tag.pose.position
+        turns = self.turn * np.concatenate([-skew(arm) for arm in arms])
+        return np.concatenate([self.shift * np.tile(np.eye(3), (4, 1)), turns], axis=1)
+
+    def of_pixels(self, camera: Camera, camera_from_world: Pose, tag: Tag) -> Array:
+        """Covariance of a tag's ideal pixels by errors of the survey, shape (8, 8), [px²]."""
+        spread = pixel_slopes(camera, camera_from_world, tag_corners(tag)) @ self.slopes(tag)
+        covariance: Array = spread @ spread.T
+        return covariance
+
+
+def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Array:
+    """Derivative of ideal pixels by points in the world, shape (n, 3): (2 n, 3 n), [px/m]."""
+    slopes = np.zeros((2 * len(points), 3 * len(points)))
+    fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
+    for k, (x, y, z) in enumerate(camera_from_world.apply(points)):
+        by_camera = np.array([[fx / z, 0.0, -fx * x / z**2], [0.0, fy / z, -fy * y / z**2]])
+        slopes[2 * k : 2 * k + 2, 3 * k : 3 * k + 3] = by_camera @ camera_from_world.rotation
+    return slopes
+
+
+LEAST_TAGS = 3
+"""Fewer cannot show that one of them was surveyed wrongly."""
+MOVED_PX = 0.5
+"""Between pictures of a camera that stands still tags do not move farther."""
+_OFF = 3.0
+"""A tag that lies so many deviations off does not agree with the survey."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SeenTag:
+    """A tag over all pictures: world corners (4, 3), mean pixels (8,), whitening of them (8, 8)."""
+
+    number: int
+    corners: Array
+    pixels: Array
+    whitening: Array
+
+    def errors(self, camera: Camera, camera_from_world: Pose) -> Array:
+        """Of the corners, shape (8,), [px]."""
+        points = camera_from_world.apply(self.corners)
+        return np.asarray(project_undistorted(camera, points).reshape(8) - self.pixels)
+
+
+def require_frame_tags(rig: Rig) -> None:
+    """Refuses a rig without surveyed tags.
+
+    Raises:
+        BadInput: It has none.
+    """
+    if not rig.frame_tags:
+        raise BadInput(
+            "the rig has no frame tags to find the camera's place by",
+            where=f"rig {rig.name}",
+            next_step="survey tags on the frame and add them to the rig file under tags: frame, or"
+            " pass --poses to go by the rig's own motion",
+        )
+
+
+def locate_by_frame_tags(
+    rig: Rig, camera: Camera, sights: TagSights, survey: Survey
+) -> ExtrinsicCalibration:
+    """Finds the camera's place from pictures taken while it stood still.
+
+    Args:
+        rig: Its frame tags are the surveyed ones.
+        camera: Its matrix and distortion hold; its place in the rig file does not matter.
+        sights: Of frame tags.
+        survey: How well the tags were surveyed.
+
+    Raises:
+        BadInput: The tags allow no place.
+    """
+    sights = _still(sights)
+    start = _start(rig, camera, sights)
+    tags = _seen_tags(rig, camera, sights, start, survey)
+    tags, strangers = _agreeing(camera, tags, start)
+    best = _fit(camera, tags, start)
+    unused = {f"tag {tag.number}": _is_off(camera, tag, best) for tag in strangers}
+    covariance = _covariance(camera, tags, best)
+    pose = best.inverse()
+    changes = []
+    for k in range(len(tags) if len(tags) >= LEAST_TAGS else 0):
+        other = _fit(camera, tags[:k] + tags[k + 1 :], best).inverse()
+        turn = rotation_vector_from_matrix(other.rotation @ pose.rotation.T)
+        changes.append(np.concatenate([other.position - pose.position, turn]))
+    return ExtrinsicCalibration(
+        camera=replace(camera, world_from_camera=pose),
+        by="frame tags",
+        covariance=read_only(covariance),
+        half_widths=read_only(widths_of(covariance, changes)),
+        points=workspace_corners(rig),
+        tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},
+        pictures=len(sights.squares),
+        unused={**sights.unused, **unused},
+        lacks=tuple(_lacks(camera, tags, best)),
+        data_hash=sights.data_hash(),
+    )
+
+
+def _still(sights: TagSights) -> TagSights:
+    """Without pictures in which all is seen elsewhere than in most."""
+    middle = {
+        number: np.median([s[number].corners for s in sights.squares.values() if number in s], 0)
+        for number in sights.numbers
+    }
+    unused = {}
+    for name, squares in sights.squares.items():
+        off = [np.linalg.norm(s.corners - middle[k], axis=1).mean() for k, s in squares.items()]
+        if len(sights.squares) > 2 and np.median(off) > MOVED_PX:
+            unused[name] = (
+                f"shows the tags {np.median(off):.1f} px from where the others do: the camera moved"
+            )
+    return sights.without(unused)
+
+
+def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
+    """``camera_from_world`` by the tags of one picture.
+
+    Raises:
+        BadInput: They allow none.
+    """
+    tags = {tag.id: tag for tag in rig.frame_tags}
+    fullest = max(sights.squares.values(), key=len)
+    views = [TagView(tags[number], square) for number, square in fullest.items()]
+    found = solve_pnp(camera, views, camera.world_from_camera.inverse())
+    if found is None:
+        raise BadInput(
+            "the frame tags allow no place of the camera",
+            where=f"camera {camera.name}",
+            why="with the rig file's places and sizes they cannot be seen like this",
+            next_step="check the tags' places, rotations and sizes in the rig file",
+        )
+    return found.camera_from_body
+
+
+def _seen_tags(
+    rig: Rig, camera: Camera, sights: TagSights, start: Pose, survey: Survey
+) -> list[_SeenTag]:
+    tags = {tag.id: tag for tag in rig.frame_tags}
+    found = []
+    for number in sights.numbers:
+        squares = [s[number] for s in sights.squares.values() if number in s]
+        corners = tag_corners(tags[number])
+        covariance = _of_picture(squares) + survey.of_pixels(camera, start, tags[number])
+        pixels = np.mean([square.corners.reshape(8) for square in squares], axis=0)
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        found.append(_SeenTag(number, corners, pixels, whitening))
+    return found
+
+
+def _of_picture(squares: Sequence[RefinedTag]) -> Array:
+    """Covariance of corners in one picture; more pictures of a still scene err alike."""
+    return np.asarray(np.mean([square.covariance for square in squares], axis=0))
+
+
+def _errors(camera: Camera, tags: Sequence[_SeenTag], pose: Pose) -> Array:
+    return np.concatenate([tag.whitening @ tag.errors(camera, pose) for tag in tags])
+
+
+def _fit(camera: Camera, tags: Sequence[_SeenTag], start: Pose) -> Pose:
+    """``camera_from_world`` that fits best; a tag far off counts less (Huber)."""
+    found = least_squares(
+        lambda step: _errors(camera, tags, moved(start, step)),
+        np.zeros(6),
+        loss="huber",
+        f_scale=2.0,
+        x_scale=[1e-3] * 6,
+        xtol=1e-12,
+        ftol=1e-12,
+    )
+    return moved(start, found.x)
+
+
+def _misfit(camera: Camera, tags: Sequence[_SeenTag], pose: Pose) -> float:
+    """Squares of the errors, in variances, for each that is free."""
+    return float(np.sum(_errors(camera, tags, pose) ** 2)) / (8 * len(tags) - 6)
+
+
+def _agreeing(
+    camera: Camera, tags: list[_SeenTag], start: Pose
+) -> tuple[list[_SeenTag], list[_SeenTag]]:
+    """Tags that agree with each other, and those that all others contradict."""
+    strangers: list[_SeenTag] = []
+    while len(tags) > LEAST_TAGS:
+        misfit = _misfit(camera, tags, _fit(camera, tags, start))
+        rests = [tags[:k] + tags[k + 1 :] for k in range(len(tags))]
+        without = [_misfit(camera, rest, _fit(camera, rest, start)) for rest in rests]
+        k = int(np.argmin(without))
+        if misfit < _OFF or without[k] > 0.5 * misfit:
+            break
+        strangers.append(tags[k])
+        tags = rests[k]
+    return tags, strangers
+
+
+def _is_off(camera: Camera, tag: _SeenTag, best: Pose) -> str:
+    depth = float(best.apply(tag.corners)[:, 2].mean())
+    pixels = float(np.sqrt(2.0 * np.mean(tag.errors(camera, best) ** 2)))
+    away = pixels * depth / float(camera.matrix[0, 0])
+    return f"is seen {away * 1e3:.1f} mm from where the rig file puts it"
+
+
+def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
+    """Of ``world_from_camera``, shape (6, 6); wider where corners scatter more than they should."""
+    step = 1e-6
+    slopes = np.column_stack(
+        [
+            (_errors(camera, tags, moved(best, d)) - _errors(camera, tags, moved(best, -d)))
+            / (2 * step)
+            for d in step * np.eye(6)
+        ]
+    )
+    scale = max(1.0, _misfit(camera, tags, best))
+    covariance = scale * np.linalg.inv(slopes.T @ slopes)
+    change = change_of_inverse(best)
+    return np.asarray(change @ covariance @ change.T)
+
+
+def _lacks(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> list[Issue]:
+    lacks = []
+    if len(tags) < LEAST_TAGS:
+        seen = f"{len(tags)} frame tag{'s are' if len(tags) != 1 else ' is'} seen"
+        what = f"{seen}, {LEAST_TAGS} are needed"
+        step = "survey more tags, all around what the camera sees"
+        lacks.append(Issue(what, step))
+    for tag in tags:
+        size = np.sqrt(np.mean((tag.whitening @ tag.errors(camera, best)) ** 2))
+        if len(tags) >= LEAST_TAGS and size > _OFF:
+            what = f"tag {tag.number} {_is_off(camera, tag, best)}"
+            step = f"survey tag {tag.number} again, or take it out of the rig file"
+            lacks.append(Issue(what, step))
+    return lacks

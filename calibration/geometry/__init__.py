@@ -1,0 +1,1 @@
+"""Calibrates the rig's geometry: outlets, anchors, drums and cable offsets."""

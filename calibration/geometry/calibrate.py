@@ -1,0 +1,323 @@
+"""Finds a rig's numbers from drive positions at rest, and how well they are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from calibration.geometry.fit import RigFit, poses_from_lengths
+from calibration.geometry.identifiability import (
+    Observability,
+    RigUncertainty,
+    identified,
+    sentences,
+    uncertainty_of_rig,
+)
+from calibration.geometry.measurements import RigMeasurements
+from calibration.geometry.model import Parameters, RigGeometry, RigModel, rig_with
+from calibration.statistics import Interval
+from model.errors import BadInput
+from model.kinematics import cables_to, poses_near
+from model.pose import Array
+from model.rig import Rig
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
+
+# Leaves out places that contradict the others: a drive that slipped, a pose that was mistaken.
+
+
+FAR_OFF = 4.0
+"""A place is left out that is so many times as far off as the median,"""
+OFF = 2.0
+"""and farther off than so many of the standard deviations that were stated."""
+
+
+def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> RigMeasurements:
+    """The places that agree with each other; the others are named as unused.
+
+    Args:
+        measured: Places at rest.
+        fit: Of all of them, robust.
+        fewest: Nothing is left out where fewer places than that would remain.
+    """
+    cables = fit.residuals / fit.deviations
+    misfits = _misfits(cables, fit.pose_misfits, measured)
+    usual = float(np.median(misfits))
+    bad = misfits > max(FAR_OFF * usual, OFF)
+    if not bad.any() or len(measured) - int(bad.sum()) < fewest:
+        return measured
+    unused = dict(measured.unused)
+    for k in np.flatnonzero(bad):
+        worst = int(np.argmax(np.abs(cables[k])))
+        by_pose = fit.pose_misfits[k] > abs(cables[k, worst])
+        what = "pose" if by_pose else f"cable {worst + 1}"
+        apart = fit.positions[k] - measured.positions[k]
+        off = float(np.linalg.norm(apart)) if by_pose else float(abs(fit.residuals[k, worst]))
+        unused[measured.names[k]] = (
+            f"contradicts the others: {what} is {off * 1e3:.3g} mm off, the place"
+            f" {misfits[k] / usual:.3g} times as far as most"
+        )
+    return replace(measured, unused=unused).part(~bad)
+
+
+def _misfits(cables: Array, poses: Array, measured: RigMeasurements) -> Array:
+    """How far off places are, RMS in standard deviations, shape (n,)."""
+    freedom = np.maximum(cables.shape[1] - 6 * ~measured.posed, 1)
+    misfits: Array = np.sqrt((np.sum(cables**2, axis=1) + poses**2) / freedom)
+    return misfits
+
+
+# How well a rig's numbers tell places that the fit has not seen, each left out once.
+
+
+FOLDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Places that a fit has not seen, each left out once.
+
+    Attributes:
+        before: How far off they are by the rig file, shape (n,), [m].
+        after: By the fits that did not see them, shape (n,), [m].
+        poses: Distances of positions; else of cables from any pose, for lengths alone.
+    """
+
+    before: Array
+    after: Array
+    poses: bool
+
+
+def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation: float) -> HeldOut:
+    """Fits without every fifth place in turn, and looks at those.
+
+    Args:
+        parameters: The unknowns.
+        measured: Places at rest.
+        length_deviation: Of a cable's length as a drive tells it, [m].
+
+    Raises:
+        Fault: A part of the measurements cannot be fitted.
+    """
+    n = len(measured)
+    posed = bool(measured.posed.all())
+    before, after = np.empty(n), np.empty(n)
+    zero = np.zeros(len(parameters))
+    for fold in range(FOLDS):
+        out = np.arange(n) % FOLDS == fold
+        rest, left_out = measured.part(~out), measured.part(out)
+        fit, _ = identified(parameters, rest, length_deviation)
+        for errors, values in ((before, zero), (after, fit.values)):
+            errors[out] = _errors(parameters, values, left_out, posed)
+    return HeldOut(before, after, posed)
+
+
+def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
+    """How far off places are that a fit has not seen, shape (n,), [m]."""
+    model, geometry = RigModel(parameters, measured), parameters.geometry(values)
+    lengths, rig = model.counted.by(geometry), rig_with(parameters.rig, geometry)
+    if not posed:
+        found = poses_from_lengths(rig, lengths)
+        return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in found])
+    positions, _ = poses_near(rig, lengths, measured.positions, measured.rotations, steps=8)
+    return np.asarray(np.linalg.norm(positions - measured.positions, axis=1))
+
+
+FEWEST_PLACES = 10
+"""Fewer say too little to be fitted at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigCalibration:
+    """A rig's numbers from measurements.
+
+    Attributes:
+        parameters: The unknowns and the rig file.
+        measured: What they are from, without places that contradict the others.
+        fit: The best fit that leaves what cannot be identified as in the rig file.
+        observability: What the data tell.
+        uncertainty: Of the unknowns.
+        held_out: Places left out of fits.
+        length_deviation: Of a cable's length as a drive tells it, its tension measured, [m].
+    """
+
+    parameters: Parameters
+    measured: RigMeasurements
+    fit: RigFit
+    observability: Observability
+    uncertainty: RigUncertainty
+    held_out: HeldOut
+    length_deviation: float
+
+    @property
+    def rig(self) -> Rig:
+        """As its file tells it."""
+        return self.parameters.rig
+
+    @cached_property
+    def geometry(self) -> RigGeometry:
+        """The rig as found."""
+        return self.parameters.geometry(self.fit.values)
+
+    @cached_property
+    def at_home_counts(self) -> Array:
+        """Unstrained cable at the rig file's home counts, shape (m,), [m]."""
+        return RigModel(self.parameters, self.measured).counted.at_home(self.geometry)
+
+    @cached_property
+    def not_identified(self) -> list[str]:
+        """What the data do not tell, in words."""
+        return sentences(self.observability, self.parameters)
+
+    @cached_property
+    def intervals(self) -> dict[str, Interval]:
+        """What was found, by name with unit, 95 %."""
+        geometry, m = self.geometry, self.rig.cable_count
+        found: dict[str, Interval] = {}
+        drums = np.array([w.drum_mm_per_rev for w in self.rig.document.winches])
+        tables: dict[str, tuple[Array, str, Array]] = {
+            "outlets": (geometry.outlets.ravel() * 1e3, "_mm", np.full(3 * m, 1e3)),
+            "anchors": (geometry.anchors.ravel() * 1e3, "_mm", np.full(3 * m, 1e3)),
+            "pulleys": (np.array([geometry.pulley_radius * 1e3]), "_mm", np.array([1e3])),
+            "drum_scale": (drums * (1.0 + geometry.drum_scale), "_mm_per_rev", drums),
+            "offsets": (geometry.offsets * 1e3, "_mm", np.full(m, 1e3)),
+        }
+        half_widths = self.uncertainty.half_widths
+        for group, place in self.parameters.slices().items():
+            if group == "stiffness":
+                found["stiffness_n"] = self._stiffness()
+                continue
+            values, unit, scale = tables[group]
+            widths = half_widths[place] * scale
+            rows = zip(self.parameters.names[place], values, widths, strict=True)
+            found |= {f"{n}{unit}": Interval(float(v), float(w)) for n, v, w in rows}
+        return found
+
+    def _stiffness(self) -> Interval:
+        """Of the cables, [N]: its logarithm is as uncertain to both sides, itself is not."""
+        width = float(self.uncertainty.half_widths[self.parameters.slices()["stiffness"]][0])
+        stiffness = self.geometry.stiffness
+        return Interval.between(stiffness * math.exp(-width), stiffness * math.exp(width))
+
+    def position_error(self, positions: Array, rotations: Array) -> Array:
+        """How far off the platform may be where its drives are told to bring it, 95 %.
+
+        Args:
+            positions: World frame, shape (k, 3), [m].
+            rotations: ``world_from_platform``, shape (k, 3, 3).
+
+        Returns:
+            Along the worst direction, shape (k,), [m].
+        """
+        there = _sent_to(self.rig, positions, rotations)
+        line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
+        moved = -np.linalg.pinv(line.by_pose) @ line.by_values
+        return self.uncertainty.worst(moved[:, :3])
+
+    def reached(self, positions: Array, rotations: Array) -> Array:
+        """Where the platform truly goes when the rig file's numbers are to bring it to poses.
+
+        Args:
+            positions: World frame, shape (k, 3), [m].
+            rotations: ``world_from_platform``, shape (k, 3, 3).
+
+        Returns:
+            Shape (k, 3), [m].
+        """
+        there = _sent_to(self.rig, positions, rotations)
+        lengths = RigModel(self.parameters, there).counted.by(self.geometry)
+        rig = rig_with(self.rig, self.geometry)
+        return poses_near(rig, lengths, positions, rotations, steps=10)[0]
+
+
+def fit_rig(
+    rig: Rig,
+    measured: RigMeasurements,
+    deviations: Mapping[str, float],
+    length_deviation: float,
+) -> RigCalibration:
+    """Finds the numbers of a rig.
+
+    Args:
+        rig: As its file tells it.
+        measured: Places at rest.
+        deviations: How far off the rig file may be by group of numbers; groups left out are taken
+            as known.
+        length_deviation: Of a cable's length as a drive tells it, its tension measured, [m].
+
+    Raises:
+        BadInput: Too few places, a pose outside the rig, or nothing to look for.
+        Fault: The measurements cannot be fitted.
+    """
+    if len(measured) < FEWEST_PLACES:
+        raise BadInput(
+            f"only {len(measured)} places at rest, {FEWEST_PLACES} are needed and 60 are good",
+            where="calibrate rig",
+            next_step="measure in more places: `cdpr calibrate poses` plans them",
+        )
+    _require_within(rig, measured)
+    parameters = Parameters.of(rig, deviations)
+    if not len(parameters):
+        raise BadInput(
+            "there is nothing to look for",
+            where="calibrate rig",
+            why="every group of numbers is taken as known",
+            next_step="leave out --known for one of them",
+        )
+    fit, observability = identified(parameters, measured, length_deviation)
+    agreeing = without_outliers(measured, fit, FEWEST_PLACES)
+    if len(agreeing) < len(measured):
+        measured = agreeing
+        fit, observability = identified(parameters, measured, length_deviation)
+    return RigCalibration(
+        parameters,
+        measured,
+        fit,
+        observability,
+        uncertainty_of_rig(parameters, measured, fit, observability),
+        held_out(parameters, measured, length_deviation),
+        length_deviation,
+    )
+
+
+def _require_within(rig: Rig, measured: RigMeasurements) -> None:
+    """Poses are where the platform can be: numbers in another unit are not.
+
+    Raises:
+        BadInput: One is outside the box around outlets, home and workspace.
+    """
+    corners = np.vstack([rig.outlets, rig.workspace_lower, rig.workspace_upper, rig.home.position])
+    lower, upper = corners.min(axis=0), corners.max(axis=0)
+    outside = ((measured.positions < lower) | (measured.positions > upper)).any(axis=1)
+    if outside.any():
+        k = int(np.argmax(outside))
+        raise BadInput(
+            f"the pose ({_mm(measured.positions[k])}) is outside the rig, whose outlets and"
+            f" workspace reach from ({_mm(lower)}) to ({_mm(upper)})",
+            where=measured.names[k],
+            why="another unit or frame, or a pose that was mistaken",
+            next_step="check units and axes of x_mm, y_mm, z_mm, or leave out the line",
+        )
+
+
+def _mm(point: Array) -> str:
+    return ", ".join(f"{x * 1e3:.4g}" for x in point) + " mm"
+
+
+def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:
+    """Places with the drive positions of poses, by the rig file and under the tensions of home."""
+    anchors = positions[:, None, :] + np.einsum("kij,mj->kmi", rotations, rig.anchors)
+    winches, tensions = WinchMap(rig), working_tensions(rig, rig.home).tensions
+    counts = winches.counts(winches.unstrained(cables_to(rig, anchors).lengths, tensions))
+    return RigMeasurements(
+        names=("",) * len(positions),
+        counts=counts,
+        tensions=np.tile(tensions, (len(counts), 1)),
+        positions=positions,
+        rotations=rotations,
+        covariances=np.zeros((len(positions), 6, 6)),
+    )

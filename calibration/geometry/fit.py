@@ -1,0 +1,281 @@
+"""Fits a rig's numbers and the platform's poses together: damped least squares, robust.
+
+The poses are eliminated place by place (Schur complement), so that the effort grows with their
+number only in proportion. Unknowns are counted in standard deviations of the rig file, which is one
+more measurement of each.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.geometry.measurements import RigMeasurements
+from calibration.geometry.model import Parameters, RigModel
+from calibration.statistics import huber, share_of
+from model.errors import Fault
+from model.kinematics import ForwardSolution, NoCable, forward_kinematics
+from model.pose import Array, matrix_from_rotation_vector, read_only, rotation_vector_from_matrix
+from model.rig import Rig
+
+# The normal equations of a rig's fit, place by place, with the places' poses eliminated.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """The equations of n places for r unknowns.
+
+    Attributes:
+        own: Of the unknowns, shape (n, r, r).
+        prior: How far the unknowns are from the rig file, shape (r,): of all places together.
+        mixed: Of unknowns and pose, shape (n, r, 6).
+        poses: Of the pose, shape (n, 6, 6).
+        pull: Half the slope of the squares by the unknowns, shape (n, r).
+        pose_pull: Half the slope by the pose, shape (n, 6).
+    """
+
+    own: Array
+    prior: Array
+    mixed: Array
+    poses: Array
+    pull: Array
+    pose_pull: Array
+
+    def by_place(self, damping: float = 0.0) -> tuple[Array, Array]:
+        """What each place says of the unknowns with its pose eliminated.
+
+        Returns:
+            Information, shape (n, r, r), and half the slope of the squares, shape (n, r).
+        """
+        poses = self._poses(damping)
+        gained = np.linalg.solve(poses, np.swapaxes(self.mixed, 1, 2))
+        alone = np.asarray(np.linalg.solve(poses, self.pose_pull[..., None]))
+        reduced = self.own - self.mixed @ gained
+        symmetric: Array = (reduced + np.swapaxes(reduced, 1, 2)) / 2.0
+        slopes: Array = self.pull - (self.mixed @ alone)[..., 0]
+        return symmetric, slopes
+
+    def solved(self, damping: float) -> tuple[Array, Array]:
+        """Steps of the unknowns, shape (r,), and twists of the poses, shape (n, 6)."""
+        informations, slopes = self.by_place(damping)
+        right = self.prior + slopes.sum(axis=0)
+        left = informations.sum(axis=0) + (1.0 + damping) * np.eye(len(right))
+        step: Array = -np.linalg.solve(left, right)
+        moved = self.pose_pull + np.swapaxes(self.mixed, 1, 2) @ step
+        twists = -np.asarray(np.linalg.solve(self._poses(damping), moved[..., None]))[..., 0]
+        return step, twists
+
+    def _poses(self, damping: float) -> Array:
+        diagonal = np.einsum("nii->ni", self.poses)
+        damped: Array = self.poses + damping * diagonal[:, None, :] * np.eye(6)
+        return damped
+
+
+MOST_STEPS = 200
+SETTLED = 1e-6
+"""The fit has come to its end where a step makes the sum of squares smaller by less, as a share."""
+MOST_DAMPING = 1e9
+"""No smaller step is tried: what it would gain is below round-off."""
+START_TOLERANCE = 1e-5
+"""Poses to begin with need be no nearer, [m] and [rad]."""
+CABLE_BEND, POSE_BEND = 3.0, 4.0
+"""Where residuals of cables and of poses begin to count less than their square."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigFit:
+    """What fits the measurements best.
+
+    Attributes:
+        values: Of the unknowns, shape (p,), [m] or share.
+        positions: World frame, shape (n, 3), [m].
+        rotations: ``world_from_platform``, shape (n, 3, 3).
+        residuals: Of cable lengths, shape (n, m), [m].
+        deviations: How far off each length was taken to be, shape (n, m), [m].
+        weights: How much of each residual's square counts, shape (n, m); less than 1 where it is
+            far off.
+        pose_misfits: Of the poses from the measured ones, in standard deviations, shape (n,); 0
+            where there is none.
+        informations: What each place alone says of the unknowns, its pose projected out, shape
+            (n, p, p), per variance of the rig file.
+        scores: Half the slope of each place's squares by the unknowns in the same units, (n, p).
+    """
+
+    values: Array
+    positions: Array
+    rotations: Array
+    residuals: Array
+    deviations: Array
+    weights: Array
+    pose_misfits: Array
+    informations: Array
+    scores: Array
+
+    @property
+    def information(self) -> Array:
+        """What the data alone say of the unknowns, shape (p, p), per variance of the rig file.
+
+        Eigenvalues above 1 are known better from the data than from the rig file.
+        """
+        total: Array = self.informations.sum(axis=0)
+        return total
+
+
+class RigFitter:
+    """One set of measurements and unknowns."""
+
+    def __init__(
+        self, parameters: Parameters, measured: RigMeasurements, length_deviation: float
+    ) -> None:
+        """Prepares; nothing is fitted yet.
+
+        Args:
+            parameters: The unknowns.
+            measured: Places at rest.
+            length_deviation: Of a cable's length as a drive tells it, [m].
+        """
+        self._parameters, self._measured = parameters, measured
+        self._model = RigModel(parameters, measured)
+        self._deviations = self._model.length_deviations(length_deviation)
+        self._posed = measured.posed
+        self._pose_weights = np.zeros((len(measured), 6, 6))
+        self._pose_weights[self._posed] = np.linalg.inv(measured.covariances[self._posed])
+
+    def fit(self, basis: Array | None = None) -> RigFit:
+        """The most probable values and poses.
+
+        Args:
+            basis: Directions in which the unknowns may leave the rig file, orthonormal columns in
+                standard deviations of the rig file, shape (p, r); all when left out.
+
+        Raises:
+            Fault: The search does not come to an end.
+        """
+        free = np.eye(len(self._parameters)) if basis is None else basis
+        spread = self._parameters.deviations[:, None] * free
+        z = np.zeros(free.shape[1])
+        positions, rotations = self._start()
+        cost, damping = self._cost(spread @ z, z, positions, rotations), 1e-3
+        for _ in range(MOST_STEPS):
+            system = self._system(spread @ z, z, spread, positions, rotations)
+            gain = -1.0
+            while gain < 0.0 and damping < MOST_DAMPING:
+                step, twists = system.solved(damping)
+                trial = (z + step, positions + twists[:, :3], _turned(rotations, twists[:, 3:]))
+                gain = cost - self._cost(spread @ trial[0], *trial)
+                damping *= 0.1 if gain >= 0.0 else 10.0
+            if gain >= 0.0:
+                z, positions, rotations = trial
+                cost -= gain
+            if gain < SETTLED * (1.0 + cost):
+                return self._result(spread @ z, positions, rotations)
+        raise Fault(
+            "the rig's numbers could not be fitted to the measurements",
+            where="calibrate rig",
+            why="they contradict each other, or the rig file is far off",
+            next_step="check units, the order of the cables and the reference of the drives",
+        )
+
+    def _start(self) -> tuple[Array, Array]:
+        """Measured poses; the others from the rig file's forward kinematics, each near the last."""
+        rig, counted = self._parameters.rig, self._model.counted
+        lengths = counted.by(self._parameters.geometry(np.zeros(len(self._parameters))))
+        positions, rotations = self._measured.positions.copy(), self._measured.rotations.copy()
+        unknown = np.flatnonzero(~self._posed)
+        for k, found in zip(unknown, poses_from_lengths(rig, lengths[unknown]), strict=True):
+            positions[k], rotations[k] = found.pose.position, found.pose.rotation
+        return positions, rotations
+
+    def _pose_errors(self, positions: Array, rotations: Array) -> Array:
+        """Estimated less measured poses, shape (n, 6), [m, rad]; 0 where there is none."""
+        errors = np.zeros((len(positions), 6))
+        errors[:, :3] = positions - self._measured.positions
+        turns = rotations @ np.swapaxes(self._measured.rotations, 1, 2)
+        for k in np.flatnonzero(self._posed):
+            errors[k, 3:] = rotation_vector_from_matrix(turns[k])
+        errors[~self._posed] = 0.0
+        return errors
+
+    def _distances(self, errors: Array) -> Array:
+        """Of poses from the measured ones, in standard deviations, shape (n,)."""
+        squares = np.einsum("ni,nij,nj->n", errors, self._pose_weights, errors)
+        distances: Array = np.sqrt(np.maximum(squares, 0.0))
+        return distances
+
+    def _cost(self, values: Array, z: Array, positions: Array, rotations: Array) -> float:
+        try:
+            residuals = self._model.residuals(values, positions, rotations)
+        except NoCable:
+            return float("inf")
+        cables = np.abs(residuals) / self._deviations
+        poses = self._distances(self._pose_errors(positions, rotations))
+        return float(z @ z + huber(cables, CABLE_BEND).sum() + huber(poses, POSE_BEND).sum())
+
+    def _system(
+        self, values: Array, z: Array, spread: Array, positions: Array, rotations: Array
+    ) -> NormalEquations:
+        line = self._model.linearised(values, positions, rotations)
+        weights = self._cable_share(line.residuals) / self._deviations**2
+        errors = self._pose_errors(positions, rotations)
+        share = share_of(self._distances(errors), POSE_BEND)
+        pose_weights = share[:, None, None] * self._pose_weights
+        by_z = line.by_values @ spread
+        weighted = weights[..., None] * line.by_pose
+        return NormalEquations(
+            own=np.swapaxes(by_z, 1, 2) @ (weights[..., None] * by_z),
+            prior=z,
+            mixed=np.swapaxes(by_z, 1, 2) @ weighted,
+            poses=np.swapaxes(line.by_pose, 1, 2) @ weighted + pose_weights,
+            pull=np.einsum("nmp,nm,nm->np", by_z, weights, line.residuals),
+            pose_pull=np.einsum("nmi,nm->ni", weighted, line.residuals)
+            + np.einsum("nij,nj->ni", pose_weights, errors),
+        )
+
+    def _cable_share(self, residuals: Array) -> Array:
+        """How much of each cable's square counts, shape (n, m)."""
+        return share_of(np.abs(residuals) / self._deviations, CABLE_BEND)
+
+    def _result(self, values: Array, positions: Array, rotations: Array) -> RigFit:
+        spread = np.diag(self._parameters.deviations)
+        zero = np.zeros(len(values))
+        system = self._system(values, zero, spread, positions, rotations)
+        residuals = self._model.residuals(values, positions, rotations)
+        return RigFit(
+            values,
+            positions,
+            rotations,
+            residuals,
+            read_only(self._deviations),
+            self._cable_share(residuals),
+            self._distances(self._pose_errors(positions, rotations)),
+            *system.by_place(),
+        )
+
+
+def poses_from_lengths(rig: Rig, lengths: Array) -> list[ForwardSolution]:
+    """Forward kinematics of places, each from near the last, from home, or from anywhere.
+
+    Args:
+        rig: With its numbers as they are taken to be.
+        lengths: From outlet to anchor, shape (n, m), [m].
+
+    Raises:
+        Fault: No start leads to a pose.
+    """
+    found: list[ForwardSolution] = []
+    for wanted in lengths:
+        tries = []
+        for start in (found[-1].pose if found else rig.home, rig.home):
+            with suppress(Fault):
+                tries.append(forward_kinematics(rig, wanted, start, tolerance=START_TOLERANCE))
+        if not tries:
+            tries = [forward_kinematics(rig, wanted, tolerance=START_TOLERANCE)]
+        found.append(min(tries, key=lambda solution: solution.worst))
+    return found
+
+
+def _turned(rotations: Array, turns: Array) -> Array:
+    turned: Array = np.array([matrix_from_rotation_vector(t) for t in turns]) @ rotations
+    return turned

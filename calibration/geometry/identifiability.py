@@ -1,0 +1,256 @@
+"""Which directions of a rig's numbers the data tell, and words for those that they do not.
+
+The information of the data is compared with the rig file's: along an eigenvector with a value above
+1 the data know more. The others cannot be identified; they are left as the rig file says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from calibration.geometry.fit import RigFit, RigFitter
+from calibration.geometry.measurements import RigMeasurements
+from calibration.geometry.model import AXES, Parameters
+from calibration.statistics import CONFIDENCE
+from model.pose import Array, read_only, skew
+
+LEAST_INFORMATION = 1.0
+"""Of a direction, in units of what the rig file tells."""
+NAMED_SHARE = 0.85
+"""A direction with a name is unknown when so much of its square lies among the unknown ones."""
+LARGEST_PARTS = 4
+"""So many unknowns are named for a direction without a name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observability:
+    """What data tell about the unknowns of a rig.
+
+    Attributes:
+        information: Eigenvalues, falling, shape (p,).
+        known: Orthonormal directions that the data tell, in standard deviations of the rig file,
+            shape (p, r).
+        unknown: The others, shape (p, p − r).
+    """
+
+    information: Array
+    known: Array
+    unknown: Array
+
+    @classmethod
+    def of(cls, information: Array) -> Observability:
+        """From `RigFit.information`, shape (p, p)."""
+        directions, values, _ = np.linalg.svd(information)
+        told = values > LEAST_INFORMATION
+        return cls(values, directions[:, told], directions[:, ~told])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Named:
+    """A direction with a name; several with one name and different parts are told together."""
+
+    name: str
+    part: str
+    direction: Array
+
+
+def sentences(observability: Observability, parameters: Parameters) -> list[str]:
+    """What cannot be identified, in words; nothing when all is."""
+    left = observability.unknown.copy()
+    found: dict[str, list[str]] = {}
+    for named in _named(parameters):
+        size = np.linalg.norm(named.direction)
+        if size == 0.0 or not left.shape[1]:
+            continue
+        direction = named.direction / size
+        within = left.T @ direction
+        if within @ within < NAMED_SHARE:
+            continue
+        found.setdefault(named.name, []).append(named.part)
+        left = _without(left, left @ within)
+    told = [_sentence(name, parts, parameters.rig.cable_count) for name, parts in found.items()]
+    if left.shape[1]:
+        told.append(
+            f"{left.shape[1]} sums of several numbers, {_by_parts(left[:, -1], parameters)}"
+        )
+    return told
+
+
+def _sentence(name: str, parts: list[str], cables: int) -> str:
+    if parts == [""]:
+        return name
+    if len(parts) == 3 * cables:
+        return f"{name}: every cable along x, y and z"
+    return f"{name}: {', '.join(parts)}"
+
+
+def _without(space: Array, direction: Array) -> Array:
+    """The subspace of a space orthogonal to a direction in it, one dimension less."""
+    unit = direction / np.linalg.norm(direction)
+    rest = space - np.outer(unit, unit @ space)
+    left, _, _ = np.linalg.svd(rest, full_matrices=False)
+    return left[:, : space.shape[1] - 1]
+
+
+def _named(parameters: Parameters) -> list[_Named]:
+    """Directions that people have a word for, those that matter most first."""
+    rig, places = parameters.rig, parameters.slices()
+    m, p = rig.cable_count, len(parameters)
+    zero = np.zeros(p)
+
+    def scaled(**groups: Array) -> Array:
+        direction = zero.copy()
+        for group, values in groups.items():
+            if group in places:
+                direction[places[group]] = values.ravel()
+        return direction / parameters.deviations
+
+    found: list[_Named] = []
+    if "outlets" in places and "anchors" in places:
+        for cable in range(m):
+            for axis, name in enumerate(AXES):
+                shift = np.zeros((m, 3))
+                shift[cable, axis] = 1.0
+                what = "outlet and anchor of one cable moved together"
+                part = f"cable {cable + 1} along {name}"
+                found.append(_Named(what, part, scaled(outlets=shift, anchors=shift)))
+    found += _rigid(
+        "outlets", "all outlets moved or turned as one in the world", rig.outlets, scaled
+    )
+    found += _rigid(
+        "anchors", "all anchors moved or turned as one on the platform", rig.anchors, scaled
+    )
+    if "drum_scale" in places:
+        grown = scaled(
+            outlets=rig.outlets - rig.outlets.mean(axis=0),
+            anchors=rig.anchors,
+            drum_scale=np.ones(m),
+        )
+        found.append(_Named("the size of the whole rig", "", grown))
+    if "stiffness" in places:
+        found.append(_Named("the stiffness of the cables", "", scaled(stiffness=np.ones(1))))
+    for number, name in enumerate(parameters.names):
+        alone = zero.copy()
+        alone[number] = 1.0
+        found.append(_Named("single numbers", name, alone))
+    return found
+
+
+def _rigid(group: str, what: str, points: Array, scaled: Callable[..., Array]) -> list[_Named]:
+    centred = points - points.mean(axis=0)
+    moves = {f"along {a}": np.tile(np.eye(3)[i], (len(points), 1)) for i, a in enumerate(AXES)}
+    turns = {f"about {a}": centred @ skew(np.eye(3)[i]).T for i, a in enumerate(AXES)}
+    return [_Named(what, part, scaled(**{group: v})) for part, v in (moves | turns).items()]
+
+
+def _by_parts(direction: Array, parameters: Parameters) -> str:
+    largest = np.argsort(-np.abs(direction))[:LARGEST_PARTS]
+    parts = ", ".join(f"{parameters.names[i]} {direction[i]:+.2f}" for i in largest)
+    return f"one of them mostly {parts} (in standard deviations of the rig file)"
+
+
+def identified(
+    parameters: Parameters, measured: RigMeasurements, length_deviation: float
+) -> tuple[RigFit, Observability]:
+    """The fit in the directions that the data tell, and which those are.
+
+    Args:
+        parameters: The unknowns.
+        measured: Places at rest.
+        length_deviation: Of a cable's length as a drive tells it, [m].
+
+    Raises:
+        Fault: The measurements cannot be fitted.
+    """
+    fitter = RigFitter(parameters, measured, length_deviation)
+    observability = Observability.of(fitter.fit().information)
+    return fitter.fit(observability.known), observability
+
+
+# How well places determine a rig's numbers: by the scatter of cables, and place by place.
+#
+# The scatter alone promises too much where residuals of one place err together: a pose that is off,
+# a cable law that is not the rig file's. The spread of the fits without any one place (the
+# jackknife over places, to first order) feels that. The rig file's numbers are a measurement beside
+# the places, stated and never left out.
+#
+# Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigUncertainty:
+    """What is known about the errors of a rig's numbers, [m] or share.
+
+    Attributes:
+        by_scatter: Covariance, shape (p, p); what is not identified has that of the rig file.
+        by_places: The same by what leaving each place out changes.
+        scatter: By how much the residuals' variance is larger than stated; 1 where it is not.
+        quantile: Half the width of a 95 % interval in standard deviations.
+    """
+
+    by_scatter: Array
+    by_places: Array
+    scatter: float
+    quantile: float
+
+    @property
+    def half_widths(self) -> Array:
+        """Of the 95 % intervals, the larger of both, shape (p,)."""
+        return self.worst(np.eye(len(self.by_scatter))[:, None])
+
+    def worst(self, slopes: Array) -> Array:
+        """How far off vectors that depend on the numbers may be, along their worst direction.
+
+        Args:
+            slopes: Their derivatives by the numbers, shape (k, d, p).
+
+        Returns:
+            95 %, shape (k,).
+        """
+        variances = [
+            np.linalg.eigvalsh(slopes @ covariance @ np.swapaxes(slopes, 1, 2))[:, -1]
+            for covariance in (self.by_scatter, self.by_places)
+        ]
+        worst: Array = self.quantile * np.sqrt(np.maximum(*variances))
+        return worst
+
+
+def uncertainty_of_rig(
+    parameters: Parameters,
+    measured: RigMeasurements,
+    fit: RigFit,
+    observability: Observability,
+) -> RigUncertainty:
+    """The uncertainty of a fit.
+
+    Args:
+        parameters: The unknowns.
+        measured: Places at rest.
+        fit: Of them, in the directions that they tell; where residuals tell of lengths farther off
+            than they were taken to be, that holds.
+        observability: Which those are.
+    """
+    known, unknown = observability.known, observability.unknown
+    informations = known.T @ fit.informations @ known
+    scores = fit.scores @ known
+    whole = informations.sum(axis=0) + np.eye(known.shape[1])
+    squares = float(np.sum(fit.weights * (fit.residuals / fit.deviations) ** 2))
+    freedom = fit.residuals.size - known.shape[1] - 6 * int((~measured.posed).sum())
+    scatter = max(1.0, squares / max(freedom, 1))
+    count = len(measured)
+    without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]
+    apart = without - without.mean(axis=0)
+    by_drawing = np.linalg.inv(whole @ whole)
+    places = (count - 1) / count * apart.T @ apart + by_drawing
+    spread = parameters.deviations
+    of_all = (
+        known @ inner @ known.T + unknown @ unknown.T
+        for inner in (scatter * np.linalg.inv(whole), places)
+    )
+    by_scatter, by_places = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
+    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
+    return RigUncertainty(by_scatter, by_places, scatter, quantile)

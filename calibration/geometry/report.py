@@ -1,0 +1,371 @@
+"""The report of a rig's calibration: what changed, how well it is known, how well it fits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from calibration.geometry.calibrate import RigCalibration
+from calibration.geometry.model import AXES
+from calibration.geometry.quality import RigQuality
+from calibration.report import Section, drawing, page_of, table_of
+from calibration.statistics import Interval
+from executor.report.scene import frame_surface, platform_surface
+from model.kinematics import cables_to
+from model.pages.charts import DOTTED, Chart, ChartLine, chart_grid, charts
+from model.pages.page import bullets, list_table, paragraph, tile, tiles
+from model.pages.scene import (
+    Label,
+    Moment,
+    SceneFigure,
+    arrows,
+    grid_floor,
+    scene_data,
+    viewer,
+)
+from model.pose import Array
+from model.rig import Rig
+
+_SHARE = 0.12
+"""The longest arrow of the picture, as a share of the frame's diagonal."""
+_LAYERS = (
+    ("outlets", "Outlets moved", "limit", True),
+    ("anchors", "Anchors moved", "tag", True),
+    ("robot", "Platform and cables, by the rig file", "platform", True),
+    ("numbers", "Cable numbers", "ink", True),
+    ("frame", "Frame of outlets", "frame", True),
+    ("floor", "Floor", "line", True),
+)
+_HEAD = ("", "rig file", "new", "change", "± 95 %", "changed")
+
+
+def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) -> str:
+    """The whole page."""
+    data, out = result.measured, result.held_out
+    kind = "poses and drive positions" if out.poses else "drive positions alone"
+    scene, factor = _scene(result)
+    told = result.not_identified
+    sections = [
+        Section("What moved", _picture(result, scene, factor)),
+        *_number_sections(result),
+        Section(
+            "How well it fits poses that the fit did not see",
+            _held_out(quality) + charts(_by_pose(result)),
+            "Every fifth pose is left out of the fit in turn.",
+        ),
+        Section(
+            "Residuals of each cable",
+            _cables(result) + chart_grid(_residuals(result)),
+            "The length of a cable at the fitted pose less that of its drive, pose by pose.",
+        ),
+        Section(
+            "What cannot be identified",
+            bullets(told) if told else paragraph("Everything that was looked for was found."),
+            "Left as in the rig file. It makes no difference at the poses that were measured.",
+        ),
+        Section(
+            "Information of each direction",
+            _falling(result.observability.information),
+            "On a logarithmic scale; below the line the rig file knows more than the data.",
+        ),
+        Section("Poses", _poses(result)),
+        Section("Not used", table_of(data.unused.items(), ("pose", "why"))),
+    ]
+    return page_of(
+        f"Calibration of rig {result.rig.name}",
+        f"{name}, {date}, {kind} in {len(data)} places",
+        quality.verdict,
+        sections,
+        tiles=_headline(result, quality),
+        scripts=("charts.js", "viewer.js"),
+        data={"scene-data": scene_data(scene)},
+    )
+
+
+def _headline(result: RigCalibration, quality: RigQuality) -> str:
+    """What the calibration does for the rig, in five figures."""
+    what = "positions" if result.held_out.poses else "lengths of cables"
+    moved = np.linalg.norm(result.geometry.outlets - result.rig.outlets, axis=1) * 1e3
+    changed = sum(row[-1] == "yes" for row in number_rows(result))
+    tilt = np.degrees(quality.tilt)
+    return tiles(
+        [
+            tile(
+                "Error" if result.held_out.poses else "Error of lengths",
+                f"{quality.before * 1e3:.2f} → {quality.held_out * 1e3:.2f} mm",
+                f"RMS of {what} left out of the fit: by the rig file → by this calibration",
+                "headline",
+            ),
+            tile(
+                "In the workspace",
+                f"{quality.level * 1e3:.2g} mm",
+                f"at most, 95 %; turned by {tilt:.3g}° {quality.turned * 1e3:.2g} mm",
+            ),
+            tile(
+                "Farthest outlet",
+                f"{moved.max():.1f} mm",
+                f"from the rig file: outlet {int(np.argmax(moved)) + 1}",
+            ),
+            tile(
+                "Numbers changed",
+                f"{changed}",
+                f"of {len(result.intervals)} by more than their interval",
+            ),
+            tile("Poses", f"{len(result.measured)}", f"{len(result.measured.unused)} not used"),
+        ]
+    )
+
+
+# The numbers: rig file, calibration, change and interval.
+
+
+def numbers_in_file(rig: Rig) -> dict[str, float]:
+    """What the rig file says of all numbers that a calibration may find, by name with unit."""
+    found = {
+        f"{what}_{i}_{axis}_mm": float(value) * 1e3
+        for what, points in (("outlet", rig.outlets), ("anchor", rig.anchors))
+        for i, point in enumerate(points, start=1)
+        for axis, value in zip(AXES, point, strict=True)
+    }
+    found["pulley_radius_mm"] = rig.pulley_radius * 1e3
+    for i, winch in enumerate(rig.document.winches, start=1):
+        found |= {f"drum_{i}_mm_per_rev": winch.drum_mm_per_rev, f"offset_{i}_mm": 0.0}
+    return {**found, "stiffness_n": rig.cable_stiffness}
+
+
+def number_rows(result: RigCalibration) -> list[tuple[str, str, str, str, str, str]]:
+    """A row a number: name, rig file, calibration, change, half width, whether it changed."""
+    before = numbers_in_file(result.rig)
+    return [_row(name, before[name], interval) for name, interval in result.intervals.items()]
+
+
+def _row(name: str, before: float, found: Interval) -> tuple[str, str, str, str, str, str]:
+    change = found.value - before
+    digits = 0 if abs(found.value) > 2000.0 else 2
+    return (
+        name,
+        f"{before:.{digits}f}",
+        f"{found.value:.{digits}f}",
+        f"{change:+z.{digits}f}",
+        found.doubt.removeprefix("± "),
+        "yes" if abs(change) > found.half_width else "no",
+    )
+
+
+def _number_sections(result: RigCalibration) -> list[Section]:
+    """A table a kind of number."""
+    rows = number_rows(result)
+    kinds = (
+        ("Outlets [mm]", "outlet_", "World frame."),
+        ("Anchors [mm]", "anchor_", "Platform frame."),
+        ("Drums [mm per revolution]", "drum_", "Cable paid out by a revolution of the drum."),
+        (
+            "Cable at the reference [mm]",
+            "offset_",
+            "Cable at the home counts beyond what reaches the home pose; the rig file says none."
+            " The home counts of the result take it up.",
+        ),
+        ("Pulleys and cables", ("pulley_", "stiffness_"), ""),
+    )
+    return [
+        Section(title, _numbers(chosen), note)
+        for title, start, note in kinds
+        if (chosen := [row for row in rows if row[0].startswith(start)])
+    ]
+
+
+def _numbers(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of one kind without what their heading says; points three to a line."""
+    if not rows[0][0].startswith(("outlet_", "anchor_")):
+        return list_table(_HEAD, [(_short(row[0]), *row[1:]) for row in rows], "numbers")
+    points = [rows[k : k + 3] for k in range(0, len(rows), 3)]
+    return list_table(_HEAD, map(_point, points), "numbers")
+
+
+def _short(name: str) -> str:
+    words = name.split("_")
+    return f"{words[0]} {words[1]}" if words[1].isdigit() else name
+
+
+def _point(rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """x, y and z of a point in one line each, in one row."""
+    name = "\n".join((_short(rows[0][0]) if k == 0 else "") + f" {AXES[k]}" for k in range(3))
+    return (name, *("\n".join(row[k] for row in rows) for k in range(1, 6)))
+
+
+# The rig in 3-D.
+
+
+def _scene(result: RigCalibration) -> tuple[SceneFigure, float]:
+    """Rig file's rig, arrows from it to what was found, and by what factor they are too long."""
+    rig, geometry = result.rig, result.geometry
+    home = rig.home
+    by_outlets, by_anchors = geometry.outlets - rig.outlets, geometry.anchors - rig.anchors
+    frame = frame_surface(rig)
+    longest = max(float(np.linalg.norm(d, axis=1).max()) for d in (by_outlets, by_anchors))
+    span = float(np.linalg.norm(np.ptp(frame.vertices, axis=0)))
+    factor = _round(_SHARE * span / longest) if longest > 0.0 else 1.0
+    floor, _ = grid_floor(frame.vertices)
+    anchors = home.apply(rig.anchors)
+    exits = cables_to(rig, anchors).exits if rig.pulley_radius else rig.outlets
+    turned = by_anchors @ home.rotation.T
+    scene = SceneFigure(
+        surfaces=(frame,),
+        strokes=(
+            floor,
+            arrows("outlets", "limit", rig.outlets, rig.outlets + factor * by_outlets, 2.5),
+            arrows("anchors", "tag", anchors, anchors + factor * turned, 2.0),
+        ),
+        labels=_moved_labels(rig, by_outlets),
+        anchors=rig.anchors,
+        platform=platform_surface(rig),
+        moments=(Moment(0.0, home.position, home.rotation, exits),),
+    )
+    return scene, factor
+
+
+def _round(value: float) -> float:
+    """The round number below."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= value) * power)
+
+
+def _moved_labels(rig: Rig, moved: Array) -> tuple[Label, ...]:
+    return tuple(
+        Label("outlets", f"{np.linalg.norm(shift) * 1e3:.1f} mm", outlet)
+        for outlet, shift in zip(rig.outlets, moved, strict=True)
+    )
+
+
+def _picture(result: RigCalibration, scene: SceneFigure, factor: float) -> str:
+    moved = np.linalg.norm(result.geometry.outlets - result.rig.outlets, axis=1) * 1e3
+    label = (
+        f"The rig of the rig file, with arrows to the {len(moved)} outlets and anchors that were"
+        f" found, {factor:g} times as long as they are; outlets moved by {moved.min():.1f} to"
+        f" {moved.max():.1f} mm."
+    )
+    hint = f"Arrows are {factor:g} times as long as the change from the rig file."
+    return viewer(scene, label, _LAYERS, hint)
+
+
+# Residuals.
+
+
+def _chart(title: str, text: str, quantity: str, lines: Iterable[ChartLine], count: int) -> Chart:
+    """A chart over the number of the pose."""
+    return Chart(
+        title,
+        text,
+        quantity,
+        "mm",
+        tuple(lines),
+        (0.5, count + 0.5),
+        x_quantity="pose",
+        x_unit="number",
+        from_zero=True,
+        group="poses",
+    )
+
+
+def _by_pose(result: RigCalibration) -> Chart:
+    out, number = result.held_out, np.arange(1.0, len(result.measured) + 1.0)
+    text = (
+        f"Line chart of the error of {len(number)} poses: up to {out.before.max() * 1e3:.2f} mm by"
+        f" the rig file, up to {out.after.max() * 1e3:.2f} mm left out of the fit."
+    )
+    lines = (
+        ChartLine("by the rig file", number, out.before * 1e3, "limit", dash=DOTTED),
+        ChartLine("left out of the fit", number, out.after * 1e3, "encoder"),
+    )
+    return _chart("Error at each pose", text, "error", lines, len(number))
+
+
+def _residuals(result: RigCalibration) -> list[Chart]:
+    """A chart a cable, all of one height."""
+    residuals = result.fit.residuals * 1e3
+    number = np.arange(1.0, len(residuals) + 1.0)
+    largest = float(np.abs(residuals).max())
+    return [
+        Chart(
+            f"Cable {i}",
+            f"Line chart of the residual of cable {i} at each pose, at most"
+            f" {np.abs(column).max():.3f} mm.",
+            "residual",
+            "mm",
+            (ChartLine("residual", number, column, "encoder", 1.2),),
+            (0.5, len(number) + 0.5),
+            x_quantity="pose",
+            x_unit="number",
+            y_includes=(-largest, 0.0, largest),
+            height=120,
+            group="poses",
+        )
+        for i, column in enumerate(residuals.T, start=1)
+    ]
+
+
+def _cables(result: RigCalibration) -> str:
+    residuals = result.fit.residuals * 1e3
+    rows = [
+        (
+            f"cable {i}",
+            f"{np.sqrt(np.mean(column**2)):.3f}",
+            f"{np.abs(column).max():.3f}",
+            f"pose {int(np.argmax(np.abs(column))) + 1}",
+        )
+        for i, column in enumerate(residuals.T, start=1)
+    ]
+    return list_table(("", "RMS [mm]", "largest [mm]", "at"), rows, "numbers")
+
+
+def _held_out(quality: RigQuality) -> str:
+    rows = [
+        ("by the rig file as it is", f"{quality.before * 1e3:.3f} mm RMS"),
+        ("each left out of the fit once", f"{quality.held_out * 1e3:.3f} mm RMS"),
+        ("anywhere in the workspace, turned as at home", f"within {quality.level * 1e3:.2g} mm"),
+        (f"turned by {np.degrees(quality.tilt):.3g}°", f"within {quality.turned * 1e3:.2g} mm"),
+    ]
+    return table_of(rows)
+
+
+def _poses(result: RigCalibration) -> str:
+    """Every pose in a line, folded up."""
+    out, residuals = result.held_out, np.abs(result.fit.residuals) * 1e3
+    each = zip(result.measured.names, out.before * 1e3, out.after * 1e3, residuals, strict=True)
+    rows = [
+        (
+            f"{k}",
+            name,
+            f"{before:.3f}",
+            f"{after:.3f}",
+            f"{worst.max():.3f}",
+            f"{worst.argmax() + 1}",
+        )
+        for k, (name, before, after, worst) in enumerate(each, start=1)
+    ]
+    head = ("", "pose", "rig file [mm]", "left out [mm]", "largest residual [mm]", "of cable")
+    return (
+        f"<details><summary>All {len(rows)} poses</summary>"
+        f"{list_table(head, rows, 'numbers')}</details>"
+    )
+
+
+def _falling(information: Array) -> str:
+    """A bar a direction, from 10⁻³ to 10⁶."""
+    width, height = 560.0, 200.0
+    digits = np.clip(np.log10(np.maximum(information, 1e-3)), -3.0, 6.0)
+    step, one = width / len(digits), height * 6.0 / 9.0
+    bars = "".join(
+        f'<rect x="{k * step:.1f}" y="{height - (d + 3.0) / 9.0 * height:.1f}"'
+        f' width="{0.8 * step:.1f}" height="{(d + 3.0) / 9.0 * height:.1f}"'
+        f' style="fill:var(--{"encoder" if d > 0.0 else "limit"})"/>'
+        for k, d in enumerate(digits.tolist())
+    )
+    line = f'<path d="M0 {one:.1f}H{width:.0f}" style="stroke:var(--ink)"/>'
+    known = int((information > 1.0).sum())
+    label = (
+        f"Bars of the information of {len(information)} directions; of {known} of them the data"
+        " know more than the rig file."
+    )
+    return drawing(bars + line, (width, height), label)

@@ -1,0 +1,234 @@
+"""The result file of a rig's geometry and winches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import date
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from calibration.geometry.calibrate import RigCalibration
+from calibration.geometry.quality import RigQuality, judged_places
+from calibration.results import ResultDocument, common_keys
+from model.errors import BadInput
+from model.files.documents import AnyNonNegative, AnyNumber, Finding, Positive, Vector
+from model.files.rig_file import RigDocument
+from model.pose import Array
+from model.rig import Rig, rig_from_document
+from model.winches import WinchMap
+
+_WHAT = "outlets, anchors, pulleys, winches, cables or home pose"
+
+
+class RigResult(ResultDocument):
+    """Outlets, anchors, pulleys, winches and cables' stiffness, in the keys of the rig file."""
+
+    order: ClassVar[int] = 3
+
+    kind: Literal["rig"] = "rig"
+    outlets_mm: list[Vector]
+    anchors_mm: list[Vector]
+    pulley_radius_mm: Positive | None
+    drums_mm_per_rev: list[Positive]
+    stiffness_n: Positive = Field(description="E·A of a cable")
+    home_counts: list[AnyNumber] = Field(description="drive positions with the platform at home")
+    groups: list[str] = Field(description="of numbers that were looked for")
+    not_identified: list[str] = Field(description="left as in the rig file, in words")
+    information: list[AnyNumber] = Field(
+        description="of each direction, falling; below 1 the rig file knows more than the data"
+    )
+    places: int
+    with_poses: bool = Field(description="false: from lengths alone")
+    held_out_mm: AnyNonNegative = Field(description="RMS of places left out of the fit")
+    before_mm: AnyNonNegative = Field(description="the same by the rig file as it is")
+    level_mm: AnyNonNegative = Field(description="of the platform turned as at home, 95 %")
+    turned_mm: AnyNonNegative = Field(description="turned by tilt_deg, 95 %")
+    tilt_deg: AnyNonNegative
+    reached_mm: list[Vector] = Field(
+        description="where the platform goes when the rig file as it is would bring it to the"
+        " centre of the workspace and near its corners"
+    )
+    cable_residuals_mm: list[AnyNonNegative] = Field(description="RMS, one a cable")
+
+    def rules(self) -> Sequence[Callable[[], list[Finding]]]:
+        """Those of every result, and one entry a cable."""
+        return (*super().rules(), self._one_a_cable)
+
+    def _one_a_cable(self) -> list[Finding]:
+        cables = len(self.outlets_mm)
+        keys = ("anchors_mm", "drums_mm_per_rev", "home_counts", "cable_residuals_mm")
+        return [
+            ((key,), f"has {len(getattr(self, key))} entries, outlets_mm has {cables}")
+            for key in keys
+            if len(getattr(self, key)) != cables
+        ]
+
+    def apart_mm(self, other: Self) -> float:
+        """How far apart both say that the platform goes, RMS over the workspace, [mm].
+
+        Outlets and anchors may differ by more where they cannot be told from each other.
+
+        Raises:
+            BadInput: The results rest on different rig files.
+        """
+        if self.rests_on != other.rests_on:
+            raise BadInput(
+                "the results rest on different rig files",
+                where=f"rig {self.name}, {self.date} and {other.date}",
+                next_step="compare results that were made with one rig file",
+            )
+        apart = np.array(other.reached_mm) - np.array(self.reached_mm)
+        return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with these numbers.
+
+        Raises:
+            BadInput: The result is of another rig.
+        """
+        self.require_basis(drawing_of(rig), _WHAT)
+        if len(self.outlets_mm) != len(rig.winches):
+            raise BadInput(
+                f"this result is of {len(self.outlets_mm)} cables, the rig has {len(rig.winches)}",
+                where=f"calibration {self.kind} {self.name}, {self.date}",
+                next_step="run `cdpr calibrate rig` again; the file was changed after it was made",
+            )
+        return _with_numbers(
+            rig,
+            self.outlets_mm,
+            self.anchors_mm,
+            self.pulley_radius_mm,
+            self.drums_mm_per_rev,
+            self.stiffness_n,
+            [round(home) for home in self.home_counts],
+        )
+
+
+def _with_numbers(
+    rig: RigDocument,
+    outlets_mm: list[list[float]],
+    anchors_mm: list[list[float]],
+    pulley_radius_mm: float | None,
+    drums_mm_per_rev: list[float],
+    stiffness_n: float,
+    home_counts: list[int],
+) -> RigDocument:
+    """The rig file's content with other numbers."""
+    winches = [
+        winch.model_copy(update={"drum_mm_per_rev": drum, "home_counts": home})
+        for winch, drum, home in zip(rig.winches, drums_mm_per_rev, home_counts, strict=True)
+    ]
+    changes: dict[str, Any] = {
+        "outlets_mm": outlets_mm,
+        "anchors_mm": anchors_mm,
+        "winches": winches,
+        "cables": rig.cables.model_copy(update={"stiffness_n": stiffness_n}),
+    }
+    if rig.pulleys is not None and pulley_radius_mm is not None:
+        changes["pulleys"] = rig.pulleys.model_copy(update={"radius_mm": pulley_radius_mm})
+    return rig.model_copy(update=changes)
+
+
+def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date) -> RigResult:
+    """The result with its quality.
+
+    Args:
+        result: What was found.
+        quality: What it is good for.
+        name: Of the result.
+        on: The date.
+    """
+    rig, geometry = result.rig, result.geometry
+    drums = [w.drum_mm_per_rev for w in rig.document.winches] * (1.0 + geometry.drum_scale)
+    numbers: dict[str, Any] = {
+        "outlets_mm": _rows(geometry.outlets),
+        "anchors_mm": _rows(geometry.anchors),
+        "pulley_radius_mm": geometry.pulley_radius * 1e3 if rig.pulley_radius else None,
+        "drums_mm_per_rev": [float(x) for x in drums],
+        "stiffness_n": float(geometry.stiffness),
+    }
+    data = result.measured
+    return RigResult(
+        **common_keys(
+            name,
+            on,
+            data.data_hash,
+            result.intervals,
+            quality.verdict,
+            data.unused,
+            drawing_of(rig.document),
+        ),
+        **numbers,
+        home_counts=_home_counts(result, numbers),
+        groups=list(result.parameters.groups),
+        not_identified=result.not_identified,
+        information=[float(f"{x:.4g}") for x in result.observability.information],
+        places=len(data),
+        with_poses=result.held_out.poses,
+        held_out_mm=quality.held_out * 1e3,
+        before_mm=quality.before * 1e3,
+        level_mm=quality.level * 1e3,
+        turned_mm=quality.turned * 1e3,
+        tilt_deg=float(np.degrees(quality.tilt)),
+        reached_mm=_rows(result.reached(*judged_places(rig, 0.0))),
+        cable_residuals_mm=[
+            float(x) * 1e3 for x in np.sqrt(np.mean(result.fit.residuals**2, axis=0))
+        ],
+    )
+
+
+def drawing_of(rig: RigDocument) -> object:
+    """The parts of a rig file that a rig's calibration takes as known, or corrects.
+
+    Counts at home are not among them: `cdpr home` makes others.
+    """
+    document = rig.model_dump(mode="json")
+    parts = {key: document[key] for key in ("outlets_mm", "anchors_mm", "pulleys", "cables")}
+    home_counts = {"home_counts"}
+    winches = [{k: v for k, v in w.items() if k not in home_counts} for w in document["winches"]]
+    return {**parts, "winches": winches, "home": document["platform"]["home"]}
+
+
+def require_one_drawing(rig: Rig, others: Sequence[tuple[str, Rig]]) -> Rig:
+    """The rig with the counts at home that all runs were made with.
+
+    Args:
+        rig: Of the rig file.
+        others: Of the runs, with their names.
+
+    Raises:
+        BadInput: A run is of another rig, or they were referenced differently.
+    """
+    for name, other in others:
+        if drawing_of(other.document) != drawing_of(rig.document):
+            raise BadInput(
+                f"this run was made with other {_WHAT} than those of {rig.name!r}",
+                where=name,
+                why="it is of another rig, the rig file was changed since, or it was run with a"
+                " calibration of the rig",
+                next_step="name the rig file that it was run with, without --calibration",
+            )
+        homes = [[w.home_counts for w in r.winches] for r in (other, others[0][1])]
+        if homes[0] != homes[1]:
+            raise BadInput(
+                "the drives were referenced again between these runs",
+                where=f"{others[0][0]}, {name}",
+                next_step="use runs made after one and the same `cdpr home`",
+            )
+    return others[0][1] if others else rig
+
+
+def _rows(points: Array) -> list[list[float]]:
+    return [[round(float(x) * 1e3, 6) for x in point] for point in points]
+
+
+def _home_counts(result: RigCalibration, numbers: dict[str, Any]) -> list[float]:
+    """What the drives count at home, where the corrected rig expects its own length of cable."""
+    rig = result.rig
+    before = [winch.home_counts for winch in rig.winches]
+    corrected = rig_from_document(_with_numbers(rig.document, **numbers, home_counts=before))
+    winches = WinchMap(corrected)
+    beyond = result.at_home_counts - winches.home_unstrained
+    return [float(h) for h in winches.home_counts - winches.counts_per_metre * beyond]

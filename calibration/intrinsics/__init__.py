@@ -1,0 +1,1 @@
+"""Calibrates a camera: focal length, principal point and distortion."""

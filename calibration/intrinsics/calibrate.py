@@ -1,0 +1,233 @@
+"""Camera matrix and lens distortion from pictures of a board."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from calibration.intrinsics.uncertainty import NAMES, Uncertainty, uncertainty_of
+from calibration.intrinsics.views import EvenSample, as_in, is_duplicate_view
+from calibration.results import data_hash
+from calibration.statistics import Interval
+from calibration.targets.board import Board, Seen, mirrored
+from model.errors import BadInput
+from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+from tracking.camera_model import Image
+
+LEAST_VIEWS = 4
+"""Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
+_FAR_OFF, _OFF = 4.0, 0.5
+"""A view is left out whose error is so many times the median, and so many pixels at least."""
+_LOOKED_AT = 5
+"""So many pictures without the board, spread over all, are looked at for what they show instead."""
+_MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraCalibration:
+    """A camera's matrix and distortion, and what they rest on.
+
+    Attributes:
+        size: Width and height of the pictures, [px].
+        matrix: Camera matrix, shape (3, 3), [px].
+        distortion: k1, k2, p1, p2, k3; shape (5,).
+        uncertainty: What is known about their errors.
+        views: What was seen of the board in each picture used, by name.
+        boards: Where the board was in the camera's frame, by name.
+        view_errors: RMS distance of each used picture's corners, by name, [px].
+        unused: Why each of the other pictures is not used, by name.
+        data_hash: Of the corners it rests on.
+    """
+
+    size: tuple[int, int]
+    matrix: Array
+    distortion: Array
+    uncertainty: Uncertainty
+    views: Mapping[str, Seen]
+    boards: Mapping[str, Pose]
+    view_errors: Mapping[str, float]
+    unused: Mapping[str, str]
+    data_hash: str
+
+    @property
+    def error(self) -> float:
+        """RMS distance over all corners, [px]; small also when too little is covered."""
+        counts = [len(view.corners) for view in self.views.values()]
+        squares = np.square(list(self.view_errors.values()))
+        return float(np.sqrt(np.average(squares, weights=counts)))
+
+    @property
+    def intervals(self) -> dict[str, Interval]:
+        """The nine numbers by the names of `calibration.intrinsics.uncertainty.NAMES`."""
+        m, widths = self.matrix, self.uncertainty.half_widths
+        numbers = [m[0, 0], m[1, 1], m[0, 2], m[1, 2], *self.distortion]
+        return {
+            name: Interval(float(number), float(width))
+            for name, number, width in zip(NAMES, numbers, widths, strict=True)
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    matrix: Array
+    distortion: Array
+    turns: dict[str, Array]
+    places: dict[str, Array]
+    errors: dict[str, float] = field(default_factory=dict)
+
+
+def fit_camera(
+    pictures: Iterable[tuple[str, Image]],
+    board: Board,
+    unused: Mapping[str, str] | None = None,
+) -> CameraCalibration:
+    """Fits a pinhole with five distortion coefficients.
+
+    Args:
+        pictures: Names and grey pictures of one size.
+        board: What they show.
+        unused: Pictures that were left out before, with the reasons.
+
+    Raises:
+        BadInput: Pictures of different sizes, or too few that show the board.
+    """
+    views: dict[str, Seen] = {}
+    left_out = dict(unused or {})
+    size: tuple[int, int] | None = None
+    without = EvenSample[tuple[str, Image]](_LOOKED_AT)
+    for name, image in pictures:
+        own = (image.shape[1], image.shape[0])
+        size = size or own
+        if own != size:
+            raise BadInput(
+                f"the picture has {own[0]} x {own[1]} px, the ones before {size[0]} x {size[1]} px",
+                where=name,
+                next_step="use pictures of one camera in one size",
+            )
+        seen = board.find(image)
+        if seen is None:
+            left_out[name] = "does not show the board"
+            without.add((name, image))
+        elif first := next((n for n, before in views.items() if _same(seen, before)), None):
+            left_out[name] = as_in(first)
+        else:
+            views[name] = seen
+            left_out |= {f"{name}, {k}": "is seen more than once" for k in seen.twice}
+    if size is None or len(views) < LEAST_VIEWS:
+        raise _too_few(views, left_out, board, without.chosen())
+    return calibrate_from_views(views, size, left_out)
+
+
+def _same(seen: Seen, before: Seen) -> bool:
+    same_points = np.array_equal(seen.points, before.points)
+    return same_points and is_duplicate_view(seen.corners, before.corners)
+
+
+def calibrate_from_views(
+    views: Mapping[str, Seen], size: tuple[int, int], unused: Mapping[str, str] | None = None
+) -> CameraCalibration:
+    """Fits the camera to the board's corners in each picture.
+
+    A picture whose corners are far off, as of a board that moved or was mistaken, is left out.
+
+    Raises:
+        BadInput: Too few pictures are left, or they determine nothing.
+    """
+    left_out, used = dict(unused or {}), dict(views)
+    fit = _fit(used, size)
+    limit = max(_FAR_OFF * float(np.median(list(fit.errors.values()))), _OFF)
+    bad = {name: error for name, error in fit.errors.items() if error > limit}
+    if bad and len(used) - len(bad) >= LEAST_VIEWS:
+        for name, error in bad.items():
+            left_out[name] = f"has corners that are {error:.2f} px off, far more than the others"
+            del used[name]
+        fit = _fit(used, size)
+    return CameraCalibration(
+        size=size,
+        matrix=read_only(fit.matrix),
+        distortion=read_only(fit.distortion),
+        uncertainty=uncertainty_of(
+            list(used.values()),
+            list(fit.turns.values()),
+            list(fit.places.values()),
+            fit.matrix,
+            fit.distortion,
+        ),
+        views=used,
+        boards={
+            name: Pose(fit.places[name], matrix_from_rotation_vector(fit.turns[name]))
+            for name in used
+        },
+        view_errors=fit.errors,
+        unused=left_out,
+        data_hash=data_hash(
+            name.encode() + np.round(seen.corners, 6).tobytes() for name, seen in used.items()
+        ),
+    )
+
+
+def _fit(views: Mapping[str, Seen], size: tuple[int, int]) -> _Fit:
+    points = [seen.points.astype(np.float32).reshape(-1, 1, 3) for seen in views.values()]
+    corners = [seen.corners.astype(np.float32).reshape(-1, 1, 2) for seen in views.values()]
+    try:
+        _, matrix, distortion, turns, places, _, _, errors = cv2.calibrateCameraExtended(
+            points, corners, size, np.eye(3), np.zeros(0)
+        )
+    except cv2.error:
+        raise _undetermined() from None
+    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all() and matrix[0, 0] > 0.0):
+        raise _undetermined()
+    return _Fit(
+        matrix=np.asarray(matrix, dtype=np.float64),
+        distortion=np.ravel(distortion)[:5].astype(np.float64),
+        turns={name: np.ravel(turn) for name, turn in zip(views, turns, strict=True)},
+        places={name: np.ravel(place) for name, place in zip(views, places, strict=True)},
+        errors=dict(zip(views, np.ravel(errors).tolist(), strict=True)),
+    )
+
+
+def _undetermined() -> BadInput:
+    return BadInput(
+        "these pictures do not determine a camera",
+        why="the fit found no finite answer, as when the board stands the same way in all of them",
+        next_step="take more pictures, with the board tilted up to 40° every way",
+    )
+
+
+def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
+    """What most of the pictures without the board show, if anything is known."""
+    shown: dict[str, list[str]] = {}
+    for name, image in without:
+        flipped = mirrored(board, image)
+        if what := _MIRRORED if flipped else board.instead(image):
+            shown.setdefault(what, []).append(name)
+    if not shown:
+        return ""
+    what, names = max(shown.items(), key=lambda item: len(item[1]))
+    verb = "shows"
+    if len(names) > 1:
+        verb = f"and {len(names) - 1} of {len(without) - 1} others that were looked at show"
+    return f"; {names[0]} {verb} {what}"
+
+
+def _too_few(
+    views: Mapping[str, Seen],
+    unused: Mapping[str, str],
+    board: Board,
+    without: Sequence[tuple[str, Image]],
+) -> BadInput:
+    count = len(views) + len(unused)
+    why = f"{board} was looked for{_instead(board, without)}"
+    told = [f"{name} {reason}" for name, reason in unused.items()]
+    if told:
+        more = f" and {len(told) - 4} more" if len(told) > 5 else ""
+        why += "; " + "; ".join(told[: 4 if more else 5]) + more
+    return BadInput(
+        f"the board is to be seen in {len(views)} of {count} pictures; {LEAST_VIEWS} are the least",
+        why=why,
+        next_step="check the board's kind and numbers, or take more pictures of it, tilted up to"
+        " 40°; 40 are good",
+    )

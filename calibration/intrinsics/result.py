@@ -1,0 +1,235 @@
+"""The result file of a camera's matrix and lens distortion."""
+
+from __future__ import annotations
+
+from datetime import date
+from typing import Annotated, ClassVar, Literal, Self
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from calibration.intrinsics.calibrate import CameraCalibration
+from calibration.intrinsics.quality import CameraQuality, picture_grid
+from calibration.intrinsics.uncertainty import NAMES
+from calibration.report import Section, drawing, interval_rows, page_of, table_of
+from calibration.results import ResultDocument, common_keys
+from model.errors import BadInput
+from model.files.documents import AnyNonNegative, AnyNumber, Positive
+from model.files.rig_file import CameraDocument, RigDocument
+from model.pose import Array
+
+Pixels = Annotated[int, Field(ge=1, le=16384)]
+
+
+class CameraResult(ResultDocument):
+    """A camera's matrix and distortion, in the keys of the rig file's ``cameras`` section."""
+
+    order: ClassVar[int] = 0
+
+    kind: Literal["camera"] = "camera"
+    width_px: Pixels
+    height_px: Pixels
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: AnyNumber
+    cy_px: AnyNumber
+    distortion: list[AnyNumber]
+    rms_px: AnyNonNegative
+    distance_m: Positive = Field(description="for which error_mm is stated")
+    halves_apart_mm: AnyNonNegative = Field(description="as two halves of the pictures see a point")
+    covered: AnyNonNegative = Field(description="share of the picture in which the board was seen")
+    pictures_used: int
+    view_errors_px: dict[str, AnyNonNegative]
+
+    @property
+    def matrix(self) -> Array:
+        """Camera matrix, shape (3, 3), [px]."""
+        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    def apart_mm(self, other: Self) -> float:
+        """How far apart points at the distance are seen, RMS over the picture, [mm].
+
+        Raises:
+            BadInput: The pictures are of different sizes.
+        """
+        size = (self.width_px, self.height_px)
+        if size != (other.width_px, other.height_px):
+            raise BadInput(
+                f"one camera's pictures have {size[0]} x {size[1]} px, the other's"
+                f" {other.width_px} x {other.height_px} px",
+                next_step="compare results for one size of pictures",
+            )
+        flat = [
+            cv2.undistortPoints(
+                picture_grid(size).reshape(-1, 1, 2), r.matrix, np.array(r.distortion)
+            ).reshape(-1, 2)
+            for r in (self, other)
+        ]
+        squares = np.sum((flat[1] - flat[0]) ** 2, axis=1)
+        return float(np.sqrt(np.mean(squares))) * self.distance_m * 1e3
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this camera's numbers.
+
+        Raises:
+            BadInput: The rig has no camera of this name, or one of another size.
+        """
+        camera = camera_named(rig, self.name)
+        if (camera.width_px, camera.height_px) != (self.width_px, self.height_px):
+            raise BadInput(
+                f"this result is for pictures of {self.width_px} x {self.height_px} px, camera"
+                f" {self.name!r} takes {camera.width_px} x {camera.height_px} px",
+                where=f"calibration {self.kind} {self.name}, {self.date}",
+                next_step="calibrate the camera in the size that it is used in",
+            )
+        keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+        return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
+
+
+def camera_result(
+    result: CameraCalibration, quality: CameraQuality, name: str, on: date
+) -> CameraResult:
+    """The result with its quality.
+
+    Args:
+        result: What was found.
+        quality: What it is good for.
+        name: Of the camera in the rig file.
+        on: The date.
+    """
+    m = result.matrix
+    return CameraResult(
+        **common_keys(name, on, result.data_hash, result.intervals, quality.verdict, result.unused),
+        width_px=result.size[0],
+        height_px=result.size[1],
+        fx_px=float(m[0, 0]),
+        fy_px=float(m[1, 1]),
+        cx_px=float(m[0, 2]),
+        cy_px=float(m[1, 2]),
+        distortion=[float(x) for x in result.distortion],
+        rms_px=result.error,
+        distance_m=quality.distance,
+        halves_apart_mm=quality.halves * 1e3,
+        covered=quality.covered,
+        pictures_used=len(result.views),
+        view_errors_px={k: float(v) for k, v in result.view_errors.items()},
+    )
+
+
+def camera_named(rig: RigDocument, name: str) -> CameraDocument:
+    """A camera of a rig file.
+
+    Raises:
+        BadInput: It has none of this name; those that it has are listed.
+    """
+    for camera in rig.cameras:
+        if camera.name == name:
+            return camera
+    names = ", ".join(camera.name for camera in rig.cameras) or "none"
+    raise BadInput(
+        f"no camera {name!r}",
+        where=f"rig {rig.name}",
+        why=f"the rig's cameras: {names}",
+        next_step="name one of them, or add the camera to the rig file",
+    )
+
+
+def with_camera(rig: RigDocument, changed: CameraDocument) -> RigDocument:
+    """The rig file's content with a camera in place of that of its name."""
+    cameras = [changed if camera.name == changed.name else camera for camera in rig.cameras]
+    return rig.model_copy(update={"cameras": cameras})
+
+
+# The report of a camera calibration.
+
+
+_WIDTH = 560.0
+
+
+def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, date: str) -> str:
+    """The whole page."""
+    lead = (
+        f"{date}, {result.size[0]} × {result.size[1]} px, {len(result.views)} pictures used,"
+        f" {len(result.unused)} not"
+    )
+    covered = f"{quality.covered:.0%} of the picture's cells have seen corners"
+    tilted = "A dot for each picture: forward and backward up and down, left and right across."
+    used = "Error, corners, and how fx changes without the picture."
+    return page_of(
+        f"Calibration of camera {name}",
+        lead,
+        quality.verdict,
+        [
+            Section("Numbers, with 95 % intervals", _numbers(result, quality)),
+            Section("Where the board was seen", _map(result, quality), covered),
+            Section("How the board was tilted", _tilts(quality), tilted),
+            Section("Pictures used", _pictures(result), used),
+            Section("Pictures not used", table_of(result.unused.items())),
+        ],
+    )
+
+
+def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
+    verdict = quality.verdict
+    return table_of(
+        [
+            *interval_rows(result.intervals),
+            ("corners off, RMS", f"{result.error:.3f} px"),
+            (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
+            ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
+            ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
+            ("data", result.data_hash[:23]),
+        ]
+    )
+
+
+def _map(result: CameraCalibration, quality: CameraQuality) -> str:
+    """Corners seen, on cells that are darker the more corners they have."""
+    width, height = result.size
+    scale = _WIDTH / width
+    columns, rows = quality.coverage.shape
+    most = max(float(quality.coverage.max()), 1.0)
+    shapes = []
+    for (i, j), count in np.ndenumerate(quality.coverage):
+        shade = 0.0 if count == 0 else 0.15 + 0.45 * float(count) / most
+        shapes.append(
+            f'<rect x="{i * _WIDTH / columns:.1f}" y="{j * height * scale / rows:.1f}"'
+            f' width="{_WIDTH / columns:.1f}" height="{height * scale / rows:.1f}"'
+            f' fill="var(--encoder)" fill-opacity="{shade:.2f}" stroke="var(--line)"/>'
+        )
+    for seen in result.views.values():
+        shapes += [
+            f'<circle cx="{x * scale:.1f}" cy="{y * scale:.1f}" r="1.4" fill="var(--ink)"/>'
+            for x, y in seen.corners
+        ]
+    label = f"Corners seen in the camera's picture, in {quality.covered:.0%} of its cells."
+    return drawing("".join(shapes), (_WIDTH, height * scale), label)
+
+
+def _tilts(quality: CameraQuality) -> str:
+    """Tilt of each picture's board, about both axes, ± 50°."""
+    dots = "".join(
+        f'<circle cx="{140 + 2.4 * np.clip(y, -50, 50):.1f}"'
+        f' cy="{140 - 2.4 * np.clip(x, -50, 50):.1f}" r="4" fill="var(--ink)"/>'
+        for x, y in quality.tilts
+    )
+    rings = "".join(
+        f'<circle cx="140" cy="140" r="{2.4 * ring}" fill="none" stroke="var(--muted)"/>'
+        f'<text x="{144 + 2.4 * ring}" y="137">{ring}°</text>'
+        for ring in (20, 40)
+    )
+    label = f"Tilt of the board in {len(quality.tilts)} pictures; rings at 20° and 40°."
+    return drawing(rings + dots, (280, 280), label, "small")
+
+
+def _pictures(result: CameraCalibration) -> str:
+    """Error of each picture, and how much of the focal length hangs on it."""
+    change = result.uncertainty.without[:, NAMES.index("fx_px")]
+    rows = [
+        (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+.2f} px")
+        for (name, error), seen, without in zip(
+            result.view_errors.items(), result.views.values(), change, strict=True
+        )
+    ]
+    return table_of(rows, ("picture", "error, RMS", "corners", "fx without it"))

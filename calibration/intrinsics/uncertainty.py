@@ -1,0 +1,117 @@
+"""How well pictures determine a camera: the fit linearised, picture by picture.
+
+With r the errors of a picture's corners and A, B their derivatives by the camera's nine numbers and
+by the board's pose, what the picture says of the nine is H = AᵀPA and s = AᵀPr, P projecting the
+pose out. From these follow the covariance by the scatter of the corners, the fit without any one
+picture, and the fits of two halves of the pictures, each to first order.
+
+The scatter alone promises too much: corners of one picture err together (a bent board, blur, the
+lens model). The spread of the fits without one picture (the jackknife over pictures) feels that,
+and the larger of both is stated.
+
+Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.stats import t as student
+
+from calibration.statistics import CONFIDENCE
+from calibration.targets.board import Seen
+from model.errors import BadInput
+from model.pose import Array, read_only
+
+NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+"""The camera's numbers, in the order of every array here."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """What is known about the errors of a camera's nine numbers.
+
+    Attributes:
+        covariance: Shape (9, 9).
+        half_widths: Of the 95 % intervals, shape (9,).
+        without: How the numbers change when a picture is left out, shape (pictures, 9).
+        halves: How the even pictures' numbers differ from the odd ones', shape (9,).
+    """
+
+    covariance: Array
+    half_widths: Array
+    without: Array
+    halves: Array
+
+
+def uncertainty_of(
+    views: Sequence[Seen],
+    turns: Sequence[Array],
+    places: Sequence[Array],
+    matrix: Array,
+    distortion: Array,
+) -> Uncertainty:
+    """The uncertainty of a fit.
+
+    Args:
+        views: The board in each picture.
+        turns: Rotation vectors of the board in the camera's frame, shape (3,) each, [rad].
+        places: Its origin there, shape (3,) each, [m].
+        matrix: Camera matrix, shape (3, 3), [px].
+        distortion: k1, k2, p1, p2, k3; shape (5,).
+
+    Raises:
+        BadInput: The pictures leave some of the nine numbers open.
+    """
+    parts, scores, squares, residuals = [], [], 0.0, 0
+    for seen, turn, place in zip(views, turns, places, strict=True):
+        expected, slopes = cv2.projectPoints(seen.points, turn, place, matrix, distortion)
+        errors = (seen.corners - expected.reshape(-1, 2)).ravel()
+        of_pose, of_camera = slopes[:, :6], slopes[:, 6:15]
+        base = np.linalg.qr(of_pose)[0]
+        left = of_camera - base @ (base.T @ of_camera)
+        parts.append(left.T @ left)
+        scores.append(left.T @ errors)
+        squares += float(errors @ errors)
+        residuals += len(errors) - 6
+    information, count = np.sum(parts, axis=0), len(parts)
+    scale = np.sqrt(np.diag(information))
+    if not (scale > 0.0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
+        raise BadInput(
+            "these pictures do not determine a camera",
+            why="other numbers would explain them as well",
+            next_step="take more pictures, with the board tilted up to 40° every way",
+        )
+    by_scatter = np.linalg.inv(information) * squares / max(residuals - 9, 1)
+    without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
+    spread = without - without.mean(axis=0)
+    by_pictures = (count - 1) / count * spread.T @ spread
+    larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures))
+    grown = np.sqrt(larger / np.diag(by_scatter))
+    return Uncertainty(
+        covariance=read_only(by_scatter * np.outer(grown, grown)),
+        half_widths=read_only(_quantile(count) * np.sqrt(larger)),
+        without=read_only(without),
+        halves=read_only(_half(parts, scores, 1) - _half(parts, scores, 0)),
+    )
+
+
+def _without(information: Array, part: Array, score: Array) -> Array:
+    """The change of the numbers when one picture is left out."""
+    return np.asarray(-np.linalg.pinv(information - part, hermitian=True) @ score)
+
+
+def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
+    """The change of the numbers when every other picture is used, from the first or the second."""
+    information = np.sum(parts[which::2], axis=0)
+    return np.asarray(
+        np.linalg.pinv(information, hermitian=True) @ np.sum(scores[which::2], axis=0)
+    )
+
+
+def _quantile(count: int) -> float:
+    """Of Student's distribution, for so many pictures."""
+    return float(student.ppf(0.5 + CONFIDENCE / 2.0, max(count - 1, 1)))

@@ -1,0 +1,160 @@
+"""Pictures that a calibration is made from: of a folder, a video, or a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+
+from calibration.intrinsics.capture import CaptureGuide
+from calibration.targets.board import Board, plain_camera
+from drivers.cameras.files import OneCamerasPictures
+from drivers.cameras.live import LiveCamera, VideoFile, video_size
+from executor.cameras.sources import require_camera_source
+from model.errors import BadInput
+from model.files.documents import write_bytes_atomic
+from model.progress import SILENT, Listener
+from model.rig import Camera
+from tracking.camera_model import Image
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """Pictures of one size.
+
+    Attributes:
+        images: Names and grey pictures.
+        count: How many there will be.
+        unused: Why files are not used, by name.
+    """
+
+    images: Iterable[tuple[str, Image]]
+    count: int
+    unused: Mapping[str, str] = field(default_factory=dict)
+
+    @contextmanager
+    def reported(self, text: str, listener: Listener) -> Iterator[Iterator[tuple[str, Image]]]:
+        """The pictures, each reported when it was used."""
+        with listener.progress(text, self.count) as advance:
+            yield self._advancing(advance)
+
+    def _advancing(self, advance: Callable[[float], None]) -> Iterator[tuple[str, Image]]:
+        for number, picture in enumerate(self.images, 1):
+            yield picture
+            advance(number)
+
+
+def pictures_in(folder: Path) -> Pictures:
+    """The pictures of a folder, all of one size.
+
+    Raises:
+        BadInput: The folder is missing or has no pictures.
+    """
+    images = OneCamerasPictures(folder)
+    return Pictures(images, len(images.names), images.unused)
+
+
+def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: int) -> Pictures:
+    """The pictures of a source.
+
+    Args:
+        source: A folder, a video file, a camera's index or its address.
+        camera: The rig's camera that took them.
+        wanted: How many to take of a camera, or of a video, spread over it.
+        usual: How many where that is left out.
+
+    Raises:
+        BadInput: It is none of these, its pictures are of another size, or a number is wanted of
+            a folder.
+        HardwareMissing: The camera does not open.
+    """
+    path, most = Path(source), wanted or usual
+    if path.is_dir():
+        if wanted is not None:
+            raise BadInput(
+                "--pictures is for a video or a camera",
+                where=str(source),
+                next_step="leave it out: a folder's pictures are all used",
+            )
+        folder = OneCamerasPictures(path, (camera.width, camera.height))
+        return Pictures(folder, len(folder.names), folder.unused)
+    if path.is_file():
+        video = VideoFile(path, camera)
+        every = max(1, -(-len(video) // most))
+        frames = (frame for number, frame in enumerate(video) if number % every == 0)
+        return Pictures(((f.name, f.image) for f in frames), -(-len(video) // every))
+    require_camera_source(str(source))
+    return Pictures(_live(str(source), camera, most), most)
+
+
+def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:
+    with LiveCamera(source, camera) as live:
+        for _ in range(most):
+            frame = live.read()
+            yield frame.name, frame.image
+
+
+def take_pictures(
+    source: str,
+    folder: Path,
+    board: Board,
+    *,
+    wanted: int = 40,
+    size: tuple[int, int] = (1280, 720),
+    on_advice: Callable[[str], None] = SILENT.note,
+    stopped: Callable[[], bool] = lambda: False,
+) -> int:
+    """Takes pictures of a board that is moved, until enough are there or the video ends.
+
+    Args:
+        source: A camera's index, device or address, or a video file.
+        folder: Where pictures go, which exists.
+        board: What is shown.
+        wanted: How many pictures at least.
+        size: Width and height of the camera's pictures, [px]; a video has its own.
+        on_advice: Receives what the person who moves the board should do, when that changes.
+        stopped: Whether to take no more; asked after each picture.
+
+    Returns:
+        How many were taken.
+
+    Raises:
+        HardwareMissing: The camera does not open.
+        BadInput: The source is none, its pictures are of another size, or none was taken.
+    """
+    guide, last = CaptureGuide(board, wanted), ""
+    with _frames(source, size) as frames:
+        for image in frames:
+            if stopped():
+                break
+            advice = guide.look(image)
+            if advice.taken:
+                data = cv2.imencode(".png", image)[1].tobytes()
+                write_bytes_atomic(folder / f"live_{len(guide.views):03}.png", data)
+            if advice.text != last:
+                last = advice.text
+                on_advice(last)
+            if advice.done:
+                break
+    if not guide.views:
+        raise BadInput(
+            "no picture was taken",
+            where=f"camera {source}",
+            why=f"{board} was never seen standing still",
+            next_step="check the board's kind and numbers and the light, and hold it still",
+        )
+    return len(guide.views)
+
+
+@contextmanager
+def _frames(source: str, size: tuple[int, int]) -> Iterator[Iterator[Image]]:
+    """Grey pictures of a camera or a video."""
+    path = Path(source)
+    if path.is_file():
+        yield (frame.image for frame in VideoFile(path, plain_camera(video_size(path), source)))
+        return
+    with LiveCamera(source, plain_camera(size, source)) as live:
+        yield (frame.image for frame in live)

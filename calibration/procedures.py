@@ -1,0 +1,352 @@
+"""Whole calibrations: from pictures or runs to a judged result and its report.
+
+`calibration.load.with_calibrations` puts their result files into a rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, date, datetime
+from math import radians
+from pathlib import Path
+from typing import Generic, Self, TypeVar
+
+import numpy as np
+
+from calibration.extrinsics.hand_eye import locate_by_motion
+from calibration.extrinsics.quality import ExtrinsicCalibration, judge_extrinsics
+from calibration.extrinsics.result import ExtrinsicsResult, extrinsics_page, extrinsics_result
+from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
+from calibration.geometry.calibrate import RigCalibration, fit_rig
+from calibration.geometry.model import DEFAULT_DEVIATIONS
+from calibration.geometry.quality import RigQuality, judge_rig
+from calibration.geometry.report import rig_page
+from calibration.geometry.result import RigResult, rig_result
+from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
+from calibration.intrinsics.quality import CameraQuality, judge_camera
+from calibration.intrinsics.result import CameraResult, camera_page, camera_result
+from calibration.pictures import Pictures, pictures_in, pictures_of
+from calibration.results import ResultDocument, require_file_name, result_file_name, write_result
+from calibration.run_data import poses_by_picture, rig_measurements
+from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
+from calibration.tag_map.observations import sights_of
+from calibration.tag_map.result import TagsResult, judge_layout, tags_page, tags_result
+from calibration.targets.board import Board
+from calibration.verdict import CalibrationVerdict
+from executor.kernels import ready_to_measure
+from model.display import html_table
+from model.errors import BadInput, Fault, Refused
+from model.files.documents import write_atomic
+from model.files.output import make_place, require_new_file
+from model.files.rig_file import RigDocument
+from model.kinematics import NoCable
+from model.pose import Pose
+from model.progress import SILENT, Listener
+from model.rig import Camera, Rig
+
+Result = TypeVar("Result", bound=ResultDocument, covariant=True)
+Found = TypeVar("Found", covariant=True)
+Quality = TypeVar("Quality", covariant=True)
+
+PicturesFrom = Pictures | str | Path | Callable[[], Pictures]
+"""Pictures, what opens them, or where they are: a folder, a video, a camera's index or address."""
+USUAL_PICTURES, USUAL_TAG_PICTURES = 20, 40
+"""Taken of a camera or a video to find where the camera is, and where tags are on the platform."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration(Generic[Result, Found, Quality]):
+    """A finished calibration.
+
+    Attributes:
+        result: As it is written to a file: numbers, intervals, verdict.
+        page: The report, HTML.
+        found: What it rests on.
+        quality: What it is good for.
+        files: Result and report, where they were written.
+    """
+
+    result: Result
+    page: str
+    found: Found
+    quality: Quality
+    files: tuple[Path, ...] = ()
+
+    @property
+    def order(self) -> int:
+        """When it is applied; with what follows, what `Rig.with_calibration` takes."""
+        return self.result.order
+
+    @property
+    def kind(self) -> str:
+        """What was calibrated, such as ``camera``."""
+        return self.result.kind
+
+    @property
+    def name(self) -> str:
+        """Which of its kind."""
+        return self.result.name
+
+    @property
+    def date(self) -> str:
+        """When, ISO 8601."""
+        return self.result.date
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this result in place.
+
+        Raises:
+            BadInput: The result is not about this rig.
+        """
+        return self.result.corrected(rig)
+
+    def __repr__(self) -> str:
+        """What was calibrated, and what it is good for."""
+        return f"<Calibration {self.kind} {self.name}, {self.date}: {self.result.verdict}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        rows = [*self.result.in_words(), ("verdict", self.result.verdict)]
+        return html_table(f"Calibration {self.kind} {self.name}", rows)
+
+    def saved_in(self, folder: Path | None) -> Self:
+        """The calibration with its result and report written into a folder; None writes nothing.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        if folder is None:
+            return self
+        written = write_result(folder, self.result)
+        report = written.with_suffix(".html")
+        write_atomic(report, self.page)
+        return replace(self, files=(written, report))
+
+
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """Where a result goes.
+
+    Attributes:
+        folder: For the result file and its report; None writes nothing.
+        replace: Files of the same name and day may be replaced.
+        on: The result's date; today when left out.
+    """
+
+    folder: Path | None = None
+    replace: bool = False
+    on: date = field(default_factory=lambda: datetime.now(UTC).date())
+
+    def require_free(self, kind: str, name: str) -> None:
+        """Makes the folder before the work, so that no work is lost.
+
+        Raises:
+            BadInput: It cannot be made or written to, or holds such a result or report.
+        """
+        if self.folder is None:
+            return
+        result = self.folder / result_file_name(kind, name, self.on.isoformat())
+        if self.folder.is_dir():
+            for file in (result, result.with_suffix(".html")):
+                require_new_file(file, self.replace)
+        make_place(self.folder)
+
+
+CameraOutcome = Calibration[CameraResult, CameraCalibration, CameraQuality]
+ExtrinsicsOutcome = Calibration[ExtrinsicsResult, ExtrinsicCalibration, CalibrationVerdict]
+TagsOutcome = Calibration[TagsResult, TagLayout, CalibrationVerdict]
+RigOutcome = Calibration[RigResult, RigCalibration, RigQuality]
+
+
+def calibrate_camera(
+    pictures: Pictures | Path,
+    board: Board,
+    *,
+    name: str = "camera",
+    wanted: float = 1e-3,
+    distance: float | None = None,
+    to: Destination | None = None,
+    listener: Listener = SILENT,
+) -> CameraOutcome:
+    """Finds a camera's matrix and lens distortion.
+
+    Args:
+        pictures: Of the board, or the folder that they are in.
+        board: What they show.
+        name: Of the camera in the rig file.
+        wanted: What is good enough, 95 %, [m].
+        distance: From which the camera measures, [m]; that of the boards when left out.
+        to: Where the result is written; nowhere when left out.
+        listener: Receives how far it is.
+
+    Raises:
+        BadInput: Pictures of different sizes, or too few that show the board.
+    """
+    require_file_name(name, "--name")
+    source = pictures if isinstance(pictures, Pictures) else pictures_in(pictures)
+    to = to or Destination()
+    to.require_free("camera", name)
+    with source.reported("looking for the board", listener) as images:
+        found = fit_camera(images, board, source.unused)
+    quality = judge_camera(found, wanted, distance)
+    result = camera_result(found, quality, name, to.on)
+    return Calibration(
+        result, camera_page(found, quality, name, result.date), found, quality
+    ).saved_in(to.folder)
+
+
+def locate_camera(
+    rig: Rig,
+    camera: Camera,
+    pictures: PicturesFrom,
+    *,
+    poses: Mapping[str, Pose] | Path | None = None,
+    survey: Survey | None = None,
+    wanted: float = 1e-3,
+    to: Destination | None = None,
+    listener: Listener = SILENT,
+) -> ExtrinsicsOutcome:
+    """Finds where a camera is, by surveyed tags on the frame or by the rig's own motion.
+
+    Args:
+        rig: The robot, with its tags.
+        camera: Its matrix and distortion hold.
+        pictures: Taken while the camera does not move.
+        poses: The platform's by picture, or a CSV file of them, or a run folder: go by the rig's
+            motion. Left out, by the tags on the frame.
+        survey: How well the frame tags were surveyed; each corner to 0.5 mm when left out.
+        wanted: What is good enough in the work space, 95 %, [m].
+        to: Where the result is written; nowhere when left out.
+        listener: Receives how far it is.
+
+    Raises:
+        BadInput: There are no tags, or too few pictures that show them.
+    """
+    require_file_name(camera.name, "cameras")
+    known = poses_by_picture(poses, camera.name) if isinstance(poses, Path) else poses
+    if known is None:
+        require_frame_tags(rig)
+    tags = rig.frame_tags if known is None else rig.platform_tags
+    source, to = _pictures(pictures, camera, USUAL_PICTURES), to or Destination()
+    to.require_free("extrinsics", camera.name)
+    ready_to_measure(listener)
+    with source.reported("looking for tags", listener) as images:
+        sights = sights_of(images, rig, camera, [tag.id for tag in tags], source.unused)
+    if known is None:
+        found = locate_by_frame_tags(rig, camera, sights, survey or Survey(0.5e-3, None))
+    else:
+        found = locate_by_motion(rig, camera, sights, known)
+    verdict = judge_extrinsics(found, wanted)
+    result = extrinsics_result(found, verdict, rig.document, to.on)
+    page = extrinsics_page(found, result, verdict, camera.world_from_camera)
+    return Calibration(result, page, found, verdict).saved_in(to.folder)
+
+
+def locate_tags(
+    rig: Rig,
+    camera: Camera,
+    pictures: PicturesFrom,
+    *,
+    fixed_tag: int | None = None,
+    wanted: float = 0.2e-3,
+    to: Destination | None = None,
+    listener: Listener = SILENT,
+) -> TagsOutcome:
+    """Finds where the tags are on the platform, from pictures that show two or more at once.
+
+    Args:
+        rig: The robot, with its tags.
+        camera: Its matrix and distortion hold.
+        pictures: Taken from anywhere.
+        fixed_tag: Is as in the rig file; all fit it best when left out.
+        wanted: What is good enough for corners of tags, 95 %, [m].
+        to: Where the result is written; nowhere when left out.
+        listener: Receives how far it is.
+
+    Raises:
+        BadInput: There are no tags, or too few pictures that show them.
+    """
+    require_file_name(rig.name, "name")
+    require_tags(rig, fixed_tag)
+    source, to = _pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
+    to.require_free("tags", rig.name)
+    ready_to_measure(listener)
+    with source.reported("looking for tags", listener) as images:
+        numbers = [tag.id for tag in rig.platform_tags]
+        sights = sights_of(images, rig, camera, numbers, source.unused)
+    found = measure_layout(rig, camera, sights, fixed_tag)
+    verdict = judge_layout(found, wanted)
+    result = tags_result(found, verdict, rig.document, to.on)
+    return Calibration(result, tags_page(found, result, verdict), found, verdict).saved_in(
+        to.folder
+    )
+
+
+def _pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
+    if isinstance(pictures, Pictures):
+        return pictures
+    if callable(pictures):
+        return pictures()
+    return pictures_of(pictures, camera, None, usual)
+
+
+def calibrate_rig(
+    rig: Rig,
+    data: Sequence[Path],
+    *,
+    deviations: Mapping[str, float] = DEFAULT_DEVIATIONS,
+    length_deviation: float = 0.1e-3,
+    pose_deviations: tuple[float, float] = (0.1e-3, radians(0.02)),
+    without_poses: bool = False,
+    tilt: float = radians(5.0),
+    wanted: float = 1e-3,
+    name: str = "rig",
+    rig_file: Path | None = None,
+    to: Destination | None = None,
+    listener: Listener = SILENT,
+) -> RigOutcome:
+    """Finds outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
+
+    Args:
+        rig: As its file tells it.
+        data: Run folders, and CSV files (docs/data-formats.md).
+        deviations: How far off the rig file may be by group of numbers, one standard deviation;
+            groups left out are taken as known.
+        length_deviation: Of a cable's length from the encoders, [m].
+        pose_deviations: Of poses beside what their file tells, [m] and [rad].
+        without_poses: Drive positions alone, as without a camera.
+        tilt: How far the platform will be rotated, [rad].
+        wanted: What is good enough, 95 %, [m].
+        name: Of the result.
+        rig_file: Named in messages.
+        to: Where the result is written; nowhere when left out.
+        listener: Receives how far it is.
+
+    Raises:
+        BadInput: Data cannot be read, are too few, or do not fit the rig file.
+    """
+    require_file_name(name, "--name")
+    counted, measured = rig_measurements(rig, data)
+    length, turn = pose_deviations
+    measured = measured.with_doubt(np.array([length] * 3 + [turn] * 3))
+    if without_poses:
+        measured = measured.without_poses()
+    to = to or Destination()
+    to.require_free("rig", name)
+    with listener.waiting("fitting"):
+        try:
+            found = fit_rig(counted, measured, deviations, length_deviation)
+            quality = judge_rig(found, wanted, tilt)
+            result = rig_result(found, quality, name, to.on)
+        except (Fault, NoCable, Refused) as error:
+            raise BadInput(
+                f"the measurements do not fit the rig file {rig_file or rig.name}",
+                where=", ".join(map(str, data)),
+                why=error.what,
+                next_step="check units, the order of the cables, the reference of the drives and"
+                " the rig file",
+            ) from error
+    return Calibration(
+        result, rig_page(found, quality, name, result.date), found, quality
+    ).saved_in(to.folder)

@@ -1,0 +1,91 @@
+"""The report of a calibration: one page that needs neither a server nor a network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+from calibration.statistics import Interval
+from calibration.verdict import CalibrationVerdict
+from model.pages.page import bullets, list_table, page, paragraph, section, table
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of a report.
+
+    Attributes:
+        heading: Plain text.
+        body: HTML, such as of `table_of`.
+        note: Plain text between both.
+    """
+
+    heading: str
+    body: str
+    note: str = ""
+
+
+def page_of(
+    title: str,
+    lead: str,
+    verdict: CalibrationVerdict,
+    sections: Iterable[Section],
+    *,
+    tiles: str = "",
+    scripts: Sequence[str] = (),
+    data: Mapping[str, object] | None = None,
+) -> str:
+    """The whole page: verdict and next steps first, then the sections.
+
+    Args:
+        title: Plain text.
+        lead: Plain text below it.
+        verdict: What the calibration is good for.
+        sections: In order.
+        tiles: Key figures, HTML of `model.pages.page.tiles`.
+        scripts: As of `model.pages.page.page`.
+        data: What they read.
+    """
+    mark = "pass" if verdict.good else "fail"
+    banner = (
+        f'<section class="verdict {mark}" id="verdict">'
+        f'<p class="sentence">{escape(str(verdict))}</p>'
+        f"{bullets(verdict.next_steps)}</section>"
+    )
+    body = "\n".join(_section(k, part) for k, part in enumerate(sections, start=1))
+    return page(title, banner + tiles + body, lead=paragraph(lead), scripts=scripts, data=data)
+
+
+def _section(number: int, part: Section) -> str:
+    note = paragraph(part.note) if part.note else ""
+    return section(f"part-{number}", part.heading, note, part.body)
+
+
+def table_of(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
+    """A table of plain texts, with a head line or with names first; "none" without rows."""
+    found = [tuple(row) for row in rows]
+    if not found:
+        return paragraph("none")
+    return list_table(head, found) if head else table((row[0], ", ".join(row[1:])) for row in found)
+
+
+def drawing(shapes: str, size: tuple[float, float], label: str, kind: str = "medium") -> str:
+    """A figure of SVG shapes.
+
+    Args:
+        shapes: SVG elements, in colours of the page's variables.
+        size: Width and height of their coordinates.
+        label: What a reader who does not see it should know; plain text.
+        kind: CSS class of its size, ``small`` or ``medium``.
+    """
+    text = escape(label, quote=True)
+    return (
+        f'<figure class="drawing {kind}"><svg viewBox="0 0 {size[0]:.0f} {size[1]:.0f}" role="img"'
+        f' aria-label="{text}"><title>{text}</title>{shapes}</svg></figure>'
+    )
+
+
+def interval_rows(intervals: dict[str, Interval]) -> list[tuple[str, str]]:
+    """Rows of numbers and how far off they may be."""
+    return [(name, str(interval)) for name, interval in intervals.items()]

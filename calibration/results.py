@@ -1,0 +1,199 @@
+"""Calibration results as dated YAML files, beside the rig file and never written into it.
+
+Every kind of result has the keys of `ResultDocument` and its own, which are those of the rig file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import yaml
+from pydantic import AfterValidator, Field
+
+from calibration.statistics import Interval
+from calibration.verdict import CalibrationVerdict
+from model.errors import BadInput
+from model.files.documents import (
+    AnyNonNegative,
+    AnyNumber,
+    Document,
+    content_hash,
+    document_hash,
+    write_atomic,
+)
+from model.files.rig_file import RigDocument
+
+
+def _is_date(text: str) -> str:
+    date.fromisoformat(text)
+    return text
+
+
+Bounds = Annotated[list[AnyNumber], Field(min_length=2, max_length=2)]
+"""Both ends of a 95 % interval."""
+
+
+class ResultDocument(Document, ABC):
+    """What every calibration result tells."""
+
+    order: ClassVar[int]
+    """Results of lower order are applied first: those of higher order rest on them."""
+
+    schema_version: Literal[1] = 1
+    kind: str
+    name: str = Field(description="of what was calibrated, such as the camera in the rig file")
+    date: Annotated[str, AfterValidator(_is_date)]
+    rests_on: str = Field(
+        default="", description="hash of the parts of the rig file that were taken as known"
+    )
+    data_sha256: str = Field(description="of the measurements")
+    intervals: dict[str, Bounds] = Field(description="95 %, by name with unit")
+    error_mm: AnyNonNegative = Field(description="of what is measured with it, 95 %")
+    wanted_mm: AnyNonNegative = Field(description="what was asked for")
+    verdict: str
+    good_enough: bool
+    next_steps: list[str]
+    unused: dict[str, str] = Field(default={}, description="why data were left out, by name")
+    hash: str = Field(default="", description="over everything else in the file")
+
+    @property
+    def file_name(self) -> str:
+        """What its file is called."""
+        return result_file_name(self.kind, self.name, self.date)
+
+    def sealed(self) -> Self:
+        """The result with its hash, by which one that was edited is told."""
+        return self.model_copy(update={"hash": document_hash(self, {"hash"})})
+
+    @property
+    def stated(self) -> dict[str, Interval]:
+        """What was found, by name with unit."""
+        return {name: Interval.between(*ends) for name, ends in self.intervals.items()}
+
+    def in_words(self) -> list[tuple[str, str]]:
+        """What was found, for people: names with unit, and values with their half widths."""
+        return [(name, str(interval)) for name, interval in self.stated.items()]
+
+    def changes_to(self, other: Self) -> dict[str, float]:
+        """By how much another result's numbers are larger, by name with unit."""
+        mine, others = self.stated, other.stated
+        return {name: others[name].value - mine[name].value for name in mine if name in others}
+
+    @abstractmethod
+    def apart_mm(self, other: Self) -> float:
+        """How far apart the same thing is measured with either result, RMS, [mm]."""
+
+    @abstractmethod
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this result in place.
+
+        Raises:
+            BadInput: The result is not about this rig.
+        """
+
+    def require_basis(self, parts: object, what: str) -> None:
+        """Refuses a rig whose parts are others than those that this result rests on.
+
+        Args:
+            parts: The JSON-like parts of the rig file, as when the result was made.
+            what: Their names, for the message.
+
+        Raises:
+            BadInput: They are others.
+        """
+        if content_hash(parts) != self.rests_on:
+            raise BadInput(
+                f"this result rests on other {what} than the rig's",
+                where=f"calibration {self.kind} {self.name}, {self.date}",
+                why="the rig file was changed since, it is of another rig, or a calibration that"
+                " was applied then is not applied now",
+                next_step=f"pass the calibrations it was made with, or run `cdpr calibrate"
+                f" {self.kind}` again",
+            )
+
+
+def common_keys(
+    name: str,
+    on: date,
+    data_hash: str,
+    intervals: Mapping[str, Interval],
+    verdict: CalibrationVerdict,
+    unused: Mapping[str, str],
+    rests_on: object = None,
+) -> dict[str, Any]:
+    """The keys of every result.
+
+    Args:
+        name: Of what was calibrated.
+        on: The date.
+        data_hash: Of the measurements.
+        intervals: What was found, by name with unit.
+        verdict: What it is good for.
+        unused: Why data were left out, by name.
+        rests_on: The JSON-like parts of the rig file that were taken as known; None for none.
+    """
+    return {
+        "name": name,
+        "date": on.isoformat(),
+        "rests_on": "" if rests_on is None else content_hash(rests_on),
+        "data_sha256": data_hash,
+        "intervals": {key: interval.bounds for key, interval in intervals.items()},
+        "error_mm": verdict.error * 1e3,
+        "wanted_mm": verdict.wanted * 1e3,
+        "verdict": str(verdict),
+        "good_enough": verdict.good,
+        "next_steps": list(verdict.next_steps),
+        "unused": dict(unused),
+    }
+
+
+def result_file_name(kind: str, name: str, day: str) -> str:
+    """What the file of a result is called."""
+    return f"calibration_{kind}_{name}_{day}.yaml"
+
+
+def require_file_name(name: str, where: str) -> None:
+    """The name becomes part of a file's; told before the long work, not after it.
+
+    Raises:
+        BadInput: It cannot.
+    """
+    if not name or "/" in name or "\0" in name:
+        raise BadInput(
+            f"{name!r} cannot be part of a file name",
+            where=where,
+            next_step="use a name without a slash",
+        )
+
+
+def write_result(folder: Path, result: ResultDocument) -> Path:
+    """Writes a result into a folder, sealed, whole or not at all; returns the file.
+
+    Raises:
+        BadInput: The folder cannot be written to.
+    """
+    path = folder / result.file_name
+    plain = result.sealed().model_dump(mode="json")
+    write_atomic(path, yaml.safe_dump(plain, sort_keys=False, allow_unicode=True))
+    return path
+
+
+def in_order(results: Sequence[ResultDocument]) -> list[ResultDocument]:
+    """Results in the order in which they are applied."""
+    return sorted(results, key=lambda result: result.order)
+
+
+# The hash of the measurements that a result rests on, in one form for all kinds.
+
+
+def data_hash(pieces: Iterable[bytes]) -> str:
+    """``sha256:`` and the hash of all pieces in their order."""
+    digest = hashlib.sha256()
+    for piece in pieces:
+        digest.update(piece)
+    return f"sha256:{digest.hexdigest()}"

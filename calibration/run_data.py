@@ -1,0 +1,117 @@
+"""What runs tell a calibration: poses of the encoders, and where the platform was at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibration.extrinsics.hand_eye import read_poses
+from calibration.geometry.measurements import (
+    Recording,
+    RigMeasurements,
+    at_rest,
+    joined,
+    read_rig_data,
+)
+from calibration.geometry.result import require_one_drawing
+from executor.recording.run_folder import RunFolder
+from model.errors import BadInput
+from model.pose import Pose, interpolate, matrix_from_quaternion
+from model.rig import Rig
+
+
+def poses_by_picture(path: Path, camera: str) -> Mapping[str, Pose]:
+    """The platform's poses by picture, from a CSV file or the encoders of a run folder.
+
+    Raises:
+        BadInput: It cannot be read, or the camera took no pictures in the run.
+    """
+    return poses_of_run(path, camera) if path.is_dir() else read_poses(path)
+
+
+def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
+    """Poses from the encoders when a camera's kept pictures of a run were taken.
+
+    Raises:
+        BadInput: The camera took none.
+    """
+    run = RunFolder.open(folder)
+    cycles, alone = run.cycles(), run.poses_by_camera()
+    names = [one["name"] for one in run.summary().get("cameras", [])]
+    if camera not in names:
+        raise BadInput(
+            f"camera {camera!r} took no pictures in this run",
+            where=str(folder),
+            next_step=f"name one of its cameras with --camera: {', '.join(names)}",
+        )
+    looks = alone[camera] if alone else run.poses()
+    times = cycles.time
+    poses = {}
+    for time, picture in zip(looks.time, looks.picture, strict=True):
+        after = int(np.searchsorted(times, time))
+        if not picture or not 0 < after < len(times):
+            continue
+        ends = [
+            Pose.from_quaternion(cycles.encoder[row], cycles.encoder_rotation[row])
+            for row in (after - 1, after)
+        ]
+        share = float((time - times[after - 1]) / (times[after] - times[after - 1]))
+        if all(np.isfinite(end.matrix()).all() for end in ends):
+            poses[Path(picture).name] = interpolate(ends[0], ends[1], share)
+    return poses
+
+
+def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasurements]:
+    """The rig as its drives counted, and where the platform was at rest.
+
+    Args:
+        rig: As its file tells it.
+        data: Run folders, and CSV files (docs/data-formats.md).
+
+    Raises:
+        BadInput: A file cannot be read, is of another rig, or is named twice.
+    """
+    _require_once(data)
+    runs = [(str(path), RunFolder.open(path).rig()) for path in data if path.is_dir()]
+    counted = require_one_drawing(rig, runs)
+    parts = [
+        _at_rest(path) if path.is_dir() else read_rig_data(path, rig.cable_count) for path in data
+    ]
+    return counted, joined(parts)
+
+
+def _require_once(data: Sequence[Path]) -> None:
+    """Samples count once."""
+    named: dict[Path, Path] = {}
+    for path in data:
+        if path.resolve() in named:
+            raise BadInput(
+                f"{path} is named twice",
+                where="DATA",
+                why=f"it is the same as {named[path.resolve()]}",
+                next_step="name each file and each run once",
+            )
+        named[path.resolve()] = path
+
+
+def _at_rest(run: Path) -> RigMeasurements:
+    """Where the platform of a run was at rest."""
+    folder = RunFolder.open(run)
+    cycles, poses = folder.cycles(), folder.poses()
+    good = poses.ok
+    turned = [matrix_from_quaternion(q) for q in poses.rotation[good]]
+    return at_rest(
+        str(run),
+        Recording(
+            time=cycles.time,
+            asked=cycles.set_counts.astype(np.float64),
+            counts=cycles.actual_counts.astype(np.float64),
+            tensions=cycles.tensions,
+            seen=poses.time[good],
+            positions=poses.position[good],
+            rotations=np.array(turned).reshape(-1, 3, 3),
+            covariances=poses.covariance[good],
+        ),
+    )

@@ -1,0 +1,1 @@
+"""Finds where tags are from images that show several of them."""

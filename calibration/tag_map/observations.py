@@ -1,0 +1,286 @@
+"""The tags of a rig in many pictures of one camera, and why others are of no use."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.intrinsics.views import as_in, is_duplicate_view
+from calibration.results import data_hash
+from model.errors import BadInput
+from model.pose import Array, Pose
+from model.rig import Camera, Rig, Tag
+from tracking.camera_model import Image, project_undistorted
+from tracking.detection.detector import Detection
+from tracking.detection.diagnostics import what_else_is_seen
+from tracking.detection.libraries import make_detector
+from tracking.detection.tags import CORNER_SIGNS, modules_across
+from tracking.edges.refine import RefinedTag, refine
+from tracking.pnp import moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagSights:
+    """Whole tags that were seen.
+
+    Attributes:
+        squares: Of every picture that shows some, by its name: the tags' squares by number.
+        unused: Why a picture, or a tag in it, is not used, by name.
+    """
+
+    squares: Mapping[str, Mapping[int, RefinedTag]]
+    unused: Mapping[str, str]
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of the tags that were seen."""
+        return tuple(sorted({number for squares in self.squares.values() for number in squares}))
+
+    def without(self, unused: Mapping[str, str]) -> TagSights:
+        """The sights without some more pictures, and why."""
+        left = {name: squares for name, squares in self.squares.items() if name not in unused}
+        return TagSights(left, {**self.unused, **unused})
+
+    def each_view_once(self) -> TagSights:
+        """Without pictures in which all tags are where another, which shows no fewer, has them."""
+        kept: dict[str, Mapping[int, RefinedTag]] = {}
+        unused = {}
+        for name, squares in sorted(self.squares.items(), key=lambda sight: -len(sight[1])):
+            first = next((n for n, before in kept.items() if _alike(squares, before)), None)
+            if first is None:
+                kept[name] = squares
+            else:
+                unused[name] = as_in(first)
+        return self.without(unused)
+
+    def data_hash(self) -> str:
+        """Hash of what was seen."""
+        return data_hash(
+            f"{name} {number}".encode() + np.round(square.corners, 6).tobytes()
+            for name, squares in self.squares.items()
+            for number, square in sorted(squares.items())
+        )
+
+
+def sights_of(
+    pictures: Iterable[tuple[str, Image]],
+    rig: Rig,
+    camera: Camera,
+    wanted: Collection[int],
+    unused: Mapping[str, str] | None = None,
+) -> TagSights:
+    """Looks for tags.
+
+    A number that is seen twice in a picture is left out there: nobody knows which is the rig's.
+    A copy of a picture is left out: it tells nothing more. Pictures of a camera that stands still
+    differ by their noise at least.
+
+    Args:
+        pictures: Names and grey pictures of the camera's size.
+        rig: Its family of tags, and what finds them.
+        camera: Its matrix and distortion hold.
+        wanted: Their numbers.
+        unused: Pictures that were left out before, with the reasons.
+
+    Raises:
+        BadInput: No picture shows any of them whole.
+    """
+    family = rig.tag_family
+    detector, modules = make_detector(rig.tag_detector, family), modules_across(family)
+    found: dict[str, Mapping[int, RefinedTag]] = {}
+    left_out = dict(unused or {})
+    example: tuple[str, Image] | None = None
+    names: dict[bytes, str] = {}
+    for name, image in pictures:
+        first = names.setdefault(hashlib.sha256(image.tobytes()).digest(), name)
+        if first != name:
+            left_out[name] = f"is the same picture as {first}"
+            continue
+        mine = [d for d in detector.detect_all(image) if d.id in wanted]
+        twice = [number for number, count in Counter(d.id for d in mine).items() if count > 1]
+        left_out |= {f"{name}, tag {number}": "is seen more than once" for number in twice}
+        squares = _whole(image, camera, [d for d in mine if d.id not in twice], modules)
+        if squares:
+            found[name] = squares
+        elif not twice:
+            left_out[name] = "shows none of the tags whole"
+            example = example or (name, image)
+    if not found:
+        raise _nothing_seen(camera, family, wanted, left_out, example)
+    return TagSights(found, left_out)
+
+
+def _alike(squares: Mapping[int, RefinedTag], before: Mapping[int, RefinedTag]) -> bool:
+    both = squares.keys() & before.keys()
+    if not both:
+        return False
+    corners, earlier = (np.array([one[k].corners for k in both]) for one in (squares, before))
+    return is_duplicate_view(corners, earlier)
+
+
+def _whole(
+    image: Image, camera: Camera, detections: list[Detection], modules: int
+) -> dict[int, RefinedTag]:
+    corners = np.array([d.corners for d in detections]).reshape(-1, 4, 2)
+    squares = refine(image, camera, corners, modules)
+    pairs = zip(detections, squares, strict=True)
+    return {d.id: square for d, square in pairs if square is not None and square.whole}
+
+
+def _nothing_seen(
+    camera: Camera,
+    family: str,
+    wanted: Collection[int],
+    unused: Mapping[str, str],
+    example: tuple[str, Image] | None,
+) -> BadInput:
+    why = "; ".join(f"{name} {reason}" for name, reason in list(unused.items())[:4])
+    if example is not None:
+        name, image = example
+        why += f"; {name} shows {what_else_is_seen(image, family, list(wanted))}"
+    return BadInput(
+        f"none of the {family} tags {', '.join(map(str, wanted))} is to be seen whole",
+        where=f"camera {camera.name}",
+        why=why,
+        next_step="check that the camera sees them, that the light suffices, and that the rig file"
+        " names the family and numbers of the printed tags",
+    )
+
+
+# All tags in all pictures as arrays: errors of their edges, and what these say of the layout.
+
+
+def moved_tags(tags: Sequence[Tag], steps: Array) -> tuple[Tag, ...]:
+    """Tags after shifts [m] and turns [rad] along their carrier's axes, shape (6 t,)."""
+    return tuple(
+        replace(tag, pose=moved(tag.pose, step))
+        for tag, step in zip(tags, steps.reshape(-1, 6), strict=True)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagViews:
+    """v views of t tags in p pictures.
+
+    Attributes:
+        camera: That took them.
+        picture: Which picture each view is in, shape (v,).
+        tag: Which tag it shows, shape (v,).
+        whitening: Shape (v, 8, 8), [1/px].
+        target: Shape (v, 8).
+        flat: Corners of each view's tag in its own frame, shape (v, 4, 3), [m].
+    """
+
+    camera: Camera
+    picture: NDArray[np.int64]
+    tag: NDArray[np.int64]
+    whitening: Array
+    target: Array
+    flat: Array
+
+    @classmethod
+    def of(cls, camera: Camera, sights: TagSights, tags: Sequence[Tag]) -> TagViews:
+        """The views of those tags."""
+        numbers = [tag.id for tag in tags]
+        found = [
+            (k, numbers.index(number), square)
+            for k, squares in enumerate(sights.squares.values())
+            for number, square in squares.items()
+        ]
+        halves = np.array([tags[which].size / 2.0 for _, which, _ in found])
+        signs = np.column_stack([CORNER_SIGNS, np.zeros(4)])
+        return cls(
+            camera,
+            np.array([k for k, _, _ in found], dtype=np.int64),
+            np.array([which for _, which, _ in found], dtype=np.int64),
+            np.array([square.whitening for _, _, square in found]),
+            np.array([square.target for _, _, square in found]),
+            halves[:, None, None] * signs,
+        )
+
+    def errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> Array:
+        """Whitened errors of the edges, shape (v, 8)."""
+        points, _, _ = self._points(cameras, tags)
+        pixels = project_undistorted(self.camera, points).reshape(-1, 8)
+        return np.asarray(np.einsum("vij,vj->vi", self.whitening, pixels) - self.target)
+
+    def slopes(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array]:
+        """Of the errors, by the picture's camera pose and by the tag's pose, shape (v, 8, 6)."""
+        points, arms_camera, arms_tag = self._points(cameras, tags)
+        depth = points[..., 2]
+        by_point = np.zeros((*points.shape[:2], 2, 3))
+        for axis in range(2):
+            focal = self.camera.matrix[axis, axis]
+            by_point[..., axis, axis] = focal / depth
+            by_point[..., axis, 2] = -focal * points[..., axis] / depth**2
+        turn = np.array([pose.rotation for pose in cameras])[self.picture]
+        by_place = np.einsum("vcij,vjk->vcik", by_point, turn)
+        by_camera = np.concatenate([by_point, np.cross(arms_camera[:, :, None], by_point)], -1)
+        by_tag = np.concatenate([by_place, np.cross(arms_tag[:, :, None], by_place)], -1)
+        return (
+            np.asarray(self.whitening @ by_camera.reshape(-1, 8, 6)),
+            np.asarray(self.whitening @ by_tag.reshape(-1, 8, 6)),
+        )
+
+    def dense_slopes(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> Array:
+        """Of all errors by all poses of cameras, then of tags, shape (8 v, 6 p + 6 t)."""
+        by_camera, by_tag = self.slopes(cameras, tags)
+        whole = np.zeros((len(self.tag), 8, 6 * (len(cameras) + len(tags))))
+        six = np.arange(6)
+        view = np.arange(len(self.tag))[:, None, None]
+        row = np.arange(8)[None, :, None]
+        whole[view, row, (6 * self.picture[:, None] + six)[:, None, :]] = by_camera
+        place = 6 * (len(cameras) + self.tag[:, None]) + six
+        whole[view, row, place[:, None, :]] = by_tag
+        return whole.reshape(8 * len(self.tag), -1)
+
+    def about_tags(
+        self, cameras: Sequence[Pose], tags: Sequence[Tag], huber: float
+    ) -> tuple[list[Array], list[Array], float]:
+        """What each picture says of the tags' poses, its camera pose projected out.
+
+        Returns:
+            Information, shape (6 t, 6 t), and score, shape (6 t,), of each picture; and the squares
+            of the errors, in variances, for each that is free.
+        """
+        errors = self.errors(cameras, tags)
+        weight = np.sqrt(np.minimum(1.0, huber / np.maximum(np.abs(errors), 1e-12)))
+        errors = errors * weight
+        by_camera, by_tag = (part * weight[..., None] for part in self.slopes(cameras, tags))
+        informations, scores = [], []
+        for k in range(len(cameras)):
+            mine = np.flatnonzero(self.picture == k)
+            wide = np.zeros((len(mine), 8, 6 * len(tags)))
+            for row, view in enumerate(mine.tolist()):
+                place = 6 * int(self.tag[view])
+                wide[row, :, place : place + 6] = by_tag[view]
+            base = np.linalg.qr(by_camera[mine].reshape(-1, 6))[0]
+            flat = wide.reshape(-1, 6 * len(tags))
+            left = flat - base @ (base.T @ flat)
+            informations.append(left.T @ left)
+            scores.append(-left.T @ errors[mine].ravel())
+        freedom = errors.size - 6 * len(cameras) - 6 * (len(tags) - 1)
+        return informations, scores, float(np.sum(errors**2)) / max(freedom, 1)
+
+    def picture_errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> list[float]:
+        """RMS corner error of each picture, [px]."""
+        points, _, _ = self._points(cameras, tags)
+        pixels = project_undistorted(self.camera, points).reshape(-1, 8)
+        measured = np.linalg.solve(self.whitening, self.target[..., None])[..., 0]
+        squares = np.sum((pixels - measured) ** 2, axis=1) / 4.0
+        return [float(np.sqrt(squares[self.picture == k].mean())) for k in range(len(cameras))]
+
+    def _points(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array, Array]:
+        """Corners in the camera's frame, (v, 4, 3); arms of camera turns and of tag turns."""
+        tag_turn = np.array([tag.pose.rotation for tag in tags])[self.tag]
+        tag_place = np.array([tag.pose.position for tag in tags])[self.tag]
+        turn = np.array([pose.rotation for pose in cameras])[self.picture]
+        place = np.array([pose.position for pose in cameras])[self.picture]
+        arms_tag = np.einsum("vij,vcj->vci", tag_turn, self.flat)
+        arms_camera = np.einsum("vij,vcj->vci", turn, arms_tag + tag_place[:, None])
+        return arms_camera + place[:, None], arms_camera, arms_tag

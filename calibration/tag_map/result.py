@@ -1,0 +1,296 @@
+"""The result file of the tags' places on the platform."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import date
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from calibration.extrinsics.result import AXES, SCALES, pose_rows
+from calibration.report import Section, page_of, table_of
+from calibration.results import ResultDocument, common_keys
+from calibration.statistics import Interval
+from calibration.tag_map.bundle_adjustment import TagLayout
+from calibration.verdict import CalibrationVerdict, Issue
+from model.errors import BadInput
+from model.files.documents import AnyNonNegative, PoseDocument, Positive
+from model.files.rig_file import RigDocument, TagDocument
+from model.pose import Array, Pose, rotation_vector_from_matrix
+from model.rig import Tag
+from tracking.detection.tags import tag_corners
+
+
+class TagsResult(ResultDocument):
+    """Tags on the platform, in the keys of the rig file's ``tags.platform``."""
+
+    order: ClassVar[int] = 1
+
+    kind: Literal["tags"] = "tags"
+    platform: Annotated[list[TagDocument], Field(min_length=2)]
+    fixed_tag: int | None = Field(description="that is as in the rig file; null: all fit it best")
+    scale: Positive = Field(description="size of the layout by that of the rig file")
+    rms_px: AnyNonNegative
+    picture_errors_px: dict[str, AnyNonNegative]
+    seen: dict[str, int] = Field(description="in how many pictures each tag was")
+
+    def in_words(self) -> list[tuple[str, str]]:
+        """As of every result; turns are from the stated rotation, so that only doubt is told."""
+        return pose_rows(self.stated)
+
+    def changes_to(self, other: Self) -> dict[str, float]:
+        """How far the other result's tags are off, and how turned about the platform's axes."""
+        others = {tag.id: tag.pose() for tag in other.platform}
+        changes: dict[str, float] = {}
+        for tag in self.platform:
+            if tag.id in others:
+                changes |= _named(tag.id, _difference(others[tag.id], tag.pose()))
+        return changes
+
+    def apart_mm(self, other: Self) -> float:
+        """How far apart corners of tags that both have are, RMS, [mm].
+
+        Raises:
+            BadInput: They have no tag in common.
+        """
+        corners = {tag.id: tag_corners(_plain(tag)) for tag in other.platform}
+        gaps = [
+            tag_corners(_plain(tag)) - corners[tag.id] for tag in self.platform if tag.id in corners
+        ]
+        if not gaps:
+            raise BadInput(
+                "the results have no tag in common",
+                where=f"calibration {self.kind} {self.name}, {self.date}",
+                next_step="compare results for one platform",
+            )
+        return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1)))) * 1e3
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with the tags at these places.
+
+        Raises:
+            BadInput: The rig has tags of other numbers, sizes or families.
+        """
+        self.require_basis(_basis(rig), "sizes or numbers of tags")
+        assert rig.tags is not None  # or their basis were another
+        placed = {tag.id: tag for tag in self.platform}
+        tags = [placed.get(tag.id, tag) for tag in rig.tags.platform]
+        return rig.model_copy(update={"tags": rig.tags.model_copy(update={"platform": tags})})
+
+
+def tags_result(
+    result: TagLayout, verdict: CalibrationVerdict, rig: RigDocument, on: date
+) -> TagsResult:
+    """The result with its quality.
+
+    Args:
+        result: What was found.
+        verdict: What it is good for.
+        rig: The rig file's content that it was found with.
+        on: The date.
+    """
+    unseen = {f"tag {number}": why for number, why in result.unseen.items()}
+    return TagsResult(
+        **common_keys(
+            rig.name,
+            on,
+            result.data_hash,
+            tag_intervals(result),
+            verdict,
+            {**result.unused, **unseen},
+            _basis(rig),
+        ),
+        platform=[_document(tag) for tag in result.tags],
+        fixed_tag=result.fixed,
+        scale=result.scale,
+        rms_px=result.reprojection,
+        picture_errors_px={name: float(error) for name, error in result.errors.items()},
+        seen={str(number): count for number, count in result.seen.items()},
+    )
+
+
+def tag_intervals(result: TagLayout) -> dict[str, Interval]:
+    """All tags' numbers; turns are about the platform's axes, from the stated rotation."""
+    found: dict[str, Interval] = {}
+    widths = result.half_widths.reshape(-1, 6) * SCALES
+    for tag, own in zip(result.tags, widths, strict=True):
+        values = _named(tag.id, np.concatenate([tag.pose.position, np.zeros(3)]))
+        found |= {
+            name: Interval(value, float(width))
+            for (name, value), width in zip(values.items(), own, strict=True)
+        }
+    return found
+
+
+def _named(number: int, values: Array) -> dict[str, float]:
+    """Six numbers of a tag, [m, rad], by name with unit."""
+    scaled = (values * SCALES).tolist()
+    return {f"tag_{number}_{axis}": value for axis, value in zip(AXES, scaled, strict=True)}
+
+
+def _difference(pose: Pose, from_: Pose) -> Array:
+    turn = rotation_vector_from_matrix(pose.rotation @ from_.rotation.T)
+    return np.concatenate([pose.position - from_.position, turn])
+
+
+def _plain(tag: TagDocument) -> Tag:
+    return Tag(tag.id, tag.size_mm / 1e3, tag.pose())
+
+
+def _document(tag: Tag) -> TagDocument:
+    pose = PoseDocument.of(tag.pose)
+    return TagDocument(
+        id=tag.id,
+        size_mm=round(tag.size * 1e3, 9),
+        position_mm=pose.position_mm,
+        rotation_wxyz=pose.rotation_wxyz,
+    )
+
+
+def _basis(rig: RigDocument) -> dict[str, Any]:
+    """What the result takes as known."""
+    platform: Sequence[TagDocument] = rig.tags.platform if rig.tags else ()
+    return {
+        "family": rig.tags.family if rig.tags else None,
+        "sizes": sorted([tag.id, tag.size_mm] for tag in platform),
+    }
+
+
+# The report of the tags' places on a platform.
+
+
+def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdict) -> str:
+    """The whole page."""
+    gauge = "The platform's frame is put where all tags fit the rig file best."
+    if result.fixed is not None:
+        gauge = f"Tag {result.fixed} is taken to be as in the rig file."
+    return page_of(
+        f"Tags on the platform of {document.name}",
+        f"{document.date}, {len(result.errors)} pictures used",
+        verdict,
+        [
+            Section(
+                "Tags against the rig file",
+                table_of(
+                    change_rows(result),
+                    ("tag", "moved [mm]", "turned [°]", "x, y, z [mm]", "seen in"),
+                ),
+                gauge,
+            ),
+            Section(
+                "Places, with 95 % intervals",
+                table_of(_places(document), ("tag", *AXES)),
+                "Turns are about the platform's axes, from the stated rotation.",
+            ),
+            Section(
+                "Quality",
+                table_of(
+                    [
+                        ("corners off, RMS", f"{result.reprojection:.3f} px"),
+                        ("tags located", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
+                        ("size by the rig file", f"{result.scale:.5f}"),
+                        ("data", document.data_sha256[:23]),
+                    ]
+                ),
+            ),
+            Section(
+                "Pictures used",
+                table_of((name, f"{error:.3f} px") for name, error in result.errors.items()),
+            ),
+            Section("Not used", table_of(document.unused.items())),
+        ],
+    )
+
+
+def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
+    """What changed against the rig file, tag by tag."""
+    rows = []
+    for tag, drawn in zip(result.tags, result.drawn, strict=True):
+        shift = (tag.pose.position - drawn.pose.position) * 1e3
+        rows.append(
+            (
+                f"tag {tag.id}",
+                f"{np.linalg.norm(shift):.3f}",
+                f"{np.degrees(tag.pose.angle_to(drawn.pose)):.3f}",
+                ", ".join(f"{value:+.3f}" for value in shift),
+                f"{result.seen[tag.id]} pictures",
+            )
+        )
+    return rows
+
+
+def _places(document: TagsResult) -> list[tuple[str, ...]]:
+    told = dict(document.in_words())
+    return [
+        (f"tag {tag.id}", *(told[f"tag_{tag.id}_{axis}"] for axis in AXES))
+        for tag in document.platform
+    ]
+
+
+# Whether the tags of a platform are located well enough.
+
+
+GOOD_PICTURES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
+"""Pictures in all, pictures of each tag, pixels."""
+GOOD_SIDES_DEG = 40.0
+GOOD_SCALE = 0.02
+"""Share by which a layout may be larger or smaller than in the rig file."""
+FAR_MM, FAR_DEG = 10.0, 8.0
+"""A tag farther from its place in the rig file was glued elsewhere, or this is another platform."""
+
+
+def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
+    """Judges a layout.
+
+    Args:
+        result: What was found.
+        wanted: What is good enough, for corners of tags, [m].
+    """
+    lacks = [*_about_pictures(result), *_about_tags(result)]
+    error = result.error
+    if not error <= wanted:
+        what = f"tags are located within {error * 1e3:.2g} mm, {wanted * 1e3:.2g} mm are wanted"
+        lacks.append(Issue(what, "take more pictures, closer, sharp and from all sides"))
+    return CalibrationVerdict.of(error, wanted, "in the tags' places", lacks)
+
+
+def _about_pictures(result: TagLayout) -> list[Issue]:
+    lacks = []
+    if len(result.errors) < GOOD_PICTURES:
+        what = f"{len(result.errors)} pictures show two tags or more, {GOOD_PICTURES} are needed"
+        lacks.append(Issue(what, "take 20 pictures from all sides, two or three tags in each"))
+    if np.degrees(result.sides) < GOOD_SIDES_DEG:
+        what = (
+            f"all pictures are taken from within {np.degrees(result.sides):.0f}°,"
+            f" {GOOD_SIDES_DEG:.0f}° are needed"
+        )
+        lacks.append(Issue(what, "take pictures from all sides, not alike"))
+    if result.reprojection > GOOD_ERROR:
+        what = f"corners are {result.reprojection:.2f} px off"
+        step = "check sizes and numbers of the tags, that they lie flat, and the camera's numbers"
+        lacks.append(Issue(what, step))
+    if abs(result.scale - 1.0) > GOOD_SCALE:
+        way = "larger" if result.scale > 1.0 else "smaller"
+        what = f"the layout is {abs(result.scale - 1.0):.1%} {way} than in the rig file"
+        lacks.append(Issue(what, "measure the black squares and correct size_mm in the rig file"))
+    return lacks
+
+
+def _about_tags(result: TagLayout) -> list[Issue]:
+    lacks = []
+    for number, why in result.unseen.items():
+        step = f"take pictures that show tag {number} together with others"
+        lacks.append(Issue(f"tag {number} {why}", step))
+    for number, count in result.seen.items():
+        if count < GOOD_VIEWS:
+            what = f"tag {number} is in {count} pictures, {GOOD_VIEWS} are needed"
+            lacks.append(Issue(what, f"take more pictures of tag {number} with its neighbours"))
+    for tag, drawn in zip(result.tags, result.drawn, strict=True):
+        shift, turn = drawn.pose.distance_to(tag.pose) * 1e3, drawn.pose.angle_to(tag.pose)
+        if shift > FAR_MM or np.degrees(turn) > FAR_DEG:
+            what = f"tag {tag.id} is {shift:.1f} mm and {np.degrees(turn):.1f}° from the rig file"
+            step = f"check that tag {tag.id} is where, and turned as, the rig file says"
+            lacks.append(Issue(what, step))
+    return lacks

@@ -1,0 +1,149 @@
+"""ChArUco boards: the corners between markers, in a picture that may show a part only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.targets.board import LEAST_POINTS, Seen, require_board
+from model.files.rig_file import FAMILIES
+from model.pose import Array
+from tracking.camera_model import Image
+from tracking.detection.detector import TagDetector
+from tracking.detection.diagnostics import what_else_is_seen
+
+_LEAST_FOURS = 4
+"""Markers of 16 modules are found by chance: so many are not."""
+_ARUCO = {
+    name.removeprefix("DICT_"): getattr(cv2.aruco, name)
+    for name in dir(cv2.aruco)
+    if name.startswith("DICT_") and name.isupper()
+}
+DICTIONARIES = tuple(sorted(_ARUCO))
+"""Names of the dictionaries of ArUco markers, such as 4X4_50."""
+
+
+@dataclass(frozen=True)
+class Charuco:
+    """A chessboard with ArUco markers in its white squares; parts of it will do.
+
+    Attributes:
+        columns: Squares along a row.
+        rows: Squares along a column.
+        square: Side of a square, [m].
+        marker: Side of a marker, [m].
+        dictionary: One of `DICTIONARIES`.
+        legacy: Whether the first square is as OpenCV drew it before 4.6, where the number of rows
+            is even.
+    """
+
+    columns: int
+    rows: int
+    square: float
+    marker: float
+    dictionary: str
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses boards that cannot be.
+
+        Raises:
+            BadInput: Too few squares, a marker that does not fit its square, or a dictionary that
+                is not known or has too few markers.
+        """
+        require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares a side")
+        require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")
+        require_board(
+            self.dictionary in _ARUCO,
+            f"unknown dictionary {self.dictionary!r}",
+            f"use one of {', '.join(DICTIONARIES)}",
+        )
+        markers = cv2.aruco.getPredefinedDictionary(_ARUCO[self.dictionary]).bytesList.shape[0]
+        wanted = self.columns * self.rows // 2
+        require_board(
+            markers >= wanted,
+            f"dictionary {self.dictionary} has {markers} markers, the board needs {wanted}",
+            "check the dictionary's name",
+        )
+
+    def __str__(self) -> str:
+        """Its kind, size and dictionary."""
+        return f"a ChArUco board of {self.columns} x {self.rows} squares with {self.dictionary}"
+
+    def find(self, image: Image) -> Seen | None:
+        """Its inner corners, as far as they are to be seen."""
+        squares, markers, twice = self._markers_in(image)
+        if not len(markers):
+            return None
+        corners, numbers, _, _ = self._detector.detectBoard(
+            image, markerCorners=squares, markerIds=markers
+        )
+        if np.size(numbers) < LEAST_POINTS:  # None where there is none
+            return None
+        points = np.asarray(self._board.getChessboardCorners(), dtype=np.float64)
+        chosen = points[np.ravel(numbers)]
+        if _in_a_line(chosen):
+            return None
+        return Seen(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
+
+    def instead(self, image: Image) -> str:
+        """Tags and markers that the picture shows."""
+        family = self.dictionary if self.dictionary in FAMILIES else FAMILIES[-1]
+        told = what_else_is_seen(image, family, [])
+        fours = TagDetector("4X4_1000").detect(image)
+        if len(fours) < _LEAST_FOURS:
+            return told
+        return f"{told}; 4X4 {', '.join(str(d.id) for d in fours)}"
+
+    def _markers_in(
+        self, image: Image
+    ) -> tuple[list[NDArray[np.float32]], NDArray[np.int32], tuple[int, ...]]:
+        """Markers, their numbers, and numbers that were seen more than once and are left out."""
+        corners, found, _ = self._marker_detector.detectMarkers(image)
+        numbers = np.array([], np.int32) if not corners else np.ravel(found).astype(np.int32)
+        seen, counts = np.unique(numbers, return_counts=True)
+        once = np.isin(numbers, seen[counts == 1])
+        kept = [np.asarray(c, np.float32) for c, one in zip(corners, once, strict=True) if one]
+        return kept, numbers[once].reshape(-1, 1), tuple(seen[counts > 1].tolist())
+
+    def markers(self) -> list[tuple[Array, NDArray[np.bool_]]]:
+        """Top left corner in the board's plane, shape (2,), [m], and white modules of each."""
+        dictionary = self._board.getDictionary()
+        side = dictionary.markerSize + 2
+        numbers = [int(number) for number in np.ravel(self._board.getIds())]
+        return [
+            (
+                np.asarray(corners, dtype=np.float64)[0, :2],
+                np.asarray(cv2.aruco.generateImageMarker(dictionary, number, side) > 127),
+            )
+            for number, corners in zip(numbers, self._board.getObjPoints(), strict=True)
+        ]
+
+    @cached_property
+    def _board(self) -> cv2.aruco.CharucoBoard:
+        board = cv2.aruco.CharucoBoard(
+            (self.columns, self.rows),
+            self.square,
+            self.marker,
+            cv2.aruco.getPredefinedDictionary(_ARUCO[self.dictionary]),
+        )
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    @cached_property
+    def _marker_detector(self) -> cv2.aruco.ArucoDetector:
+        return cv2.aruco.ArucoDetector(self._board.getDictionary())
+
+    @cached_property
+    def _detector(self) -> cv2.aruco.CharucoDetector:
+        return cv2.aruco.CharucoDetector(self._board)
+
+
+def _in_a_line(points: Array) -> bool:
+    """Whether points do not span the board's plane."""
+    flat = points[:, :2] - points[:, :2].mean(axis=0)
+    return bool(np.linalg.svd(flat, compute_uv=False)[1] < 1e-9)

@@ -1,0 +1,386 @@
+"""What is black on boards and tags: rectangles in exact size, and the white they need around."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.targets.board import Board
+from calibration.targets.charuco import Charuco
+from calibration.targets.chessboard import Chessboard
+from calibration.targets.tag_grid import TagGrid
+from model.errors import BadInput
+from model.pose import Array
+from model.rig import Rig
+from tracking.detection.tags import modules_across, official_modules
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Print:
+    """Something to be printed.
+
+    Attributes:
+        black: Left, top, width and height of black rectangles, from the top left of what is
+            printed, shape (n, 4), [m].
+        size: Width and height of what is printed, shape (2,), [m].
+        quiet: Width of the white that must surround it, [m].
+        caption: What it is, printable ASCII.
+    """
+
+    black: Array
+    size: Array
+    quiet: float
+    caption: str
+
+
+def board_print(board: Board) -> Print:
+    """The print of a calibration board.
+
+    Raises:
+        BadInput: Its tags would touch.
+    """
+    match board:
+        case Chessboard():
+            return _chessboard(board)
+        case Charuco():
+            return _charuco(board)
+        case TagGrid():
+            return _tag_grid(board)
+        case _:
+            raise TypeError(f"no print of {board}")
+
+
+def tag_print(family: str, number: int, size: float) -> Print:
+    """The print of a single tag whose black square has side ``size`` [m]."""
+    module = size / modules_across(family)
+    black = _modules(~official_modules(family, number), np.zeros(2), module)
+    caption = f"{family} {number}, black square {size * 1e3:g} mm"
+    return Print(black, np.full(2, size), module, caption)
+
+
+def _chessboard(board: Chessboard) -> Print:
+    """One square more than inner corners each way, the one at the top left black."""
+    rows, columns = np.indices((board.rows + 1, board.columns + 1))
+    black = _modules((rows + columns) % 2 == 0, np.zeros(2), board.square)
+    size = np.array([board.columns + 1, board.rows + 1]) * board.square
+    caption = f"{board}, squares {board.square * 1e3:g} mm"
+    return Print(black, size, _quiet(board.square), caption)
+
+
+def _charuco(board: Charuco) -> Print:
+    """Squares that hold a marker are white, the others black."""
+    markers = board.markers()
+    black = np.ones((board.rows, board.columns), dtype=np.bool_)
+    parts = []
+    for corner, modules in markers:
+        column, row = np.floor((corner + board.marker / 2.0) / board.square).astype(int)
+        black[row, column] = False
+        parts.append(_modules(~modules, corner, board.marker / len(modules)))
+    squares = _modules(black, np.zeros(2), board.square)
+    caption = (
+        f"{board}, squares {board.square * 1e3:g} mm, markers {board.marker * 1e3:g} mm"
+        f"{', legacy' if board.legacy else ''}"
+    )
+    size = np.array([board.columns, board.rows]) * board.square
+    return Print(np.concatenate([squares, *parts]), size, _quiet(board.square), caption)
+
+
+def _tag_grid(board: TagGrid) -> Print:
+    module = board.tag / modules_across(board.family)
+    if board.gap < module:
+        raise BadInput(
+            f"the gap between tags is {board.gap * 1e3:g} mm, less than a module of them"
+            f" ({module * 1e3:.3g} mm)",
+            where="--gap-mm",
+            why="a tag is found by the white around it",
+            next_step=f"use {2.0 * module * 1e3:.3g} mm or more",
+        )
+    step = board.tag + board.gap
+    parts = []
+    for place in range(board.columns * board.rows):
+        row, column = divmod(place, board.columns)
+        modules = ~official_modules(board.family, board.first + place)
+        parts.append(_modules(modules, np.array([column, row]) * step, module))
+    size = np.array([board.columns, board.rows]) * step - board.gap
+    caption = f"{board}, black squares {board.tag * 1e3:g} mm, gaps {board.gap * 1e3:g} mm"
+    return Print(np.concatenate(parts), size, max(module, board.gap / 2.0), caption)
+
+
+def _quiet(square: float) -> float:
+    """White around a chessboard, [m]: enough to tell its outermost squares from the table."""
+    return min(square / 3.0, 0.008)
+
+
+def _modules(black: NDArray[np.bool_], corner: Array, side: float) -> Array:
+    """Rectangles of the black modules of a grid, runs along a row joined, shape (n, 4), [m]."""
+    found = []
+    for row, line in enumerate(black):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
+        for first, after in edges.reshape(-1, 2).tolist():
+            left, top = corner + np.array([first, row]) * side
+            found.append([left, top, (after - first) * side, side])
+    return np.array(found).reshape(-1, 4)
+
+
+# Vector pages in exact size: black rectangles and plain text, in millimetres, as PDF 1.4.
+#
+# Rectangles of a page are one path, so that no viewer shows seams where they touch.
+#
+# Source: ISO 32000-1, 7.5 (file structure), 8.5 (paths), 9.4 (text).
+
+
+POINTS_A_MM = 72.0 / 25.4
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A line of text.
+
+    Attributes:
+        x_mm: Of its start, from the left.
+        y_mm: Of its base line, from the top.
+        size_mm: Of the letters.
+        text: Printable ASCII.
+    """
+
+    x_mm: float
+    y_mm: float
+    size_mm: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Page:
+    """A page.
+
+    Attributes:
+        width_mm: Of the paper.
+        height_mm: Of the paper.
+        black_mm: Left, top, width and height of black rectangles, from the top left, shape (n, 4).
+        texts: On top of them.
+    """
+
+    width_mm: float
+    height_mm: float
+    black_mm: Array
+    texts: tuple[Text, ...]
+
+
+def pdf_of(pages: list[Page], title: str) -> bytes:
+    """The whole file.
+
+    Args:
+        pages: One or more.
+        title: Printable ASCII.
+    """
+    kids = " ".join(f"{4 + 2 * k} 0 R" for k in range(len(pages)))
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        f"<< /Type /Pages /Kids [{kids}] /Count {len(pages)} >>".encode(),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
+    ]
+    for number, page in enumerate(pages):
+        box = f"[0 0 {page.width_mm * POINTS_A_MM:.4f} {page.height_mm * POINTS_A_MM:.4f}]"
+        objects.append(
+            f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /Contents {5 + 2 * number} 0 R"
+            " /Resources << /Font << /F1 3 0 R >> >> >>".encode()
+        )
+        drawn = _drawn(page)
+        objects.append(b"<< /Length %d >>\nstream\n%s\nendstream" % (len(drawn), drawn))
+    objects.append(f"<< /Title ({_escaped(title)}) /Producer (cdpr) >>".encode())
+    return _file(objects)
+
+
+def _drawn(page: Page) -> bytes:
+    """The operators of a page; one unit is a millimetre, y runs down."""
+    scale = f"{POINTS_A_MM:.10f}"
+    lines = [f"{scale} 0 0 -{scale} 0 {page.height_mm * POINTS_A_MM:.6f} cm", "0 g"]
+    lines += [f"{x:.5f} {y:.5f} {w:.5f} {h:.5f} re" for x, y, w, h in page.black_mm.tolist()]
+    lines.append("f")
+    for text in page.texts:
+        place = f"1 0 0 -1 {text.x_mm:.4f} {text.y_mm:.4f} Tm"
+        lines.append(f"BT /F1 {text.size_mm:.3f} Tf {place} ({_escaped(text.text)}) Tj ET")
+    return "\n".join(lines).encode("ascii")
+
+
+def _escaped(text: str) -> str:
+    plain = text.encode("ascii", "replace").decode()
+    return plain.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
+
+
+def _file(objects: list[bytes]) -> bytes:
+    """Objects numbered from 1, the table of their places, and the trailer."""
+    out = bytearray(b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n")
+    places = []
+    for number, body in enumerate(objects, 1):
+        places.append(len(out))
+        out += b"%d 0 obj\n%s\nendobj\n" % (number, body)
+    start = len(out)
+    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
+    for place in places:
+        out += b"%010d 00000 n \n" % place
+    out += b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\n" % (len(objects) + 1, len(objects))
+    out += b"startxref\n%d\n%%%%EOF\n" % start
+    return bytes(out)
+
+
+# Prints on paper: in exact size, with a ruler to prove it, or refused.
+
+
+PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
+"""Width and height upright, [mm]."""
+MARGIN_MM = 5.0
+"""What printers leave white."""
+_FOOT_MM = 12.0
+"""For ruler and caption."""
+_CAPTION_MM = 5.0
+"""For the line below each of several prints."""
+_LETTERS_MM = 2.8
+RULER_MM = 100.0
+
+
+def sheet_of(print_: Print, paper: str) -> Page:
+    """A print in the middle of a page of its own, upright or across.
+
+    Raises:
+        BadInput: It does not fit, and must not be scaled or cut into tiles.
+    """
+    for width, height in _turns(paper):
+        if _fits(print_, width, height):
+            border = _border(print_)
+            free = np.array([width, height - _FOOT_MM - MARGIN_MM + border])
+            corner = (free - 1e3 * print_.size) / 2.0
+            corner[1] = min(corner[1], free[1] - border - 1e3 * (print_.size[1] + print_.quiet))
+            return _page(width, height, [(print_, corner)], f"{print_.caption}. This side down.")
+    raise _too_large(print_, paper)
+
+
+def sheets_of(prints: Sequence[Print], paper: str) -> list[Page]:
+    """Several prints with their names below, row after row on upright pages.
+
+    Raises:
+        BadInput: One of them does not fit.
+    """
+    width, height = PAPERS[paper]
+    room = np.array([width, height - _FOOT_MM]) - 2.0 * MARGIN_MM
+    pages: list[list[tuple[Print, Array]]] = [[]]
+    x = y = deepest = 0.0
+    for print_ in sorted(prints, key=lambda p: -float(p.size[1])):
+        needed = 1e3 * (print_.size + 2.0 * print_.quiet) + [0.0, _CAPTION_MM]
+        if (needed > room).any():
+            raise _too_large(print_, paper)
+        if x + needed[0] > room[0]:
+            x, y, deepest = 0.0, y + deepest, 0.0
+        if y + needed[1] > room[1]:
+            pages.append([])
+            x, y, deepest = 0.0, 0.0, 0.0
+        pages[-1].append((print_, np.array([x, y]) + MARGIN_MM + 1e3 * print_.quiet))
+        x, deepest = x + float(needed[0]), max(deepest, float(needed[1]))
+    return [_page(width, height, placed, "") for placed in pages]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Printout:
+    """Targets on sheets of paper.
+
+    Attributes:
+        what: The targets, for people.
+        pages: The sheets.
+    """
+
+    what: str
+    pages: tuple[Page, ...]
+
+    def pdf(self) -> bytes:
+        """The sheets as a PDF file, in exact size."""
+        return pdf_of(list(self.pages), f"cdpr: {self.what}")
+
+
+def printout(of: Board | Rig, paper: str = "a4") -> Printout:
+    """A board, or all tags of a rig, on paper of a size: ``a4``, ``a3`` or ``letter``.
+
+    Raises:
+        BadInput: The rig has no tags, or something does not fit the paper.
+    """
+    if isinstance(of, Rig):
+        prints = tag_prints(of)
+        return Printout(f"{len(prints)} tags", tuple(sheets_of(prints, paper)))
+    return Printout(str(of), (sheet_of(board_print(of), paper),))
+
+
+def tag_prints(rig: Rig) -> list[Print]:
+    """The prints of all tags of a rig, each captioned with its group.
+
+    Raises:
+        BadInput: It has none.
+    """
+    groups = {"platform": rig.platform_tags, "frame": rig.frame_tags}
+    if not any(groups.values()):
+        raise BadInput("the rig has no tags", where=rig.name, next_step="add a `tags` section")
+    prints = [
+        (group, tag_print(rig.tag_family, tag.id, tag.size))
+        for group, tags in groups.items()
+        for tag in tags
+    ]
+    return [replace(made, caption=f"{made.caption}, {group}") for group, made in prints]
+
+
+def _turns(paper: str) -> list[tuple[float, float]]:
+    width, height = PAPERS[paper]
+    return [(width, height), (height, width)]
+
+
+def _border(print_: Print) -> float:
+    """White at the sides and above, [mm]: what it needs, of which the printer leaves some."""
+    return max(MARGIN_MM, 1e3 * print_.quiet)
+
+
+def _needed(print_: Print) -> Array:
+    """Width and height of the paper that it needs, shape (2,), [mm]."""
+    border = _border(print_)
+    below = 1e3 * print_.quiet + _FOOT_MM + MARGIN_MM
+    return np.asarray(1e3 * print_.size + [2.0 * border, border + below])
+
+
+def _fits(print_: Print, width: float, height: float) -> bool:
+    return bool((_needed(print_) <= [width, height]).all())
+
+
+def _page(width: float, height: float, placed: Sequence[tuple[Print, Array]], caption: str) -> Page:
+    """A page with prints, the ruler, and one caption at its foot or each print's below it."""
+    black, texts = _ruler(width, height)
+    for print_, corner in placed:
+        black = np.concatenate([black, 1e3 * print_.black + [*corner, 0.0, 0.0]])
+        if not caption:
+            below = float(corner[1]) + 1e3 * (float(print_.size[1]) + print_.quiet) + _LETTERS_MM
+            texts.append(Text(float(corner[0]), below, _LETTERS_MM, print_.caption))
+    if caption:
+        texts.append(Text(MARGIN_MM, height - MARGIN_MM - 0.8, _LETTERS_MM, caption))
+    return Page(width, height, black, tuple(texts))
+
+
+def _ruler(width: float, height: float) -> tuple[Array, list[Text]]:
+    """The ruler at the foot of the page."""
+    left, top = MARGIN_MM, height - MARGIN_MM - _FOOT_MM + 2.0
+    ticks = [[left, top, RULER_MM, 0.2]]
+    for millimetre in range(int(RULER_MM) + 1):
+        deep = 4.0 if millimetre % 10 == 0 else 2.5 if millimetre % 5 == 0 else 1.5
+        ticks.append([left + millimetre - 0.05, top, 0.1, deep])
+    say = f"{RULER_MM:g} mm: measure it. Print at 100 %, not fitted to the page."
+    return np.array(ticks), [Text(left + RULER_MM + 3.0, top + 3.0, _LETTERS_MM, say)]
+
+
+def _too_large(print_: Print, paper: str) -> BadInput:
+    needed = _needed(print_)
+    others = [name for name in PAPERS if any(_fits(print_, *turned) for turned in _turns(name))]
+    width, height = PAPERS[paper]
+    return BadInput(
+        f"{print_.caption} needs paper of {needed[0]:.0f} x {needed[1]:.0f} mm with its white"
+        f" border and the ruler; {paper} has {width:g} x {height:g} mm",
+        where="--paper",
+        why="a board in several parts would not be flat or exact, so it is not cut into tiles",
+        next_step=f"use --paper {others[0]}" if others else "make it smaller, or order it printed",
+    )

@@ -1,0 +1,189 @@
+"""What every verb's arguments must be, looked at before the verb opens or writes anything.
+
+Paths that can be none, outputs that would overwrite an input or each other, and numbers past any
+machine are refused here, once for all verbs.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+from model.errors import BadInput
+from model.files.reading import shown, unreadable
+
+OUTPUTS = ("output", "mcap", "overlay")
+"""The arguments that name what a verb writes; every other path is read."""
+
+MOST, MOST_WHOLE, MOST_SEED = 1e9, 2**31 - 1, 2**63 - 1
+"""Largest sizes of a number, of a whole number, and of a seed of random numbers."""
+MOST_OF = {"seed": MOST_SEED, "workers": 1024, "columns": 1000, "rows": 1000, "size_px": 16384}
+"""Largest whole number of an argument, where it is another one."""
+LONGEST_TEXT = 100
+"""Of a name that becomes part of a file's, [bytes]."""
+NAMES = ("name", "channel", "interface")
+
+Identity = tuple[int, int] | str
+
+
+def check_arguments(arguments: Mapping[str, object]) -> None:
+    """Refuses arguments that no verb can use.
+
+    Args:
+        arguments: The verb's, by the name of its parameter.
+
+    Raises:
+        BadInput: A path or number can be none, or an output is also an input or another output.
+    """
+    given = dict(_single(arguments))
+    for name, values in given.items():
+        for value in values:
+            _check(name, value)
+    outputs = {_option(n): p for n in OUTPUTS for p in _paths(n, given.get(n, ()))}
+    inputs = [p for n, values in given.items() if n not in OUTPUTS for p in _inputs(values)]
+    refuse_overwriting(outputs, inputs)
+
+
+def refuse_overwriting(outputs: Mapping[str, Path], inputs: Iterable[Path]) -> None:
+    """Refuses outputs that are an input, a file in an input folder, or one another.
+
+    Links of both kinds are seen through; what does not exist yet is compared by where it will be.
+
+    Args:
+        outputs: What is written, by what names it on the command line.
+        inputs: What is read.
+
+    Raises:
+        BadInput: Writing would destroy something.
+    """
+    taken: dict[Identity, str] = {}
+    for name, path in outputs.items():
+        _require_writable_kind(path, name)
+        other = taken.setdefault(_identity(path), name)
+        if other != name:
+            raise BadInput(
+                f"{other} and {name} name the same file",
+                where=shown(path),
+                why="one would overwrite the other",
+                next_step="give each output a name of its own",
+            )
+    for source in inputs:
+        for identity in _identities(source):
+            if identity in taken:
+                raise BadInput(
+                    f"{taken[identity]} would overwrite what the command reads",
+                    where=shown(outputs[taken[identity]]),
+                    why=f"it is the same as {shown(source)}, or in it",
+                    next_step="choose another name for the output; --force does not help here",
+                )
+
+
+def _single(arguments: Mapping[str, object]) -> Iterator[tuple[str, list[object]]]:
+    """Each argument's values; of options in a dataclass, its fields."""
+    for name, value in arguments.items():
+        if is_dataclass(value) and not isinstance(value, type):
+            yield from _single({field.name: getattr(value, field.name) for field in fields(value)})
+        elif isinstance(value, (list, tuple)):
+            yield name, list(value)
+        else:
+            yield name, [value]
+
+
+def _check(name: str, value: object) -> None:
+    match value:
+        case bool() | None:
+            return
+        case int():
+            _check_whole(name, value)
+        case float():
+            _check_number(name, value)
+        case Path():
+            _identity(value)
+        case str():
+            _check_text(name, value)
+
+
+def _check_whole(name: str, value: int) -> None:
+    most = MOST_OF.get(name, MOST_WHOLE)
+    if abs(value) > most:
+        what = f"{_option(name)} is {str(value)[:40]}; {most} is the most"
+        raise BadInput(what, where="command line", next_step="give a smaller number")
+
+
+def _check_number(name: str, value: float) -> None:
+    if not math.isfinite(value) or abs(value) > MOST:
+        what = f"{_option(name)} is {value:g}; it must be a finite number of {MOST:g} at most"
+        raise BadInput(what, where="command line", next_step="give a smaller number, in that unit")
+
+
+def _check_text(name: str, text: str) -> None:
+    if "\0" in text or (name in NAMES and len(os.fsencode(text)) > LONGEST_TEXT):
+        what = f"{_option(name)} is a text of {len(text)} characters that can be no name"
+        hint = f"give a name of {LONGEST_TEXT} bytes at most"
+        raise BadInput(what, where=shown(text), next_step=hint)
+    if "://" not in text:
+        _identity(Path(text))
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _paths(name: str, values: Iterable[object]) -> list[Path]:
+    """Of an output; a folder for results may be one that is read, as their names are their own."""
+    found = [value for value in values if isinstance(value, Path)]
+    return [path for path in found if name == "overlay" or not path.is_dir()]
+
+
+def _inputs(values: Iterable[object]) -> Iterator[Path]:
+    """Paths that are read, and texts such as ``front=video.avi`` that turn out to be files."""
+    for value in values:
+        if isinstance(value, Path):
+            yield value
+        elif isinstance(value, str):
+            for text in {value, value.partition("=")[2]} - {""}:
+                if os.path.exists(text):
+                    yield Path(text)
+
+
+def _require_writable_kind(path: Path, name: str) -> None:
+    if isinstance(_identity(path), str):
+        return
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise BadInput(
+            f"{name} is no plain file but a device, a pipe or a socket",
+            where=shown(path),
+            why="writing would replace it by a file",
+            next_step="name a file or a folder",
+        )
+
+
+def _identity(path: Path) -> Identity:
+    """What two paths of one file have in common; of no file yet, where it will be.
+
+    Raises:
+        BadInput: No file can have such a path.
+    """
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return os.path.realpath(path)
+    except (OSError, ValueError) as error:
+        raise unreadable(path, error) from None
+    return found.st_dev, found.st_ino
+
+
+def _identities(path: Path) -> Iterator[Identity]:
+    """Of an input, and of the files in it where it is a folder."""
+    yield _identity(path)
+    with suppress(OSError), os.scandir(path) as entries:  # of what is no folder, the verb says so
+        for entry in entries:
+            if not entry.is_dir():
+                with suppress(BadInput):  # a link that leads nowhere
+                    yield _identity(Path(entry.path))

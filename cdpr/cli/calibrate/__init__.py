@@ -1,0 +1,1 @@
+"""The verbs of `cdpr calibrate`; each is imported when it is called."""

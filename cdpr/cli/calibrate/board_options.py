@@ -1,0 +1,95 @@
+"""Options that say which board was printed, defined once, and the board that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from calibration.targets.board import Board
+from calibration.targets.charuco import Charuco
+from calibration.targets.chessboard import Chessboard
+from calibration.targets.tag_grid import TagGrid
+from model.errors import BadInput
+
+
+class BoardName(StrEnum):
+    """What was printed."""
+
+    chessboard = "chessboard"
+    charuco = "charuco"
+    tags = "tags"
+
+
+_NEEDED = {
+    BoardName.chessboard: ("square_mm",),
+    BoardName.charuco: ("square_mm", "marker_mm"),
+    BoardName.tags: ("tag_mm", "gap_mm"),
+}
+_SIZES = ("square_mm", "marker_mm", "tag_mm", "gap_mm")
+
+
+@dataclass(frozen=True, slots=True)
+class BoardOptions:
+    """What was said about a board; every field is an option of the verbs that know boards."""
+
+    board: Annotated[BoardName, typer.Option(help="what was printed")] = BoardName.chessboard
+    columns: Annotated[
+        int | None,
+        typer.Option(min=1, help="inner corners (chessboard), squares (charuco) or tags in a row"),
+    ] = None
+    rows: Annotated[int | None, typer.Option(min=1, help="how many rows of them")] = None
+    square_mm: Annotated[
+        float | None, typer.Option(help="side of a square (chessboard, charuco)")
+    ] = None
+    marker_mm: Annotated[float | None, typer.Option(help="side of a marker (charuco)")] = None
+    dictionary: Annotated[str, typer.Option(help="of the markers (charuco), as 5X5_100")] = "4X4_50"
+    legacy: Annotated[
+        bool, typer.Option("--legacy", help="charuco as OpenCV before 4.6 drew it")
+    ] = False
+    tag_mm: Annotated[float | None, typer.Option(help="side of a tag's black square (tags)")] = None
+    gap_mm: Annotated[float | None, typer.Option(help="between black squares (tags)")] = None
+    family: Annotated[str, typer.Option(help="of the tags (tags)")] = "tag36h11"
+    first: Annotated[int, typer.Option(min=0, help="number of the top left tag (tags)")] = 0
+
+    def made(self) -> Board:
+        """The board.
+
+        Raises:
+            BadInput: A number or size is missing or one too many is given, or there can be no such
+                board.
+        """
+        if self.columns is None or self.rows is None:
+            raise BadInput(
+                "a board needs --columns and --rows",
+                next_step="count inner corners (chessboard), squares (charuco) or tags on it",
+            )
+        count, sides = (self.columns, self.rows), self._sides()
+        match self.board:
+            case BoardName.chessboard:
+                return Chessboard(*count, sides[0])
+            case BoardName.charuco:
+                return Charuco(*count, sides[0], sides[1], self.dictionary, self.legacy)
+            case BoardName.tags:
+                return TagGrid(*count, sides[0], sides[1], self.family, self.first)
+
+    def _sides(self) -> list[float]:
+        """The sizes of this kind of board, [m]."""
+        needed = _NEEDED[self.board]
+        sizes: dict[str, float | None] = {name: getattr(self, name) for name in _SIZES}
+        if missing := [name for name in needed if sizes[name] is None]:
+            raise BadInput(
+                f"--board {self.board.value} needs {_listed(missing)}",
+                next_step="measure it on the print, with a ruler over many squares",
+            )
+        given = [name for name, size in sizes.items() if size is not None]
+        if others := [name for name in given if name not in needed]:
+            what = f"--board {self.board.value} knows no {_listed(others)}"
+            raise BadInput(what, next_step="leave it out")
+        return [(sizes[name] or 0.0) / 1e3 for name in needed]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names)

@@ -1,0 +1,127 @@
+"""`cdpr calibrate camera`: from pictures of a board."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibration.intrinsics.quality import FULL_COVERAGE
+from calibration.pictures import take_pictures
+from calibration.procedures import CameraOutcome, Destination, calibrate_camera
+from calibration.results import require_file_name
+from calibration.targets.board import Board
+from cdpr.cli.calibrate.board_options import BoardOptions
+from cdpr.cli.calibrate.output import FolderOption, ForceOption, WantedOption, show_calibration
+from cdpr.cli.options import JsonOption, with_option_groups
+from cdpr.cli.output import Terminal, err
+from cdpr.cli.supervision import stop_requests
+from executor.cameras.sources import require_camera_source
+from executor.operator_requests import LocalRequests
+from model.errors import BadInput
+from model.files.output import make_folder
+
+
+@with_option_groups
+def camera(
+    folder: Annotated[
+        Path, typer.Argument(help="folder of pictures of the board, or for --live", metavar="DIR")
+    ],
+    printed: BoardOptions,
+    live: Annotated[
+        str | None,
+        typer.Option(help="take the pictures with this camera (or of a video) into DIR first"),
+    ] = None,
+    pictures: Annotated[
+        int | None, typer.Option(min=4, help="with --live: how many at least (default: 40)")
+    ] = None,
+    size_px: Annotated[
+        tuple[int, int] | None,
+        typer.Option(help="with --live: width and height (default: 1280 720)"),
+    ] = None,
+    name: Annotated[str, typer.Option(help="of the camera in the rig file")] = "camera",
+    wanted_mm: WantedOption = 1.0,
+    distance_m: Annotated[
+        float | None,
+        typer.Option(min=0.01, help="from which the camera measures, else the boards'"),
+    ] = None,
+    output: FolderOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Find a camera's matrix and lens distortion, and say whether they are good enough.
+
+    Exit code 3 where they are not. Files that cannot be used are named; the others are used.
+
+    [dim]Examples:[/dim]
+
+      cdpr calibrate camera pictures/ --columns 9 --rows 6 --square-mm 25 -o calibration
+
+      cdpr calibrate camera pictures/ --board charuco --columns 7 --rows 5 --square-mm 30
+      --marker-mm 22 --dictionary 4X4_50
+
+      cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
+    """
+    require_file_name(name, "--name")
+    board = printed.made()
+    if live is None and (pictures is not None or size_px is not None):
+        raise BadInput(
+            "--pictures and --size-px are for taking pictures",
+            where="calibrate camera",
+            next_step="pass --live CAMERA too, or leave them out: a folder's pictures are all used",
+        )
+    to = Destination(output, force)
+    if live is not None:
+        to.require_free("camera", name)
+        if not Path(live).is_file():
+            require_camera_source(live)
+        make_folder(folder, force)
+        _take_pictures(live, folder, board, pictures or 40, size_px or (1280, 720))
+    made = calibrate_camera(
+        folder,
+        board,
+        name=name,
+        wanted=wanted_mm / 1e3,
+        distance=distance_m,
+        to=to,
+        listener=Terminal(quiet=as_json),
+    )
+    show_calibration(made, _facts(made), as_json)
+
+
+def _take_pictures(
+    source: str, folder: Path, board: Board, wanted: int, size: tuple[int, int]
+) -> None:
+    """Takes pictures until enough are there, the video ends, or Ctrl-C."""
+    requests = LocalRequests()
+    with stop_requests(requests):
+        take_pictures(
+            source,
+            folder,
+            board,
+            wanted=wanted,
+            size=size,
+            on_advice=lambda text: err.print(text, soft_wrap=True),
+            stopped=lambda: requests.read().stop,
+        )
+    if requests.read().stop:
+        err.print("no more pictures are taken; those that were are used")
+
+
+def _facts(made: CameraOutcome) -> list[tuple[str, str]]:
+    """What was found beside the numbers, for people."""
+    result, quality = made.found, made.quality
+    return [
+        ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
+        (
+            "boards were",
+            f"{quality.nearest:.3g} to {quality.farthest:.3g} m away; if not, the sizes are wrong",
+        ),
+        ("covered", f"{quality.covered:.0%} of the picture, {FULL_COVERAGE:.0%} are good"),
+        (
+            "precision",
+            f"{quality.verdict.error * 1e3:.2g} mm at {quality.distance:.2f} m (95 %); two halves"
+            f" of the pictures are {quality.halves * 1e3:.2g} mm apart",
+        ),
+    ]

@@ -1,0 +1,39 @@
+"""`cdpr explain`: what a fault means, its likely cause, and the next step."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from cdpr.cli.output import out
+from executor.recording.verdict import fault_codes, page_text
+from model.errors import BadInput
+
+
+def explain(
+    code: Annotated[
+        str | None, typer.Argument(help="code of the fault, such as drive_silent", metavar="CODE")
+    ] = None,
+) -> None:
+    """Explain a fault that a run reported: meaning, likely cause, state of the machine, next step.
+
+    Without a code, list all of them.
+
+    [dim]Example:[/dim]
+
+      cdpr explain drive_silent
+    """
+    codes = fault_codes()
+    if code is None:
+        for known in codes:
+            title = page_text(known).split("\n", 1)[0].removeprefix("# ")
+            out.print(f"  {known:<22} {title}", markup=False, soft_wrap=True)
+        return
+    if code not in codes:
+        raise BadInput(
+            f"no fault has the code {code!r}",
+            where="cdpr explain",
+            next_step=f"give one of these: {', '.join(codes)}",
+        )
+    out.print(page_text(code).rstrip(), markup=False, soft_wrap=True)

@@ -1,0 +1,353 @@
+"""What the verbs that reach drives show of a motion, a rig and a run: facts for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from cdpr.cli.output import err, out, show_facts, show_json
+from cdpr.cli.stop_facts import stop_facts
+from drivers.can_bus import IN_PROCESS
+from executor.cameras.sources import looked_with
+from executor.homing import ForgetProposal, HomeResult, HomingProposal
+from executor.interlock.interlock import MotionInterlock
+from executor.interlock.reference import HomingReference
+from executor.jogging import CableProposal
+from executor.recording.resume import RunEnd
+from executor.recording.verdict import faults_among
+from executor.runner import MotionProposal, RunResult
+from executor.service import (
+    ReferenceStatus,
+    ReleaseProposal,
+    ResetProposal,
+    StatusResult,
+    reference_status,
+)
+from model.files.documents import PoseDocument
+from model.pose import Pose
+from model.rig import Camera, Rig
+from tracking.track import rates
+
+COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
+
+# Before and after a run.
+
+
+def clearance_fact(proposal: MotionProposal) -> str:
+    """What stops the run when it comes too near to an obstacle, or why nothing does."""
+    scene = proposal.prepared.scene
+    if not proposal.clearance_stop:
+        return "off (--no-clearance-stop)"
+    if not proposal.cameras:
+        return "off (no camera)"
+    if not scene.obstacles:
+        return "off (no obstacles in the scene)"
+    return f"below {scene.obstacle_clearance * 1000:g} mm, as the cameras see it"
+
+
+def show_prepared(proposal: MotionProposal, on: Console) -> None:
+    """The run that is about to move the platform."""
+    prepared = proposal.prepared
+    rig, bus = prepared.rig, prepared.rig.document.bus
+    simulated = ", simulated drives" if bus.interface == IN_PROCESS else ""
+    start, goal = prepared.scene.start.position * 1000, prepared.scene.goal.position * 1000
+    table = prepared.checked.table
+    show_facts(
+        "ready to run",
+        [
+            ("rig, scene", f"{rig.name}, {prepared.scene.name}"),
+            ("from", f"{start[0]:z.1f}, {start[1]:z.1f}, {start[2]:z.1f} mm"),
+            ("to", f"{goal[0]:z.1f}, {goal[1]:z.1f}, {goal[2]:z.1f} mm"),
+            *stop_facts(prepared.scene),
+            (
+                "motion",
+                f"{prepared.length * 1000:.1f} mm in {prepared.duration:.1f} s,"
+                f" at most {rig.motion.speed * 1000:g} mm/s",
+            ),
+            ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),
+            *_reference(rig),
+            ("cameras", _cameras(rig, proposal.cameras)),
+            ("clearance stop", clearance_fact(proposal)),
+            ("bus", f"{bus.interface} {bus.channel}{simulated}"),
+        ],
+        on,
+    )
+
+
+def _cameras(rig: Rig, used: Mapping[Camera, str]) -> str:
+    """Which cameras look, and which of the rig file's do not."""
+    names = {camera.name for camera in used}
+    unused = [camera.name for camera in rig.cameras if camera.name not in names]
+    parts = [looked_with(used)] if used else []
+    parts += [f"not used: {', '.join(unused)}"] if unused else []
+    return "; ".join(parts) or "none"
+
+
+def _reference(rig: Rig) -> list[tuple[str, str]]:
+    """Which reference the drives' counts are read by, where it is not the rig file's own."""
+    interlock = MotionInterlock(rig)
+    reference = interlock.kept_reference()
+    if reference is None:
+        return []
+    return [("reference", f"{reference.made}, {reference.how}; {interlock.file.path}")]
+
+
+def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
+    """How a run ended."""
+    if as_json:
+        show_json({"run": str(folder), **summary})
+        return
+    colour = COLOURS[summary["verdict"]]
+    sentence = escape(summary["sentence"])
+    out.print(f"[bold {colour}]{summary['verdict']}[/] {sentence}", soft_wrap=True)
+    for reason in summary["reasons"]:
+        out.print(f"  {reason}", markup=False, soft_wrap=True)
+    if summary["verdict"] == "FAILED":
+        for code in faults_among(event["code"] for event in summary["events"]):
+            out.print(f"  more about it: cdpr explain {code}", markup=False, soft_wrap=True)
+        out.print(f"  next: {_step_after(summary)}", markup=False, soft_wrap=True)
+
+
+def _step_after(summary: dict[str, Any]) -> str:
+    """What to do after a run that failed."""
+    if summary["final_state"] in ("finished", "stopped"):
+        return "see in the report what was out of its limits, before the next run"
+    if summary.get("interface") == IN_PROCESS:
+        return "find the cause, then run again into a new folder"
+    return "find the cause and look at the platform, then `cdpr reset RIG`"
+
+
+def show_missing(result: RunResult) -> None:
+    """Files of a run that could not be written; nothing where all were."""
+    missing, folder = result.missing, result.folder
+    if not missing:
+        return
+    lines = [f"error: {folder}: not every file of the run could be written"]
+    for why in dict.fromkeys(missing.values()):
+        names = [name for name, reason in missing.items() if reason == why]
+        lines.append(f"  why: {', '.join(names)}: {why}")
+    lines.append("  next: the verdict and the exit code stand; free some space where the disk is")
+    lines[-1] += f" full, then `cdpr report {folder}` makes what is missing from what is there"
+    for line in lines:
+        err.print(line, markup=False, soft_wrap=True)
+
+
+def resumed_facts(end: RunEnd, folder: Path, done: int, left: int) -> list[tuple[str, str]]:
+    """Where a plan begins that continues a run.
+
+    Args:
+        end: Of that run.
+        folder: Of that run.
+        done: How many stops are behind it.
+        left: How many are left.
+    """
+    how = "finished" if end.finished else "stopped"
+    text = f"where {folder} {how}, {_millimetres(end.pose, 3)}, carrying {end.payload.mass_kg:g} kg"
+    text += f"; {done} stops done, {left} left"
+    if end.waiting_at:
+        text += f"; the dwell at {end.waiting_at!r} was cut short and is done again"
+    return [("from", text)]
+
+
+def _millimetres(pose: Pose, decimals: int) -> str:
+    return ", ".join(f"{c * 1e3:z.{decimals}f}" for c in pose.position.tolist()) + " mm"
+
+
+# Before and after homing and jogging.
+
+
+def show_homing(proposal: HomingProposal, on: Console) -> None:
+    """The homing that is about to wind cables in."""
+    rig, eye = proposal.rig, proposal.camera
+    fastest, reach = proposal.fastest * 1000.0, proposal.reach * 1000.0
+    bus = rig.document.bus
+    measured = f"measured, camera {eye[0].name} ({eye[1]})" if eye else "stated, held by a jig"
+    show_facts(
+        "ready to wind in",
+        [
+            ("rig", rig.name),
+            ("pretension", f"{proposal.target:g} N a cable, at most {proposal.limit:g} N"),
+            ("winches", f"all together, at most {fastest:.2f} mm/s and {reach:g} mm each"),
+            ("pose", measured),
+            ("bus", f"{bus.interface} {bus.channel}".strip()),
+        ],
+        on,
+    )
+
+
+def show_home(result: HomeResult) -> None:
+    """The reference that a homing made."""
+    reference = result.reference
+    x, y, z = reference.pose.position_mm
+    tensions = reference.tensions_n
+    kept = result.file or "not kept: simulated drives end with this process"
+    show_facts(
+        "drives referenced; they hold",
+        [
+            ("platform", f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm, {reference.how}"),
+            ("uncertainty", _uncertainty(reference)),
+            ("tensions", f"{min(tensions):.1f} to {max(tensions):.1f} N"),
+            ("reference", str(kept)),
+        ],
+    )
+    out.print(
+        "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`",
+        soft_wrap=True,
+    )
+
+
+def _uncertainty(reference: HomingReference) -> str:
+    """How well the pose is known; it is not measured how well a jig holds it."""
+    if reference.uncertainty_mm == 0.0:
+        return "that of the jig, which was not measured"
+    return f"{reference.uncertainty_mm:.3f} mm (one standard deviation)"
+
+
+def show_forgotten(proposal: ForgetProposal, on: Console) -> None:
+    """The reference that is about to be given up."""
+    text = reference_text(reference_status(proposal.interlock))
+    line = f"the reference that is given up: {text}"
+    on.print(line, soft_wrap=True, markup=False)
+
+
+def show_cable(proposal: CableProposal, on: Console) -> None:
+    """The cable that is about to move."""
+    rig, mm = proposal.rig, proposal.length * 1000.0
+    winch, speed = rig.winches[proposal.cable - 1], proposal.speed * 1000.0
+    limit = f"at most {proposal.limit:g} N in any cable; none that is taut may go slack"
+    show_facts(
+        "ready to move one cable",
+        [
+            ("rig", rig.name),
+            ("cable", rig.drive_names[winch.node_id]),
+            ("way", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed:g} mm/s"),
+            ("tension", limit),
+        ],
+        on,
+    )
+
+
+# Reference and status of a rig, its reset and its release.
+
+
+def reference_dict(reference: ReferenceStatus) -> dict[str, Any]:
+    """``counts``, ``why_not``, ``made``, ``how`` and ``file``; what there is none of is null."""
+    return {
+        "counts": reference.counts,
+        "why_not": reference.why_not,
+        "made": reference.made,
+        "how": reference.how,
+        "file": reference.file,
+    }
+
+
+def reference_text(reference: ReferenceStatus) -> str:
+    """The same in a sentence."""
+    made = f"made {reference.made} ({reference.how})" if reference.made else ""
+    if not reference.counts:
+        return f"does not count: {reference.why_not}"
+    return f"counts, {made}" if made else "none kept: absolute encoders count as the rig file says"
+
+
+def show_reset(proposal: ResetProposal, on: Console) -> None:
+    """The fault that is about to be taken off."""
+    latched = proposal.latched
+    cause = f"latched since {latched.since}: {latched.cause}" if latched else "no fault latched"
+    on.print(f"bus {proposal.bus}: {cause}", soft_wrap=True, markup=False)
+
+
+def show_release(proposal: ReleaseProposal, on: Console) -> None:
+    """The drives that are about to lose their torque."""
+    braked, kept = proposal.braked, reference_text(proposal.reference)
+    show_facts(
+        "ready to take the torque off",
+        [
+            ("rig", proposal.rig.name),
+            ("bus", proposal.bus),
+            ("afterwards", "the brakes hold the drums" if braked else "nothing holds the cables"),
+            ("reference", kept if braked else "given up: `cdpr home` before the next motion"),
+        ],
+        on,
+    )
+
+
+def status_dict(status: StatusResult) -> dict[str, Any]:
+    """The state of a rig, for programs."""
+    pose: dict[str, Any] | None = None
+    if status.pose is not None:
+        pose = PoseDocument.of(status.pose).model_dump(mode="json")
+    elif status.why_no_pose is not None:
+        pose = {"why_not": status.why_no_pose}
+    drives = [
+        {
+            "node": drive.node,
+            "state": drive.state,
+            "position_counts": drive.position,
+            "tension_n": round(drive.tension, 2),
+            "set_up": drive.set_up,
+        }
+        for drive in status.drives or ()
+    ]
+    return {
+        "rig": status.rig,
+        "bus": status.bus,
+        "run": status.run,
+        "latched": status.latched,
+        "being_set_up": status.being_set_up,
+        "reference": reference_dict(status.reference),
+        "drives": None if status.drives is None else drives,
+        "pose": pose,
+    }
+
+
+def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
+    """The state of a rig, for people."""
+    latched = status.latched or "none"
+    if status.run is not None:
+        latched = f"none; process {status.run} moves or resets it, see `cdpr monitor`"
+    facts = [
+        ("rig", rig.name),
+        ("bus", status.bus),
+        ("latched fault", latched),
+        ("reference", reference_text(status.reference)),
+    ]
+    if status.being_set_up:
+        facts.append(("drives", "not asked: a motion is being prepared, or somebody else asks"))
+    if status.pose is not None:
+        place = f"{_millimetres(status.pose, 2)} by the drives, without a load"
+        facts.append(("platform", place))
+    elif status.why_no_pose is not None:
+        facts.append(("platform", status.why_no_pose))
+    if next_step:
+        facts.append(("next", next_step))
+    show_facts("how the rig stands", facts)
+    for drive in status.drives or ():
+        new = "" if drive.set_up else "  not set up since it was switched on"
+        out.print(
+            f"  {rig.drive_names[drive.node]:<19} {drive.state:<24}"
+            f" {drive.position:>11} counts {drive.tension:8.2f} N{new}",
+            soft_wrap=True,
+            markup=False,
+        )
+
+
+def camera_line(camera: Mapping[str, Any]) -> str:
+    """One camera while pictures are measured.
+
+    Args:
+        camera: As `executor.remote.status` has it.
+    """
+    parts = [
+        f"{camera['name']} ({camera['source']})",
+        rates(camera["pictures_per_second"], camera["measuring_ms"], len(camera["tags"])),
+        f"{camera['poses']} of {camera['pictures']} with a pose",
+    ]
+    if camera["dropped"]:
+        parts.append(f"{camera['dropped']} dropped")
+    if camera["trouble"]:
+        parts.append(camera["trouble"])
+    return ", ".join(parts)

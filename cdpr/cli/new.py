@@ -1,0 +1,107 @@
+"""`cdpr new`: asks what a rig file needs to know, and writes it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from model.files.new_rig import RigQuestion
+
+_Point = tuple[float, float, float]
+
+
+def new(
+    context: typer.Context,
+    rig: Annotated[Path, typer.Argument(help="rig file to write")],
+    coordinates: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", help="CSV with a line a cable; asks nothing, defaults for all that is left"
+        ),
+    ] = None,
+    platform_mm: Annotated[_Point | None, typer.Option(metavar="X Y Z", help="its size")] = None,
+    mass_kg: Annotated[float | None, typer.Option(help="mass of the platform")] = None,
+    home_mm: Annotated[_Point | None, typer.Option(metavar="X Y Z", help="home position")] = None,
+    lower_mm: Annotated[
+        _Point | None, typer.Option(metavar="X Y Z", help="lower corner of the workspace")
+    ] = None,
+    upper_mm: Annotated[
+        _Point | None, typer.Option(metavar="X Y Z", help="upper corner of the workspace")
+    ] = None,
+    radius_mm: Annotated[float | None, typer.Option(help="radius of the cables")] = None,
+    stiffness_n: Annotated[float | None, typer.Option(help="axial stiffness of a cable")] = None,
+    min_tension_n: Annotated[float | None, typer.Option(help="least tension of a cable")] = None,
+    max_tension_n: Annotated[float | None, typer.Option(help="largest tension of a cable")] = None,
+    drum_radius_mm: Annotated[float | None, typer.Option(help="radius of the drums")] = None,
+    gear_ratio: Annotated[float | None, typer.Option(help="motor turns a drum turn")] = None,
+    counts_per_rev: Annotated[int | None, typer.Option(help="encoder counts a motor turn")] = None,
+    encoder: Annotated[str | None, typer.Option(help="absolute or incremental")] = None,
+    max_speed_mm_s: Annotated[float | None, typer.Option(help="largest cable speed")] = None,
+    torque_constant_n: Annotated[float | None, typer.Option(help="tension at rated torque")] = None,
+    interface: Annotated[str | None, typer.Option(help="python-can's name of the bus")] = None,
+    channel: Annotated[str | None, typer.Option(help="channel of the bus")] = None,
+    bitrate: Annotated[int | None, typer.Option(help="of the bus, bit/s")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
+) -> None:
+    """Ask for the least that a rig file needs, and write a commented one.
+
+    Each question has a unit and a default, which Enter takes; what an option gives is not asked.
+
+    [dim]Examples:[/dim]
+
+      cdpr new my_rig.yaml
+
+      cdpr new my_rig.yaml --from cables.csv --mass-kg 2.5 --interface socketcan --channel can0
+    """
+    from cdpr.cli.output import out
+    from model.errors import BadInput
+    from model.files.documents import write_atomic
+    from model.files.new_rig import OPTIONS, collect_answers, read_coordinates
+    from model.files.rig_template import rig_text
+
+    if rig.exists() and not force:
+        raise BadInput(
+            "the file exists already",
+            where=str(rig),
+            next_step="choose another name, or pass --force to replace it",
+        )
+    given = {key: context.params[key] for key in OPTIONS if context.params[key] is not None}
+    if coordinates is None:
+        answers = collect_answers(rig.stem, given, _ask, _refuse)
+    else:
+        answers = collect_answers(rig.stem, given | read_coordinates(coordinates))
+    write_atomic(rig, rig_text(answers))
+    name = shlex.quote(str(rig))
+    out.print(f"wrote {rig}: {answers['cables']} cables", markup=False, soft_wrap=True)
+    out.print(
+        f"next: read it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def _ask(question: RigQuestion, default: str) -> str:
+    """The typed answer; standard error has the question, so that output can go to a file."""
+    from model.errors import BadInput
+
+    unit = f" {question.unit}" if question.unit else ""
+    print(f"{question.text} [{default}]{unit}: ", end="", file=sys.stderr, flush=True)
+    line = sys.stdin.readline()
+    if not line.endswith("\n"):
+        print(file=sys.stderr)
+        raise BadInput(
+            f"the answers ended at the question about {question.text!r}",
+            where="cdpr new",
+            why="standard input is at its end; nothing was written",
+            next_step="answer every question, or give the cables with --from FILE.csv",
+        )
+    return line.strip()
+
+
+def _refuse(reason: str) -> None:
+    print(f"  {reason}; once more", file=sys.stderr)

@@ -1,0 +1,124 @@
+"""Options that several verbs have, and groups of options that belong together."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from cdpr.cli.calibrations import calibrated_rig
+from model.errors import BadInput
+from model.rig import Rig, load_rig
+
+RigArgument = Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")]
+SceneArgument = Annotated[Path, typer.Argument(help="scene file (YAML)", metavar="SCENE")]
+PlanFileOption = Annotated[Path, typer.Option("-o", "--output", help="plan file to write (JSON)")]
+ReplacePlanOption = Annotated[bool, typer.Option("--force", help="replace an existing plan file")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
+WorkersOption = Annotated[
+    int | None, typer.Option(min=1, help="processes; else one a core", metavar="N")
+]
+DaskOption = Annotated[
+    str | None, typer.Option(help="do the work on this Dask cluster", metavar="ADDRESS")
+]
+Triple = tuple[float, float, float]
+
+
+def finite(value: float | None) -> float | None:
+    """The number of an option, as its callback: `inf` and `nan` pass the limits of a type.
+
+    Raises:
+        typer.BadParameter: It is not finite.
+    """
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number")
+    return value
+
+
+def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the fields of each dataclass among its parameters as options of their own.
+
+    Fields are annotated as options are, and have defaults.
+    """
+    whole = inspect.signature(command, eval_str=True)
+    groups: dict[str, Any] = {
+        p.name: p.annotation for p in whole.parameters.values() if is_dataclass(p.annotation)
+    }
+    expanded = {name: _parameters(group) for name, group in groups.items()}
+
+    @wraps(command)
+    def with_options(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{p.name: values.pop(p.name) for p in expanded[name]})
+        command(**values)
+
+    parameters = [p for one in whole.parameters.values() for p in expanded.get(one.name, [one])]
+    as_seen: Any = with_options
+    as_seen.__signature__ = whole.replace(parameters=parameters)
+    as_seen.__annotations__ = {p.name: p.annotation for p in parameters}
+    return with_options
+
+
+def _parameters(group: Any) -> list[inspect.Parameter]:
+    hints = get_type_hints(group, include_extras=True)
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    return [
+        inspect.Parameter(option.name, kind, default=option.default, annotation=hints[option.name])
+        for option in fields(group)
+    ]
+
+
+# Verbs that reach drives: the rig, its bus, and how its drives are moved.
+
+InterfaceOption = Annotated[
+    str | None,
+    typer.Option("--interface", help="python-can interface instead of the rig file's"),
+]
+ChannelOption = Annotated[str | None, typer.Option("--channel", help="its channel")]
+FastOption = Annotated[
+    bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
+]
+YesOption = Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")]
+NoQuestionOption = Annotated[bool, typer.Option("--yes", help="do not ask")]
+WithoutRealTimeOption = Annotated[
+    bool,
+    typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
+]
+SummaryJsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON")]
+
+
+def rig_on_bus(
+    path: Path,
+    interface: str | None,
+    channel: str | None,
+    calibration: list[Path] | None = None,
+) -> Rig:
+    """The rig of a file, on another bus when one is named, with the results of calibrations."""
+    return calibrated_rig(load_rig(path).with_bus(interface, channel), calibration)
+
+
+def require_unused(verb: str, options: Mapping[str, object], why: str) -> None:
+    """Refuses options that would have no effect: whoever gave one expects something else.
+
+    Args:
+        verb: As it is called, ``cdpr jog``.
+        options: Name and value; None and False are not given.
+        why: They have no effect.
+
+    Raises:
+        BadInput: One was given; with the names of all.
+    """
+    given = [name for name, value in options.items() if value is not None and value is not False]
+    if given:
+        raise BadInput(
+            f"no effect here: {', '.join(given)}",
+            where=verb,
+            why=why,
+            next_step=f"leave them out, or see `{verb} --help`",
+        )

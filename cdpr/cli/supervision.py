@@ -1,0 +1,187 @@
+"""The operator at the terminal: asked before something moves, heard while it moves."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from types import FrameType
+from typing import Any, TypeVar
+
+from rich.console import Console
+
+from cdpr.cli.output import err, out
+from executor.operator_requests import RequestBoard
+from executor.supervision import Supervisor
+from model.errors import BadInput
+
+_T = TypeVar("_T")
+_P = TypeVar("_P")
+
+#: A closed terminal (SIGHUP) must not leave the rig without its loop.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_GIVING_UP = b"\nleaving out what is not written yet; press Ctrl-C again to leave at once\n"
+
+
+def confirmation(
+    show: Callable[[_P, Console], None], *, asks: bool, as_json: bool
+) -> Callable[[_P], bool]:
+    """A `confirm` callback: shows what is about to happen to whoever is asked, or reads; then asks.
+
+    Args:
+        show: Shows it, on standard error where a program reads the other.
+        asks: There is something to ask; False with ``--yes``.
+        as_json: Standard output is for a program.
+    """
+
+    def confirm(proposal: Any) -> bool:
+        show_before(show, proposal, asks=asks, as_json=as_json)
+        return not asks or has_agreed(proposal.question, proposal.otherwise)
+
+    return confirm
+
+
+def show_before(
+    show: Callable[[_P, Console], None], proposal: _P, *, asks: bool, as_json: bool
+) -> None:
+    """Shows what is about to happen; arguments as for `confirmation`."""
+    if asks or not as_json:
+        show(proposal, err if as_json else out)
+
+
+def has_agreed(question: str, otherwise: str) -> bool:
+    """Whether the answer is yes; silence is none.
+
+    Args:
+        question: Shown to whoever sits there.
+        otherwise: What a no leaves, such as ``nothing was moved``.
+
+    Raises:
+        BadInput: There is nobody to ask.
+    """
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    answer = sys.stdin.readline()
+    if not answer:
+        print(file=sys.stderr)
+        raise BadInput(
+            f"nobody answered: {question}",
+            where="standard input",
+            next_step=f"run it in a terminal, or pass --yes; {otherwise}",
+        )
+    return answer.strip().lower() in ("y", "yes")
+
+
+@contextmanager
+def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """The signals of the operator call a function to the end of the block."""
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    if before[signal.SIGHUP] is signal.SIG_IGN:  # started with nohup: meant to outlive its terminal
+        del before[signal.SIGHUP]
+    try:
+        for number in before:
+            signal.signal(number, handler)
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier if earlier is not None else signal.SIG_DFL)
+
+
+@contextmanager
+def stop_requests(board: RequestBoard) -> Iterator[None]:
+    """Turns Ctrl-C, SIGTERM and a closed terminal into the wish to stop."""
+    with _handling(lambda _number, _frame: board.ask_stop()):
+        yield
+
+
+class SignalSupervisor(Supervisor):
+    """Turns the signals of the operator into a stop, while a motion is under way."""
+
+    def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
+        """See `Supervisor`."""
+        with stop_requests(board):
+            return motion()
+
+
+class RunSupervisor(SignalSupervisor):
+    """What Ctrl-C, SIGTERM and a closed terminal mean before, during and after a run's motion.
+
+    Once something moved, the exit code rests on what the drives did alone: neither a terminal that
+    is gone nor Ctrl-C while the report is made changes it.
+    """
+
+    def __init__(self, show: Callable[[Any], None]) -> None:
+        """Nothing moved yet.
+
+        Args:
+            show: Shows a `RunResult` when its verdict is known.
+        """
+        super().__init__()
+        self.moved = False
+        self.code: int | None = None
+        """The exit code, once it is decided."""
+        self._given_up = False
+        self._show = show
+        self._signals = ExitStack()
+
+    def __enter__(self) -> RunSupervisor:
+        """Signals have their usual meaning until `take_over`."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """They have it again."""
+        self._signals.close()
+
+    def take_over(self) -> None:
+        """From now on signals are the run's: the operator agreed to it."""
+        self._signals.enter_context(_handling(self._on_signal))
+
+    def on_motion(self) -> None:
+        """See `Supervisor`."""
+        self.moved = True
+
+    def on_verdict(self, result: Any) -> None:
+        """See `Supervisor`."""
+        self.code = result.exit_code
+        say(lambda: self._show(result), result)
+
+    def leaves_files_out(self) -> bool:
+        """See `Supervisor`."""
+        return self._given_up
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        """Before the motion the end; up to the verdict nothing; then the files are left out.
+
+        Raises:
+            KeyboardInterrupt: Nothing moved.
+        """
+        if not self.moved:
+            raise KeyboardInterrupt
+        if self.code is None:
+            return
+        if self._given_up:
+            os._exit(self.code)  # a disk that hangs keeps every milder end waiting
+        self._given_up = True
+        with suppress(OSError):
+            os.write(2, _GIVING_UP)  # print is not to be called in a signal handler
+
+
+def say(write: Callable[[], None], result: Any) -> None:
+    """Writes to standard output; where that is full or gone, the verdict to standard error.
+
+    Args:
+        write: Writes it.
+        result: The `RunResult`.
+    """
+    try:
+        write()
+        sys.stdout.flush()
+    except (Exception, SystemExit):  # rich ends the program when nobody reads it any more
+        with suppress(OSError, ValueError):
+            output = sys.stdout.fileno()
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, output)  # or the interpreter fails to flush it at its end
+            os.close(nothing)
+        line = f"{result.verdict} {result.sentence}"
+        err.print(line, markup=False, soft_wrap=True)

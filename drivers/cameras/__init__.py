@@ -1,0 +1,1 @@
+"""Cameras and recorded images: live devices, folders, videos, and image output."""

@@ -1,0 +1,333 @@
+"""The picture files of a folder."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.cameras.live import Frame, Image, is_too_large
+from model.errors import BadInput, Fault
+from model.files.documents import write_bytes_atomic
+from model.files.reading import PICTURE_LIMIT, read_bytes
+from model.rig import Camera
+
+#: Endings of picture files, in lower case.
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
+_NO_PICTURE, _CAMERA = "is no picture that can be read", "the camera has"
+
+
+class ImageFolder:
+    """The pictures of a folder in the order of their names, numbers counted as numbers.
+
+    Args:
+        folder: Where they are.
+        camera: The camera that took them.
+        rate: Pictures a second; the camera's when left out.
+        on_unused: Told the name of each file that cannot be used, and why; the others are used.
+
+    Attributes:
+        files: All that end like pictures.
+        unused: Why files were not used, by name.
+
+    Raises:
+        BadInput: The folder is missing or has no pictures.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        camera: Camera,
+        rate: float | None = None,
+        on_unused: Callable[[str, str], None] | None = None,
+    ) -> None:
+        self.files = picture_files(folder)
+        self.unused: dict[str, str] = {}
+        self._folder, self._camera = folder, camera
+        self._rate = rate or camera.rate
+        self._on_unused = on_unused
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The pictures of the camera's size.
+
+        Raises:
+            BadInput: None can be read, or none is of the camera's size.
+        """
+        self.unused.clear()
+        wanted = (self._camera.width, self._camera.height)
+        none_read = True
+        for number, path in enumerate(self.files):
+            image = read_picture(path)
+            none_read &= image is None
+            if image is not None and _size(image) == wanted:
+                yield Frame(number / self._rate, image, path.name)
+                continue
+            why = _NO_PICTURE if image is None else _other_size(_size(image), _CAMERA, wanted)
+            self.unused[path.name] = why
+            if self._on_unused is not None:
+                self._on_unused(path.name, why)
+        if none_read:
+            raise _no_picture(self._folder, len(self.files))
+        if len(self.unused) == len(self.files):
+            raise _wrong_sizes(self._folder, self.unused, wanted)
+
+
+class OneCamerasPictures:
+    """The pictures of a folder that are of one size, upright as their files say (EXIF).
+
+    A camera that was turned by hand stores how; where the pictures are of one size only as the
+    sensor gave them, they are taken so. Files that cannot be used are named, the others are used.
+
+    Args:
+        folder: Where they are.
+        wanted: Width and height of the camera that took them, [px]; left out, that of most.
+
+    Attributes:
+        size: Width and height, [px].
+        names: Of the pictures used, in order.
+        unused: Why each of the other files is not used, by name.
+        upright: Whether pictures are turned as their files say.
+
+    Raises:
+        BadInput: The folder is missing, has no pictures, or none that can be read or is of the
+            wanted size.
+    """
+
+    def __init__(self, folder: Path, wanted: tuple[int, int] | None = None) -> None:
+        files = picture_files(folder)
+        self.unused: dict[str, str] = {}
+        sizes: dict[Path, tuple[int, int]] = {}
+        for path in files:
+            image = read_picture(path)
+            if image is None:
+                self.unused[path.name] = _NO_PICTURE
+            else:
+                sizes[path] = _size(image)
+        if not sizes:
+            raise _no_picture(folder, len(files))
+        self.upright = True
+        if set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
+            as_stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
+            if set(as_stored.values()) == {wanted or next(iter(as_stored.values()))}:
+                sizes, self.upright = as_stored, False
+        counted = Counter(sizes.values())
+        self.size = wanted or max(counted, key=lambda size: (counted[size], size))
+        for path, size in sizes.items():
+            if size != self.size:
+                whose = _CAMERA if wanted else "most have"
+                self.unused[path.name] = _other_size(size, whose, self.size)
+        if self.size not in counted:
+            raise _wrong_sizes(folder, self.unused, self.size)
+        self._files = [path for path in sizes if path.name not in self.unused]
+        self.names = tuple(path.name for path in self._files)
+
+    def __iter__(self) -> Iterator[tuple[str, Image]]:
+        """Name and grey picture."""
+        for path in self._files:
+            image = read_picture(path, self.upright)
+            if image is not None and _size(image) == self.size:
+                yield path.name, image
+
+
+def picture_files(folder: Path) -> tuple[Path, ...]:
+    """The files of a folder that end like pictures, in order of their names.
+
+    Numbers in names are counted as numbers.
+
+    Raises:
+        BadInput: The folder is missing or has none.
+    """
+    if not folder.is_dir():
+        raise BadInput("no such folder", where=str(folder), next_step="check the path")
+    found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS]
+    if not found:
+        raise BadInput(
+            "the folder has no pictures",
+            where=str(folder),
+            next_step=f"name a folder with files that end in {', '.join(PICTURE_ENDINGS)}",
+        )
+    return tuple(sorted(found, key=lambda path: _natural(path.name)))
+
+
+def read_picture(path: Path, upright: bool = True) -> Image | None:
+    """A grey picture, or None when the file holds none; also for names that OpenCV cannot open.
+
+    Args:
+        path: The file.
+        upright: Whether it is turned as the file says (EXIF).
+    """
+    try:
+        data = read_bytes(path, PICTURE_LIMIT)
+    except BadInput:
+        return None
+    if not data or is_too_large(data):
+        return None
+    flags = cv2.IMREAD_GRAYSCALE | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
+    return None if picture is None else np.asarray(picture, dtype=np.uint8)
+
+
+def _other_size(size: tuple[int, int], whose: str, wanted: tuple[int, int]) -> str:
+    return f"has {size[0]} x {size[1]} px, {whose} {wanted[0]} x {wanted[1]} px"
+
+
+def _size(image: Image | None) -> tuple[int, int]:
+    return (0, 0) if image is None else (image.shape[1], image.shape[0])
+
+
+def _no_picture(folder: Path, count: int) -> BadInput:
+    return BadInput(
+        f"none of the {count} files is a picture that can be read",
+        where=str(folder),
+        next_step="check that the files were copied whole",
+    )
+
+
+def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) -> BadInput:
+    return BadInput(
+        f"none of the {len(unused)} pictures has the camera's {wanted[0]} x {wanted[1]} px",
+        where=str(folder),
+        why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4]),
+        next_step="use full pictures of this camera, or calibrate it in this size",
+    )
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorts ``frame_10`` behind ``frame_9``."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts]
+
+
+# Pictures written to a folder or into a video.
+
+
+#: Endings of videos that are written, and how their pictures are coded.
+VIDEO_CODES = {".mp4": "mp4v", ".avi": "MJPG"}
+
+
+class PictureOutput:
+    """Writes colour pictures one after the other, as a context manager.
+
+    Args:
+        path: A folder to make, or a video file by its ending.
+        rate: Pictures a second of a video.
+        force: Whether something that is there may be replaced (a video) or added to (a folder).
+
+    Raises:
+        BadInput: It is there already, or its ending is no known one.
+    """
+
+    def __init__(self, path: Path, rate: float, force: bool = False) -> None:
+        self._path, self._rate = path, rate
+        self._video: cv2.VideoWriter | None = None
+        self._unfinished = path.with_name(f".{path.stem[:40]}.{os.getpid()}{path.suffix}")
+        self._count = 0
+        self._names: dict[str, str] = {}
+        self._is_video = path.suffix.lower() in VIDEO_CODES
+        if not self._is_video and path.suffix and not path.is_dir():
+            raise BadInput(
+                "neither a folder nor a video that can be written",
+                where=str(path),
+                next_step=f"name a folder, or a file that ends in {', '.join(VIDEO_CODES)}",
+            )
+        if path.exists() and not force:
+            raise BadInput(
+                "it exists already", where=str(path), next_step="name another one, or pass --force"
+            )
+        try:
+            (path.parent if self._is_video else path).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BadInput(
+                "the folder cannot be made", where=str(path), why=error.strerror or str(error)
+            ) from None
+
+    def __enter__(self) -> PictureOutput:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._video is None:
+            return
+        self._video.release()
+        try:
+            if error is None or isinstance(error, KeyboardInterrupt):
+                self._keep_video()
+        finally:
+            self._unfinished.unlink(missing_ok=True)
+
+    def _keep_video(self) -> None:
+        """The video gets its name once it is whole; OpenCV does not say when the disk is full."""
+        reader = cv2.VideoCapture(str(self._unfinished))
+        count = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+        reader.release()
+        if count < self._count:
+            why = f"only {count} of {self._count} pictures are in it: the disk may be full"
+            raise _unwritable(self._path, why)
+        try:
+            self._unfinished.replace(self._path)
+        except OSError as error:
+            raise _unwritable(self._path, error.strerror or str(error)) from None
+
+    def write(self, picture: NDArray[np.uint8], name: str) -> None:
+        """Writes the next picture.
+
+        Args:
+            picture: Shape (height, width, 3), blue green red; all of one size.
+            name: Of the picture; a folder's file is called after it.
+
+        Raises:
+            Fault: It cannot be written.
+        """
+        if self._is_video:
+            self._to_video(picture)
+            return
+        good, data = cv2.imencode(".png", picture)
+        if not good:
+            raise ValueError(f"no picture: shape {picture.shape}, type {picture.dtype}")
+        try:
+            write_bytes_atomic(self._path / self._file_name(name), data.tobytes())
+        except BadInput as error:
+            raise _unwritable(Path(error.where), error.why) from None
+
+    def _file_name(self, name: str) -> str:
+        """Of a picture: ``a.png``; ``a.jpg.png`` where ``a.png`` is another picture's."""
+        whole = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in name)
+        short = Path(whole).stem + ".png"
+        owner = self._names.setdefault(short, name)
+        return short if owner == name else whole + ".png"
+
+    def _to_video(self, picture: NDArray[np.uint8]) -> None:
+        if self._video is None:
+            code = cv2.VideoWriter.fourcc(*VIDEO_CODES[self._path.suffix.lower()])
+            size = (picture.shape[1], picture.shape[0])
+            self._video = cv2.VideoWriter(str(self._unfinished), code, self._rate, size)
+            if not self._video.isOpened():
+                raise _unwritable(self._path, "OpenCV cannot write such a video here")
+        self._video.write(picture)
+        self._count += 1
+
+
+def _unwritable(path: Path, why: str) -> Fault:
+    return Fault(
+        "the picture cannot be written",
+        where=str(path),
+        why=why,
+        next_step="free some space, or name another place",
+    )

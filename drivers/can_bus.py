@@ -1,0 +1,340 @@
+"""The CAN bus a rig names: settings from the rig file, opened through python-can."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import struct
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+from can.interfaces.udp_multicast import UdpMulticastBus
+from can.interfaces.virtual import VirtualBus
+
+from drivers.can_errors import bus_fault
+from model.errors import BadInput, HardwareMissing
+from model.rig import Rig
+
+UDP_DEFAULT_GROUP = "239.74.163.2"
+"""python-can's own IPv4 group. Source: python-can, interfaces/udp_multicast."""
+
+UDP_DEFAULT_PORT = 43113
+"""python-can's own. Source: python-can, interfaces/udp_multicast."""
+
+IN_PROCESS = "virtual"
+"""python-can's interface inside one process; on it the drives are simulated in a run's own."""
+
+RECEIVE_BUFFER_BYTES = 4 * 2**20
+"""A socket of the default size drops the newest frames after 278 without a word."""
+
+SO_MEMINFO = 55
+MEMINFO_BYTES = 36
+"""Nine counters, the last of them the frames thrown away. Source: linux/sock_diag.h."""
+
+MIN_TRANSMIT_QUEUE = 64
+"""Frames a kernel CAN interface must queue: a cycle and a stop in one burst, with room to spare."""
+
+INTERFACES = Path("/sys/class/net")
+
+
+class SentFrame(can.Message):
+    """A classic frame whose data is replaced and never changed: copies may share it."""
+
+    __slots__ = ()
+
+    def __init__(self, can_id: int, data: bytes | bytearray) -> None:
+        """Holds data for an 11-bit identifier."""
+        super().__init__(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+class InProcessBus(VirtualBus):
+    """python-can's virtual bus with shorter paths for sent frames and for `recv` without a wait.
+
+    A run in simulated time sends some twenty frames a cycle. Whole copies of them for every
+    listener, and locks for every look into an empty queue, took as long as the simulated drives.
+    """
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Hands a copy to every other end; of a `SentFrame` one that shares its data."""
+        if not isinstance(msg, SentFrame) or self.receive_own_messages:
+            super().send(msg, timeout)
+            return
+        self._check_if_open()
+        now = time.time()
+        for inbox in self.channel:
+            if inbox is not self.queue:
+                inbox.put(self._arrived(msg, now))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame, or None when there is none within the time [s]."""
+        if timeout != 0.0 or self._filters is not None:
+            return super().recv(timeout)
+        self._check_if_open()
+        inbox = self.queue
+        with inbox.mutex:
+            return inbox.queue.popleft() if inbox.queue else None
+
+    def _arrived(self, frame: SentFrame, now: float) -> can.Message:
+        return can.Message(
+            timestamp=now,
+            arbitration_id=frame.arbitration_id,
+            is_extended_id=False,
+            channel=self.channel_id,
+            data=frame.data,
+            is_rx=True,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """How a bus is opened.
+
+    Attributes:
+        interface: python-can's name, such as ``socketcan``, ``udp_multicast`` or ``virtual``.
+        channel: What the interface calls its channel. For ``udp_multicast``: ``group[:port]``.
+        bitrate: [bit/s]; where the interface sets it (socketcan's is set with ``ip link``).
+    """
+
+    interface: str
+    channel: str
+    bitrate: int = 1_000_000
+
+    @classmethod
+    def of(cls, rig: Rig) -> BusSettings:
+        """The bus of a rig file."""
+        bus = rig.document.bus
+        return cls(bus.interface, bus.channel, bus.bitrate)
+
+    @property
+    def canonical(self) -> str:
+        """The same text for every spelling of one bus: what a channel leaves out is filled in."""
+        interface, channel = self.interface.strip().lower(), self.channel.strip()
+        if interface == "udp_multicast":
+            options = _udp_options(self)
+            channel = f"{options['channel']}:{options.get('port', UDP_DEFAULT_PORT)}"
+        return f"{interface} {channel}"
+
+    def __str__(self) -> str:
+        """Interface and channel, as messages name the bus."""
+        return f"{self.interface} {self.channel}".strip()
+
+
+def open_bus(settings: BusSettings) -> can.BusABC:
+    """Opens a bus; the caller shuts it down.
+
+    Raises:
+        BadInput: python-can has no such interface, or the channel is not one of its channels.
+        HardwareMissing: It cannot be opened; with the cause and the next step.
+    """
+    known = sorted(can.VALID_INTERFACES)
+    if settings.interface not in known:
+        raise BadInput(
+            f"unknown CAN interface {settings.interface!r}",
+            where="bus.interface",
+            next_step=f"use one of: {', '.join(known)}",
+        )
+    if settings.interface == "socketcan":
+        _check_kernel_interface(settings)
+    if settings.interface == IN_PROCESS:
+        return InProcessBus(settings.channel)
+    options = _options(settings)
+    try:
+        bus = can.Bus(interface=settings.interface, ignore_config=True, **options)
+    # Back ends raise whatever their maker's library raises: every one means that it did not open.
+    except Exception as error:
+        raise _cannot_open(settings, error) from error
+    _prepare_socket(bus)
+    return bus
+
+
+def _options(settings: BusSettings) -> dict[str, Any]:
+    if settings.interface == "udp_multicast":
+        return _udp_options(settings)
+    return {"channel": settings.channel, "bitrate": settings.bitrate}
+
+
+def _udp_options(settings: BusSettings) -> dict[str, Any]:
+    """A hop limit of 0 keeps the frames on this machine; set-points do not go out to a network."""
+    group, _, port = settings.channel.partition(":") if "." in settings.channel else ("", "", "")
+    if settings.channel and not group:
+        group = settings.channel  # an IPv6 group; its colons are its own
+    options: dict[str, Any] = {
+        "channel": group or UDP_DEFAULT_GROUP,
+        "hop_limit": 0,
+        "fd": False,
+    }
+    if port:
+        if not port.isdecimal() or not 0 < int(port) < 65536:
+            raise BadInput(
+                f"port {port!r} is not a number from 1 to 65535",
+                where="bus.channel",
+                next_step=f"write group:port, such as {UDP_DEFAULT_GROUP}:43113",
+            )
+        options["port"] = int(port)
+    return options
+
+
+def _check_kernel_interface(settings: BusSettings) -> None:
+    """Raises what python-can finds only at the first frame: no interface, down, short queue."""
+    folder = INTERFACES / settings.channel
+    if not settings.channel or not folder.exists():
+        there = sorted(p.name for p in INTERFACES.glob("*can*"))
+        raise HardwareMissing(
+            f"there is no network interface {settings.channel!r}",
+            where=f"bus {settings}",
+            why=f"CAN interfaces here: {', '.join(there) or 'none'}",
+            next_step=bring_up(settings),
+        )
+    if not int((folder / "flags").read_text(), 16) & 1:  # IFF_UP
+        raise HardwareMissing(
+            f"the network interface {settings.channel} is down",
+            where=f"bus {settings}",
+            next_step=bring_up(settings),
+        )
+    queue = int((folder / "tx_queue_len").read_text())
+    if queue < MIN_TRANSMIT_QUEUE:
+        raise HardwareMissing(
+            f"the transmit queue of {settings.channel} holds {queue} frames,"
+            f" at least {MIN_TRANSMIT_QUEUE} are needed",
+            where=f"bus {settings}",
+            why="a stop is sent as one batch and must not be refused because a cycle is queued",
+            next_step=f"sudo ip link set {settings.channel} txqueuelen 128",
+            values={"tx_queue_len": queue},
+        )
+
+
+def bring_up(settings: BusSettings) -> str:
+    """The command that makes a kernel CAN interface ready."""
+    name = settings.channel or "can0"
+    if name.startswith("vcan"):
+        return (
+            f"sudo modprobe vcan && sudo ip link add dev {name} type vcan"
+            f" && sudo ip link set {name} up txqueuelen 128"
+        )
+    return f"sudo ip link set {name} up txqueuelen 128 type can bitrate {settings.bitrate}"
+
+
+def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
+    cause = error.__cause__ or error
+    number = getattr(cause, "errno", None)
+    step = "check the adapter, its driver and the channel's name, then run `cdpr doctor`"
+    if settings.interface == "socketcan":
+        step = bring_up(settings)
+        if number == errno.EAFNOSUPPORT:
+            step = "load the kernel's CAN support: sudo modprobe can_raw"
+    elif settings.interface == "udp_multicast":
+        step = "let multicast through the loopback: sudo ip route add 239.0.0.0/8 dev lo"
+    return HardwareMissing(
+        "the bus cannot be opened",
+        where=f"bus {settings}",
+        why=f"{type(cause).__name__}: {cause}",
+        next_step=step,
+    )
+
+
+def _prepare_socket(bus: can.BusABC) -> None:
+    """Room for frames that wait, and on IP sockets no frames of groups joined by others."""
+    try:
+        descriptor = bus.fileno()
+    except NotImplementedError:  # not every bus has a socket
+        return
+    if descriptor < 0:
+        return
+    with socket.socket(fileno=os.dup(descriptor)) as bus_socket:
+        bus_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        if bus_socket.family == socket.AF_INET:
+            ip_multicast_all = 49  # Source: linux/in.h; Python names it from 3.14
+            bus_socket.setsockopt(socket.IPPROTO_IP, ip_multicast_all, 0)
+
+
+def echoes_own_frames(bus: can.BusABC) -> bool:
+    """Whether a sender receives its own frames; multicast brings them back, CAN does not."""
+    return isinstance(bus, UdpMulticastBus)
+
+
+def lost_frames(bus: can.BusABC) -> int:
+    """Frames the kernel threw away since the bus was opened, because nobody fetched them in time.
+
+    0 for buses without a socket; there only missing replies tell.
+    """
+    try:
+        descriptor = bus.fileno()
+    except NotImplementedError:
+        return 0
+    if descriptor < 0:
+        return 0
+    bus_socket = socket.socket(fileno=descriptor)
+    try:
+        # python-can refuses the control message of SO_RXQ_OVFL; this asks for the same counter.
+        memory = bus_socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_BYTES)
+    finally:
+        bus_socket.detach()
+    (lost,) = struct.unpack_from("=I", memory, MEMINFO_BYTES - 4)
+    return int(lost)
+
+
+def transmit(bus: can.BusABC, message: can.Message) -> None:
+    """Sends one frame.
+
+    Raises:
+        BusFault: The bus did not take it. A full queue is one too: a set-point sent late is wrong.
+    """
+    try:
+        bus.send(message)
+    except Exception as error:  # back ends raise errors of their own libraries
+        raise bus_fault("the bus did not take a frame", bus_name(bus), error) from error
+
+
+def take(bus: can.BusABC, timeout: float) -> can.Message | None:
+    """The next frame, or None when there is none within the time [s].
+
+    Raises:
+        BusFault: The bus failed.
+    """
+    try:
+        return bus.recv(timeout)
+    except Exception as error:  # back ends raise errors of their own libraries
+        raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
+
+
+def bus_name(bus: can.BusABC) -> str:
+    """The bus as messages name it."""
+    return f"bus {bus.channel_info}"
+
+
+# Tells frames that only a master sends apart: ours, and those of another master. No bus.
+
+
+class EchoFilter:
+    """What was sent, so that a bus on which a sender hears itself does not look like two masters.
+
+    On such a bus each frame that was sent excuses one that comes in.
+    """
+
+    #: Frames of one identifier that may be on their way back; lost ones excuse no more than these.
+    MOST_CREDIT = 8
+
+    def __init__(self, ids: frozenset[int], *, echoes_own_frames: bool) -> None:
+        """Takes the identifiers to watch and whether the bus brings back what was sent."""
+        self._ids = ids
+        self._credit: dict[int, int] | None = dict.fromkeys(ids, 0) if echoes_own_frames else None
+
+    def sent(self, can_id: int) -> None:
+        """Notes a frame that was sent."""
+        if self._credit is not None and can_id in self._credit:
+            self._credit[can_id] = min(self.MOST_CREDIT, self._credit[can_id] + 1)
+
+    def is_foreign(self, can_id: int) -> bool:
+        """Whether a frame that came in is another master's."""
+        if can_id not in self._ids:
+            return False
+        if self._credit is None:
+            return True
+        if self._credit[can_id] > 0:
+            self._credit[can_id] -= 1
+            return False
+        return True

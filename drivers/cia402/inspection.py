@@ -1,0 +1,266 @@
+"""Reads every object that a set-up needs from every drive, all problems at once; writes nothing."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import can
+
+from drivers.cia402.error_codes import abort_text
+from drivers.cia402.object_dictionary import (
+    BEFORE,
+    HEARTBEAT_CONSUMERS,
+    Expectation,
+    Setting,
+    expected_by,
+    identity,
+    settings_for,
+)
+from drivers.cia402.profile import load_profile, profile_names, profile_of
+from drivers.cia402.sdo import OBJECT_DOES_NOT_EXIST, SetupNetwork
+from drivers.cia402.state_machine import FAULTED, DriveState, state_of
+from drivers.drive_group import Pump
+from model.errors import Refused
+from model.files.drive_profile_file import object_name
+from model.rig import Rig
+from model.winches import WinchMap
+
+Verdict = Literal["ok", "remark", "wrong"]
+
+WRITE_ONLY = 0x06010001
+MOST_VALUES = 3
+"""Of an object that are listed; more are told as different ones."""
+
+_WORST: tuple[Verdict, ...] = ("ok", "remark", "wrong")
+
+_PROCESS_DATA = (
+    (0x6040, "<H", "controlword", "commands of the master"),
+    (0x607A, "<i", "target position", "set-points"),
+    (0x6064, "<i", "position actual value", "replies"),
+    (0x6077, "<h", "torque actual value", "tension of the cable"),
+)
+
+
+@dataclass(slots=True)
+class ObjectRow:
+    """One object of all drives.
+
+    Attributes:
+        object: Index, sub-index and name.
+        needed: What it must hold, or that it must be there.
+        meaning: What it is needed for.
+        verdict: The worst of all drives.
+        change: The next step where it is not good.
+        found: What was found, and in which nodes.
+    """
+
+    object: str
+    needed: str
+    meaning: str
+    verdict: Verdict = "ok"
+    change: str = ""
+    found: dict[str, list[int]] = field(default_factory=dict)
+
+    def note(self, node: int, text: str, verdict: Verdict = "ok", change: str = "") -> None:
+        """Adds what one drive told."""
+        self.found.setdefault(text, []).append(node)
+        if _WORST.index(verdict) > _WORST.index(self.verdict):
+            self.verdict, self.change = verdict, change
+
+    def found_text(self, nodes: Sequence[int]) -> str:
+        """``all: 8``, or each value with its drives."""
+        if len(self.found) > MOST_VALUES and self.verdict == "ok":
+            return "there; each drive has its own"
+        if [sorted(nodes)] == [sorted(each) for each in self.found.values()]:
+            return f"all: {next(iter(self.found))}"
+        return "; ".join(
+            f"drive {', '.join(map(str, each))}: {text}" for text, each in self.found.items()
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Examined:
+    """What was found.
+
+    Attributes:
+        nodes: The drives that answered.
+        silent: Those that did not.
+        rows: One for each object.
+    """
+
+    nodes: tuple[int, ...]
+    silent: tuple[int, ...]
+    rows: tuple[ObjectRow, ...]
+
+    @property
+    def good(self) -> bool:
+        """Every drive can be set up, as far as reading tells."""
+        return not self.silent and all(row.verdict != "wrong" for row in self.rows)
+
+
+def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
+    """Reads all objects of all drives; sends SDO uploads and nothing else.
+
+    Args:
+        rig: The robot; its profile says what the drives have.
+        bus: An open bus.
+        pump: As for `drivers.factory.make_drive_group`.
+
+    Raises:
+        BadInput: The profile or a value of the rig is wrong.
+        HardwareMissing: A drive fell silent meanwhile.
+        Fault: The bus failed.
+    """
+    profile, winch_map = profile_of(rig), WinchMap(rig)
+    all_nodes = [winch.node_id for winch in rig.winches]
+    network = SetupNetwork(bus, pump, all_nodes, timeout=profile.sdo_timeout_ms / 1000.0)
+    network.discard_waiting()
+    silent = network.silent_nodes(all_nodes)
+    rows: dict[tuple[int, int], ObjectRow] = {}
+    for drive, node in enumerate(all_nodes):
+        if node in silent:
+            continue
+        look = _Look(network, node, rows)
+        for expected in (*BEFORE, *identity(rig), *expected_by(profile)):
+            look.at_expected(expected)
+        look.at_state()
+        for index, form, name, why in _PROCESS_DATA:
+            look.at_setting(Setting(index, 0, form, 0, name, why), "readable")
+        look.at_heartbeats(profile.heartbeat_entries, rig.cable_count)
+        for setting in _last_of_each(settings_for(rig, drive, winch_map, None)):
+            look.at_setting(setting, _needed(setting))
+    answered = tuple(node for node in all_nodes if node not in silent)
+    return Examined(answered, tuple(silent), tuple(rows.values()))
+
+
+def _last_of_each(settings: Iterable[Setting]) -> list[Setting]:
+    """What an object holds in the end, without the steps towards it."""
+    return list({(s.index, s.sub): s for s in settings if not s.transient}.values())
+
+
+def _needed(setting: Setting) -> str:
+    if setting.per_mille_of is None:
+        return f"{setting.value}, written at set-up"
+    return f"{setting.value} per mille of {object_name(*setting.per_mille_of)}, written at set-up"
+
+
+class _Look:
+    """What one drive holds, into the rows of all."""
+
+    def __init__(
+        self, network: SetupNetwork, node: int, rows: dict[tuple[int, int], ObjectRow]
+    ) -> None:
+        self._client, self._node, self._rows = network.client(node), node, rows
+
+    def at_expected(self, expected: Expectation) -> None:
+        """An object that must hold a value which is not written."""
+        row = self._row(expected.index, expected.sub, str(expected), f"{expected.expected:X}h")
+        row.meaning = expected.why
+        data = self._read(expected.index, expected.sub, row, optional=False)
+        if data is None:
+            return
+        value = int.from_bytes(data, "little")
+        good = value & expected.mask == expected.expected
+        change = "" if good else _how_to_set(expected)
+        row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
+
+    def at_state(self) -> None:
+        """Where the drive is in the state machine."""
+        row = self._row(0x6041, 0, "6041h:00 statusword", "not enabled, no fault")
+        row.meaning = "drives that nobody moves are set up"
+        data = self._read(0x6041, 0, row, optional=False)
+        if data is None:
+            return
+        state = state_of(int.from_bytes(data, "little"))
+        if state in FAULTED:
+            row.note(self._node, state.value, "wrong", "remove the cause, then `cdpr reset RIG`")
+        elif state is DriveState.OPERATION_ENABLED:
+            row.note(self._node, state.value, "remark", "another program moves it; end it first")
+        else:
+            row.note(self._node, state.value)
+
+    def at_heartbeats(self, most: int | None, drives: int) -> None:
+        """How many producers the drive can watch."""
+        name = "1016h:00 consumer heartbeat entries"
+        row = self._row(HEARTBEAT_CONSUMERS, 0, name, f"1; {drives} to watch every peer too")
+        row.meaning = "stop when the master, or a peer, is gone"
+        data = self._read(HEARTBEAT_CONSUMERS, 0, row, optional=False)
+        if data is None:
+            return
+        count = int.from_bytes(data, "little")
+        if count < 1:
+            row.note(self._node, "0", "wrong", "no run is safe with a drive that cannot watch")
+        elif min(count, most or count) < drives:
+            row.note(self._node, str(count), "remark", "nothing: not every peer is watched")
+        else:
+            row.note(self._node, str(count))
+
+    def at_setting(self, setting: Setting, needed: str) -> None:
+        """An object that is written at set-up: it must be there, and of that length."""
+        row = self._row(setting.index, setting.sub, str(setting), needed)
+        row.meaning = setting.why
+        if row.needed != needed:
+            row.needed = "its own value, written at set-up"
+        data = self._read(setting.index, setting.sub, row, setting.optional, setting.instead)
+        if data is None:
+            return
+        if len(data) != struct.calcsize(setting.form):
+            text = f"{len(data)} bytes, not {struct.calcsize(setting.form)}"
+            row.note(self._node, text, "wrong", "compare with the drive's manual")
+        else:
+            row.note(self._node, str(struct.unpack(setting.form, data)[0]))
+        if setting.per_mille_of is not None:
+            rated = self._row(*setting.per_mille_of, "rated value of the limit", "more than 0")
+            found = self._read(*setting.per_mille_of, rated, optional=False)
+            if found is not None:
+                value = int.from_bytes(found, "little")
+                change = "" if value else "enter the motor's data with the maker's tool"
+                rated.note(self._node, str(value), "ok" if value else "wrong", change)
+
+    def _row(self, index: int, sub: int, name: str, needed: str) -> ObjectRow:
+        text = name if name.startswith(f"{index:04X}h") else f"{object_name(index, sub)} {name}"
+        return self._rows.setdefault((index, sub), ObjectRow(text, needed, ""))
+
+    def _read(
+        self, index: int, sub: int, row: ObjectRow, optional: bool, instead: str = ""
+    ) -> bytes | None:
+        """The object; None where it cannot be read, which is noted."""
+        try:
+            return self._client.read(index, sub, row.object)
+        except Refused as error:
+            code = error.values.get("abort_code")
+            if code is None:
+                raise
+        if code == WRITE_ONLY:
+            row.note(self._node, "there, write-only")
+            return None
+        absent = code in OBJECT_DOES_NOT_EXIST
+        text = "absent" if absent else f"refused: {abort_text(int(code))}"
+        if optional:
+            row.note(self._node, text, "remark" if instead else "ok", instead)
+        else:
+            row.note(self._node, text, "wrong", _how_without(index, sub))
+        return None
+
+
+def _how_to_set(expected: Expectation) -> str:
+    if expected.index == 0x6502:
+        return (
+            "none: without cyclic synchronous position (CSP) a drive cannot be used; Technosoft"
+            " iPOS and Pilz PRBT do not have it"
+        )
+    if expected.index in (0x1000, 0x1018):
+        return "check the node id, and vendor_id and product_code of the rig file"
+    return "set it with the maker's tool and store it"
+
+
+def _how_without(index: int, sub: int) -> str:
+    """Of an object that is needed and not there."""
+    name = object_name(index, sub)
+    fitting = [each for each in profile_names() if name in load_profile(each).absent]
+    if fitting:
+        return f"name the drives in the rig file: drives.profile: {' or '.join(fitting)}"
+    return "another drive, or another firmware of it: see its manual"

@@ -1,0 +1,256 @@
+"""What the drives told, and what of it is a fault of the group. No bus, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping, Sequence
+
+from drivers.cia402.error_codes import emergency_text
+from drivers.cia402.pdo import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    SDO_REPLY_BASE,
+    TPDO1_BASE,
+    NmtState,
+    Reply,
+    parse_emergency,
+    parse_heartbeat,
+    parse_reply,
+)
+from drivers.cia402.sdo_jobs import STANDING, SdoRequest
+from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState, state_of
+from drivers.drive_group import DriveWarning
+from drivers.plausibility import ReplyCheck
+from model.errors import Refused
+
+
+def _never(_code: int) -> bool:
+    return False
+
+
+class DriveMonitor:
+    """The last word of every drive: replies, emergencies, heartbeats.
+
+    Attributes:
+        on_answer: Takes node and data of answers to SDO requests.
+    """
+
+    def __init__(
+        self,
+        names: Mapping[int, str],
+        max_steps: Sequence[float],
+        is_warning: Callable[[int], bool] = _never,
+    ) -> None:
+        """Knows nothing of the drives yet.
+
+        Args:
+            names: By node id.
+            max_steps: The farthest each drive can turn in a cycle, [counts].
+            is_warning: Whether an EMCY code is a mere warning while the drive stays enabled.
+        """
+        count, nodes = len(names), tuple(names)
+        self.nodes = nodes
+        self._names = dict(names)
+        self.status_words = [0] * count
+        self.positions = [0] * count
+        self.torques = [0] * count
+        self.states = [DriveState.NOT_READY] * count
+        self.answered = [False] * count
+        self.restarted: set[int] = set()
+        self._wrong_lengths = 0
+        self._check = ReplyCheck(names, max_steps)
+        self._is_warning = is_warning
+        self._reported: list[DriveWarning] = []  # in this cycle; the drive may be about to stop
+        self._to_judge: list[DriveWarning] = []  # the drive's next reply says whether it stopped
+        self._warnings: list[DriveWarning] = []
+        self._news: list[tuple[int, str]] = []
+        self._dropped: list[tuple[int, str]] = []
+        self._emergencies: dict[int, str] = {}
+        self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
+        self._others = {EMCY_BASE + node: self._emergency for node in nodes}
+        self._others |= {HEARTBEAT_BASE + node: self._heartbeat for node in nodes}
+        self._others |= {SDO_REPLY_BASE + node: self._answer for node in nodes}
+        self.on_answer: Callable[[int, bytes | bytearray], None] = lambda _node, _data: None
+
+    def begin_cycle(self) -> None:
+        """From now on replies count for a new cycle."""
+        self._check.begin_cycle()
+        self._to_judge += self._reported
+        self._reported = []
+        self.answered = [False] * len(self.nodes)
+
+    def end_cycle(self) -> None:
+        """Counts the replies that did not come, or could not be believed."""
+        self._check.end_cycle()
+
+    def forget_positions(self) -> None:
+        """The drives may have been moved since: their next positions are believed as they come."""
+        self._check.forget_positions()
+
+    @property
+    def rejected(self) -> int:
+        """Frames thrown away because their length or their content could not be true."""
+        return self._check.rejected + self._wrong_lengths
+
+    @property
+    def complete(self) -> bool:
+        """Every drive has answered in this cycle."""
+        return all(self.answered)
+
+    def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
+        """Takes in one frame.
+
+        Args:
+            can_id: Its identifier.
+            data: Its data.
+            stale: A reply in it belongs to a cycle that is over and is thrown away.
+        """
+        drive = self._replies.get(can_id)
+        if drive is None:
+            other = self._others.get(can_id)
+            if other is not None:
+                other(can_id & 0x7F, data)
+            return
+        self._check.hear(drive)
+        if stale or self.answered[drive]:
+            return
+        reply = parse_reply(data)
+        if reply is None:
+            self._check.reject(drive, f"its reply has {len(data)} bytes instead of 8")
+        elif self._check.believed(drive, reply.position):
+            self._note(drive, reply)
+
+    def _note(self, drive: int, reply: Reply) -> None:
+        self.status_words[drive], self.positions[drive], self.torques[drive] = reply
+        self.answered[drive] = True
+        state, before = state_of(reply.status_word), self.states[drive]
+        self.states[drive] = state
+        self._judge(self.nodes[drive], state)
+        if before is DriveState.OPERATION_ENABLED and state is not before:
+            node = self.nodes[drive]
+            cause = self._emergencies.get(node)
+            text = f"{self._names[node]} stopped by itself: {state.value}"
+            self._dropped.append((node, f"{text}; {cause}" if cause else text))
+
+    def _judge(self, node: int, state: DriveState) -> None:
+        """What a drive reported before this SYNC is a warning if the drive is still enabled."""
+        own = [warning for warning in self._to_judge if warning.node == node]
+        self._to_judge = [warning for warning in self._to_judge if warning.node != node]
+        if state is DriveState.OPERATION_ENABLED:
+            self._warnings += own
+
+    def warnings(self) -> tuple[DriveWarning, ...]:
+        """Emergencies of drives that were still enabled at the SYNC after, since the last call.
+
+        Such a drive follows its set-points. One that stops for what it reports has left the state
+        by then and is a fault (`dropped`, `state_faults`).
+        """
+        warnings, self._warnings = tuple(self._warnings), []
+        return warnings
+
+    def take_standing(self, values: Mapping[tuple[int, SdoRequest], int]) -> None:
+        """Takes in what drives answered when they were asked how they stand; who did, answered."""
+        for drive, node in enumerate(self.nodes):
+            if all((node, job) in values for job in STANDING):
+                word, position, torque = (values[node, job] for job in STANDING)
+                self._note(drive, Reply(word, _signed(position, 32), _signed(torque, 16)))
+
+    def news(self) -> list[tuple[int, str]]:
+        """Emergencies of drives that are not enabled, restarts and NMT states since the last call.
+
+        By node.
+        """
+        news, self._news = self._news, []
+        return news
+
+    def dropped(self) -> list[tuple[int, str]]:
+        """Drives that left OPERATION ENABLED since the last call, by node."""
+        dropped, self._dropped = self._dropped, []
+        return dropped
+
+    def state_faults(self, told: Container[str], *, powered: bool) -> list[tuple[int, str]]:
+        """What is wrong with the drives as they stand, by node.
+
+        How often a drive may be silent is the executor's to say (`executor.safety.monitor`).
+
+        Args:
+            told: Faults known already; a drive whose emergency is among them is not told again.
+            powered: The group is under power or on its way there; replies that cannot be believed
+                are a fault then.
+        """
+        found: list[tuple[int, str]] = []
+        for node, state in zip(self.nodes, self.states, strict=True):
+            if state not in FAULTED:
+                continue
+            name, cause = self._names[node], self._emergencies.get(node, "it sent no reason")
+            if f"{name}: {cause}" not in told:
+                found.append((node, f"{name} is in {state.value}: {cause}"))
+        return found + (self._check.faults() if powered else [])
+
+    def require_resettable(self) -> list[int]:
+        """Nodes in fault, which may be reset only when no other drive holds the platform.
+
+        Raises:
+            Refused: Another drive holds it, or a drive restarted.
+        """
+        if self.restarted:
+            raise Refused(
+                f"{self._names[min(self.restarted)]} restarted: its set-up and its position are"
+                " lost",
+                where="drive group",
+                next_step="set the drives up again and check the reference (home) positions",
+            )
+        faulted = [n for n, s in zip(self.nodes, self.states, strict=True) if s in FAULTED]
+        if faulted and any(state in TORQUE_ON for state in self.states):
+            raise Refused(
+                f"{self._names[faulted[0]]} cannot be reset while other drives hold the platform",
+                where="drive group",
+                why="resetting one drive of a platform under tension moves it",
+                next_step="support the platform, press the emergency stop so that no drive holds,"
+                " release it, then reset the fault",
+            )
+        return faulted
+
+    def forget_emergencies(self) -> None:
+        """After a reset by the operator."""
+        self._emergencies.clear()
+        self._news.clear()
+        self._reported, self._to_judge, self._warnings = [], [], []
+
+    def _emergency(self, node: int, data: bytes | bytearray) -> None:
+        message = parse_emergency(data)
+        if message is None:
+            self._wrong_lengths += 1
+        elif message.code & 0xFF00:
+            text = emergency_text(message.code)
+            self._take_emergency(node, message.code, text)
+        else:
+            self._emergencies.pop(node, None)  # "no error": what it reported before is over
+
+    def _take_emergency(self, node: int, code: int, text: str) -> None:
+        self._emergencies[node] = text
+        told = f"{self._names[node]}: {text}"
+        if self.states[self.nodes.index(node)] is not DriveState.OPERATION_ENABLED:
+            self._news.append((node, told))
+        elif self._is_warning(code):
+            self._reported.append(DriveWarning(node, f"{told}, a warning", stops=False))
+        else:
+            self._reported.append(DriveWarning(node, told, stops=True))
+
+    def _answer(self, node: int, data: bytes | bytearray) -> None:
+        self.on_answer(node, data)
+
+    def _heartbeat(self, node: int, data: bytes | bytearray) -> None:
+        state = parse_heartbeat(data)
+        if state is None:
+            self._wrong_lengths += 1
+        elif state == NmtState.BOOT_UP:
+            self.restarted.add(node)
+            self._news.append(
+                (node, f"{self._names[node]} restarted: its set-up and its position are lost")
+            )
+        elif state != NmtState.OPERATIONAL:
+            self._news.append((node, f"{self._names[node]} left the NMT state operational"))
+
+
+def _signed(value: int, bits: int) -> int:
+    return value - (1 << bits) if value >> (bits - 1) else value

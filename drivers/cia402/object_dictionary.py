@@ -1,0 +1,427 @@
+"""Every object that is written to a drive before it is enabled, with its value and the reason."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass, replace
+
+from drivers.can_load import heartbeat_cycles, heartbeat_timeout
+from drivers.cia402.pdo import MASTER_NODE, RPDO1_BASE, TPDO1_BASE
+from drivers.cia402.profile import profile_of
+from drivers.cia402.sdo_jobs import CSP_MODE
+from drivers.plausibility import position_limits
+from model.errors import BadInput
+from model.files.drive_profile_file import ProfileDocument, Range, object_key
+from model.files.rig_file import Cia402Document
+from model.rig import Rig
+from model.winches import WinchMap
+
+PDO_INVALID = 1 << 31
+PDO_NO_RTR = 1 << 30
+
+PDO_IDENTIFIER = 0xA0000000 | 0x7FF
+"""Bits of a COB-ID that are compared: on or off, frame format, identifier. Bit 30 (no RTR) is kept
+or not as the drive likes, the others are reserved. Source: CiA 301, 7.5.2.35."""
+
+TORQUE_RESERVE = 1.2
+"""Torque limit above the largest allowed tension: the following-error watch must trip first."""
+
+_UNSIGNED_MAX = {"<B": 0xFF, "<H": 0xFFFF, "<I": 0xFFFFFFFF}
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One object to write and read back.
+
+    Attributes:
+        index: Object index.
+        sub: Sub-index.
+        form: Type, as `struct` names it.
+        value: What it must hold.
+        name: What the standard calls it.
+        why: The reason for the value.
+        transient: It is written over later in the list, so that only a refusal counts.
+        optional: Drives need not have the object.
+        instead: What does its work in drives that do not have it; nothing where none is missed.
+        mask: Bits that count when it is read back; all where it is 0.
+        per_mille_of: The value is in per mille of this object, as the drive holds it.
+    """
+
+    index: int
+    sub: int
+    form: str
+    value: int
+    name: str
+    why: str
+    transient: bool = False
+    optional: bool = False
+    instead: str = ""
+    mask: int = 0
+    per_mille_of: tuple[int, int] | None = None
+
+    def data(self) -> bytes:
+        """The value as the object holds it.
+
+        Raises:
+            BadInput: It does not fit.
+        """
+        try:
+            return struct.pack(self.form, self.value)
+        except struct.error:
+            raise BadInput(
+                f"{self} cannot hold {self.value}",
+                where="setting the drives up",
+                why=self.why,
+                next_step="check the winches, the cycle and the drive profile of the rig file",
+            ) from None
+
+    def is_kept(self, data: bytes) -> bool:
+        """Whether what the drive holds is what was to be written."""
+        if len(data) != struct.calcsize(self.form) or not self.mask:
+            return data == self.data()
+        return not (int.from_bytes(data, "little") ^ self.value) & self.mask
+
+    def of_rated(self, rated: int) -> Setting:
+        """The setting with its value in the unit of ``per_mille_of``, which holds ``rated``."""
+        return replace(self, value=math.ceil(self.value * rated / 1000.0), per_mille_of=None)
+
+    def __str__(self) -> str:
+        """Index, sub-index and name."""
+        return f"{self.index:04X}h:{self.sub:02X} {self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """One object to read: ``value & mask`` must be ``expected``."""
+
+    index: int
+    sub: int
+    mask: int
+    expected: int
+    name: str
+    why: str
+
+    def __str__(self) -> str:
+        """Index, sub-index and name."""
+        return f"{self.index:04X}h:{self.sub:02X} {self.name}"
+
+
+#: What a drive must be before anything is written to it.
+BEFORE = (
+    Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are commanded here"),
+    Expectation(
+        *(0x6502, 0, 0x80, 0x80, "supported drive modes"),
+        "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
+    ),
+)
+
+
+def identity(rig: Rig) -> tuple[Expectation, ...]:
+    """Whose drives they must be, where the rig file says so (1018h)."""
+    drives = rig.document.drives
+    if not isinstance(drives, Cia402Document):
+        return ()
+    named = ((1, drives.vendor_id, "vendor id"), (2, drives.product_code, "product code"))
+    why = "the rig file names these drives"
+    return tuple(
+        Expectation(0x1018, sub, 0xFFFFFFFF, value, name, why)
+        for sub, value, name in named
+        if value is not None
+    )
+
+
+MODE_DISPLAY = Expectation(
+    0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode was taken"
+)
+"""What it must show after the set-up, or once enabled (`ProfileDocument`)."""
+
+
+def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
+    """What drives of a profile must hold that the program does not write, such as units."""
+    return tuple(
+        Expectation(*object_key(each.object), 0xFFFFFFFF, each.value, each.name, each.why)
+        for each in profile.expect
+    )
+
+
+#: Communication parameters of process data that are not used; switched off where they exist.
+USED_PDOS = (0x1400, 0x1800)
+UNUSED_PDOS = (0x1401, 0x1402, 0x1403, 0x1801, 0x1802, 0x1803)
+
+HEARTBEAT_CONSUMERS = 0x1016
+
+
+def settings_for(
+    rig: Rig, drive: int, winch_map: WinchMap, max_tension: float | None = None
+) -> tuple[Setting, ...]:
+    """The set-up of one drive, in the order of writing.
+
+    Args:
+        rig: The robot.
+        drive: Place of its winch in the rig file, from 0.
+        winch_map: The rig's lengths and counts.
+        max_tension: From which the torque limit comes, [N]; the rig's own if None.
+
+    Raises:
+        BadInput: A value of the rig does not fit its object.
+    """
+    cycle, profile = rig.document.bus.cycle_ms / 1000.0, profile_of(rig)
+    tension = rig.max_tension if max_tension is None else max_tension
+    settings = (
+        *_process_data(rig.winches[drive].node_id),
+        *_supervision(cycle),
+        *_mode(cycle, profile),
+        *_reactions(rig, drive, cycle, profile),
+        *_limits(rig, drive, winch_map, tension, profile),
+    )
+    there = (setting for setting in settings if profile.has(setting.index, setting.sub))
+    return tuple(_within(setting, profile) for setting in there)
+
+
+def left_out(profile: ProfileDocument) -> tuple[str, ...]:
+    """What is missed in drives of a profile, one remark for each optional object without work."""
+    all_optional = (*_process_data(1), *_supervision(0.01), *_options())
+    return tuple(
+        f"there is no {setting}: {setting.instead}"
+        for setting in all_optional
+        if setting.optional and setting.instead and not profile.has(setting.index, setting.sub)
+    )
+
+
+CLAMPED = (0x6066, 0x6085)
+"""Objects that take the nearest value in range: an earlier trip, and a ramp as steep as it goes."""
+
+
+def _within(setting: Setting, profile: ProfileDocument) -> Setting:
+    """A setting that the drive takes.
+
+    Raises:
+        BadInput: It takes none that would do.
+    """
+    allowed = profile.range_of(setting.index, setting.sub)
+    if allowed is None or allowed.holds(setting.value):
+        return setting
+    if setting.index in CLAMPED and setting.value > allowed.high:
+        return replace(setting, value=allowed.high)
+    raise BadInput(
+        f"{setting} must hold {setting.value}; {profile.name} takes {allowed.low} to"
+        f" {allowed.high}",
+        where="drives.profile",
+        why=f"needed because: {setting.why}",
+        next_step="change the cycle, the limits or the drives of the rig file",
+    )
+
+
+def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ...]:
+    """Whose heartbeat the drive watches: the master's, then its peers', as far as it has entries.
+
+    Args:
+        rig: The robot.
+        drive: Place of the winch in the rig file, from 0.
+        entries: How many producers the drive can watch (1016h:00).
+    """
+    time_ms = math.ceil(1000 * heartbeat_timeout(rig.document.bus.cycle_ms / 1000.0))
+    peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
+    return tuple(
+        Setting(
+            HEARTBEAT_CONSUMERS,
+            sub,
+            "<I",
+            node << 16 | time_ms,
+            "consumer heartbeat time",
+            "stop when the master is gone" if node == MASTER_NODE else "stop when a peer is gone",
+        )
+        for sub, node in enumerate([MASTER_NODE, *peers][:entries], start=1)
+    )
+
+
+def interpolation_time(
+    cycle: float, values: Range | None = None, exponents: Range | None = None
+) -> tuple[int, int]:
+    """Value and power of ten of 60C2h for a cycle [s].
+
+    Args:
+        cycle: [s].
+        values: That the drive takes in 60C2h:01; 1 to 255 when None.
+        exponents: That it takes in 60C2h:02; -6 to -3 when None.
+
+    Raises:
+        BadInput: The object cannot hold this cycle.
+    """
+    most = 0xFF if values is None else min(values.high, 0xFF)
+    for exponent in (-3, -4, -5, -6):
+        value = cycle * 10.0**-exponent
+        taken = exponents is None or exponents.holds(exponent)
+        if taken and 0 < round(value) <= most and abs(value - round(value)) < 1e-6:
+            return round(value), exponent
+    raise BadInput(
+        f"drives cannot interpolate over a cycle of {1000 * cycle:g} ms",
+        where="bus.cycle_ms",
+        why=f"object 60C2h holds a whole number up to {most} times a power of ten"
+        + ("" if exponents is None else f" from {exponents.low} to {exponents.high}"),
+        next_step="use a rounder number, such as 10, 8 or 4",
+    )
+
+
+def _process_data(node: int) -> tuple[Setting, ...]:
+    received = (0x60400010, 0x607A0020)
+    sent = (0x60410010, 0x60640020, 0x60770010)
+    return (
+        *_mapped(0x1400, 0x1600, RPDO1_BASE + node, received),
+        # Off: a drive that stops by itself because frames to it alone were lost would be enabled
+        # again by the next one (transition 16 acts by level), before its reply tells that.
+        Setting(
+            *(0x1400, 5, "<H", 0, "RPDO1 deadline", "the program sees lost set-points, and stops"),
+            optional=True,
+        ),
+        _switched_on(0x1400, RPDO1_BASE + node, "RPDO1 identifier"),
+        *_mapped(0x1800, 0x1A00, PDO_NO_RTR | TPDO1_BASE + node, sent),
+        Setting(
+            *(0x1800, 3, "<H", 0, "TPDO1 inhibit time", "no reply is held back"), optional=True
+        ),
+        _switched_on(0x1800, PDO_NO_RTR | TPDO1_BASE + node, "TPDO1 identifier"),
+    )
+
+
+def _switched_on(parameters: int, identifier: int, name: str) -> Setting:
+    return Setting(parameters, 1, "<I", identifier, name, "switched on", mask=PDO_IDENTIFIER)
+
+
+def _mapped(
+    parameters: int, mapping: int, identifier: int, objects: tuple[int, ...]
+) -> tuple[Setting, ...]:
+    """Off, no objects, the objects, their number, at each SYNC. Source: CiA 301, 7.5.2.36."""
+    off = PDO_INVALID | identifier
+    return (
+        Setting(parameters, 1, "<I", off, "PDO identifier", "off while it is mapped", True),
+        Setting(mapping, 0, "<B", 0, "PDO mapping", "off while it is mapped", True),
+        *(
+            Setting(mapping, sub, "<I", entry, "PDO mapping", "word, position, and torque back")
+            for sub, entry in enumerate(objects, start=1)
+        ),
+        Setting(mapping, 0, "<B", len(objects), "PDO mapping", "all of them"),
+        Setting(parameters, 2, "<B", 1, "PDO transmission type", "one SYNC for all drives"),
+    )
+
+
+def _supervision(cycle: float) -> tuple[Setting, ...]:
+    period_us = round(1e6 * cycle)
+    produced_ms = round(1000 * cycle * heartbeat_cycles(cycle))
+    return (
+        Setting(0x1006, 0, "<I", period_us, "communication cycle period", "the cycle of the rig"),
+        Setting(
+            *(0x1007, 0, "<I", period_us, "synchronous window length", "the whole cycle"),
+            optional=True,
+            instead="without it the window has no end",
+        ),
+        Setting(0x1017, 0, "<H", produced_ms, "producer heartbeat time", "peers watch each other"),
+        Setting(
+            *(0x1029, 1, "<B", 1, "communication error behaviour", "keep reporting"),
+            optional=True,
+            instead="a drive may leave the NMT state operational, which is a fault",
+        ),
+    )
+
+
+def _mode(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
+    ranges = profile.range_of(0x60C2, 1), profile.range_of(0x60C2, 2)
+    value, exponent = interpolation_time(cycle, *ranges)
+    why = "one set-point a cycle"
+    return (
+        Setting(0x6060, 0, "<b", CSP_MODE, "modes of operation", "cyclic synchronous position"),
+        Setting(0x60C2, 1, "<B", value, "interpolation time period value", why),
+        Setting(0x60C2, 2, "<b", exponent, "interpolation time index", why),
+    )
+
+
+def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
+    winch = rig.winches[drive]
+    # A drive at its top speed stands within one cycle, so that drives at different speeds stop
+    # within a cycle of each other and the tensions stay near what they were.
+    ramp = _ramp(rig, drive, cycle, profile)
+    window = rig.motion.following_error * abs(winch.counts_per_metre)
+    return (
+        Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
+        Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
+        *_options(),
+        _capped(0x6085, "quick stop deceleration", ramp, "stands within one cycle"),
+        _capped(0x6065, "following error window", window, "motion.following_error_mm"),
+        Setting(0x6066, 0, "<H", math.ceil(1000 * cycle), "following error time out", "one cycle"),
+    )
+
+
+def _ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
+    """Of a quick stop, in the drive's unit of acceleration."""
+    winch = rig.winches[drive]
+    ramp = winch.max_speed / cycle * abs(winch.counts_per_metre)
+    return ramp * 60.0 / winch.counts_per_turn if profile.acceleration_unit == "rpm/s" else ramp
+
+
+def lost_master_times(rig: Rig) -> tuple[str, float, float]:
+    """What tells drives that the master is lost, when the last one notices, and its ramp, [s].
+
+    Raises:
+        BadInput: There is no such profile, or its file is wrong.
+    """
+    cycle, profile = rig.document.bus.cycle_ms / 1000.0, profile_of(rig)
+    steepest = profile.range_of(0x6085, 0)
+    wanted = max(_ramp(rig, i, cycle, profile) for i in range(rig.cable_count))
+    ramp = cycle if steepest is None else cycle * max(1.0, wanted / max(1, steepest.high))
+    if profile.monitoring == "heartbeat":
+        return "heartbeat", heartbeat_timeout(cycle), ramp
+    return "SYNC", profile.sync_timeout_periods * cycle, ramp
+
+
+def _options() -> tuple[Setting, ...]:
+    return (
+        Setting(
+            *(0x605C, 0, "<h", 1, "disable operation option code", "ramp down before torque off"),
+            optional=True,
+            instead="what a drive does when operation is disabled is its maker's choice: read its"
+            " manual before `cdpr release`",
+        ),
+        Setting(
+            *(0x605E, 0, "<h", 2, "fault reaction option code", "ramp down before torque off"),
+            optional=True,
+            instead="what a drive does in a fault is its maker's choice: read its manual",
+        ),
+    )
+
+
+def _limits(
+    rig: Rig, drive: int, winch_map: WinchMap, max_tension: float, profile: ProfileDocument
+) -> tuple[Setting, ...]:
+    winch = rig.winches[drive]
+    torque = math.ceil(1000.0 * TORQUE_RESERVE * max_tension / winch.torque_constant)
+    if torque > _UNSIGNED_MAX["<H"]:
+        raise BadInput(
+            f"max_tension_n is {max_tension / winch.torque_constant:.0f} times the tension at"
+            " rated torque",
+            where=f"rig {rig.name}: winches[{drive}].torque_constant_n",
+            next_step="give the cable tension at rated motor torque",
+        )
+    low, high = position_limits(rig, drive, winch_map)
+    why = "longest and shortest cable of the workspace"
+    return (
+        _torque_limit(torque, profile),
+        Setting(0x607D, 1, "<i", low, "min position limit", why),
+        Setting(0x607D, 2, "<i", high, "max position limit", why),
+    )
+
+
+def _torque_limit(per_mille: int, profile: ProfileDocument) -> Setting:
+    """6072h, or the object of the maker that limits the current; [per mille of rated torque]."""
+    why = "largest allowed tension and a reserve"
+    limit = profile.torque_limit
+    if limit is None:
+        return Setting(0x6072, 0, "<H", per_mille, "max torque", why)
+    rated = object_key(limit.rated)
+    return Setting(
+        *(*object_key(limit.object), "<I", per_mille, "current limit", why), per_mille_of=rated
+    )
+
+
+def _capped(index: int, name: str, value: float, why: str) -> Setting:
+    """As large as the object can hold: the largest value still means the same."""
+    return Setting(index, 0, "<I", min(math.ceil(value), _UNSIGNED_MAX["<I"]), name, why)

@@ -1,0 +1,158 @@
+"""CANopen frames as bytes: `make_*` builds, `parse_*` reads and checks the length. Pure.
+
+Source: CiA 301 (identifiers, SYNC, EMCY, heartbeat, NMT); the process data are those that
+`drivers.cia402.object_dictionary` maps.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import can
+
+from drivers.can_bus import SentFrame
+from drivers.cia402.state_machine import ControlWord
+
+NMT_ID = 0x000
+SYNC_ID = 0x080
+EMCY_BASE = 0x080
+TPDO1_BASE = 0x180
+RPDO1_BASE = 0x200
+SDO_REPLY_BASE = 0x580
+SDO_REQUEST_BASE = 0x600
+HEARTBEAT_BASE = 0x700
+
+MASTER_NODE = 127
+"""Node id under which the master sends its heartbeat; the rig file keeps winches below it."""
+
+_RPDO1 = struct.Struct("<Hi")
+_TPDO1 = struct.Struct("<Hih")
+_EMCY = struct.Struct("<HB5s")
+
+
+class NmtCommand(IntEnum):
+    """Network management commands."""
+
+    START = 0x01
+    STOP = 0x02
+    PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+class NmtState(IntEnum):
+    """What a heartbeat tells."""
+
+    BOOT_UP = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+class Reply(NamedTuple):
+    """What a drive answers to a SYNC: status word, position [counts], torque [per mille]."""
+
+    status_word: int
+    position: int
+    torque: int
+
+
+class Emergency(NamedTuple):
+    """An EMCY message: error code, error register, manufacturer's bytes."""
+
+    code: int
+    register: int
+    detail: bytes
+
+
+def make_set_point(control_word: int, target: int) -> bytes:
+    """RPDO1: 6040h control word, 607Ah target [counts]; 6 bytes.
+
+    Raises:
+        struct.error: A value does not fit its object.
+    """
+    return _RPDO1.pack(control_word, target)
+
+
+def parse_set_point(data: bytes | bytearray) -> tuple[int, int] | None:
+    """Control word and target of an RPDO1; None when its length is wrong."""
+    return _RPDO1.unpack(data) if len(data) == _RPDO1.size else None
+
+
+def make_reply(status_word: int, position: int, torque: int) -> bytes:
+    """TPDO1: 6041h status word, 6064h position actual [counts], 6077h torque [per mille].
+
+    Raises:
+        struct.error: A value does not fit its object.
+    """
+    return _TPDO1.pack(status_word, position, torque)
+
+
+def parse_reply(data: bytes | bytearray) -> Reply | None:
+    """A TPDO1; None when its length is wrong."""
+    return Reply(*_TPDO1.unpack(data)) if len(data) == _TPDO1.size else None
+
+
+def make_sync() -> bytes:
+    """SYNC without a counter."""
+    return b""
+
+
+def make_heartbeat(state: NmtState) -> bytes:
+    """Heartbeat of a node in an NMT state."""
+    return bytes((state,))
+
+
+def parse_heartbeat(data: bytes | bytearray) -> int | None:
+    """The NMT state in a heartbeat (toggle bit dropped); None when its length is wrong."""
+    return data[0] & 0x7F if len(data) == 1 else None
+
+
+def make_nmt(command: NmtCommand, node: int) -> bytes:
+    """NMT command to one node, or to all with node 0."""
+    return bytes((command, node))
+
+
+def make_emergency(code: int, register: int, detail: bytes = b"") -> bytes:
+    """EMCY message; ``detail`` is filled up to five bytes."""
+    return _EMCY.pack(code, register, detail)
+
+
+def parse_emergency(data: bytes | bytearray) -> Emergency | None:
+    """An EMCY message; None when its length is wrong."""
+    return Emergency(*_EMCY.unpack(data)) if len(data) == _EMCY.size else None
+
+
+# The frames that a master sends every cycle, built once and filled each time. No bus.
+
+
+class CyclicFrames:
+    """One set-point a drive, SYNC, and the master's sign of life.
+
+    Attributes:
+        sync: The frame at which set-points begin to count.
+        heartbeat: The master's sign of life.
+    """
+
+    def __init__(self, nodes: Sequence[int]) -> None:
+        """Takes the node ids in the order of the winches."""
+        rest = make_set_point(ControlWord.QUICK_STOP, 0)
+        self._set_points = [SentFrame(RPDO1_BASE + node, rest) for node in nodes]
+        self.sync = SentFrame(SYNC_ID, make_sync())
+        alive = make_heartbeat(NmtState.OPERATIONAL)
+        self.heartbeat = SentFrame(HEARTBEAT_BASE + MASTER_NODE, alive)
+
+    def set_points(
+        self, words: Sequence[ControlWord], targets: Sequence[int]
+    ) -> Sequence[can.Message]:
+        """One set-point a drive.
+
+        Raises:
+            struct.error: A target does not fit 32 bits.
+        """
+        for message, word, target in zip(self._set_points, words, targets, strict=True):
+            message.data = bytearray(make_set_point(word, target))
+        return self._set_points

@@ -1,0 +1,56 @@
+"""Drive profiles: those that cdpr brings along, the lab's own, and which one a rig file names.
+
+A profile is a YAML file (`model.files.drive_profile_file`), one of ours in
+``drivers/cia402/profiles`` or the lab's own; ``drives.profile`` of the rig file names it.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from model.errors import BadInput
+from model.files.documents import load_yaml
+from model.files.drive_profile_file import ProfileDocument
+from model.files.rig_file import Cia402Document
+from model.rig import Rig
+
+FOLDER = Path(__file__).parent / "profiles"
+
+
+def profile_names() -> tuple[str, ...]:
+    """The profiles that cdpr brings along."""
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
+
+
+def load_profile(name: str) -> ProfileDocument:
+    """One of cdpr's profiles by its name, or the file of that path.
+
+    Raises:
+        BadInput: There is no such profile, or the file cannot be read.
+        InvalidFile: With everything that is wrong with the file.
+    """
+    return _loaded(name)
+
+
+@lru_cache(maxsize=16)
+def _loaded(name: str) -> ProfileDocument:
+    if name in profile_names():
+        return load_yaml(FOLDER / f"{name}.yaml", ProfileDocument)
+    if name.endswith((".yaml", ".yml")):
+        return load_yaml(Path(name), ProfileDocument)
+    raise BadInput(
+        f"there is no drive profile {name!r}",
+        where="drives.profile",
+        next_step=f"use one of {', '.join(profile_names())}, or the path of your own YAML file",
+    )
+
+
+def profile_of(rig: Rig) -> ProfileDocument:
+    """The profile that a rig file names.
+
+    Raises:
+        BadInput: There is none of that name, or its file is wrong.
+    """
+    drives = rig.document.drives
+    return load_profile(drives.profile if isinstance(drives, Cia402Document) else "cia402")

@@ -1,0 +1,212 @@
+"""SDO requests to many drives at once, beside the cycle: one at a time for each. No bus, no clock.
+
+`drivers.cia402.sdo` waits for every answer, which a loop that keeps SYNC going cannot do. Values of
+up to four bytes only; source: CiA 301, 7.2.4 (expedited transfer).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+from drivers.cia402.pdo import SDO_REQUEST_BASE
+
+REQUESTS_A_CYCLE = 1
+"""SDO requests beside a cycle: as much as fits on a bus that others fill to nine tenths."""
+
+ASKED_AGAIN_AFTER = 0.5
+"""Without an answer to an SDO request, [s]; slower drives answer twice, which does no harm."""
+
+MODE_WAIT = 0.5
+"""So long an enabled drive may take to show its mode, beside the time of its SDO answer, [s]."""
+
+LOOK_TIMEOUT = 2.0
+"""For all answers of a look, [s]."""
+
+CSP_MODE = 8
+"""Cyclic synchronous position."""
+
+_DOWNLOAD = {1: 0x2F, 2: 0x2B, 4: 0x23}
+_UPLOAD = 0x40
+_DOWNLOADED, _ABORTED = 0x60, 0x80
+_UPLOADED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4}
+_LENGTH = 8
+
+#: Abort codes that say that there is no such object.
+ABSENT = frozenset({0x06020000, 0x06090011})
+
+
+@dataclass(frozen=True, slots=True)
+class SdoRequest:
+    """One object to write, or to read where there is no data.
+
+    Attributes:
+        index: Object index.
+        sub: Sub-index.
+        data: To write, 1, 2 or 4 bytes; empty to read.
+    """
+
+    index: int
+    sub: int
+    data: bytes = b""
+
+    def frame(self) -> bytes:
+        """The request."""
+        command = _DOWNLOAD[len(self.data)] if self.data else _UPLOAD
+        head = bytes((command, self.index & 0xFF, self.index >> 8, self.sub))
+        return head + self.data.ljust(4, b"\0")
+
+
+#: What a drive says of itself: status word, position [counts] and torque [per mille].
+STANDING = (SdoRequest(0x6041, 0), SdoRequest(0x6064, 0), SdoRequest(0x6077, 0))
+
+
+#: What makes a drive watch its master no more: heartbeat (the first consumer entry), set-points,
+#: and SYNC last. The heartbeats of other drives go on, and so does the watch of them.
+MONITORING_OFF = (
+    SdoRequest(0x1016, 1, bytes(4)),
+    SdoRequest(0x1400, 5, bytes(2)),
+    SdoRequest(0x1006, 0, bytes(4)),
+)
+
+
+MODE_DISPLAY = SdoRequest(0x6061, 0)
+
+
+class SdoJobs:
+    """Requests that wait, the one under way for each drive, and what was answered.
+
+    Attributes:
+        values: What was read, by node and job.
+        failed: What a drive refused to write or read, by node and job, with its abort code.
+    """
+
+    def __init__(self, jobs: Mapping[int, Iterable[SdoRequest]], again_after: int) -> None:
+        """Nothing is asked yet.
+
+        Args:
+            jobs: Of each node, in the order of sending.
+            again_after: Turns without an answer after which a request is sent again: requests and
+                answers get lost.
+        """
+        self._again_after = again_after
+        self._turns: dict[int, int] = {}
+        self._waiting = {node: deque(of_node) for node, of_node in jobs.items()}
+        self._asked: dict[int, SdoRequest] = {}
+        self.values: dict[tuple[int, SdoRequest], int] = {}
+        self.failed: dict[tuple[int, SdoRequest], int] = {}
+
+    def unfinished(self) -> set[int]:
+        """Nodes that have not answered everything."""
+        return {node for node, waiting in self._waiting.items() if waiting} | set(self._asked)
+
+    @property
+    def is_asking(self) -> bool:
+        """An answer is awaited."""
+        return bool(self._asked)
+
+    def next_requests(self, most: int) -> list[tuple[int, bytes]]:
+        """Identifier and data of requests to send in this turn, one a drive at most.
+
+        Args:
+            most: How many.
+        """
+        requests: list[tuple[int, bytes]] = []
+        for node, waiting in self._waiting.items():
+            if len(requests) == most:
+                break
+            if node in self._asked:
+                self._turns[node] += 1
+                if self._turns[node] % self._again_after:
+                    continue
+            elif waiting:
+                self._asked[node], self._turns[node] = waiting.popleft(), 0
+            else:
+                continue
+            requests.append((SDO_REQUEST_BASE + node, self._asked[node].frame()))
+        return requests
+
+    def take(self, node: int, data: bytes | bytearray) -> None:
+        """Takes in an answer; one to another question, or a late one, counts for nothing."""
+        job = self._asked.get(node)
+        if job is None or len(data) != _LENGTH:
+            return
+        if int.from_bytes(data[1:3], "little") != job.index or data[3] != job.sub:
+            return
+        if data[0] == _ABORTED:
+            self.failed[node, job] = int.from_bytes(data[4:8], "little")
+        elif job.data and data[0] == _DOWNLOADED:
+            pass
+        elif not job.data and data[0] in _UPLOADED:
+            self.values[node, job] = int.from_bytes(data[4 : 4 + _UPLOADED[data[0]]], "little")
+        else:
+            return
+        del self._asked[node]
+
+
+class AnswerListener:
+    """Hears drives until every request under way is answered; a `drivers.cyclic_group.Listener`."""
+
+    def __init__(self, take: Callable[..., None], jobs: SdoJobs) -> None:
+        """Frames are handed to ``take``, which knows the jobs."""
+        self._jobs, self.take = jobs, take
+
+    @property
+    def complete(self) -> bool:
+        """No answer is awaited."""
+        return not self._jobs.is_asking
+
+
+def mode_text(name: str, mode: int | None) -> str:
+    """What is wrong with the mode that an enabled drive shows; None where it shows none."""
+    if mode is None:
+        return f"{name} does not say once enabled which mode it is in (6061h)"
+    return f"{name} is in mode {mode} (6061h) once enabled, not in 8 (CSP)"
+
+
+class ModeCheck:
+    """Asks enabled drives for their mode until all are in CSP, or one never was in time.
+
+    For drives that show a mode only once they are enabled; until it is known they stay on the
+    targets that they were enabled on.
+    """
+
+    def __init__(self, nodes: Iterable[int], cycles: int, again_after: int) -> None:
+        """Nothing is asked yet.
+
+        Args:
+            nodes: Of all drives.
+            cycles: That it may take.
+            again_after: As for `SdoJobs`.
+        """
+        self._modes: dict[int, int | None] = dict.fromkeys(nodes)
+        self._left, self._again_after = cycles, again_after
+        self._jobs = SdoJobs({}, again_after)
+
+    def next_requests(self, most: int) -> list[tuple[int, bytes]]:
+        """Of one cycle; see `SdoJobs.next_requests`."""
+        self._left -= 1
+        self._note_answers()
+        if not self._jobs.unfinished():
+            asked = {node: (MODE_DISPLAY,) for node in self.wrong()}
+            self._jobs = SdoJobs(asked, self._again_after)
+        return self._jobs.next_requests(most)
+
+    def take(self, node: int, data: bytes | bytearray) -> None:
+        """Takes in an answer; see `SdoJobs.take`."""
+        self._jobs.take(node, data)
+        self._note_answers()
+
+    def _note_answers(self) -> None:
+        for (node, _), mode in self._jobs.values.items():
+            self._modes[node] = mode
+
+    def wrong(self) -> dict[int, int | None]:
+        """Nodes that are in another mode, or have not answered (None)."""
+        return {node: mode for node, mode in self._modes.items() if mode != CSP_MODE}
+
+    @property
+    def is_overdue(self) -> bool:
+        """No time is left."""
+        return self._left <= 0

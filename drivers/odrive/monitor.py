@@ -1,0 +1,192 @@
+"""What ODrives told, how long ago, and what of it is a fault of the group. No bus, no clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from drivers.odrive.configure import HEARTBEATS_WAITED
+from drivers.odrive.dbc import Layout, Layouts
+from drivers.odrive.messages import AxisState, can_id, error_text, status_word
+from drivers.plausibility import ReplyCheck
+from model.files.rig_file import OdriveDocument
+from model.rig import Rig
+
+SPARE_CYCLES = 1
+"""Drives keep their own time: a message may come a cycle later than its period says."""
+
+MISSED_TORQUES = 3
+"""Cycles beyond that without a torque; how long positions may stay away is the executor's to say
+(`executor.safety.monitor`)."""
+
+NEVER = 10**6
+
+
+class OdriveWatch:
+    """The last word of every drive: heartbeats, estimates, torques.
+
+    Attributes:
+        states: Axis states.
+        errors: Axis errors.
+        results: Procedure results.
+        positions: [counts].
+        torques: As the drives tell them, [N·m].
+    """
+
+    def __init__(
+        self, rig: Rig, document: OdriveDocument, layouts: Layouts, max_steps: Sequence[float]
+    ) -> None:
+        """Takes the farthest each drive can turn in a cycle, [counts]."""
+        count, cycle_ms = rig.cable_count, rig.document.bus.cycle_ms
+        self.nodes = tuple(winch.node_id for winch in rig.winches)
+        self.states, self.errors, self.results = [0] * count, [0] * count, [0] * count
+        self.positions, self.torques = [0] * count, [0.0] * count
+        self._names = rig.drive_names
+        self._per_turn = [winch.counts_per_turn for winch in rig.winches]
+        self._check = ReplyCheck(rig.drive_names, max_steps)
+        self._fresh = [False] * count
+        self._layouts = layouts
+        # Cycles since each kind of message came, and how many there may be.
+        self._ages = {kind: [NEVER] * count for kind in ("heartbeat", "position", "torque")}
+        self._most = {
+            "heartbeat": math.ceil(HEARTBEATS_WAITED * document.heartbeat_ms / cycle_ms),
+            "position": math.ceil(document.estimates_ms / cycle_ms) + SPARE_CYCLES,
+            "torque": math.ceil(document.torques_ms / cycle_ms) + SPARE_CYCLES,
+        }
+        self._routes: dict[int, tuple[int, Layout, Callable[[int, tuple[float, ...]], None]]] = {}
+        for drive, node in enumerate(self.nodes):
+            for layout, note in (
+                (layouts.heartbeat, self._heartbeat),
+                (layouts.get_encoder_estimates, self._estimate),
+                (layouts.get_torques, self._torque),
+            ):
+                self._routes[can_id(node, layout.command)] = drive, layout, note
+
+    @property
+    def window(self) -> int:
+        """Cycles back to the oldest set-point that the newest position may belong to."""
+        return self._most["position"] + 1
+
+    @property
+    def rejected(self) -> int:
+        """Frames thrown away because their length or their content could not be true."""
+        return self._check.rejected
+
+    @property
+    def complete(self) -> bool:
+        """Every drive has told a position in this cycle."""
+        return all(self._fresh)
+
+    @property
+    def missing(self) -> list[bool]:
+        """Drives whose last position is older than it may be."""
+        return [age > self._most["position"] for age in self._ages["position"]]
+
+    @property
+    def status_words(self) -> list[int]:
+        """The state of each axis as one number."""
+        return [status_word(s, e) for s, e in zip(self.states, self.errors, strict=True)]
+
+    def begin_cycle(self) -> None:
+        """From now on messages count for a new cycle."""
+        self._check.begin_cycle()
+        self._fresh = [False] * len(self.nodes)
+
+    def end_cycle(self) -> None:
+        """A cycle is over: everything is one cycle older."""
+        self._check.end_cycle()
+        for ages in self._ages.values():
+            ages[:] = [age + 1 for age in ages]
+
+    def forget_positions(self) -> None:
+        """The drives may have been moved since: their next positions are believed as they come."""
+        self._check.forget_positions()
+        self._ages["position"] = [NEVER] * len(self.nodes)
+
+    def forget_heartbeats(self) -> None:
+        """What drives say of their state counts only from now on."""
+        self._ages["heartbeat"] = [NEVER] * len(self.nodes)
+
+    @property
+    def states_known(self) -> bool:
+        """Every drive has sent a heartbeat since they were forgotten, and none is overdue."""
+        return all(age <= self._most["heartbeat"] for age in self._ages["heartbeat"])
+
+    def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
+        """Takes in one frame; drives send when it is their time, so the newest always counts."""
+        route = self._routes.get(can_id)
+        if route is None:
+            return
+        drive, layout, note = route
+        values = layout.unpack(data)
+        if values is None:
+            if data:  # without data it is a question of another program
+                self._check.reject(drive, f"its {layout.name} has {len(data)} bytes instead of 8")
+        else:
+            note(drive, values)
+
+    def in_state(self, state: AxisState) -> bool:
+        """Whether every axis is in a state."""
+        return all(known == state for known in self.states)
+
+    def any_enabled(self) -> bool:
+        """Whether an axis follows set-points, or may do so."""
+        return AxisState.CLOSED_LOOP_CONTROL in self.states
+
+    def faults(self, *, powered: bool, enabled: bool) -> list[tuple[int, str]]:
+        """What is wrong with the drives as they stand, by node.
+
+        Args:
+            powered: The group is under power or on its way there; silence is a fault then.
+            enabled: Every axis was enabled and must be so.
+        """
+        found = [
+            (node, f"{self._names[node]}: {error_text(errors)}")
+            for node, errors in zip(self.nodes, self.errors, strict=True)
+            if errors
+        ]
+        if enabled:
+            found += [
+                (
+                    node,
+                    f"{self._names[node]} was disarmed; its brake holds (axis state {state})",
+                )
+                for node, state in zip(self.nodes, self.states, strict=True)
+                if state != AxisState.CLOSED_LOOP_CONTROL
+            ]
+        return found + (self._silent() + self._check.faults() if powered else [])
+
+    def _silent(self) -> list[tuple[int, str]]:
+        found: list[tuple[int, str]] = []
+        for drive, node in enumerate(self.nodes):
+            late = {kind: self._ages[kind][drive] - self._most[kind] for kind in self._most}
+            if late["heartbeat"] > 0:
+                found.append((node, f"{self._names[node]}: its heartbeat is missing"))
+            if late["torque"] > MISSED_TORQUES:
+                found.append((node, f"{self._names[node]} does not tell its torque"))
+        return found
+
+    def _heartbeat(self, drive: int, values: tuple[float, ...]) -> None:
+        errors, state, result = values
+        self.errors[drive], self.states[drive] = int(errors), int(state)
+        self.results[drive] = int(result)
+        self._ages["heartbeat"][drive] = 0
+
+    def _estimate(self, drive: int, values: tuple[float, ...]) -> None:
+        turns, _ = values
+        if not math.isfinite(turns):
+            self._check.reject(drive, "its position is not a number")
+            return
+        position = round(turns * self._per_turn[drive])
+        if self._check.believed(drive, position):
+            self.positions[drive] = position
+            self._ages["position"][drive] = 0
+            self._fresh[drive] = True
+
+    def _torque(self, drive: int, values: tuple[float, ...]) -> None:
+        _, torque = values
+        if not math.isfinite(torque):
+            self._check.reject(drive, "its torque is not a number")
+            return
+        self.torques[drive] = torque
+        self._ages["torque"][drive] = 0

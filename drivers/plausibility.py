@@ -1,0 +1,172 @@
+"""Which replies of drives are believed: right length, one a cycle, no jump. No bus, no clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import BadInput, Refused
+from model.rig import Rig
+from model.winches import WinchMap
+
+BAD_CYCLES = 2
+"""Cycles in a row that are one too many: one bad frame may happen, two are a defect."""
+
+JUMP_RESERVE, JUMP_COUNTS = 4.0, 8.0
+"""A position that changes this much faster than its winch may turn is no position; a few counts to
+and fro are, however coarse the encoder."""
+
+
+def largest_steps(rig: Rig, cycle: float) -> tuple[float, ...]:
+    """How far each drive's position can change in a cycle [s], [counts]."""
+    fastest = [w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches]
+    return tuple(max(JUMP_COUNTS, JUMP_RESERVE * step) for step in fastest)
+
+
+class ReplyCheck:
+    """Looks at every reply before it counts.
+
+    Attributes:
+        rejected: Replies that were not believed, of all drives.
+    """
+
+    def __init__(self, names: Mapping[int, str], max_steps: Sequence[float]) -> None:
+        """Takes names by node id, and how far each position can change in a cycle, [counts]."""
+        count = len(names)
+        self.rejected = 0
+        self._names, self._max_steps = tuple(names.items()), tuple(max_steps)
+        self._positions: list[int | None] = [None] * count
+        self._age = [1] * count
+        self._heard = [0] * count
+        self._reasons: list[str] = [""] * count
+        self._bad_cycles = [0] * count
+        self._repeats = [0] * count
+
+    def forget_positions(self) -> None:
+        """The next position of each drive is believed whatever it is."""
+        self._positions = [None] * len(self._names)
+
+    def begin_cycle(self) -> None:
+        """Counts who answered the last SYNC more than once, up to now, when the next one goes."""
+        self._repeats = [
+            repeats + 1 if heard > 1 else 0
+            for repeats, heard in zip(self._repeats, self._heard, strict=True)
+        ]
+        self._heard = [0] * len(self._names)
+        self._reasons = [""] * len(self._names)
+
+    def hear(self, drive: int) -> None:
+        """Notes that a drive answered, in time or late."""
+        self._heard[drive] += 1
+
+    def believed(self, drive: int, position: int) -> bool:
+        """Whether a position [counts] can be true; it then counts as the drive's."""
+        last = self._positions[drive]
+        if last is not None:
+            step, allowed = abs(position - last), self._max_steps[drive] * self._age[drive]
+            if step > allowed:
+                text = f"its position jumped by {step} counts, at most {allowed:.0f} are possible"
+                self.reject(drive, text)
+                return False
+        self._reasons[drive] = ""
+        self._positions[drive] = position
+        self._age[drive] = 0
+        return True
+
+    def reject(self, drive: int, reason: str) -> None:
+        """A reply was thrown away."""
+        self.rejected += 1
+        self._reasons[drive] = reason
+
+    def end_cycle(self) -> None:
+        """Counts the cycles in which a drive sent nothing that could be believed."""
+        self._age = [age + 1 for age in self._age]
+        self._bad_cycles = [
+            bad + 1 if reason else 0
+            for bad, reason in zip(self._bad_cycles, self._reasons, strict=True)
+        ]
+
+    def faults(self) -> list[tuple[int, str]]:
+        """Drives whose answers cannot be relied on, by node."""
+        found = [
+            (node, f"{name}: {reason}, {bad} cycles in a row")
+            for (node, name), reason, bad in zip(
+                self._names, self._reasons, self._bad_cycles, strict=True
+            )
+            if bad >= BAD_CYCLES
+        ]
+        found += [
+            (node, f"{name} answers twice: two devices have this node id")
+            for (node, name), repeats in zip(self._names, self._repeats, strict=True)
+            if repeats >= BAD_CYCLES
+        ]
+        return found
+
+
+# How far a winch's drive may ever have to turn.
+
+
+def position_limits(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[int, int]:
+    """Software limits: positions with the platform anywhere in its workspace, any way turned.
+
+    Raises:
+        BadInput: They do not fit the 32-bit position of the drive.
+    """
+    outlet, reach = rig.outlets[drive], float(np.linalg.norm(rig.anchors[drive]))
+    wrapped = 2.0 * math.pi * rig.pulley_radius
+    nearest = np.clip(outlet, rig.workspace_lower, rig.workspace_upper)
+    middle = (rig.workspace_lower + rig.workspace_upper) / 2.0
+    farthest = np.where(outlet > middle, rig.workspace_lower, rig.workspace_upper)
+    shortest = max(0.0, float(np.linalg.norm(outlet - nearest)) - reach)
+    longest = float(np.linalg.norm(outlet - farthest)) + reach + wrapped
+    lengths = np.zeros((2, rig.cable_count))
+    lengths[:, drive] = shortest, longest
+    tensions = np.array([[rig.max_tension], [0.0]])
+    ends = winch_map.counts(winch_map.unstrained(lengths, tensions))[:, drive]
+    low, high = math.floor(min(ends)), math.ceil(max(ends))
+    if low < -(2**31) or high >= 2**31:
+        raise BadInput(
+            f"positions from {low} to {high} counts do not fit the drive's 32 bits",
+            where=f"rig {rig.name}: winches[{drive}]",
+            next_step="choose home_counts nearer to 0, or fewer counts a metre of cable",
+        )
+    return low, high
+
+
+def require_within_limits(rig: Rig, positions: Sequence[int]) -> None:
+    """Refuses to enable a drive beyond its position limits: it would run to them.
+
+    Args:
+        rig: The robot.
+        positions: Of all drives, [counts].
+
+    Raises:
+        Refused: A drive is beyond its limits (607Dh).
+    """
+    winch_map, names = WinchMap(rig), rig.drive_names
+    for drive, (node, position) in enumerate(zip(names, positions, strict=True)):
+        low, high = position_limits(rig, drive, winch_map)
+        if not low <= position <= high:
+            raise Refused(
+                f"{names[node]} is at {position} counts, beyond its position limits of {low} and"
+                f" {high}",
+                where="drive group",
+                why="once enabled it would run to its limit (607Dh)",
+                next_step="set the drives up for where they are, or reference them with"
+                " `cdpr home RIG`; nothing was enabled",
+                values={"node": node},
+            )
+
+
+# The sign of a motor's torque: a winch pulls its cable in, whichever way its counts run.
+
+
+def winding_signs(rig: Rig) -> NDArray[np.int64]:
+    """Sign of counts, speed and torque in a drive that winds its cable in, shape (m,).
+
+    A motor that holds a taut cable has torque of this sign: −1 where positive counts pay out.
+    """
+    return np.array([-1 if w.counts_per_metre > 0 else 1 for w in rig.winches], dtype=np.int64)

@@ -1,0 +1,77 @@
+"""How far the platform goes on when the master is lost: what the clearance of a plan must hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from model.errors import Refused
+from model.files.rig_file import Cia402Document, OdriveDocument
+from model.rig import Rig
+
+
+@dataclass(frozen=True, slots=True)
+class LostMaster:
+    """What drives do without their master.
+
+    Attributes:
+        noticed_by: What stays away: SYNC, the heartbeat, or set-points.
+        notice: Until the last drive begins to stop, [s].
+        ramp: Until it stands then, [s].
+        distance: How far the platform goes meanwhile at the rig's speed along the path, [m].
+    """
+
+    noticed_by: str
+    notice: float
+    ramp: float
+    distance: float
+
+
+def lost_master(rig: Rig) -> LostMaster:
+    """From the rig file and its drive profile.
+
+    Drives that interpolate may go on at their last speed until they notice, and then slow down
+    evenly, so the distance is speed × (notice + ramp / 2).
+
+    Raises:
+        BadInput: There is no such profile, or its file is wrong.
+    """
+    cycle = rig.document.bus.cycle_ms / 1000.0
+    drives = rig.document.drives
+    if isinstance(drives, Cia402Document):
+        # canopen drives only: their objects are not loaded for others
+        from drivers.cia402.object_dictionary import lost_master_times
+
+        noticed_by, notice, ramp = lost_master_times(rig)
+    else:
+        noticed_by, notice, ramp = "set-points", _watchdog(drives), cycle
+    distance = rig.motion.speed * (notice + 0.5 * ramp)
+    return LostMaster(noticed_by, notice, ramp, distance)
+
+
+def _watchdog(drives: OdriveDocument) -> float:
+    """Without one nothing is armed."""
+    return (drives.watchdog_ms or 0.0) / 1000.0
+
+
+def require_stopping_room(rig: Rig, clearance: float) -> None:
+    """A platform whose master is lost stands before it touches anything.
+
+    Args:
+        rig: The robot.
+        clearance: Proved along the whole path, [m]; infinite without obstacles.
+
+    Raises:
+        Refused: The clearance is smaller than the distance to a stop.
+    """
+    lost = lost_master(rig)
+    if not clearance < lost.distance:
+        return
+    raise Refused(
+        f"the path comes within {clearance * 1000:.1f} mm of an obstacle; without the master the"
+        f" platform goes on for up to {lost.distance * 1000:.1f} mm",
+        where="set-point table",
+        why=f"the drives notice by {lost.noticed_by} alone after {lost.notice * 1000:.0f} ms, at"
+        f" {rig.motion.speed * 1000:g} mm/s",
+        next_step="plan with a larger clearance, or lower motion.speed_mm_s; nothing was armed",
+        values={"clearance_mm": clearance * 1000.0, "distance_mm": lost.distance * 1000.0},
+    )

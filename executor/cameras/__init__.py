@@ -1,0 +1,1 @@
+"""Cameras during a run, each in a process of its own."""

@@ -1,0 +1,197 @@
+"""Opens the cameras of a run, real or synthetic, each in its own process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.cameras.live import LiveCamera
+from executor.cameras.client import CameraClient, wait_until_ready
+from executor.cameras.multi_camera import RunCameras
+from executor.cameras.process import CameraProcess
+from executor.cameras.sources import SYNTHETIC
+from executor.cameras.static_pose import looks_at_rest
+from executor.cameras.worker import CameraWorker, FrameRequest, PictureSource
+from executor.kernels import ready_for_camera_processes, ready_to_measure
+from executor.operator_requests import RequestBoard
+from executor.recording.run_folder import RunFolder
+from model.clearance import ClearanceModel
+from model.errors import Fault, StoppedByOperator
+from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument
+from model.pose import Pose
+from model.progress import Listener
+from model.rig import Camera, Rig, rig_from_document
+from model.scene import Scene, nothing_in_the_way, scene_from_document
+from tracking.measurement import Observation
+
+if TYPE_CHECKING:  # a real camera loads no simulator
+    from simulation.camera.camera import Film
+
+#: About so many pictures of a run are kept for its report.
+KEPT_PICTURES = 12
+
+
+@contextmanager
+def open_cameras(
+    rig: Rig,
+    scene: Scene,
+    eyes: Mapping[Camera, str],
+    folder: Path,
+    pictures: int,
+    board: RequestBoard,
+    *,
+    simulated_time: bool,
+    listener: Listener,
+) -> Iterator[RunCameras | None]:
+    """Starts a process for each camera; None without one.
+
+    Args:
+        rig: The robot.
+        scene: What the cameras see beside it.
+        eyes: From `resolve_cameras`.
+        folder: The run folder.
+        pictures: How many are expected of each; some of them are kept.
+        board: A stop that is wished here ends the opening.
+        simulated_time: A late picture holds the run up instead of being dropped.
+        listener: Receives that it waits.
+
+    Raises:
+        StoppedByOperator: A stop was wished before all were open.
+        CdprError: A camera cannot be used, for the reason told.
+    """
+    if not eyes:
+        yield None
+        return
+    keep_every = max(1, pictures // KEPT_PICTURES)
+    ready_for_camera_processes(listener)
+    with ExitStack() as stack:
+        processes = {}
+        for camera, source in eyes.items():
+            place = (camera.name, source, folder, keep_every)
+            make = partial(make_observer, rig.document, scene.document, *place, named=len(eyes) > 1)
+            process = CameraProcess(camera.name, make, may_wait=simulated_time)
+            stack.callback(process.close)
+            processes[camera] = process
+        names = ", ".join(camera.name for camera in eyes)
+        with listener.waiting(f"opening camera {names}"):
+            wait_until_ready(list(processes.values()), partial(require_no_stop, board))
+        yield RunCameras(
+            [CameraClient(process, eyes[camera]) for camera, process in processes.items()],
+            ClearanceModel(rig, scene),
+            scene.obstacle_clearance,
+            asked_rate(eyes),
+        )
+
+
+def asked_rate(eyes: Mapping[Camera, str]) -> float:
+    """How often all cameras are asked for a picture: as often as the slowest takes one, [Hz]."""
+    return min(camera.rate for camera in eyes)
+
+
+def require_no_stop(board: RequestBoard) -> None:
+    """The last look at the board before something is begun.
+
+    Raises:
+        StoppedByOperator: A stop is wished.
+    """
+    if board.read().stop:
+        raise StoppedByOperator(
+            "stopped before anything moved", next_step="run it again when all is well"
+        )
+
+
+def make_observer(
+    rig_document: RigDocument,
+    scene_document: SceneDocument,
+    camera_name: str,
+    source: str,
+    folder: Path | None,
+    keep_every: int,
+    *,
+    named: bool,
+) -> CameraWorker:
+    """Builds the observer inside its camera's process."""
+    rig, scene = rig_from_document(rig_document), scene_from_document(scene_document)
+    camera = rig.camera(camera_name)
+    ready_to_measure()
+    pictures = _source(rig, scene, camera, source)
+    kept = None if folder is None else RunFolder(folder)
+    return CameraWorker(rig, camera, pictures, kept, keep_every, named=named)
+
+
+def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
+    if name == SYNTHETIC:  # a real camera loads no simulator
+        from simulation.camera.camera import Film
+        from simulation.factory import make_synthetic_camera
+
+        return RenderedPictures(Film(make_synthetic_camera(rig, scene, camera)))
+    return LivePictures(LiveCamera(name, camera))
+
+
+class RenderedPictures:
+    """The synthetic camera as the run's source of pictures."""
+
+    def __init__(self, film: Film) -> None:
+        self._film = film
+
+    def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
+        """Renders the platform where it truly is."""
+        if trigger.true_pose is None:
+            raise Fault("the synthetic camera was not told where the platform is")
+        return self._film.picture(trigger.time, trigger.true_pose, trigger.frame), 0.0
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+class LivePictures:
+    """A real camera as the run's source of pictures."""
+
+    def __init__(self, camera: LiveCamera) -> None:
+        self._camera = camera
+
+    def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
+        """The next picture, and how long after the trigger it arrived."""
+        frame = self._camera.read()
+        return frame.image, frame.time - trigger.asked
+
+    def close(self) -> None:
+        """Lets go of the camera."""
+        self._camera.close()
+
+
+def look_at_rest(
+    rig: Rig,
+    eye: tuple[Camera, str],
+    pictures: int,
+    true_pose: Pose | None,
+    unless_stopped: Callable[[], None],
+    listener: Listener,
+) -> list[Observation]:
+    """Opens the camera, takes pictures of a platform that stands still, measures each.
+
+    Args:
+        rig: The robot.
+        eye: From `choose_one_camera`.
+        pictures: How many.
+        true_pose: Where the simulated platform is.
+        unless_stopped: Called all the while; what it raises ends the looking.
+        listener: Receives that the camera opens.
+    """
+    camera, source = eye
+    scene = nothing_in_the_way(rig).document
+    make = partial(
+        make_observer, rig.document, scene, camera.name, source, None, pictures, named=False
+    )
+    period = 1.0 / camera.rate if source == SYNTHETIC else None
+    with closing(CameraProcess(camera.name, make, may_wait=False)) as process:
+        with listener.waiting(f"opening camera {camera.name}"):
+            wait_until_ready([process], unless_stopped)
+        return looks_at_rest(process, pictures, period, true_pose, unless_stopped)

@@ -1,0 +1,251 @@
+"""Which of the rig's cameras look at it, and where the pictures of each come from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from model.errors import BadInput
+from model.rig import Camera, Rig
+
+SYNTHETIC = "synthetic"
+
+CameraChoice = str | Sequence[str] | Mapping[str, str | int] | None
+"""``synthetic`` for all cameras of the rig file, one source, ``NAME=SOURCE`` for each of several, a
+mapping from names to sources, an empty one for no camera; None for the default: all synthetic where
+the drives are simulated in this process, an error on a bus."""
+
+
+def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool) -> str | None:
+    """Where pictures come from: ``synthetic``, a camera's index or address, or None.
+
+    Raises:
+        BadInput: The wish cannot be met; nothing is left out silently.
+    """
+    if without:
+        if wanted is not None:
+            raise BadInput(
+                "--camera and --no-camera contradict each other", next_step="leave one of them out"
+            )
+        return None
+    if not rig.cameras or not rig.platform_tags:
+        raise BadInput(
+            "the rig file has no camera or no tags",
+            where=rig.name,
+            next_step="add cameras and tags to the rig file, or pass --no-camera",
+        )
+    if wanted is None:
+        if not in_process:
+            raise BadInput(
+                "no camera was named",
+                where="--camera",
+                why="the drives are not simulated in this process, so no picture can be rendered",
+                next_step="pass --camera INDEX for a real camera, or --no-camera",
+            )
+        return SYNTHETIC
+    if wanted == SYNTHETIC and not in_process:
+        raise BadInput(
+            "the synthetic camera needs drives that are simulated in this process",
+            where="--camera",
+            next_step="use the interface 'virtual', a real camera, or --no-camera",
+        )
+    if wanted != SYNTHETIC:
+        _require_live(wanted)
+    return wanted
+
+
+def _require_live(source: str) -> None:
+    """What was recorded shows nothing of a platform that moves now."""
+    if not is_camera(source):
+        raise BadInput(
+            f"{source!r} is no camera",
+            where="--camera",
+            why="pictures must be taken while the platform moves; a file or a folder has others",
+            next_step="name an index such as 0, a device such as /dev/video0, or an address",
+        )
+
+
+def choose_cameras(
+    rig: Rig, wanted: list[str], without: bool, in_process: bool
+) -> dict[Camera, str]:
+    """Which of the rig's cameras look at a run, and where the pictures of each come from.
+
+    Args:
+        rig: Its cameras.
+        wanted: One source, or for each of several cameras ``NAME=SOURCE``; ``synthetic`` alone, as
+            nothing at all, stands for all of them.
+        without: No camera is wanted.
+        in_process: The drives are simulated in this process.
+
+    Raises:
+        BadInput: The wish cannot be met; nothing is left out silently.
+    """
+    if not wanted:
+        source = choose_camera(rig, None, without, in_process)
+        return {} if source is None else dict.fromkeys(rig.cameras, source)
+    if wanted == [SYNTHETIC]:
+        choose_camera(rig, SYNTHETIC, without, in_process)
+        return dict.fromkeys(rig.cameras, SYNTHETIC)
+    if rig.cameras:
+        eyes = parse_camera_sources(rig, wanted, None, "--camera")
+        for source in eyes.values():
+            choose_camera(rig, source, without, in_process)
+        return eyes
+    choose_camera(rig, wanted[0], without, in_process)
+    return {}
+
+
+def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Camera, str]:
+    """The cameras of a run, from what a caller of the library names.
+
+    Args:
+        rig: Its cameras.
+        wanted: See `CameraChoice`.
+        in_process: The drives are simulated in this process.
+
+    Raises:
+        BadInput: As for `choose_cameras`.
+    """
+    if wanted is None:
+        return choose_cameras(rig, [], False, in_process)
+    if isinstance(wanted, str):
+        return choose_cameras(rig, [wanted], False, in_process)
+    if isinstance(wanted, Mapping):
+        wanted = [f"{name}={source}" for name, source in wanted.items()]
+    return choose_cameras(rig, list(wanted), not wanted, in_process)
+
+
+def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:
+    """The one camera that measures a platform at rest, and where its pictures come from.
+
+    Args:
+        rig: Its cameras.
+        wanted: One source, or ``NAME=SOURCE``.
+        in_process: The drives are simulated in this process.
+
+    Raises:
+        BadInput: There are several, or the wish cannot be met.
+    """
+    if len(wanted) != 1:
+        raise BadInput(
+            f"{len(wanted)} cameras are named, and one measures",
+            where="--camera",
+            next_step="name the one that sees the most tags, from the nearest",
+        )
+    ((camera, source),) = parse_camera_sources(rig, wanted, None, "--camera").items()
+    choose_camera(rig, source, False, in_process)
+    return camera, source
+
+
+def parse_camera_sources(
+    rig: Rig, sources: list[str], wanted: str | None, where: str = "track"
+) -> dict[Camera, str]:
+    """Which camera's pictures come from where.
+
+    Args:
+        rig: Its cameras.
+        sources: One source, or for each of several cameras ``NAME=SOURCE``.
+        wanted: The camera of a single source; None for the rig's first.
+        where: What names the sources, for messages.
+
+    Raises:
+        BadInput: A camera is not the rig's, is named twice, or not at all.
+    """
+    names = [camera.name for camera in rig.cameras]
+    if len(sources) == 1 and _is_unnamed(sources[0], names):
+        return {rig.camera(wanted): sources[0]}
+    if wanted is not None:
+        raise BadInput(
+            "--camera is for a single source without a name",
+            where=where,
+            next_step="leave it out, or name the camera in the source: NAME=SOURCE",
+        )
+    eyes: dict[Camera, str] = {}
+    for source in sources:
+        name, sign, place = source.partition("=")
+        if name in names and not place:
+            raise BadInput(
+                f"camera {name!r} has no source",
+                where=where,
+                next_step=f"write {name}=0, or what its pictures come from",
+            )
+        if not sign or "://" in name:
+            raise BadInput(
+                f"the source {source!r} does not say which camera it is of",
+                where=where,
+                next_step=f"write NAME={source}, NAME one of: {', '.join(names)}",
+            )
+        camera = rig.camera(name)
+        if camera in eyes:
+            raise BadInput(
+                f"camera {name!r} has two sources", where=where, next_step="name each camera once"
+            )
+        _require_own(place, eyes, name, where)
+        eyes[camera] = place
+    return eyes
+
+
+def _is_unnamed(source: str, names: list[str]) -> bool:
+    """Whether a source names no camera: ``0``, an address or a path, and not ``WORD=0``."""
+    word, sign, _ = source.partition("=")
+    if not sign:
+        return word not in names or Path(source).exists()
+    return "://" in word or (word not in names and Path(source).exists())
+
+
+def _require_own(place: str, eyes: Mapping[Camera, str], name: str, where: str) -> None:
+    """Two cameras cannot take the same pictures."""
+    for camera, other in eyes.items():
+        if place != SYNTHETIC and _device(place) == _device(other):
+            raise BadInput(
+                f"cameras {camera.name!r} and {name!r} have the same source {place!r}",
+                where=where,
+                next_step="give each camera its own",
+            )
+
+
+def _device(source: str) -> str:
+    """A source, the same for both names of a camera of this machine: ``0`` and ``/dev/video0``."""
+    return source.removeprefix("/dev/video")
+
+
+def require_camera_source(source: str) -> None:
+    """Refuses what can be no camera.
+
+    Raises:
+        BadInput: It is neither a number nor a device nor an address.
+    """
+    if not is_camera(source):
+        raise BadInput(
+            "neither a folder of pictures, nor a video file, nor a camera",
+            where=source,
+            next_step="check the path; a camera is an index such as 0, /dev/video0 or an address",
+        )
+
+
+def is_camera(source: str) -> bool:
+    """Whether it can be a camera: a number, a device or an address, and no file."""
+    if source.startswith("/dev/"):
+        return not (Path(source).is_file() or Path(source).is_dir())
+    return source.isdecimal() or ("://" in source and not source.startswith("file:"))
+
+
+def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
+    """In simulated time a real camera's pictures would be stamped with times that mean nothing.
+
+    Raises:
+        BadInput: ``--fast`` is given, and a source is a real camera.
+    """
+    real = [source for source in sources if source != SYNTHETIC]
+    if fast and real:
+        raise BadInput(
+            "--fast needs synthetic cameras",
+            where=f"--camera {real[0]}",
+            why="a real camera takes its pictures in real time, and the run would be over before",
+            next_step="leave --fast out, or pass --camera synthetic",
+        )
+
+
+def looked_with(eyes: Mapping[Camera, str]) -> str:
+    """The cameras of a run and their sources, in a few words."""
+    return ", ".join(f"{camera.name} ({source})" for camera, source in eyes.items())

@@ -1,0 +1,163 @@
+"""The motion of a prepared run in this process, in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from drivers.drive_group import DriveGroup
+from executor.control.loop import Loop
+from executor.control.path_job import PathMotion
+from executor.control.sync_master import SyncMaster
+from executor.interlock.interlock import MotionInterlock
+from executor.operator_requests import RequestBoard
+from executor.realtime.clock import Clock
+from executor.realtime.job import MakeDrives
+from executor.realtime.process import real_time_process
+from executor.realtime.shared_memory import SharedRequests
+from executor.recording.recorder import Recorder, RunLog
+from executor.state_machine import ON_PATH, CycleRecord, State
+from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.schedule import load_changes
+from executor.trajectory.setpoints import checked_setpoints_of
+from model.errors import CdprError
+from model.pose import Pose
+from model.progress import SILENT, Listener
+from model.scene import Load
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What the motion left behind.
+
+    Attributes:
+        state: Where the run ended.
+        cause: Why it did not finish, if it did not.
+        log: Its cycles.
+        holding: Every cable was held when the drives were last heard.
+        started: When, UTC.
+    """
+
+    state: State
+    cause: str
+    log: RunLog
+    holding: bool
+    started: datetime
+
+
+def run_in_process(
+    prepared: PreparedRun,
+    group: DriveGroup,
+    clock: Clock,
+    board: RequestBoard,
+    recorder: Recorder,
+    *,
+    true_pose: Callable[[], Pose] | None,
+    carry: Callable[[Load], None],
+    before_motion: Callable[[], None],
+) -> Outcome:
+    """Moves along the path; ends with the drives holding by themselves.
+
+    Args:
+        prepared: The checked run.
+        group: Configured drives.
+        clock: Simulated time.
+        board: What the operator wants.
+        recorder: Takes in what happens.
+        true_pose: Where the simulated platform is.
+        carry: Gives the simulated platform another load.
+        before_motion: Called when all is armed; what it raises prevents the motion.
+
+    Raises:
+        Refused: Arming was refused; nothing was enabled.
+        HardwareMissing: A drive does not answer.
+    """
+    loads = load_changes(prepared.scene, prepared.checked.table.stands)
+
+    def on_cycle(record: CycleRecord) -> None:
+        if record.state in ON_PATH:
+            for load in loads.due(record.index):
+                carry(load)
+        wanted = true_pose is not None and recorder.wants_pose(record.cycle)
+        recorder.take_cycle(record, true_pose() if wanted and true_pose else None)
+
+    loop = Loop(
+        checked_setpoints_of(prepared.checked),
+        SyncMaster(prepared.rig, group, clock),
+        wishes=board.read,
+        on_cycle=on_cycle,
+        on_event=recorder.take_event,
+    )
+    loop.arm()
+    before_motion()
+    started = datetime.now(UTC)
+    loop.run()
+    return Outcome(loop.machine.state, loop.cause, recorder.log, loop.holding, started)
+
+
+# A run along a checked path in the real-time process, from arming to its end.
+
+
+def run_in_real_time(
+    prepared: PreparedRun,
+    make_drives: MakeDrives,
+    board: SharedRequests,
+    recorder: Recorder,
+    *,
+    pose_every: int,
+    need_real_time: bool,
+    before_motion: Callable[[str], None],
+    listener: Listener = SILENT,
+) -> Outcome:
+    """Moves along the path in a process of its own; ends with the drives holding by themselves.
+
+    Args:
+        prepared: The checked run.
+        make_drives: Opens and configures the drives; called in that process; picklable.
+        board: What the operator wants.
+        recorder: Takes in what happens.
+        pose_every: Cycles from one true pose of the simulated platform to the next; 0 for none.
+        need_real_time: Refuse to arm when the system denies real-time scheduling.
+        before_motion: Called when all is armed, with what was denied; what it raises prevents the
+            motion.
+        listener: Receives what the drives cannot do.
+
+    Raises:
+        CdprError: The bus is latched, or the process could not arm the drives, for the reason told;
+            nothing was enabled.
+        StoppedByOperator: The operator wanted to stop before anything moved.
+    """
+    custody = MotionInterlock(prepared.rig)
+    reference = custody.require_ready()
+    motion = PathMotion.of(
+        checked_setpoints_of(prepared.checked),
+        pose_every=pose_every,
+        loads=load_changes(prepared.scene, prepared.checked.table.stands),
+        reference=reference,
+    )
+    with real_time_process(
+        motion, make_drives, board, need_real_time=need_real_time, listener=listener
+    ) as process:
+        denied = process.arm(recorder).denied
+        custody.begin(recorder.folder.path, reference)
+        try:
+            before_motion(denied)
+        except BaseException:
+            custody.prevented()
+            raise
+        started = datetime.now(UTC)
+        ended = process.run()
+        try:
+            custody.end(
+                ended.state,
+                ended.cause,
+                recorder.folder.path,
+                holding=ended.holding,
+                stands_at=recorder.log.last_positions,
+            )
+        except CdprError as error:  # the motion is over: its record is finished all the same
+            text = f"{error.what} ({error.where}: {error.why})"
+            process.tell("recorder", text)
+            return Outcome(State.LATCHED, ended.cause or text, recorder.log, ended.holding, started)
+        return Outcome(ended.state, ended.cause, recorder.log, ended.holding, started)

@@ -1,0 +1,194 @@
+"""Moves winches without a path: pretension, and one cable alone. The rest is the loop of a run.
+
+Enabled together, stopped together, gated and watched as a run is. Slack is no fault here: cables
+that hang slack are what these motions are for; what must not become slack is the law's to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from drivers.drive_group import CycleStatus
+from executor.control.feed import Feed
+from executor.control.loop import Loop
+from executor.control.preconditions import careful
+from executor.control.sync_master import SyncMaster
+from executor.control.winch_laws import WinchLaw
+from executor.operator_requests import OperatorRequests, RequestBoard
+from executor.realtime.clock import Clock
+from executor.realtime.job import Armed, Ended, ReadyDrives, Records
+from executor.safety.gate import Purpose
+from executor.state_machine import CycleRecord, Event, LoopEvent, State
+from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
+from model.errors import Refused, StoppedByOperator
+from model.pose import Pose
+from model.rig import Rig
+
+_ENDLESS = 10**9
+
+
+class WinchLoop(Loop):
+    """One motion by a law on one drive group; the gate allows what lies in the law's reach."""
+
+    way = "together"
+    slack_counts = False
+
+    def __init__(
+        self,
+        rig: Rig,
+        law: WinchLaw,
+        master: SyncMaster,
+        *,
+        wishes: Callable[[], OperatorRequests],
+        on_cycle: Callable[[CycleRecord], None],
+        on_event: Callable[[LoopEvent], None],
+    ) -> None:
+        """Prepares the motion; arguments as for `Loop`, with a law in place of a course."""
+        cycle = rig.document.bus.cycle_ms / 1000.0
+        reach = np.array(law.reach, dtype=np.int32)
+        course = CheckedSetpoints(rig, cycle, reach, fingerprint(cycle, reach))
+        super().__init__(course, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+        self._law = law
+        self._feed = Feed(_ENDLESS, cycle, rig.motion)
+        self._status: CycleStatus | None = None
+
+    def _follow(self) -> None:
+        """One cycle by the law, or at rest where it is; a stop has no way on which to slow down."""
+        state = self.machine.state
+        if self._status is None or (self._feed.at_rest and state is State.HOLDING):
+            self._status = self._send(Purpose.HOLD, self._exchange.resting_targets)
+        elif state is State.STOPPING or (self._law.done and state is State.MOVING):
+            self.machine.on(Event.AT_REST)
+        else:
+            before = self._feed.index
+            pace = self._feed.advance() - before
+            tensions = self._course.rig.tensions_by(self._status.torques)
+            targets, findings = self._law.next(pace, tensions.tolist())
+            if findings:
+                self._judge(findings, "")
+            if self.machine.state is state:
+                self._status = self._send(Purpose.MOVE, targets)
+
+    def _place(self) -> float:
+        """How much is done, [%]."""
+        return 100.0 * self._law.progress
+
+
+# Who moves winches by a law: the real-time process, or in simulated time this one.
+
+
+#: From the rig as its drives count, limited, and where they stand, [counts].
+MakeLaw = Callable[[Rig, Sequence[int]], WinchLaw]
+
+
+class WinchMover(Protocol):
+    """Arms the drives, moves them, and can be asked afterwards where they stand."""
+
+    def arm(self, records: Records) -> Armed:
+        """Makes all ready; what happens from now on is told to the records.
+
+        Raises:
+            CdprError: It cannot be; nothing was enabled.
+        """
+        ...
+
+    def run(self) -> Ended:
+        """Moves; the drives hold by themselves in the end."""
+        ...
+
+    def stands_now(self) -> CycleStatus:
+        """What the drives tell after the motion."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LawMotion:
+    """A motion by a law as a job of the real-time process; see `Motion` there.
+
+    Attributes:
+        cables: How many.
+        cycle: [s].
+        make_law: Makes what the winches are told; it can be sent to a process.
+        limit: Largest tension, [N].
+        speed: Fastest winch, [m/s].
+    """
+
+    cables: int
+    cycle: float
+    make_law: MakeLaw
+    limit: float
+    speed: float
+
+    def loop(
+        self,
+        drives: ReadyDrives,
+        master: SyncMaster,
+        *,
+        wishes: Callable[[], OperatorRequests],
+        on_cycle: Callable[[CycleRecord], None],
+        on_event: Callable[[LoopEvent], None],
+    ) -> Loop:
+        """See `Motion`."""
+        rig = careful(drives.rig, limit=self.limit, speed=self.speed)
+        law = self.make_law(rig, master.read_positions().positions.tolist())
+        return WinchLoop(rig, law, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+
+    def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
+        """See `Motion`; winches move by a law from wherever they are."""
+
+    def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
+        """See `Motion`; nobody asks for a pose while winches move without a path."""
+        return None
+
+    def close(self) -> None:
+        """See `Motion`; it shares no memory."""
+
+
+class WinchesHere:
+    """Moves winches in this process, in simulated time; a `WinchMover`."""
+
+    def __init__(
+        self, motion: LawMotion, drives: ReadyDrives, clock: Clock, board: RequestBoard
+    ) -> None:
+        """Nothing is sent yet."""
+        self._motion, self._drives, self._board = motion, drives, board
+        self._master = SyncMaster(drives.rig, drives.group, clock)
+        self._loop: Loop | None = None
+
+    def arm(self, records: Records) -> Armed:
+        """See `WinchMover`.
+
+        Raises:
+            CdprError: The drives cannot be armed.
+            StoppedByOperator: The operator wanted to stop before anything moved.
+        """
+        self._loop = self._motion.loop(
+            self._drives,
+            self._master,
+            wishes=self._board.read,
+            on_cycle=lambda record: records.take_cycle(record, None),
+            on_event=records.take_event,
+        )
+        self._loop.arm()
+        if self._board.read().stop:
+            raise StoppedByOperator("stopped before anything moved")
+        return Armed("", self._loop.stands_at)
+
+    def run(self) -> Ended:
+        """See `WinchMover`.
+
+        Raises:
+            Refused: It was not armed.
+        """
+        if self._loop is None:
+            raise Refused("the motion was not armed", where="executor")
+        state = self._loop.run()
+        return Ended(state, self._loop.cause, self._loop.holding, self._drives.true_pose_now())
+
+    def stands_now(self) -> CycleStatus:
+        """See `WinchMover`."""
+        return self._master.look()

@@ -1,0 +1,280 @@
+"""One motion of winches without a path, from its first cycle to its record."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from itertools import compress
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from drivers.drive_group import CycleStatus
+from executor.control.loop import SETTLING
+from executor.control.winch_loop import WinchMover
+from executor.interlock.interlock import MotionInterlock
+from executor.interlock.reference import HomingReference
+from executor.realtime.job import Ended, Records
+from executor.recording.run_folder import EVENTS
+from executor.state_machine import CycleRecord, LoopEvent, State
+from model.errors import BadInput, CdprError, Fault
+from model.pose import Array, Pose
+from model.rig import Rig
+
+#: Drives that hold move by no more than this share of the rig's start tolerance.
+HELD_SHARE = 0.1
+
+_CUT_SHORT = Ended(State.LATCHED, "the program was ended", holding=True, true_pose=None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WinchesStand:
+    """Where winches stand after a motion.
+
+    Attributes:
+        state: How it ended.
+        cause: Why it did not finish, if it did not.
+        began: Positions of the drives before it, shape (m,), [counts].
+        counts: Positions of the drives, at rest, shape (m,), [counts]; NaN when none was told.
+        tensions: By their torques, at rest, shape (m,), [N]; NaN when none was told.
+    """
+
+    state: State
+    cause: str
+    began: Array
+    counts: Array
+    tensions: Array
+
+
+def require_held(rig: Rig, stand: WinchesStand, told: CycleStatus) -> None:
+    """The drives stand where the motion left them, and hold: nobody commanded them meanwhile.
+
+    Args:
+        rig: The robot.
+        stand: Where the motion ended.
+        told: What the drives tell now.
+
+    Raises:
+        Fault: One moved, or does not hold.
+    """
+    per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
+    moved = np.abs((told.positions - stand.counts) / per_metre)
+    worst = int(moved.argmax())
+    name = list(rig.drive_names.values())[worst]
+    if not moved[worst] <= HELD_SHARE * rig.motion.start_tolerance:
+        what = f"{name} moved by {moved[worst] * 1000:.2f} mm after all winches were at rest"
+    elif told.faults:
+        what = "; ".join(text for _, text in told.faults)
+    elif told.missing.any():
+        silent = compress(rig.drive_names.values(), told.missing.tolist())
+        what = f"{', '.join(silent)}: no answer after all winches were at rest"
+    elif not told.holding:
+        what = "not all drives hold any more"
+    else:
+        return
+    raise Fault(
+        what,
+        where="winches",
+        why="a drive let go, slipped or was moved by hand; counts and pose do not belong together",
+        next_step="look at the platform and the drives, then `cdpr reset RIG`",
+    )
+
+
+class _LastCycles:
+    """Hands records on, and keeps the cycles in which the winches stood at the end."""
+
+    def __init__(self, records: Records) -> None:
+        self._records = records
+        self.cycles: deque[CycleRecord] = deque(maxlen=SETTLING)
+
+    def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
+        settling = record.state is State.SECURING and not np.isfinite(record.following_error)
+        if not (self.cycles and settling):
+            self.cycles.append(record)
+        self._records.take_cycle(record, true_pose)
+
+    def take_event(self, event: LoopEvent) -> None:
+        self._records.take_event(event)
+
+    def tell(self, code: str, text: str) -> None:
+        """Records an event that happened after the last cycle."""
+        cycle, at = (self.cycles[-1].cycle, self.cycles[-1].at) if self.cycles else (0, 0.0)
+        self._records.take_event(LoopEvent(cycle, at, code, text))
+
+
+def move_winches(
+    mover: WinchMover,
+    rig: Rig,
+    custody: MotionInterlock,
+    records: Records,
+    *,
+    record: Path,
+    anew: bool,
+    at_rest: Callable[[WinchesStand, Pose | None], HomingReference | None],
+) -> WinchesStand:
+    """Moves by a law and ends with the drives holding by themselves, whatever happens.
+
+    Args:
+        mover: Moves them, here or in a process of its own.
+        rig: The robot as its file is.
+        custody: Of that rig.
+        records: Takes in what happens.
+        record: What the latch names, should this not come to its end.
+        anew: The drives are to be referenced again afterwards.
+        at_rest: Called after a motion that came to its end, while nobody else may move the drives,
+            with where the simulated platform is; the reference that it makes is kept if the drives
+            held all the while.
+
+    Raises:
+        Refused: The bus is latched, or the drives do not stand where the law begins; nothing was
+            enabled.
+        HardwareMissing: A drive does not answer.
+        StoppedByOperator: The operator wanted to stop before anything moved.
+        CdprError: The drives did not hold after the motion, or did not tell; it is latched.
+    """
+    custody.require_free()
+    last = _LastCycles(records)
+    armed = mover.arm(last)
+    if armed.denied:
+        last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
+    custody.begin(record, custody.still_counts(armed.stands_at), anew=anew)
+    ended, told = _CUT_SHORT, None
+    try:
+        ended = mover.run()
+        stand = _stand(rig, armed.stands_at, ended, last.cycles)
+        if stand.state is State.FINISHED:
+            reference = at_rest(stand, ended.true_pose)
+            try:
+                told = mover.stands_now()
+                require_held(rig, stand, told)
+            except CdprError as error:
+                ended = _not_held(ended, told, error.what)
+                last.tell("not_held", error.what)
+                raise
+            if reference is not None:
+                custody.take(reference)
+    finally:
+        not_kept = _kept(custody, ended, record, _stands_at(last.cycles, told))
+    if not_kept:
+        last.tell("recorder", not_kept)
+        stand = replace(stand, state=State.LATCHED, cause=stand.cause or not_kept)
+    return stand
+
+
+def _stand(
+    rig: Rig, began: Sequence[int], ended: Ended, last: Sequence[CycleRecord]
+) -> WinchesStand:
+    unknown = [np.full(rig.cable_count, np.nan)]
+    torques = np.array([cycle.torques for cycle in last] or unknown, dtype=np.float64)
+    counts = np.array([cycle.actual for cycle in last] or unknown, dtype=np.float64)
+    tensions = rig.tensions_by(torques.mean(axis=0))
+    before = np.array(began, dtype=np.float64)
+    return WinchesStand(ended.state, ended.cause, before, counts.mean(axis=0), tensions)
+
+
+def _not_held(ended: Ended, told: CycleStatus | None, cause: str) -> Ended:
+    """A motion that came to its end, with what was found wrong with the drives afterwards."""
+    # Drives that tell nothing held when they were last heard.
+    holding = ended.holding if told is None else told.holding
+    return replace(ended, state=State.LATCHED, cause=cause, holding=holding)
+
+
+def _stands_at(last: Sequence[CycleRecord], told: CycleStatus | None) -> Sequence[int] | None:
+    """Where the drives stood when they were last heard, [counts]; None when nobody heard them."""
+    if told is not None:
+        return [int(position) for position in told.positions]
+    return last[-1].actual if last else None
+
+
+def _kept(
+    custody: MotionInterlock, ended: Ended, record: Path, stands_at: Sequence[int] | None
+) -> str:
+    """Keeps how it ended; why it could not, if so: the motion is over, and is told all the same."""
+    try:
+        custody.end(ended.state, ended.cause, record, holding=ended.holding, stands_at=stands_at)
+    except CdprError as error:
+        return f"{error.what} ({error.where}: {error.why})"
+    return ""
+
+
+# What a motion of winches without a path leaves: a folder with its events and its cycles.
+#
+# ``events.jsonl`` is as in a run folder. ``winches.csv`` has one row a cycle: ``cycle``,
+# ``time_s``, ``state``, and per cable ``set_counts_K``, ``counts_K`` and ``torque_per_mille_K`` (of
+# rated torque, positive where it pulls the cable in). Both are written while the winches move,
+# without waiting for the disk: what a killed program had written is there.
+
+
+WINCHES = "winches.csv"
+
+
+class WinchRecord:
+    """Of one motion; make one with `recording`.
+
+    Attributes:
+        folder: Where it is.
+        cycles: How many were taken in.
+    """
+
+    def __init__(self, folder: Path, events: TextIO, winches: TextIO) -> None:
+        """Takes open files; they stay the caller's."""
+        self.folder, self.cycles = folder, 0
+        self._events, self._winches = events, winches
+        self._began = float("inf")  # until there is a cycle
+
+    def take_cycle(self, record: CycleRecord) -> None:
+        """A cycle is over."""
+        if self.cycles == 0:
+            columns = ("set_counts", "counts", "torque_per_mille")
+            cables = range(1, len(record.actual) + 1)
+            names = [f"{column}_{cable}" for column in columns for cable in cables]
+            self._winches.write(f"cycle,time_s,state,{','.join(names)}\n")
+            self._began = record.at
+        self.cycles += 1
+        numbers = (*record.targets, *record.actual, *record.torques)
+        row = (record.cycle, f"{self._time(record.at):.6f}", record.state.value, *numbers)
+        self._winches.write(",".join(map(str, row)) + "\n")
+
+    def take_event(self, event: LoopEvent) -> None:
+        """Something happened."""
+        told = {"time_s": round(self._time(event.at), 6), "code": event.code, "text": event.text}
+        self._events.write(json.dumps(told, ensure_ascii=False) + "\n")
+
+    def _time(self, at: float) -> float:
+        """Since the first cycle, [s]; 0 before it."""
+        return max(0.0, at - self._began)
+
+
+@contextmanager
+def recording(folder: Path) -> Iterator[WinchRecord]:
+    """Makes the folder; removes it if no cycle came of it.
+
+    Raises:
+        BadInput: It cannot be made.
+    """
+    with ExitStack() as files:
+        try:
+            folder.mkdir(parents=True)
+            events = files.enter_context((folder / EVENTS).open("w", buffering=1, encoding="utf-8"))
+            # A line at a time: nothing is left that could fail to be written when it is closed.
+            winches = files.enter_context(
+                (folder / WINCHES).open("w", buffering=1, encoding="utf-8")
+            )
+        except OSError as error:
+            raise BadInput(
+                "the record of the motion cannot be made",
+                where=str(folder),
+                why=error.strerror or str(error),
+                next_step="change to a folder that you may write to; nothing was moved",
+            ) from None
+        record = WinchRecord(folder, events, winches)
+        try:
+            yield record
+        finally:
+            if record.cycles == 0:
+                shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,372 @@
+"""Whether this machine, and what a rig names, has what a run needs; nothing is changed.
+
+Libraries may be missing: whatever needs one is imported where it is used, after `libraries`.
+"""
+
+from __future__ import annotations
+
+import getpass
+import os
+import platform
+import resource
+import socket
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE, PRIORITY, has_capability
+from model.errors import BadInput, CdprError
+from model.files.rig_file import OdriveDocument
+from model.rig import Rig
+
+if TYPE_CHECKING:
+    from drivers.can_bus import BusSettings
+    from drivers.cia402.inspection import Examined
+    from drivers.socketcan import KernelInterface
+
+PACKAGES = (
+    "cdpr",
+    "calibration",
+    "executor",
+    "simulation",
+    "planner",
+    "drivers",
+    "tracking",
+    "model",
+)
+LIBRARIES = {
+    "pydantic": "pydantic",
+    "yaml": "pyyaml",
+    "rich": "rich",
+    "numpy": "numpy",
+    "numba": "numba",
+    "scipy": "scipy",
+    "cv2": "opencv-python-headless",
+    "fcl": "python-fcl",
+    "can": "python-can",
+    "canopen": "canopen",
+    "msgpack": "msgpack",
+    "daqp": "daqp",
+    "mcap": "mcap",
+    "matplotlib": "matplotlib",
+}
+
+
+LIMITS = Path("/etc/security/limits.d/cdpr.conf")
+
+
+#: States of a controller in which it takes part in the traffic without restriction.
+HEALTHY = ("ERROR-ACTIVE", "ERROR-WARNING")
+
+
+@dataclass(frozen=True, slots=True)
+class MachineCheck:
+    """One thing that was looked at.
+
+    Attributes:
+        name: What.
+        good: Whether it is as a run needs it.
+        text: What was found.
+        fix: The next step where it is not good.
+    """
+
+    name: str
+    good: bool
+    text: str
+    fix: str = ""
+
+
+def check_machine() -> list[MachineCheck]:
+    """Whether this machine has what a run needs."""
+    return [python_version(), *own_packages(), *libraries(), *machine()]
+
+
+def check_rig(rig: Rig, camera: str | None = None) -> list[MachineCheck]:
+    """Whether what a rig names is there: files of its drives, its bus, its first camera.
+
+    Args:
+        rig: The robot.
+        camera: Index, device or address of a camera that is opened; none is when left out.
+    """
+    return [*rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, camera)]
+
+
+def python_version() -> MachineCheck:
+    """Python itself."""
+    good = sys.version_info >= (3, 11)
+    return MachineCheck("python", good, platform.python_version(), "install Python 3.11 or newer")
+
+
+def own_packages() -> list[MachineCheck]:
+    """Whether the imported packages are ours: others of the same names exist."""
+    ours = Path(__file__).resolve().parents[1]
+    checks = []
+    for name in PACKAGES:
+        spec = find_spec(name)
+        origin = Path(spec.origin).resolve() if spec and spec.origin else None
+        good = origin is not None and origin.parents[1] == ours
+        text = "ours" if good else f"another package: {origin}" if origin else "not found"
+        fix = f"uninstall the other {name!r}, or use an environment of its own for cdpr"
+        checks.append(MachineCheck(f"package {name}", good, text, fix))
+    return checks
+
+
+def libraries() -> list[MachineCheck]:
+    """Whether every library can be imported, and its version."""
+    checks = []
+    for module, package in LIBRARIES.items():
+        try:
+            import_module(module)
+            checks.append(MachineCheck(package, True, version(package)))
+        except ImportError as error:
+            checks.append(MachineCheck(package, False, str(error), f"pip install {package}"))
+    return checks
+
+
+def machine() -> list[MachineCheck]:
+    """What real time and real buses need; only told, since a rehearsal needs none of it."""
+    cores = os.cpu_count() or 1
+    kernel = kernel_support()
+    text = kernel.text if kernel.good else f"{kernel.text}; other interfaces work"
+    return [
+        MachineCheck("processors", cores >= 2, f"{cores}", "use a machine with two or more cores"),
+        MachineCheck("kernel", True, text),
+    ]
+
+
+def rig_drives(rig: Rig) -> list[MachineCheck]:
+    """Whether the package and the files are there that the drives of a rig need."""
+    drives = rig.document.drives
+    if not isinstance(drives, OdriveDocument):
+        return []
+    from drivers.odrive.dbc import OWN_DBC, read_layouts
+    from drivers.odrive.endpoints import read_endpoints
+
+    try:
+        read_layouts(Path(drives.dbc) if drives.dbc else OWN_DBC)
+        if drives.endpoints is not None:
+            read_endpoints(Path(drives.endpoints), drives)
+    except BadInput as error:
+        return [MachineCheck("drives", False, f"{error.where}: {error.what}", error.next_step)]
+    known = "read back" if drives.endpoints else "not read back: the rig file names no endpoints"
+    return [MachineCheck("drives", True, f"ODrives; their settings are {known}")]
+
+
+def rig_bus(rig: Rig) -> list[MachineCheck]:
+    """Whether the bus of a rig is fast enough, is set up, and can be opened."""
+    # After the libraries were looked at: it needs python-can.
+    from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
+    from drivers.can_load import check_bus_load
+    from drivers.socketcan import can_interfaces
+
+    settings = BusSettings.of(rig)
+    checks: list[MachineCheck] = []
+    try:
+        load = check_bus_load(rig)
+        checks.append(MachineCheck("bus load", True, f"{load:.0%} at worst"))
+    except CdprError as error:
+        checks.append(MachineCheck("bus load", False, error.what, error.next_step))
+    if settings.interface == "socketcan":
+        try:
+            checks += kernel_bus(settings, can_interfaces())
+        except CdprError as error:
+            checks.append(MachineCheck("interfaces", False, error.what, error.next_step))
+    try:
+        open_bus(settings).shutdown()
+        checks.append(MachineCheck(f"bus {settings}", True, "opens"))
+    except CdprError as error:
+        checks.append(MachineCheck(f"bus {settings}", False, error.what, error.next_step))
+    if settings.interface != IN_PROCESS:
+        checks += real_time_permission()
+    return checks
+
+
+def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
+    """Whether a camera opens and its pictures have the size that the rig file states."""
+    if not rig.cameras:
+        return [
+            MachineCheck("camera", source is None, "the rig file has none", "leave --camera out")
+        ]
+    camera = rig.cameras[0]
+    if source is None:
+        devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
+        text = f"not tried (--camera INDEX tries it); devices here: {devices or 'none'}"
+        return [MachineCheck(f"camera {camera.name}", True, text)]
+    from drivers.cameras.live import LiveCamera  # needs OpenCV
+
+    try:
+        LiveCamera(source, camera).close()
+    except CdprError as error:
+        return [MachineCheck(f"camera {camera.name}", False, error.what, error.next_step)]
+    text = f"{source} opens and gives pictures of {camera.width} x {camera.height} px"
+    return [MachineCheck(f"camera {camera.name}", True, text)]
+
+
+# A kernel CAN bus, each thing with the command that puts it right.
+
+
+def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> list[MachineCheck]:
+    """Whether the interface of a rig is there, up, fast enough and healthy.
+
+    Args:
+        settings: The rig's bus.
+        interfaces: The CAN interfaces of this machine.
+    """
+    from drivers.can_bus import bring_up  # needs python-can
+
+    name = settings.channel
+    kernel = kernel_support()
+    if not kernel.good:
+        return [kernel]
+    found = next((interface for interface in interfaces if interface.name == name), None)
+    if found is None:
+        there = ", ".join(interface.name for interface in interfaces) or "none"
+        text = f"not there; CAN interfaces here: {there}"
+        return [MachineCheck(f"interface {name}", False, text, bring_up(settings))]
+    checks = [_up(found, settings), _queue(found)]
+    if found.has_hardware:
+        checks += [_bitrate(found, settings.bitrate), _controller(found, settings.bitrate)]
+    return checks
+
+
+def kernel_support() -> MachineCheck:
+    """Whether sockets of the CAN family open; no privilege is needed for them."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError) as error:
+        text = f"no SocketCAN: {error}"
+        fix = "sudo modprobe can_raw; where there is no such module, boot the ordinary kernel"
+        return MachineCheck("kernel", False, text, f"{fix} (linux-image-amd64)")
+    return MachineCheck("kernel", True, "SocketCAN is there")
+
+
+def _up(found: KernelInterface, settings: BusSettings) -> MachineCheck:
+    from drivers.can_bus import bring_up  # needs python-can
+
+    text = f"{found.kind}, {'up' if found.up else 'down'}"
+    return MachineCheck(f"interface {found.name}", found.up, text, bring_up(settings))
+
+
+def _queue(found: KernelInterface) -> MachineCheck:
+    from drivers.can_bus import MIN_TRANSMIT_QUEUE  # needs python-can
+
+    return MachineCheck(
+        f"txqueuelen of {found.name}",
+        found.queue >= MIN_TRANSMIT_QUEUE,
+        f"{found.queue} frames; {MIN_TRANSMIT_QUEUE} or more are needed",
+        f"sudo ip link set {found.name} txqueuelen 128",
+    )
+
+
+def _bitrate(found: KernelInterface, wanted: int) -> MachineCheck:
+    text = f"{found.bitrate} bit/s" if found.bitrate else "not set"
+    if found.bitrate != wanted:
+        text += f"; the rig file says {wanted}"
+    fix = _set_anew(found.name, wanted)
+    return MachineCheck(f"bit rate of {found.name}", found.bitrate == wanted, text, fix)
+
+
+def _controller(found: KernelInterface, bitrate: int) -> MachineCheck:
+    healthy = found.state in HEALTHY
+    fix = f"check power, cable and termination (60 ohm), then {_set_anew(found.name, bitrate)}"
+    text = found.state or "unknown"
+    # Down it has no state worth a word; that it is down is told already.
+    return MachineCheck(f"controller of {found.name}", healthy or not found.up, text, fix)
+
+
+def _set_anew(name: str, bitrate: int) -> str:
+    """A bit rate can be set only while the interface is down."""
+    return (
+        f"sudo ip link set {name} down && sudo ip link set {name} up txqueuelen 128"
+        f" type can bitrate {bitrate}"
+    )
+
+
+# Real time.
+
+
+def real_time_permission() -> list[MachineCheck]:
+    """Priority and locked memory, as `cdpr run` asks for them on a bus with real drives."""
+    priority = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    locked = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    return [
+        priority_check(priority, PRIORITY, privileged=has_capability(CAP_SYS_NICE)),
+        memory_check(locked, privileged=has_capability(CAP_IPC_LOCK)),
+    ]
+
+
+def priority_check(limit: int, wanted: int, *, privileged: bool) -> MachineCheck:
+    """Whether the loop may take its real-time priority (RLIMIT_RTPRIO)."""
+    unlimited = limit == resource.RLIM_INFINITY
+    text = "allowed" if privileged else f"up to {'any' if unlimited else limit}"
+    good = privileged or unlimited or limit >= wanted
+    return MachineCheck(
+        "real-time priority", good, f"{text}; {wanted} is used", _allow("rtprio", wanted)
+    )
+
+
+def memory_check(limit: int, *, privileged: bool) -> MachineCheck:
+    """Whether the loop's memory may be locked, so that it never waits for a disk."""
+    unlimited = limit == resource.RLIM_INFINITY
+    text = "allowed" if privileged or unlimited else f"{limit // 1024} KiB; all of it is needed"
+    return MachineCheck(
+        "locked memory", privileged or unlimited, text, _allow("memlock", "unlimited")
+    )
+
+
+def _allow(item: str, value: int | str) -> str:
+    line = f"{getpass.getuser()} - {item} {value}"
+    return f"echo '{line}' | sudo tee -a {LIMITS}, then log out and in again"
+
+
+# The objects of the drives.
+
+
+def examine(rig: Rig) -> Examined:
+    """What the drives of a rig hold; simulated here where its bus is of this process.
+
+    Raises:
+        BadInput: They are no CANopen drives, or their profile is wrong.
+        HardwareMissing: The bus cannot be opened.
+        Refused: Another program sets the drives up.
+    """
+    # After the libraries were looked at: it needs python-can and canopen.
+    from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
+    from drivers.cia402.inspection import examine_drives
+    from executor.interlock.locks import SetUpLock
+    from simulation.factory import make_rehearsal
+
+    if rig.document.drives.type != "cia402":
+        raise BadInput(
+            f"the drives of {rig.name} are not CANopen drives",
+            where="--drives",
+            next_step="leave --drives out; `cdpr doctor RIG` looks at the files that they need",
+        )
+    settings = BusSettings.of(rig)
+    with ExitStack() as stack:
+        stack.enter_context(SetUpLock(settings).held())
+        bus = open_bus(settings)
+        stack.callback(bus.shutdown)
+        pump = None
+        if settings.interface == IN_PROCESS:
+            far_end = open_bus(settings)
+            stack.callback(far_end.shutdown)
+            pump = make_rehearsal(rig, far_end, rig.home).pump
+        return examine_drives(rig, bus, pump)
+
+
+def stopping_text(rig: Rig) -> str:
+    """How far the platform goes on without the master; plans must keep that clearance."""
+    from drivers.stopping_distance import lost_master  # needs python-can
+
+    lost = lost_master(rig)
+    return (
+        f"without the master drives stop by {lost.noticed_by} after {lost.notice * 1000:.0f} ms:"
+        f" up to {lost.distance * 1000:.1f} mm at {rig.motion.speed * 1000:g} mm/s"
+    )

@@ -1,0 +1,1 @@
+"""What forbids motion: the fault latch, a missing encoder reference, another program."""

@@ -1,0 +1,244 @@
+"""The latch of a bus: while it is engaged nothing moves the drives there, in no process.
+
+It is a file in this computer's state folder (`executor.interlock.locks`). It is engaged before
+anything moves and disengaged when the motion ended well; a fault leaves it engaged with its cause,
+and a program that died or a computer that lost power leaves it engaged too. Only `cdpr reset`
+disengages it then.
+
+Whoever moves the drives, or resets them, holds a lock on a file beside it. The system gives it
+back when that program ends, however it ends; so every user can tell a run from what a run left.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from drivers.can_bus import BusSettings
+from executor.interlock.locks import locked_within, open_state_file, read_state_file, state_file
+from executor.state_machine import State
+from model.errors import CdprError, Refused
+from model.files.documents import write_atomic
+
+#: Who looks at the lock lets it go within this, [s].
+LOOKS_WITHIN = 0.5
+
+_CUT_SHORT = "a run did not come to its end: its program was killed, or the computer stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class LatchedFault:
+    """Why a bus is latched.
+
+    Attributes:
+        bus: Interface and channel.
+        rig: Name of the rig that was run.
+        cause: One sentence.
+        since: When, ISO 8601, UTC.
+        folder: Run folder.
+        process: Number of the process that ran it.
+    """
+
+    bus: str
+    rig: str
+    cause: str
+    since: str
+    folder: str
+    process: int
+
+
+class FaultLatch:
+    """Of one bus."""
+
+    def __init__(self, settings: BusSettings) -> None:
+        """Looks at nothing yet."""
+        self._bus = str(settings)
+        self.path = state_file("latched", settings)
+        self._lock = self.path.with_suffix(".lock")
+        self._held: weakref.finalize[[int], FaultLatch] | None = None
+
+    def read(self) -> LatchedFault | None:
+        """Why it is engaged; None when it is not. A file that cannot be read counts as engaged."""
+        try:
+            return LatchedFault(**json.loads(read_state_file(self.path)))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, RecursionError, Refused) as error:
+            why = f"{error.where}: {error.what}" if isinstance(error, Refused) else error
+            cause = f"the latch file cannot be read: {why}"
+            return LatchedFault(self._bus, "unknown", cause, "unknown", "unknown", 0)
+
+    def require_disengaged(self) -> None:
+        """Nothing may move while it is engaged.
+
+        Raises:
+            Refused: With the cause.
+        """
+        latched = self.read()
+        if latched is not None:
+            raise self._refusal(latched)
+
+    def require_no_run(self) -> None:
+        """No run is under way on this bus; its mark is not a fault.
+
+        Raises:
+            Refused: One is.
+        """
+        latched = self.read()
+        if latched is not None and self.held_by_another():
+            raise self._refusal(latched)
+
+    @contextmanager
+    def held_for_reset(self, rig: str, shown: LatchedFault | None) -> Iterator[None]:
+        """Keeps runs off the bus while the block resets its drives; then it is off.
+
+        When the block fails, the latch is as it was.
+
+        Args:
+            rig: Name of the rig.
+            shown: What the operator was shown and said yes to.
+
+        Raises:
+            Refused: It is not what is latched now.
+        """
+        if shown is None:
+            self.engage(rig, self.path.parent, "a reset did not come to its end")
+        else:
+            self._hold()
+        try:
+            if shown is not None and self.read() != shown:
+                raise Refused(
+                    "what is latched changed since it was shown",
+                    where=f"bus {self._bus}",
+                    why="somebody else reset this bus, or ran it",
+                    next_step="look at it again: `cdpr reset RIG`; nothing was reset",
+                )
+            yield
+        except BaseException:
+            if shown is None:
+                self.disengage()
+            self._let_go()
+            raise
+        self.disengage()
+
+    def engage(self, rig: str, folder: Path, cause: str = _CUT_SHORT) -> None:
+        """A run is about to move; if it does not come to its end, this is what tells of it.
+
+        Args:
+            rig: Name of the rig.
+            folder: Where the record of the run is.
+            cause: What is told then.
+
+        Raises:
+            Refused: It is engaged already, or cannot be.
+        """
+        self.require_disengaged()
+        try:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._not_kept(error.strerror or str(error)) from None
+        self._hold()
+        try:
+            self.require_disengaged()  # nobody else engages it from here on
+            self._write(self._latched(rig, cause, folder))
+        except BaseException:
+            self._let_go()
+            raise
+
+    def settle(self, rig: str, state: State, cause: str, folder: Path) -> None:
+        """The motion is over: disengaged when it ended well, else engaged with its cause."""
+        if state in (State.FINISHED, State.STOPPED):
+            self.disengage()
+        else:
+            self._write(self._latched(rig, cause, folder))
+            self._let_go()
+
+    def disengage(self) -> None:
+        """Drives may be moved again."""
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._not_kept(error.strerror or str(error)) from None
+        self._let_go()
+
+    def _hold(self) -> None:
+        """Until it is let go, or this program ends; waits for those who only look.
+
+        Raises:
+            Refused: Somebody moves or resets the drives, or the lock cannot be made.
+        """
+        if self._held is not None:
+            return
+        try:
+            lock = open_state_file(self._lock, create=True)
+        except OSError as error:
+            raise self._not_kept(error.strerror or str(error)) from None
+        if not locked_within(lock, LOOKS_WITHIN):
+            os.close(lock)
+            raise self._refusal(self.read())
+        self._held = weakref.finalize(self, os.close, lock)
+
+    def _let_go(self) -> None:
+        if self._held is not None:
+            self._held()
+            self._held = None
+
+    def held_by_another(self) -> bool:
+        """Somebody moves or resets the drives at this moment."""
+        if self._held is not None:
+            return False
+        try:
+            lock = open_state_file(self._lock)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise self._not_kept(error.strerror or str(error)) from None
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(lock)
+        return False
+
+    def _latched(self, rig: str, cause: str, folder: Path) -> LatchedFault:
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        return LatchedFault(self._bus, rig, cause, now, str(folder.resolve()), os.getpid())
+
+    def _write(self, latched: LatchedFault) -> None:
+        try:
+            write_atomic(self.path, json.dumps(asdict(latched), indent=1) + "\n")
+        except CdprError as error:
+            raise self._not_kept(error.why) from None
+
+    def _refusal(self, latched: LatchedFault | None) -> Refused:
+        if latched is None or self.held_by_another():
+            who = "" if latched is None else f" (process {latched.process})"
+            return Refused(
+                f"a motion or a reset{who} is under way on this bus",
+                where=f"bus {self._bus}",
+                next_step="wait for its end, or stop it with `cdpr stop` (`sudo cdpr stop` where it"
+                " is another user's)",
+            )
+        return Refused(
+            f"a fault is latched since {latched.since}: {latched.cause}",
+            where=f"bus {self._bus}",
+            why=f"on record in {latched.folder}",
+            next_step="find the cause and look at the platform, then `cdpr reset RIG`;"
+            " nothing was moved",
+        )
+
+    def _not_kept(self, why: str) -> Refused:
+        return Refused(
+            "the latch cannot be written, so a fault would be forgotten",
+            where=str(self.path),
+            why=why,
+            next_step="make the folder writable for those who run the rig",
+        )

@@ -1,0 +1,173 @@
+"""Where the drums' counts were referenced: a dated file of its own, never the rig file.
+
+It lies beside the latch of the bus (`executor.interlock.locks`). `cdpr home` writes it; every
+motion ends by noting in it where the drives stand, and by declaring it lost when cables were let
+go.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from drivers.can_bus import BusSettings
+from executor.interlock.locks import read_state_file, state_file
+from model.errors import CdprError, Refused
+from model.files.documents import Document, PoseDocument, content_hash, document_hash, write_atomic
+from model.kinematics import cable_lengths
+from model.pose import Array, Pose
+from model.rig import Rig, rig_from_document
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
+
+AGAIN = "reference the drives with `cdpr home RIG`; nothing was moved"
+
+
+class HomingReference(Document):
+    """What the drives of one rig count at home, and how that came to be known."""
+
+    schema_version: Literal[1]
+    rig: str
+    rig_hash: str = Field(description="of what the counts depend on")
+    made: str = Field(description="when, ISO 8601, UTC")
+    how: str
+    pose: PoseDocument = Field(description="of the platform then")
+    uncertainty_mm: float = Field(description="of the pose, one standard deviation; 0 if stated")
+    home_counts: Annotated[list[int], Field(min_length=1)]
+    tensions_n: list[float]
+    stands_at: list[int] = Field(description="drive positions at the end of the last motion")
+    lost: str = Field(default="", description="why it counts no more")
+
+
+def reference_at(
+    rig: Rig, pose: Pose, counts: Array, tensions: Array, how: str, uncertainty: float
+) -> HomingReference:
+    """The reference from taut cables at a known pose.
+
+    Args:
+        rig: The robot as its file describes it.
+        pose: ``world_from_platform``.
+        counts: Positions of the drives there, shape (m,), [counts].
+        tensions: Of the cables there, shape (m,), [N].
+        how: How the pose is known.
+        uncertainty: Of the pose, standard deviation of the position, [m].
+    """
+    winches = WinchMap(rig)
+    unstrained = winches.unstrained(cable_lengths(rig, pose), tensions)
+    home = winches.home_counts + counts - winches.counts(unstrained)
+    return HomingReference(
+        schema_version=1,
+        rig=rig.name,
+        rig_hash=counting_hash(rig),
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        how=how,
+        pose=PoseDocument.of(pose),
+        uncertainty_mm=round(uncertainty * 1000.0, 4),
+        home_counts=[int(c) for c in np.rint(home)],
+        tensions_n=[round(float(t), 3) for t in tensions],
+        stands_at=[int(c) for c in np.rint(counts)],
+    )
+
+
+def as_in_the_file(rig: Rig) -> HomingReference:
+    """What the rig file itself says that absolute encoders count at home."""
+    home = np.array([winch.home_counts for winch in rig.winches], dtype=np.float64)
+    tensions = working_tensions(rig, rig.home).tensions
+    return reference_at(rig, rig.home, home, tensions, "as in the rig file", 0.0)
+
+
+def counting_hash(rig: Rig) -> str:
+    """Of everything that decides what drives count at a pose."""
+    winches = [document_hash(winch) for winch in rig.document.winches]
+    return content_hash({"rig": rig.plan_hash, "winches": winches})
+
+
+def referenced(rig: Rig, reference: HomingReference) -> Rig:
+    """The rig with the counts of a reference in place of its file's."""
+    winches = [
+        winch.model_copy(update={"home_counts": home})
+        for winch, home in zip(rig.document.winches, reference.home_counts, strict=True)
+    ]
+    return rig_from_document(rig.document.model_copy(update={"winches": winches}))
+
+
+def moved_since(rig: Rig, reference: HomingReference, stands: Sequence[int]) -> list[float]:
+    """How far drives were moved since the last motion, of cable, [m], one a drive.
+
+    None of those with absolute encoders, which count on whoever moves them.
+
+    Args:
+        rig: The robot.
+        reference: Of its drives.
+        stands: Where they stand now, [counts].
+    """
+    rows = zip(rig.winches, stands, reference.stands_at, strict=True)
+    return [
+        0.0 if winch.absolute else abs((at - left) / winch.counts_per_metre)
+        for winch, at, left in rows
+    ]
+
+
+class ReferenceFile:
+    """The reference of one bus."""
+
+    def __init__(self, settings: BusSettings) -> None:
+        """Looks at nothing yet."""
+        self.path = state_file("reference", settings)
+
+    def read(self) -> HomingReference | None:
+        """The reference; None where there is none.
+
+        Raises:
+            Refused: The file cannot be read: what it said cannot be ignored.
+        """
+        try:
+            return HomingReference.model_validate_json(read_state_file(self.path))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError, ValueError) as error:
+            raise Refused(
+                "the reference of the drives cannot be read",
+                where=str(self.path),
+                why=str(error).splitlines()[0],
+                next_step=AGAIN,
+            ) from None
+
+    def remove(self) -> None:
+        """Nothing is on file any more.
+
+        Raises:
+            Refused: It cannot be removed.
+        """
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise Refused(
+                "the reference of the drives cannot be removed",
+                where=str(self.path),
+                why=error.strerror or str(error),
+                next_step="make the folder writable for those who run the rig",
+            ) from None
+
+    def write(self, reference: HomingReference) -> None:
+        """Keeps it.
+
+        Raises:
+            Refused: It cannot be kept.
+        """
+        try:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            text = json.dumps(reference.model_dump(mode="json"), indent=1) + "\n"
+            write_atomic(self.path, text)
+        except (OSError, CdprError) as error:
+            raise Refused(
+                "the reference of the drives cannot be kept",
+                where=str(self.path),
+                why=error.why if isinstance(error, CdprError) else error.strerror or str(error),
+                next_step="make the folder writable for those who run the rig, then `cdpr home`",
+            ) from None

@@ -1,0 +1,338 @@
+"""Jogs: short, slow motions of the platform along a straight path, or of one winch alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from executor.control.preconditions import require_still_referenced
+from executor.control.winch_laws import CableStep
+from executor.current_pose import standing_pose
+from executor.drives import is_simulated, look_at, require_own_time
+from executor.interlock.interlock import MotionInterlock
+from executor.recording.run_course import free_folder
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.runner import MotionProposal, RunOptions, RunResult, prepare_plan, run_prepared
+from executor.supervision import Supervisor, require_confirmed
+from executor.winch_runs import WinchMotion, limit_of, move_by_law
+from model.errors import BadInput, Refused
+from model.files.plan_file import PlanDocument
+from model.files.scene_file import RotationLimitsDocument
+from model.jit import KernelSet, compilation
+from model.plan import plan_from_document
+from model.pose import Array, Pose
+from model.progress import SILENT, Listener
+from model.rig import Rig, rig_from_document
+from model.rotation_limits import largest_rotations
+from model.scene import Scene, nothing_in_the_way, scene_from_document
+from planner.kernels.jit import KERNELS
+from planner.planning import make_plan
+from planner.settings import OptimalSettings, TurningSettings
+
+#: A jog is no longer than this, [mm], and turns the platform by no more than that, [deg].
+LONGEST_MM, MOST_DEG = 50.0, 10.0
+_ROUNDED = 1.0 + 1e-12
+"""A length that went from mm to m and back may have gained the last bit."""
+#: A jog is no faster than this, [m/s], and without another speed as fast as that, [m/s].
+FASTEST, SPEED = 0.020, 0.005
+
+
+def jog(
+    rig: Rig,
+    scene: Scene | None,
+    *,
+    by: Array | None = None,
+    to_home: bool = False,
+    speed: float = SPEED,
+    folder: Path | str | None = None,
+    realtime: bool = True,
+    need_real_time_rights: bool = True,
+    listener: Listener = SILENT,
+    confirm: Callable[[MotionProposal], bool] | None = None,
+    on_event: Callable[[RunEvent], None] | None = None,
+    supervisor: Supervisor | None = None,
+) -> RunResult:
+    """Moves the platform straight by a few millimetres, slowly, from where it is.
+
+    A jog is a run: planned, proved, checked and gated like any other. On the interface ``virtual``
+    the simulated platform is at home.
+
+    Args:
+        rig: The robot and its bus.
+        scene: What is in the way, and what the platform carries; its stops are left out. None
+            states that nothing is in the way.
+        by: How far, shape (3,), in the world frame, [m].
+        to_home: Instead: to the rig's home pose, rotated as there.
+        speed: At most the rig's own, [m/s].
+        folder: Of the run, which is made; None for ``runs/jog``, ``runs/jog-2`` …
+        realtime: As for `executor.runner.run`, as all that follow.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
+        listener: Receives progress.
+        confirm: Called once, before anything moves; False cancels it.
+        on_event: Receives each event of the run.
+        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+
+    Raises:
+        CdprError: As for `executor.runner.run`; or the straight path is too long, or not free.
+    """
+    slow = with_speed(rig, speed)
+    require_own_time(slow, realtime)
+    require_distance(by, to_home=to_home)
+    around = nothing_in_the_way(slow) if scene is None else scene.changed(stops=())
+    output = free_folder("jog") if folder is None else Path(folder)
+    RunFolder.require_free(output)
+    interlock = MotionInterlock(slow)
+    interlock.require_free()
+    ready = interlock.referenced_rig()
+    start = ready.home if is_simulated(ready) else measured_pose(ready, around)
+    goal = ready.home if by is None else Pose(start.position + by, start.rotation)
+    plan = plan_from_document(straight_way(ready, around, start, goal, listener))
+    options = RunOptions(
+        realtime=realtime,
+        start=start,
+        need_real_time_rights=need_real_time_rights,
+        listener=listener,
+        confirm=confirm,
+        on_event=on_event,
+        supervisor=supervisor or Supervisor(),
+    )
+    return run_prepared(prepare_plan(plan, ready, listener), output, {}, options)
+
+
+def with_speed(rig: Rig, speed: float) -> Rig:
+    """The same rig with a lower speed [m/s]; plans do not rest on it.
+
+    Raises:
+        BadInput: It is no speed of a jog.
+    """
+    if not 0.0 < speed <= FASTEST:
+        raise BadInput(
+            f"the speed of {speed:g} m/s is not above 0 and up to {FASTEST:g} m/s",
+            where="jog",
+            next_step="give a smaller speed",
+        )
+    document = rig.document
+    slower = min(speed * 1000.0, document.motion.speed_mm_s)
+    motion = document.motion.model_copy(update={"speed_mm_s": slower})
+    return rig_from_document(document.model_copy(update={"motion": motion}))
+
+
+def measured_pose(rig: Rig, scene: Scene) -> Pose:
+    """Where the drives' positions put the platform; nothing of them is changed for it.
+
+    Raises:
+        Refused: Their reference is lost, or their positions fit no pose.
+    """
+    reference = MotionInterlock(rig).require_ready()
+    seen = look_at(rig, rig.home, scene.load)
+    positions = seen.positions.tolist()
+    require_still_referenced(rig, reference, seen.restarted, positions)
+    return standing_pose(rig, np.array(positions, dtype=np.float64), scene.load)
+
+
+def straight_way(
+    rig: Rig, scene: Scene, start: Pose, goal: Pose, listener: Listener = SILENT
+) -> PlanDocument:
+    """A plan that goes straight there, rotating on the path where start and goal differ in it.
+
+    Raises:
+        CdprError: Start or goal cannot be used.
+        Refused: It is too long, or something is in the straight path.
+    """
+    straight, turn = 1000.0 * start.distance_to(goal), float(np.degrees(start.angle_to(goal)))
+    _require_jog(straight, turn)
+    way, turns = scene.changed(start=start, goal=goal), turn > 1e-6
+    settings = TurningSettings if turns else OptimalSettings
+    if turns:
+        way = _free_to_turn(way, (start, goal))
+    task = KernelSet("turning" if turns else "optimal", KERNELS)
+    with (
+        compilation(task, "the planner", "one to three minutes", listener) as compiled,
+        listener.waiting("planning") if compiled else nullcontext(),
+    ):
+        document = make_plan(rig, way, settings(seed=0, rounds=1))
+    if document.quality.length_mm > straight + 0.01:
+        raise Refused(
+            f"the straight way of {straight:.1f} mm is not free; the way around is"
+            f" {document.quality.length_mm:.1f} mm",
+            where="cdpr jog",
+            why="cables or platform would come too near to something on the straight way",
+            next_step="jog another way, or plan a path with `cdpr plan --start-mm`",
+        )
+    return document
+
+
+def require_distance(by: Array | None, *, to_home: bool) -> None:
+    """Exactly one of both is given, and it is neither zero nor long; as for `jog`.
+
+    Raises:
+        BadInput: It is not.
+        Refused: It is too long.
+    """
+    if (by is None) != to_home:
+        raise BadInput(
+            "say how far: --by-mm X Y Z, --to-home, or --cable N --mm X",
+            where="cdpr jog",
+            next_step="see `cdpr jog --help`",
+        )
+    if by is None:
+        return
+    length_mm = math.hypot(*by) * 1000.0
+    if not 0.0 < length_mm < math.inf:
+        raise BadInput(
+            "that is no way to go", where="--by-mm", next_step="give x y z in mm, not all 0"
+        )
+    _require_jog(length_mm, 0.0)
+
+
+def _require_jog(length_mm: float, turn_deg: float) -> None:
+    if length_mm > LONGEST_MM * _ROUNDED or turn_deg > MOST_DEG:
+        raise Refused(
+            f"a jog of {length_mm:.1f} mm and {turn_deg:.1f}° is longer than {LONGEST_MM:g} mm or"
+            f" turns more than {MOST_DEG:g}°",
+            where="cdpr jog",
+            why="a longer way is planned around what is in it",
+            next_step="jog less far, or plan a path from here with `cdpr plan --start-mm`",
+        )
+
+
+def _free_to_turn(scene: Scene, poses: tuple[Pose, ...]) -> Scene:
+    """The scene, allowing what is between these orientations."""
+    first, last = poses[0].quaternion, poses[-1].quaternion
+    tilt, turn = np.degrees(largest_rotations(first, last))
+    limits = RotationLimitsDocument(
+        tilt_deg=min(90.0, float(tilt) + 0.1), turn_deg=min(180.0, float(turn) + 0.1)
+    )
+    return scene_from_document(scene.document.model_copy(update={"rotation_limits": limits}))
+
+
+def _require_cable(rig: Rig, cable: int, length: float) -> None:
+    """There is such a cable, and it is to move by a little.
+
+    Raises:
+        BadInput: There is not, or the length is zero.
+        Refused: It is too long.
+    """
+    if not 1 <= cable <= rig.cable_count:
+        raise BadInput(
+            f"there is no cable {cable}",
+            where="--cable",
+            next_step=f"name one from 1 to {rig.cable_count}, in the order of the rig file",
+        )
+    if length == 0.0 or not math.isfinite(length):
+        raise BadInput("that is no way to go", where="--mm", next_step="give mm, not 0")
+    length_mm = abs(length) * 1000.0
+    if length_mm > LONGEST_MM * _ROUNDED:
+        raise Refused(
+            f"{length_mm:g} mm are more than {LONGEST_MM:g} mm",
+            where="--mm",
+            why="one cable alone is moved in short steps, somebody looking",
+            next_step="go there in several steps",
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CableProposal:
+    """One winch that is about to move; see `executor.supervision.Proposal`.
+
+    Attributes:
+        rig: The robot.
+        cable: Its number, from 1.
+        length: Paid out, [m]; negative is wound in.
+        limit: Largest tension of any cable, [N].
+        speed: Of the winch, [m/s].
+    """
+
+    question: ClassVar[str] = "Move this cable now?"
+    otherwise: ClassVar[str] = "nothing was moved"
+
+    rig: Rig
+    cable: int
+    length: float
+    limit: float
+    speed: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CableJog:
+    """What one cable did.
+
+    Attributes:
+        cable: Its number, from 1.
+        moved: Paid out by the drive's count, [m]; negative was wound in.
+        tensions: Of all cables afterwards, shape (m,), [N].
+    """
+
+    cable: int
+    moved: float
+    tensions: Array
+
+
+def jog_cable(
+    rig: Rig,
+    cable: int,
+    length: float,
+    *,
+    limit: float | None = None,
+    speed: float = SPEED,
+    realtime: bool = True,
+    need_real_time_rights: bool = True,
+    listener: Listener = SILENT,
+    confirm: Callable[[CableProposal], bool] | None = None,
+    supervisor: Supervisor | None = None,
+) -> CableJog:
+    """Moves one winch alone, a little and slowly, for commissioning.
+
+    On a taut platform one cable alone moves by hardly more than its stretch before a tension is
+    too large, or another cable slack: both stop it.
+
+    Args:
+        rig: The robot and its bus.
+        cable: Its number, from 1, in the order of the rig file.
+        length: To pay out, [m]; negative winds in.
+        limit: No cable may carry more, [N]; None for 60 % of the rig's range.
+        speed: At most the rig's own, [m/s].
+        realtime: As for `executor.runner.run`, as all that follow.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
+        listener: Receives progress.
+        confirm: Called once, before anything moves; False cancels it.
+        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+
+    Raises:
+        BadInput: There is no such cable, or the length is zero.
+        Refused: The length is too large, or the bus is latched.
+        Fault: A tension left its bounds; all drives stopped together.
+        StoppedByOperator: It was cancelled, or stopped; the drives hold.
+    """
+    slow = with_speed(rig, speed)
+    require_own_time(slow, realtime)
+    _require_cable(slow, cable, length)
+    winch = slow.winches[cable - 1]
+    limit = limit_of(slow, limit)
+    fastest = slow.motion.speed
+    MotionInterlock(slow).require_free()
+    require_confirmed(confirm, CableProposal(slow, cable, length, limit, fastest))
+    motion = WinchMotion(
+        rig=slow,
+        pose=slow.home,
+        limit=limit,
+        speed=fastest,
+        make_law=partial(CableStep, cable=cable - 1, way=length, limit=limit, speed=fastest),
+        lost_power=None,
+        realtime=realtime,
+        need_real_time_rights=need_real_time_rights,
+        rehome=False,
+        name="jog-cable",
+        listener=listener,
+        supervisor=supervisor or Supervisor(),
+    )
+    stand = move_by_law(motion, lambda _stand, _true_pose, _board: None)
+    moved = (stand.counts - stand.began)[cable - 1] / winch.counts_per_metre
+    return CableJog(cable, float(moved), stand.tensions)

@@ -1,0 +1,112 @@
+"""The real-time process: one thread that opens the drives, arms them and runs the loop."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import suppress
+from functools import partial
+from multiprocessing.connection import Connection
+
+from drivers.drive_group import CycleStatus
+from executor.control.sync_master import SyncMaster
+from executor.realtime.clock import RealClock
+from executor.realtime.job import (
+    CYCLE_SLOTS,
+    EVENT_SLOTS,
+    Armed,
+    Ended,
+    Failed,
+    Go,
+    Gone,
+    Job,
+    ReadDrives,
+    ReadyDrives,
+)
+from executor.realtime.scheduling import real_time, require_real_time
+from executor.realtime.shared_memory import CycleRecordCodec, Ring, Supervised, pack_event
+from executor.state_machine import SIMULATED, CycleRecord, LoopEvent, State
+from model.errors import CdprError, Fault
+
+_FROM_A_TERMINAL = (
+    signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU
+)  # fmt: skip
+
+
+def serve(job: Job, link: Connection, supervisor: int) -> None:
+    """What the process does; it ends with the drives holding by themselves, whatever happens.
+
+    Args:
+        job: What to do.
+        link: To the supervisor.
+        supervisor: Number of its process.
+    """
+    supervised = Supervised(job.board, supervisor)
+    # What a terminal sends is the supervisor's to decide on; it tells by the board, and where it is
+    # suspended or killed its silence does.
+    for number in _FROM_A_TERMINAL:
+        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: supervised.ask_stop())
+    try:
+        with job.make_drives() as drives:
+            _arm_and_run(job, drives, link, supervised)
+    except CdprError as error:
+        _say(link, Failed(error))
+    except Exception as error:
+        _say(link, Failed(Fault(f"the real-time process broke: {type(error).__name__}: {error}")))
+
+
+def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Supervised) -> None:
+    motion = job.motion
+    cycles, events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
+    wire = CycleRecordCodec(motion.cables)
+
+    def on_cycle(record: CycleRecord) -> None:
+        cycles.put(wire.pack(record, motion.after(record, drives)))
+
+    def on_event(event: LoopEvent) -> None:
+        events.put(pack_event(event, events.largest_content))
+
+    with real_time() as denied:
+        require_real_time(denied, needed=job.need_real_time)
+        master = SyncMaster(
+            drives.rig, drives.group, RealClock(motion.cycle, supervised.note_cycle)
+        )
+        try:
+            loop = motion.loop(
+                drives, master, wishes=supervised.read, on_cycle=on_cycle, on_event=on_event
+            )
+            loop.arm(partial(motion.require, drives))
+            if drives.group.capabilities.simulated and drives.true_pose is None:  # on a real bus
+                on_event(LoopEvent(0, 0.0, SIMULATED, "the drives say that they are simulated"))
+            _say(link, Armed(denied, loop.stands_at, drives.restarted, drives.remarks))
+            said = master.keep_until(lambda: _word(link))
+        except Exception:
+            master.leave_unmoved()
+            raise
+        if not isinstance(said, Go):
+            master.leave_unmoved()
+            return
+        state = loop.run()
+    true_pose = drives.true_pose_now()
+    _say(link, Ended(state, loop.cause, loop.holding, true_pose, loop.error))
+    # After any other end the supervisor may hang, and nobody asks.
+    while state is State.FINISHED and isinstance(_heard(link), ReadDrives):
+        _say(link, master.look())
+
+
+def _word(link: Connection) -> object:
+    """The supervisor's word, or that none can come any more; None as long as there is nothing."""
+    return (_heard(link) or Gone()) if link.poll() else None
+
+
+def _heard(link: Connection) -> object:
+    """The supervisor's next word; None when it changed its mind, is done, or is gone."""
+    try:
+        return link.recv()
+    except (EOFError, OSError):
+        return None
+
+
+def _say(link: Connection, what: Armed | Ended | Failed | CycleStatus) -> None:
+    with suppress(OSError):  # nobody is there to hear it; the drives hold all the same
+        link.send(what)

@@ -1,0 +1,348 @@
+"""Memory that two processes share. It has no name, so nothing is left of it whoever is killed."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import mmap
+import os
+import struct
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from multiprocessing.reduction import DupFd
+from typing import Protocol
+
+from executor.operator_requests import OperatorRequests, StopReason
+from executor.state_machine import CycleRecord, LoopEvent, State
+from model.pose import Pose
+
+
+class _Sent(Protocol):
+    """A descriptor on its way to a process that is being started."""
+
+    def detach(self) -> int:
+        """The same file here."""
+        ...
+
+
+class SharedMemory:
+    """A piece of memory; given to a process that is being started, it is the same piece there.
+
+    Attributes:
+        view: Its content.
+        size: [bytes].
+    """
+
+    def __init__(self, descriptor: int, size: int, *, writable: bool) -> None:
+        """Takes over an open memory file; `create` and `sealed` make one."""
+        self._descriptor, self._writable = descriptor, writable
+        self.size = size
+        protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
+        self.view = mmap.mmap(descriptor, size, prot=protection)
+
+    @classmethod
+    def create(cls, size: int) -> SharedMemory:
+        """Empty memory that both sides may write to."""
+        descriptor = os.memfd_create("cdpr", os.MFD_CLOEXEC)
+        os.ftruncate(descriptor, size)
+        return cls(descriptor, size, writable=True)
+
+    @classmethod
+    def sealed(cls, content: bytes) -> SharedMemory:
+        """Memory that nobody can write to any more, in no process."""
+        descriptor = os.memfd_create("cdpr", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        left = memoryview(content)
+        while left:
+            left = left[os.write(descriptor, left) :]
+        seals = fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
+        return cls(descriptor, len(content), writable=False)
+
+    def close(self) -> None:
+        """Lets go of it; what NumPy still looks at stays until that is gone."""
+        os.close(self._descriptor)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Only while a process is being started: the descriptor goes along."""
+        return _received, (DupFd(self._descriptor), self.size, self._writable)
+
+
+def _received(descriptor: _Sent, size: int, writable: bool) -> SharedMemory:
+    return SharedMemory(descriptor.detach(), size, writable=writable)
+
+
+# A ring of slots in shared memory: one process writes, one reads, and neither waits.
+
+
+_HEAD = struct.Struct("<QII")  # number from 1, length, checksum over both and the content
+_CHECKED = struct.Struct("<QI")
+
+
+class Ring:
+    """Slots that are written round and round.
+
+    A slot counts when its checksum is right, so that a reader on another core never takes half a
+    slot for a whole one, whatever the order in which writes become visible there.
+
+    Attributes:
+        lost: Slots that were written over before they were read.
+    """
+
+    def __init__(self, memory: SharedMemory, slots: int) -> None:
+        """Lays a ring over memory that was empty at first; both sides with the same count."""
+        self._view = memory.view
+        self._slots, self._slot_size = slots, memory.size // slots
+        self._number = 0  # last one written or read, on this side
+        self.lost = 0
+
+    @staticmethod
+    def size(content: int, slots: int) -> int:
+        """Memory for slots of so much content, [bytes]."""
+        return slots * (content + _HEAD.size)
+
+    @property
+    def largest_content(self) -> int:
+        """What fits into a slot, [bytes]."""
+        return self._slot_size - _HEAD.size
+
+    def put(self, content: bytes) -> None:
+        """Writes the next slot.
+
+        Raises:
+            ValueError: It does not fit.
+        """
+        if len(content) > self.largest_content:
+            raise ValueError(f"{len(content)} bytes do not fit into a slot")
+        self._number += 1
+        at = self._place(self._number)
+        begin = at + _HEAD.size
+        self._view[begin : begin + len(content)] = content
+        checksum = _checksum(self._number, content)
+        _HEAD.pack_into(self._view, at, self._number, len(content), checksum)
+
+    def take(self) -> Iterator[bytes]:
+        """What was written since the last call, in order."""
+        while True:
+            at = self._place(self._number + 1)
+            number, length, checksum = _HEAD.unpack_from(self._view, at)
+            if number <= self._number or length > self.largest_content:
+                return
+            begin = at + _HEAD.size
+            content = bytes(self._view[begin : begin + length])
+            if checksum != _checksum(number, content):
+                return  # being written just now
+            self.lost += number - self._number - 1
+            self._number = number
+            yield content
+
+    def _place(self, number: int) -> int:
+        return (number - 1) % self._slots * self._slot_size
+
+
+def _checksum(number: int, content: bytes) -> int:
+    return zlib.crc32(content, zlib.crc32(_CHECKED.pack(number, len(content))))
+
+
+# Records and events as bytes in the status ring.
+
+
+_STATES = tuple(State)
+_NUMBERS = {state: number for number, state in enumerate(_STATES)}
+_NO_POSE = (math.nan,) * 7
+
+
+class CycleRecordCodec:
+    """How a record of a rig with m cables is laid out.
+
+    Attributes:
+        size: [bytes].
+    """
+
+    def __init__(self, cables: int) -> None:
+        """For so many cables."""
+        self._cables = cables
+        self._layout = struct.Struct(f"<Qd B dd HQQ dd {4 * cables}i 7d")
+        self.size = self._layout.size
+
+    def pack(self, record: CycleRecord, pose: Pose | None) -> bytes:
+        """A record, and where the simulated platform is if that is known."""
+        place = (*pose.position, *pose.quaternion) if pose is not None else _NO_POSE
+        return self._layout.pack(
+            record.cycle,
+            record.at,
+            _NUMBERS[record.state],
+            record.index,
+            record.rate,
+            record.missing,
+            record.rejected,
+            record.error_frames,
+            record.following_error,
+            record.lateness,
+            *record.targets,
+            *record.actual,
+            *record.torques,
+            *record.words,
+            *place,
+        )
+
+    def unpack(self, content: bytes) -> tuple[CycleRecord, Pose | None]:
+        """The inverse of `pack`."""
+        values = self._layout.unpack(content)
+        cycle, at, state, index, rate, missing, rejected, error_frames = values[:8]
+        error, lateness = values[8:10]
+        m = self._cables
+        targets, actual, torques, words = (values[10 + k * m : 10 + (k + 1) * m] for k in range(4))
+        place = values[10 + 4 * m :]
+        record = CycleRecord(
+            cycle=cycle,
+            at=at,
+            state=_STATES[state],
+            index=index,
+            rate=rate,
+            targets=targets,
+            actual=actual,
+            torques=torques,
+            words=words,
+            missing=missing,
+            rejected=rejected,
+            error_frames=error_frames,
+            following_error=error,
+            lateness=lateness,
+        )
+        if math.isnan(place[0]):
+            return record, None
+        return record, Pose.from_quaternion(place[:3], place[3:])
+
+
+def pack_event(event: LoopEvent, most: int) -> bytes:
+    """An event in at most so many bytes; a text that is too long loses its middle."""
+    text = event.text
+    while len(content := json.dumps({**asdict(event), "text": text}).encode()) > most:
+        keep = len(text) * 2 // 5
+        text = f"{text[:keep]} … {text[len(text) - keep :]}"
+    return content
+
+
+def unpack_event(content: bytes) -> LoopEvent:
+    """The inverse of `pack_event`."""
+    return LoopEvent(**json.loads(content))
+
+
+# The operator's wishes and both sides' signs of life, in memory that they share.
+
+
+#: The supervisor has hung if nothing is heard of it for so long, [s].
+SILENCE = 2.0
+
+_BEATS, _LENGTH = struct.Struct("<Q"), struct.Struct("<H")
+_LONGEST_TEXT = 400
+_STOP, _HOLD, _PERCENT, _BEAT, _CYCLES, _TROUBLE = 0, 1, 2, 8, 16, 24
+_REASON = _TROUBLE + _LENGTH.size + _LONGEST_TEXT
+_SIZE = _REASON + _LENGTH.size + _LONGEST_TEXT
+
+
+class SharedRequests:
+    """The supervisor's side; a `RequestBoard`. Each wish has a byte of its own."""
+
+    def __init__(self) -> None:
+        """Nothing is wished yet."""
+        self.memory = SharedMemory.create(_SIZE)
+        self.memory.view[_PERCENT] = 100
+        self._beats = 0
+
+    def ask_stop(self, for_what: StopReason | None = None) -> None:
+        """See `RequestBoard`."""
+        if for_what is not None and not self.memory.view[_STOP]:
+            # Before the stop: whoever reads that knows why.
+            _write(self.memory, _REASON, f"{for_what.code} {for_what.text}")
+        self.memory.view[_STOP] = 1
+
+    def ask_hold(self, hold: bool) -> None:
+        """See `RequestBoard`."""
+        self.memory.view[_HOLD] = int(hold)
+
+    def ask_speed(self, percent: int) -> None:
+        """See `RequestBoard`."""
+        self.memory.view[_PERCENT] = percent
+
+    def read(self) -> OperatorRequests:
+        """See `RequestBoard`."""
+        return _read(self.memory)
+
+    def close(self) -> None:
+        """Lets go of the memory; who still has it open keeps it."""
+        self.memory.close()
+
+    def beat(self) -> None:
+        """A sign of life."""
+        self._beats += 1
+        _BEATS.pack_into(self.memory.view, _BEAT, self._beats)
+
+    @property
+    def cycles(self) -> int:
+        """Cycles that the other process has begun, with or without a record of them."""
+        return int(_BEATS.unpack_from(self.memory.view, _CYCLES)[0])
+
+    def complain(self, trouble: str) -> None:
+        """The run cannot be supervised any more, for this reason; the first one is kept."""
+        if not _text(self.memory, _TROUBLE):
+            _write(self.memory, _TROUBLE, trouble)
+
+
+class Supervised:
+    """The side of the process that moves the drives: wishes, and whether somebody supervises."""
+
+    def __init__(self, memory: SharedMemory, supervisor: int) -> None:
+        """Listens to the process with this number, this process's parent."""
+        self._memory, self._supervisor = memory, supervisor
+        self._stopped = False
+        self._beats, self._heard, self._cycles = 0, time.monotonic(), 0
+
+    def ask_stop(self) -> None:
+        """This process itself was asked to end."""
+        self._stopped = True
+
+    def note_cycle(self) -> None:
+        """A cycle has begun: this process's sign of life."""
+        self._cycles += 1
+        _BEATS.pack_into(self._memory.view, _CYCLES, self._cycles)
+
+    def read(self) -> OperatorRequests:
+        """What is wished now, and whether anybody is there to wish."""
+        wishes = _read(self._memory)
+        return replace(wishes, stop=wishes.stop or self._stopped, lost=self._lost())
+
+    def _lost(self) -> str:
+        beats = _BEATS.unpack_from(self._memory.view, _BEAT)[0]
+        now = time.monotonic()
+        if beats != self._beats:
+            self._beats, self._heard = beats, now
+        if os.getppid() != self._supervisor:
+            return "the process that supervises the run is gone"
+        if now - self._heard > SILENCE:
+            return f"the process that supervises the run was silent for {SILENCE:g} s"
+        return _text(self._memory, _TROUBLE)
+
+
+def _read(memory: SharedMemory) -> OperatorRequests:
+    view = memory.view
+    stop, hold = bool(view[_STOP]), bool(view[_HOLD])
+    code, _, text = (_text(memory, _REASON) if stop else "").partition(" ")
+    for_what = StopReason(code, text) if code else None
+    return OperatorRequests(stop, hold, view[_PERCENT] / 100.0, for_what=for_what)
+
+
+def _write(memory: SharedMemory, place: int, text: str) -> None:
+    content = text.encode()[:_LONGEST_TEXT]
+    begin = place + _LENGTH.size
+    memory.view[begin : begin + len(content)] = content
+    _LENGTH.pack_into(memory.view, place, len(content))  # last: no text is read half-written
+
+
+def _text(memory: SharedMemory, place: int) -> str:
+    length = _LENGTH.unpack_from(memory.view, place)[0]
+    begin = place + _LENGTH.size
+    return bytes(memory.view[begin : begin + length]).decode(errors="replace")

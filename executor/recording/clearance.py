@@ -1,0 +1,285 @@
+"""How far cables and platform stayed from the obstacles during a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from executor.recording.csv import TableFile, numbers, texts, write_table
+from model.clearance import ClearanceModel, Nearest
+from model.kinematics import cable_lengths, structure_matrix
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.winches import WinchMap
+from tracking.clearance import MeasuredClearance, clearance_at
+
+_MM = 1e3
+
+
+def source_of(camera: str) -> str:
+    """The source of what one of several cameras measured alone."""
+    return f"tag:{camera}"
+
+
+def camera_of(source: str) -> str:
+    """The camera that a source is of alone; nothing for all cameras and for the drives."""
+    return source.partition(":")[2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClearanceTable:
+    """Distances at n poses to each of k obstacles; no rows for a scene without obstacles.
+
+    Attributes:
+        time: Since the start of the run, shape (n,), [s].
+        source: Where each pose came from, n texts: ``tag`` (all cameras), ``encoder``, or one of
+            several cameras alone (`source_of`).
+        distance: Smallest distance, shape (n,), [m].
+        uncertainty: How much less than that the smallest true one may be, shape (n,), [m].
+        at_most: The smallest true one is no more than this, shape (n,), [m].
+        body: Which part of the robot is nearest, n texts.
+        obstacle: Which obstacle it is nearest to, n texts.
+        planned_distance: Smallest distance of the planned pose at that time, shape (n,), [m].
+        obstacles: Names of the scene's obstacles, k texts.
+        distances: To each obstacle, shape (n, k), [m].
+        planned_distances: Of the planned pose to each obstacle, shape (n, k), [m].
+    """
+
+    time: Array
+    source: tuple[str, ...]
+    distance: Array
+    uncertainty: Array
+    at_most: Array
+    body: tuple[str, ...]
+    obstacle: tuple[str, ...]
+    planned_distance: Array
+    obstacles: tuple[str, ...]
+    distances: Array
+    planned_distances: Array
+
+    def __post_init__(self) -> None:
+        """Refuses arrays of different sizes.
+
+        Raises:
+            ValueError: Naming the attribute.
+        """
+        rows, count = len(self.time), len(self.obstacles)
+        for field in fields(self):
+            if field.name != "obstacles" and len(getattr(self, field.name)) != rows:
+                raise ValueError(f"{field.name} does not have {rows} rows, as time has")
+        for name in ("distances", "planned_distances"):
+            if getattr(self, name).shape != (rows, count):
+                raise ValueError(f"{name} must have shape ({rows}, {count})")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def of(self, source: str) -> ClearanceTable:
+        """The rows of one source."""
+        rows = np.array([name == source for name in self.source], dtype=bool)
+        chosen = np.flatnonzero(rows)
+        return ClearanceTable(
+            time=self.time[rows],
+            source=tuple(self.source[i] for i in chosen),
+            distance=self.distance[rows],
+            uncertainty=self.uncertainty[rows],
+            at_most=self.at_most[rows],
+            body=tuple(self.body[i] for i in chosen),
+            obstacle=tuple(self.obstacle[i] for i in chosen),
+            planned_distance=self.planned_distance[rows],
+            obstacles=self.obstacles,
+            distances=self.distances[rows],
+            planned_distances=self.planned_distances[rows],
+        )
+
+    def write_csv(self, path: Path) -> None:
+        """Writes ``clearance.csv``.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        columns = [
+            numbers("time_s", self.time),
+            texts("source", self.source),
+            numbers("distance_mm", self.distance, _MM),
+            numbers("uncertainty_mm", self.uncertainty, _MM),
+            numbers("at_most_mm", self.at_most, _MM),
+            texts("body", self.body),
+            texts("obstacle", self.obstacle),
+            numbers("planned_distance_mm", self.planned_distance, _MM),
+        ]
+        for i, name in enumerate(self.obstacles):
+            columns.append(numbers(f"{name}_mm", self.distances[:, i], _MM))
+            columns.append(numbers(f"planned_{name}_mm", self.planned_distances[:, i], _MM))
+        write_table(path, columns)
+
+    @classmethod
+    def read_csv(cls, path: Path) -> ClearanceTable:
+        """Reads ``clearance.csv``.
+
+        Raises:
+            BadInput: The file is missing, cut short or has other columns.
+        """
+        table = TableFile(path)
+        # By place, not by name: one obstacle may be called "x" and another "planned_x".
+        own = range(8, len(table.names), 2)
+        return cls(
+            time=table.floats("time_s"),
+            source=table.texts("source"),
+            distance=table.floats("distance_mm", _MM),
+            uncertainty=table.floats("uncertainty_mm", _MM),
+            at_most=table.floats("at_most_mm", _MM),
+            body=table.texts("body"),
+            obstacle=table.texts("obstacle"),
+            planned_distance=table.floats("planned_distance_mm", _MM),
+            obstacles=tuple(table.names[i].removesuffix("_mm") for i in own),
+            distances=table.matrix_at(own, _MM),
+            planned_distances=table.matrix_at(range(9, len(table.names), 2), _MM),
+        )
+
+
+def no_clearance(obstacles: tuple[str, ...] = ()) -> ClearanceTable:
+    """A table without rows."""
+    nothing, nowhere = np.empty(0), np.empty((0, len(obstacles)))
+    return ClearanceTable(
+        nothing, (), nothing, nothing, nothing, (), (), nothing, obstacles, nowhere, nowhere
+    )
+
+
+# How exactly the drives tell where the platform is: whole counts, and stretch by noisy torques.
+
+
+#: Standard deviation of a normal distribution by the median of its absolute values.
+_BY_MEDIAN = 1.4826
+
+
+def tension_noise(rig: Rig, tensions: Array) -> Array:
+    """Standard deviation of the tensions that torques tell, by what changes between two cycles.
+
+    What the platform's motion changes in a cycle counts as noise, too: a torque may be a cycle old.
+
+    Args:
+        rig: The robot.
+        tensions: Of every cycle, shape (n, m), [N]; NaN where none was told.
+
+    Returns:
+        Shape (m,), [N].
+    """
+    # One is the smallest step of a torque: drives tell whole per mille of the rated one.
+    rounding: Array = np.abs(rig.tensions_by(np.ones(rig.cable_count))) / np.sqrt(12.0)
+    steps = np.abs(np.diff(tensions, axis=0))
+    known = np.isfinite(steps).all(axis=1)
+    if not known.any():
+        return rounding
+    told = _BY_MEDIAN * np.median(steps[known], axis=0) / np.sqrt(2.0)
+    noise: Array = np.hypot(told, rounding)
+    return noise
+
+
+def covariance_by_drives(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) -> Array:
+    """Covariance of a pose that fits the cable lengths which the drives tell.
+
+    Args:
+        winches: Of the robot.
+        rig: The robot.
+        pose: ``world_from_platform``.
+        noise: See `tension_noise`, shape (m,), [N].
+
+    Returns:
+        Of position and rotation vector about world axes, shape (6, 6), [m, rad].
+    """
+    counts = 1.0 / np.abs(winches.counts_per_metre) / np.sqrt(12.0)
+    whole = cable_lengths(rig, pose) + winches.behind_outlet
+    lengths = np.hypot(counts, whole / winches.stiffness * noise)
+    spread = np.linalg.pinv(structure_matrix(rig, pose).T) * lengths
+    covariance: Array = spread @ spread.T
+    return covariance
+
+
+# Clearance along a run: from the drives' positions and, with a camera, from the tags.
+
+
+#: What the covariance of a pose by the drives does not know, [m]: forward kinematics takes cables
+#: for straight and weightless, and the rig for as it was calibrated.
+ALLOWANCE = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClearanceRow:
+    """Distances at one measured pose, one entry an obstacle.
+
+    Attributes:
+        time: [s].
+        source: As `ClearanceTable` has it.
+        measured: At the measured pose.
+        uncertainty: How much less than the smallest of them the smallest true one may be, [m].
+        at_most: The smallest true one is no more than this, [m].
+        planned: At the planned pose of the same time.
+    """
+
+    time: float
+    source: str
+    measured: tuple[Nearest, ...]
+    uncertainty: float
+    at_most: float
+    planned: tuple[Nearest, ...]
+
+    @classmethod
+    def at(
+        cls, time: float, source: str, clearance: MeasuredClearance, planned: tuple[Nearest, ...]
+    ) -> ClearanceRow:
+        """The row of a measured pose."""
+        measured, spread = clearance.nearest, clearance.uncertainty
+        return cls(time, source, measured, spread, clearance.at_most, planned)
+
+
+def encoder_rows(
+    model: ClearanceModel,
+    winches: WinchMap,
+    times: Array,
+    measured: Sequence[Pose],
+    planned: Sequence[Pose],
+    noise: Array,
+) -> list[ClearanceRow]:
+    """A row for each pose that follows from the drives' positions; none without an obstacle.
+
+    Args:
+        model: Robot and scene.
+        winches: Of the robot.
+        times: Of n poses, shape (n,), [s].
+        measured: By the drives, ``world_from_platform``.
+        planned: At the same times.
+        noise: Of the tensions that the drives tell, shape (m,), [N].
+    """
+    rows = []
+    for time, at, due in zip(times.tolist(), measured, planned, strict=True):
+        covariance = covariance_by_drives(winches, model.rig, at, noise)
+        clearance = clearance_at(model, at, covariance, ALLOWANCE)
+        if clearance is not None:
+            rows.append(ClearanceRow.at(time, "encoder", clearance, model.obstacles(due)))
+    return rows
+
+
+def clearance_table(names: tuple[str, ...], rows: Sequence[ClearanceRow]) -> ClearanceTable:
+    """Rows as a table; a scene without obstacles has none."""
+    if not rows or not names:
+        return no_clearance(names)
+    nearest = [min(row.measured, key=lambda n: n.distance) for row in rows]
+    measured = np.array([[n.distance for n in row.measured] for row in rows])
+    planned = np.array([[n.distance for n in row.planned] for row in rows])
+    return ClearanceTable(
+        time=np.array([row.time for row in rows]),
+        source=tuple(row.source for row in rows),
+        distance=measured.min(axis=1),
+        uncertainty=np.array([row.uncertainty for row in rows]),
+        at_most=np.array([row.at_most for row in rows]),
+        body=tuple(n.first for n in nearest),
+        obstacle=tuple(n.second for n in nearest),
+        planned_distance=planned.min(axis=1),
+        obstacles=names,
+        distances=measured,
+        planned_distances=planned,
+    )

@@ -1,0 +1,203 @@
+"""Tables of a run as CSV files: named columns with the unit in the name, all of one length."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import BadInput
+from model.files.documents import write_atomic
+from model.files.reading import CsvFile
+from model.pose import Array
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Column:
+    """One column of a CSV file.
+
+    Attributes:
+        name: Header, with the unit at its end.
+        values: Shape (n,): numbers in that unit, or texts.
+        form: ``%`` format of one value.
+    """
+
+    name: str
+    values: NDArray[np.float64] | Integers | Sequence[str]
+    form: str
+
+
+def numbers(name: str, values: Array, scale: float = 1.0, decimals: int = 6) -> Column:
+    """A column of floats; the file holds ``values * scale``."""
+    return Column(name, np.asarray(values, dtype=np.float64) * scale, f"%.{decimals}f")
+
+
+def integers(name: str, values: Integers) -> Column:
+    """A column of whole numbers."""
+    return Column(name, values, "%d")
+
+
+def texts(name: str, values: Sequence[str]) -> Column:
+    """A column of texts, quoted where CSV asks for it."""
+    return Column(name, [_quoted(value) for value in values], "%s")
+
+
+def write_table(path: Path, columns: Sequence[Column]) -> None:
+    """Writes a whole table or nothing.
+
+    Raises:
+        BadInput: The folder cannot be written to.
+    """
+    write_atomic(path, header(columns) + rows(columns))
+
+
+def header(columns: Sequence[Column]) -> str:
+    """The first line of a table."""
+    return ",".join(_quoted(column.name) for column in columns) + "\n"
+
+
+def rows(columns: Sequence[Column]) -> str:
+    """All lines of a table but the first."""
+    # One format for the whole row: twenty times faster than csv.writer with a format a value.
+    form = ",".join(column.form for column in columns) + "\n"
+    values = [
+        column.values.tolist() if isinstance(column.values, np.ndarray) else column.values
+        for column in columns
+    ]
+    return "".join(form % row for row in zip(*values, strict=True))
+
+
+def _quoted(text: str) -> str:
+    if not any(sign in text for sign in ',"\r\n'):
+        return text
+    return '"' + text.replace('"', '""').replace("\r", " ").replace("\n", " ") + '"'
+
+
+class TableFile:
+    """A CSV file that was read, column by column.
+
+    Args:
+        path: The file.
+        text: Its content, where the caller has read it already.
+
+    Raises:
+        BadInput: It cannot be read, or a row has more or fewer values than the header.
+    """
+
+    def __init__(self, path: Path, text: str | None = None) -> None:
+        self._path = path
+        rows = CsvFile(path, text).rows
+        if not rows:
+            raise self._bad("the file is empty; its first line must name the columns")
+        self.names = tuple(rows[0])
+        for number, row in enumerate(rows[1:], start=2):
+            if len(row) != len(self.names):
+                raise self._bad(
+                    f"line {number} has {len(row)} values for {len(self.names)} columns"
+                )
+        columns: list[Sequence[str]] = list(zip(*rows[1:], strict=True))
+        self._columns = columns or [()] * len(self.names)
+
+    def count(self, pattern: str) -> int:
+        """How many columns have a name that fully matches a regular expression."""
+        return sum(1 for name in self.names if re.fullmatch(pattern, name))
+
+    def texts(self, name: str) -> tuple[str, ...]:
+        """A column of texts.
+
+        Raises:
+            BadInput: There is no such column.
+        """
+        if name not in self.names:
+            raise self._bad(f"the column {name!r} is missing")
+        return tuple(self._columns[self.names.index(name)])
+
+    def floats(self, name: str, scale: float = 1.0) -> Array:
+        """A column of numbers divided by ``scale``, shape (n,).
+
+        Raises:
+            BadInput: The column is missing or holds something that is no number.
+        """
+        return self._numbers(name, self.texts(name)) / scale
+
+    def ints(self, name: str) -> Integers:
+        """A column of whole numbers, shape (n,).
+
+        Raises:
+            BadInput: The column is missing or holds something that is no whole number.
+        """
+        values = self.texts(name)
+        try:
+            return np.fromiter(map(int, values), np.int64, len(values))
+        except (ValueError, OverflowError) as error:
+            raise self._bad(f"the column {name!r} holds no whole number: {error}") from None
+
+    def matrix(self, names: Sequence[str], scale: float = 1.0) -> Array:
+        """Columns side by side, shape (n, len(names)), divided by ``scale``.
+
+        Raises:
+            BadInput: A column is missing or holds something that is no number.
+        """
+        if not names:
+            return np.empty((len(self._columns[0]), 0))
+        return np.column_stack([self.floats(name, scale) for name in names])
+
+    def matrix_at(self, places: range, scale: float = 1.0) -> Array:
+        """As `matrix`, with columns chosen by their place, for names that may stand twice.
+
+        Raises:
+            BadInput: A column holds something that is no number.
+        """
+        if not places:
+            return np.empty((len(self._columns[0]), 0))
+        columns = [self._numbers(self.names[i], self._columns[i]) for i in places]
+        return np.column_stack(columns) / scale
+
+    def int_matrix(self, names: Sequence[str]) -> Integers:
+        """Columns of whole numbers side by side, shape (n, len(names)).
+
+        Raises:
+            BadInput: A column is missing or holds something that is no whole number.
+        """
+        return np.column_stack([self.ints(name) for name in names])
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """All columns by name: whole numbers, numbers or texts, each shape (n,).
+
+        Of columns with the same name the first counts.
+        """
+        found: dict[str, NDArray[Any]] = {}
+        for name, values in zip(self.names, self._columns, strict=True):
+            found.setdefault(name, _typed(values))
+        return found
+
+    def _numbers(self, name: str, values: Sequence[str]) -> Array:
+        try:
+            return np.fromiter(map(float, values), np.float64, len(values))
+        except ValueError as error:
+            raise self._bad(f"the column {name!r} holds a text: {error}") from None
+
+    def _bad(self, what: str) -> BadInput:
+        return BadInput(
+            what,
+            where=str(self._path),
+            why="the file was edited or cut short after the run",
+            next_step="restore the file, or run the plan again into a new folder",
+        )
+
+
+def _typed(values: Sequence[str]) -> NDArray[Any]:
+    """Texts as the narrowest of whole numbers, numbers and texts that holds them all."""
+    for kind in (np.int64, np.float64):
+        try:
+            return np.array(values, dtype=np.str_).astype(kind)
+        except (ValueError, OverflowError):
+            continue
+    return np.array(values, dtype=np.str_)

@@ -1,0 +1,330 @@
+"""``run.mcap``: all channels of a run in one file for Foxglove or PlotJuggler."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import Writer
+
+from executor.recording.clearance import ClearanceTable, camera_of
+from executor.recording.fused import FusedTable
+from executor.recording.mcap_channels import (
+    CHANNELS,
+    WORLD,
+    Message,
+    channel_of,
+    column_of,
+    nanoseconds,
+    pose_value,
+    poses_of,
+    rows_of,
+    stamp_of,
+    topic_of,
+)
+from executor.recording.mcap_scene import robot_messages, scene_messages
+from executor.recording.run_folder import RunFolder
+from executor.recording.summary import RunContext
+from executor.recording.tables import OK, CycleTable, PoseTable
+from model.errors import Fault
+from tracking.clearance import MeasuredClearance
+from tracking.measurement import NoPose
+from tracking.pose_log import LoggedPicture
+
+# What cameras saw, as messages of ``run.mcap``: poses, why there is none, kept pictures.
+
+
+def camera_messages(
+    folder: RunFolder, poses: PoseTable, alone: Mapping[str, PoseTable], start: int
+) -> Iterator[Message]:
+    """All messages of a run's cameras.
+
+    Args:
+        folder: Holds the kept pictures.
+        poses: What all cameras measured together.
+        alone: What each of several measured, by its name; nothing for a single one.
+        start: [ns since 1970].
+    """
+    yield from _tags(poses, start)
+    for name, table in alone.items():
+        yield from _tags(table, start, name)
+        yield from _pictures(folder, table, start, name)
+    if not alone:
+        yield from _pictures(folder, poses, start)
+
+
+def _tags(poses: PoseTable, start: int, camera: str = "") -> Iterator[Message]:
+    topic = topic_of("/tag_pose", camera)
+    yield from poses_of(topic, poses.time, poses.position, poses.rotation, start)
+    covariances = rows_of(poses.covariance.reshape(-1, 36))
+    rows = zip(
+        poses.time.tolist(),
+        poses.frame.tolist(),
+        poses.status,
+        poses.tags,
+        column_of(poses.reprojection),
+        covariances,
+        strict=True,
+    )
+    for time, frame, status, tags, reprojection, covariance in rows:
+        content = {
+            "frame": frame,
+            "status": status,
+            "tags": tags,
+            "reprojection_px": reprojection,
+            "covariance": covariance,
+        }
+        yield topic_of("/tag_status", camera), time, content
+
+
+def _pictures(
+    folder: RunFolder, poses: PoseTable, start: int, camera: str = ""
+) -> Iterator[Message]:
+    for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
+        if name:
+            content = {
+                "timestamp": stamp_of(start, time),
+                "frame_id": camera or "camera",
+                "data": base64.b64encode(folder.picture(name)).decode(),
+                "format": "jpeg",
+            }
+            yield topic_of("/pictures", camera), time, content
+
+
+_INFO, _WARNING = 2, 3
+
+
+def write_mcap(
+    folder: RunFolder,
+    context: RunContext,
+    cycles: CycleTable,
+    poses: PoseTable,
+    clearance: ClearanceTable,
+    fused: FusedTable,
+    alone: Mapping[str, PoseTable],
+) -> Path:
+    """Writes ``run.mcap``; times in it are the start of the run plus run time.
+
+    Args:
+        folder: The run's folder; its pictures go into the file too.
+        context: What the run was.
+        cycles: Every cycle is logged.
+        poses: Every picture's pose, or why there is none.
+        clearance: Every row.
+        fused: Every row.
+        alone: What each of several cameras measured, by its name; nothing for a single one.
+
+    Raises:
+        Fault: The disk is full or gone; no part of the file is left.
+    """
+    start = int(context.started.timestamp() * 1e6) * 1000
+    messages = [
+        *scene_messages(context, start),
+        *robot_messages(context.rig, cycles, start),
+        *_cycles(cycles, start),
+        *camera_messages(folder, poses, alone, start),
+        *_clearance(clearance),
+        *poses_of("/fused_pose", fused.time, fused.position, fused.rotation, start),
+        *_events(context, start),
+    ]
+    write_messages(folder.mcap, messages, start)
+    return folder.mcap
+
+
+def write_messages(path: Path, messages: Sequence[Message], start: int) -> None:
+    """Writes messages in the order of their times, or no file.
+
+    Args:
+        path: The file.
+        messages: Of the channels in `executor.recording.mcap_channels.CHANNELS`, or of one of them
+            for a camera alone (`executor.recording.mcap_channels.topic_of`).
+        start: What their times count from, [ns since 1970].
+
+    Raises:
+        Fault: The disk is full or gone; no part of the file is left.
+    """
+    unfinished = path.with_name(f".{path.name[:40]}.{os.getpid()}")
+    try:
+        _write(unfinished, sorted(messages, key=lambda message: message[1]), start)
+        unfinished.replace(path)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise Fault(
+            "the log cannot be written",
+            where=str(path),
+            why=error.strerror or str(error),
+            next_step="free some space; the CSV files hold the same numbers",
+        ) from None
+
+
+def _write(path: Path, messages: Sequence[Message], start: int) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="", library="cdpr")
+        schemas, channels = {}, {}
+        for topic, (name, schema) in CHANNELS.items():
+            data = json.dumps(schema).encode()
+            schemas[topic] = writer.register_schema(name, "jsonschema", data)
+        of_cameras = {topic for topic, _, _ in messages} - CHANNELS.keys()
+        for topic in (*CHANNELS, *sorted(of_cameras)):
+            number = schemas[channel_of(topic)]
+            channels[topic] = writer.register_channel(topic, "json", number)
+        counts = dict.fromkeys(channels, 0)
+        for topic, time, content in messages:
+            at = start + nanoseconds(time)
+            data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+            writer.add_message(channels[topic], at, data, at, counts[topic])
+            counts[topic] += 1
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _cycles(cycles: CycleTable, start: int) -> Iterator[Message]:
+    yield from poses_of(
+        "/planned_pose", cycles.time, cycles.planned, cycles.planned_rotation, start
+    )
+    yield from poses_of(
+        "/encoder_pose", cycles.time, cycles.encoder, cycles.encoder_rotation, start
+    )
+    yield from _drives(cycles)
+
+
+def _drives(cycles: CycleTable) -> Iterator[Message]:
+    drive_keys = ("set_counts", "actual_counts", "length_mm", "planned_tension_n", "tension_n")
+    heads = zip(
+        cycles.state,
+        cycles.path_index.tolist(),
+        cycles.leg.tolist(),
+        cycles.stop,
+        column_of(cycles.travelled * 1e3),
+        column_of(cycles.lateness * 1e3),
+        cycles.missing.tolist(),
+        column_of(cycles.following_error * 1e3),
+        strict=True,
+    )
+    drives = zip(
+        cycles.set_counts.tolist(),
+        cycles.actual_counts.tolist(),
+        rows_of(cycles.lengths * 1e3),
+        rows_of(cycles.planned_tensions),
+        rows_of(cycles.tensions),
+        strict=True,
+    )
+    where, how = ("state", "path_index", "leg", "stop", "path_mm"), ("lateness_ms", "missing")
+    head_keys = (*where, *how, "following_error_mm")
+    every = zip(cycles.time.tolist(), heads, drives, strict=True)
+    for number, (time, head, values) in enumerate(every):
+        content: dict[str, Any] = {"cycle": number, **dict(zip(head_keys, head, strict=True))}
+        content["drives"] = [
+            dict(zip(drive_keys, one, strict=True)) for one in zip(*values, strict=True)
+        ]
+        yield "/drives", time, content
+
+
+def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
+    near, planned = rows_of(clearance.distances * 1e3), rows_of(clearance.planned_distances * 1e3)
+    keys = ("distance_mm", "uncertainty_mm", "at_most_mm", "planned_distance_mm")
+    columns = (
+        clearance.distance,
+        clearance.uncertainty,
+        clearance.at_most,
+        clearance.planned_distance,
+    )
+    values = zip(*(column_of(column * 1e3) for column in columns), strict=True)
+    for i, row in enumerate(values):
+        camera = camera_of(clearance.source[i])
+        each = zip(clearance.obstacles, near[i], planned[i], strict=True)
+        content: dict[str, Any] = {
+            "source": "tag" if camera else clearance.source[i],
+            **dict(zip(keys, row, strict=True)),
+            "body": clearance.body[i],
+            "obstacle": clearance.obstacle[i],
+            "obstacles": [
+                {"name": n, "distance_mm": d, "planned_distance_mm": p} for n, d, p in each
+            ],
+        }
+        yield topic_of("/clearance", camera), float(clearance.time[i]), content
+
+
+def _events(context: RunContext, start: int) -> Iterator[Message]:
+    for event in context.events:
+        content = {
+            "timestamp": stamp_of(start, event.time_s),
+            "level": _INFO if context.final_state == "finished" else _WARNING,
+            "message": event.text,
+            "name": event.code,
+            "file": "",
+            "line": 0,
+        }
+        yield "/events", event.time_s, content
+
+
+# Poses of `cdpr track` as an MCAP file, in the channels of a run's.
+
+
+def write_track_mcap(
+    path: Path,
+    pictures: Sequence[LoggedPicture],
+    alone: Mapping[str, Sequence[LoggedPicture]],
+    start: int,
+) -> None:
+    """Writes ``/tag_pose``, ``/tag_status`` and ``/clearance``, of each of several cameras too.
+
+    Args:
+        path: The file.
+        pictures: What was measured; their times count from ``start``.
+        alone: What each of several cameras measured, by its name; nothing for a single one.
+        start: [ns since 1970].
+
+    Raises:
+        Fault: The disk is full or gone; no part of the file is left.
+    """
+    messages = list(_messages(pictures, start, ""))
+    for name, own in alone.items():
+        messages += _messages(own, start, name)
+    write_messages(path, messages, start)
+
+
+def _messages(pictures: Sequence[LoggedPicture], start: int, camera: str) -> Iterator[Message]:
+    pose_topic, status_topic, clearance_topic = (
+        topic_of(channel, camera) for channel in ("/tag_pose", "/tag_status", "/clearance")
+    )
+    for frame, logged in enumerate(pictures):
+        found = logged.observation
+        status: dict[str, Any] = {"frame": frame, "status": OK, "tags": "", "reprojection_px": None}
+        if isinstance(found, NoPose):
+            nothing = [None] * 36
+            yield (
+                status_topic,
+                found.time,
+                {**status, "status": found.reason, "covariance": nothing},
+            )
+            continue
+        pose = pose_value(found.pose.position.tolist(), found.pose.quaternion.tolist())
+        stamp = stamp_of(start, found.time)
+        yield pose_topic, found.time, {"timestamp": stamp, "frame_id": WORLD, "pose": pose}
+        status |= {"tags": " ".join(map(str, found.tags)), "reprojection_px": found.reprojection}
+        status["covariance"] = found.covariance.ravel().tolist()
+        yield status_topic, found.time, status
+        if logged.clearance is not None:
+            yield clearance_topic, found.time, _track_clearance(logged.clearance)
+
+
+def _track_clearance(clearance: MeasuredClearance) -> dict[str, Any]:
+    nearest = min(clearance.nearest, key=lambda n: n.distance)
+    return {
+        "source": "tag",
+        "distance_mm": clearance.distance * 1e3,
+        "uncertainty_mm": clearance.uncertainty * 1e3,
+        "at_most_mm": clearance.at_most * 1e3,
+        "planned_distance_mm": None,
+        "body": nearest.first,
+        "obstacle": nearest.second,
+        "obstacles": [
+            {"name": n.second, "distance_mm": n.distance * 1e3, "planned_distance_mm": None}
+            for n in clearance.nearest
+        ],
+    }

@@ -1,0 +1,217 @@
+"""What ``summary.json`` and ``events.jsonl`` of a run folder must hold so that they can be read.
+
+Keys that nothing reads are not looked at: a later version may add some. What is written is
+`executor.recording.summary`'s; a damaged or edited run folder ends in one message that names the
+key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from model.errors import BadInput, InvalidFile
+from model.files.reading import parse_json, read_json
+from model.files.validation import problems_of
+
+AGAIN = "restore the file, or run the plan again into a new folder"
+
+Number = Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)]
+Maybe = Number | None
+Count = Annotated[int, Field(ge=0, le=2**53)]
+
+
+def _is_moment(text: str) -> str:
+    datetime.fromisoformat(text)
+    return text
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
+
+
+class EventRecord(BaseModel):
+    """One line of ``events.jsonl``."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    time_s: Number
+    code: str
+    text: str
+
+
+class CheckRecord(_Record):
+    """One question about the run."""
+
+    name: str
+    passed: bool
+    text: str
+
+
+class StopRecord(_Record):
+    """When a stop was reached and left."""
+
+    name: str
+    kind: str
+    reached_s: Maybe
+    left_s: Maybe
+
+
+class SizeRecord(_Record):
+    """Of an error over the run."""
+
+    max: Maybe
+    rms: Maybe
+
+    @model_validator(mode="after")
+    def _both_or_none(self) -> SizeRecord:
+        if (self.max is None) != (self.rms is None):
+            raise ValueError("max and rms must both be numbers, or neither")
+        return self
+
+
+class LimitedSizeRecord(SizeRecord):
+    """With the limit that it kept to."""
+
+    limit: Number
+
+
+class TagErrorRecord(SizeRecord):
+    """With the pictures behind it."""
+
+    frames: Count
+    frames_without_pose: Count
+
+
+class CameraRecordDocument(_Record):
+    """What became of a camera's pictures."""
+
+    name: str
+    source: str
+    pictures: Count
+    poses: Count
+    dropped: Count
+    measuring_ms: Maybe
+    failed: str
+
+
+class ClearanceRecord(_Record):
+    """The smallest clearance."""
+
+    required: Number
+    planned_min: Maybe
+    measured_min: Maybe
+    measured_uncertainty: Maybe
+    measured_at_most: Maybe
+    pair: Annotated[list[str], Field(min_length=2, max_length=2)]
+    at_s: Maybe
+    source: Literal["tag", "encoder"]
+
+    @model_validator(mode="after")
+    def _whole(self) -> ClearanceRecord:
+        span = (self.measured_min, self.measured_uncertainty, self.measured_at_most)
+        if self.measured_min is not None and None in span:
+            raise ValueError("a measured_min needs measured_uncertainty and measured_at_most")
+        return self
+
+
+class TensionRecord(_Record):
+    """The range of tensions."""
+
+    min: Maybe
+    max: Maybe
+    planned_min: Maybe
+    planned_max: Maybe
+    lower_limit: Number
+    upper_limit: Number
+
+    @model_validator(mode="after")
+    def _whole(self) -> TensionRecord:
+        for first, second in ((self.min, self.max), (self.planned_min, self.planned_max)):
+            if (first is None) != (second is None):
+                raise ValueError("a smallest tension needs a largest one")
+        return self
+
+
+class LatenessRecord(_Record):
+    """How late cycles began."""
+
+    p50: Maybe
+    p99: Maybe
+    max: Maybe
+
+
+class SummaryDocument(_Record):
+    """``summary.json`` (schema_version 1)."""
+
+    schema_version: Literal[1]
+    verdict: Literal["PASSED", "FAILED", "STOPPED"]
+    passed: bool
+    sentence: str
+    reasons: list[str]
+    checks: list[CheckRecord]
+    interface: str
+    simulated: bool
+    fast: bool
+    started: Annotated[str, AfterValidator(_is_moment)]
+    duration_s: Number
+    cycles: Count
+    cycle_ms: Number
+    lost_replies: Count
+    rejected_frames: Count
+    error_frames: Count
+    path_length_mm: Number
+    travelled_mm: Maybe
+    stops: list[StopRecord]
+    following_error_mm: LimitedSizeRecord
+    encoder_error_mm: SizeRecord
+    tag_error_mm: TagErrorRecord | None
+    cameras: list[CameraRecordDocument]
+    clearance_mm: ClearanceRecord | None
+    tension_n: TensionRecord
+    lateness_ms: LatenessRecord | None
+    final_state: str
+    events: list[EventRecord]
+    versions: dict[str, str]
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """What ``summary.json`` holds, as it stands there.
+
+    Raises:
+        BadInput: It cannot be read, or is of another version.
+        InvalidFile: With every key that cannot be used.
+    """
+    data = read_json(path, AGAIN)
+    if not isinstance(data, dict) or data.get("schema_version") != 1:
+        raise BadInput(
+            "not a summary of schema_version 1",
+            where=str(path),
+            next_step="run the plan again with this version of cdpr",
+        )
+    try:
+        SummaryDocument.model_validate(data)
+    except ValidationError as error:
+        problems = problems_of(error, SummaryDocument, {})
+        raise InvalidFile(str(path), problems, AGAIN) from None
+    return data
+
+
+def read_events(path: Path, lines: Sequence[str]) -> list[EventRecord]:
+    """The events in whole lines of ``events.jsonl``.
+
+    Raises:
+        BadInput: A line cannot be read.
+    """
+    events = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            events.append(EventRecord.model_validate(parse_json(line)))
+        except ValueError:
+            what = "not an event"
+            raise BadInput(what, where=f"{path}:{number}", next_step=AGAIN) from None
+    return events

@@ -1,0 +1,367 @@
+"""Takes in what the loop tells of a run: cycles and events to log and disk, pictures asked."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from functools import partial
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from executor.recording.csv import Integers
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.tables import CycleTable, quaternions_of
+from executor.remote.status import RunStatus
+from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
+from executor.trajectory.dwell import legs_at
+from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.schedule import stop_events
+from executor.trajectory.setpoints import CheckedTrajectory
+from model.errors import CdprError, Fault
+from model.kinematics import forward_kinematics, poses_near
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.scene import Scene
+
+# Collects the cycles of a run in memory and makes their table afterwards.
+
+
+class RunLog:
+    """The cycles of one run, in the order in which they were sent."""
+
+    def __init__(self, rig: Rig, scene: Scene, checked: CheckedTrajectory) -> None:
+        """An empty log of a run of a checked table on a rig in a scene."""
+        self._rig, self._scene, self._checked = rig, scene, checked
+        self._records: list[CycleRecord] = []
+        self.events: list[RunEvent] = []
+        """What happened, in order."""
+
+    def add(self, record: CycleRecord) -> None:
+        """Takes in a cycle; costs next to nothing."""
+        self._records.append(record)
+
+    def __len__(self) -> int:
+        """Number of cycles."""
+        return len(self._records)
+
+    @property
+    def last_positions(self) -> tuple[int, ...] | None:
+        """Where the drives last said that they stand, [counts]; None before the first cycle."""
+        return self._records[-1].actual if self._records else None
+
+    def pose_by_drives(self, record: CycleRecord) -> Pose | None:
+        """Where the drives' positions put the platform in a cycle; None when they fit no pose."""
+        planned, row = self._checked.table, round(record.index)
+        lengths, _ = self._lengths([record], np.array([row]))
+        try:
+            guess = Pose(planned.positions[row], planned.rotations[row])
+            return forward_kinematics(self._rig, lengths[0], guess).pose
+        except Fault:
+            return None
+
+    def table(self, first: int = 0, end: int | None = None) -> CycleTable:
+        """Everything that is known of the run's cycles, or of those from ``first`` up to ``end``.
+
+        It may be called from another thread while cycles are added.
+        """
+        rig, planned = self._rig, self._checked.table
+        records = self._records[first:end]
+        began = self._records[0].at if records else 0.0
+        # A drive answers a SYNC with where it is then: at what it was told one cycle before.
+        before = self._records[first - 1].index if first else 0.0
+        index = np.array([before, *(r.index for r in records[:-1])])[: len(records)]
+        rows = np.rint(index).astype(np.int64)
+        actual = _matrix([r.actual for r in records], rig.cable_count)
+        lengths, tensions = self._lengths(records, rows)
+        encoder, turned = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
+        legs = legs_at(planned.stands, index)
+        return CycleTable(
+            time=np.array([r.at - began for r in records]),
+            state=tuple(r.state.value for r in records),
+            path_index=rows,
+            leg=legs,
+            stop=tuple(self._stop_at(row) for row in rows.tolist()),
+            travelled=between(planned.travelled, index),
+            lateness=np.array([r.lateness for r in records]) * planned.cycle,
+            missing=np.array([r.missing for r in records], dtype=np.int64),
+            rejected=np.array([r.rejected for r in records], dtype=np.int64),
+            error_frames=np.array([r.error_frames for r in records], dtype=np.int64),
+            planned=between(planned.positions, index),
+            planned_rotation=quaternions_of(planned.rotations[rows]),
+            encoder=encoder,
+            encoder_rotation=quaternions_of(turned),
+            following_error=np.array([r.following_error for r in records]),
+            set_counts=_matrix([r.targets for r in records], rig.cable_count),
+            actual_counts=actual,
+            lengths=lengths,
+            planned_tensions=between(planned.tensions, index),
+            tensions=tensions,
+        )
+
+    def _lengths(self, records: list[CycleRecord], rows: Integers) -> tuple[Array, Array]:
+        """Cable lengths [m] by the drives' positions, and tensions [N] where torques tell them.
+
+        Args:
+            records: n cycles.
+            rows: The set-points that the drives were told, shape (n,).
+        """
+        actual = _matrix([r.actual for r in records], self._rig.cable_count)
+        tensions = self._rig.tensions_by(
+            _matrix([r.torques for r in records], self._rig.cable_count)
+        )
+        # Only drives that follow their set-points tell the cables' tensions by their torques.
+        taut = np.isfinite([r.following_error for r in records])[:, None]
+        stretch = np.where(taut, tensions, self._checked.table.tensions[rows])
+        winches = self._checked.winches
+        lengths = winches.strained(
+            winches.unstrained_from_counts(actual.astype(np.float64)), stretch
+        )
+        return lengths, np.where(taut, tensions, np.nan)
+
+    def _stop_at(self, row: int) -> str:
+        """Name of the stop at which the platform stands; nothing on the way."""
+        for stop, stand in zip(self._scene.stops, self._checked.table.stands, strict=True):
+            if stand.first <= row <= stand.last:
+                return stop.name
+        return ""
+
+
+def _matrix(
+    rows: list[tuple[int, ...]], width: int
+) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    return np.array(rows, dtype=np.int64).reshape(len(rows), width)
+
+
+def between(values: Array, index: ArrayLike) -> Array:
+    """Rows of a table at one fractional place or several."""
+    index = np.asarray(index, dtype=np.float64)
+    low = np.floor(index).astype(np.int64)
+    high = np.minimum(low + 1, len(values) - 1)
+    share = index - low
+    if values.ndim > 1:
+        share = share[..., None]
+    mixed: Array = (1.0 - share) * values[low] + share * values[high]
+    return mixed
+
+
+# Writes the record of a run while it goes on, so that a killed program leaves it behind.
+#
+# In real time a thread of its own writes: neither the loop, which is another process, nor the
+# reading of what it reports waits for the disk. What is to be written queues up; a disk that is
+# `BEHIND` seconds behind, or full, or gone, is a fault of the record, for which the run stops along
+# the path. In simulated time the run waits for the disk.
+
+
+#: Cycles are appended this often, [s]: what is lost with a killed program is at most twice that.
+EVERY = 0.4
+#: A disk may hang for so long, [s]: SD cards do so for a second or two.
+BEHIND = 5.0
+#: Things that may wait to be written: the cycles of `BEHIND` seconds, and many events.
+_MOST_WAITING = 512
+
+
+class RecordWriter:
+    """Of one run; its thread, if it has one, ends with the block.
+
+    Args:
+        folder: Where it writes.
+        log: Holds the cycles that are written.
+        own_thread: Write in a thread, and fsync.
+    """
+
+    def __init__(self, folder: RunFolder, log: RunLog, *, own_thread: bool) -> None:
+        self._folder, self._log, self._own_thread = folder, log, own_thread
+        self._queued, self._written = 0, 0
+        self._queued_until, self._written_until = 0.0, 0.0
+        self._trouble: CdprError | None = None
+        self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        if own_thread:
+            self._thread = threading.Thread(target=self._write, name="cdpr-record", daemon=True)
+            self._thread.start()
+
+    def __enter__(self) -> RecordWriter:
+        """Nothing more."""
+        return self
+
+    def __exit__(
+        self,
+        _kind: type[BaseException] | None,
+        _error: BaseException | None,
+        _trace: TracebackType | None,
+    ) -> None:
+        """See `close`."""
+        self.close()
+
+    def take_cycles(self, at: float) -> None:
+        """Cycles were added to the log, the last of them at this time, [s].
+
+        Raises:
+            CdprError: The record cannot be written, or the disk is far behind.
+        """
+        if not self._queued:
+            self._queued_until = self._written_until = at
+        if at - self._queued_until >= EVERY or not self._queued:
+            self._queue_cycles(at)
+
+    def take_event(self, event: RunEvent) -> None:
+        """Something happened.
+
+        Raises:
+            CdprError: As for `take_cycles`.
+        """
+        self._put(partial(self._folder.append_event, event))
+
+    def close(self) -> None:
+        """Writes what is left, and waits for it; never raises."""
+        try:
+            self._queue_cycles(self._queued_until)
+        except CdprError as error:
+            self._trouble = self._trouble or error
+        if self._thread is not None:
+            self._waiting.put(None)
+            self._thread.join()
+            self._thread = None
+
+    def _queue_cycles(self, at: float) -> None:
+        first, end = self._queued, len(self._log)
+        if end == first:
+            return
+        self._queued, self._queued_until = end, at
+        self._put(partial(self._append, first, end, at))
+
+    def _append(self, first: int, end: int, at: float) -> None:
+        if first != self._written:  # cycles before them could not be written: no gap
+            return
+        table = self._log.table(first, end)
+        text = table.csv_rows(first)
+        if first == 0:
+            text = table.csv_header() + text
+        self._folder.append_cycles(text, fsync=self._own_thread)
+        self._written, self._written_until = end, at
+
+    def _put(self, write: Callable[[], None]) -> None:
+        if self._trouble is not None:
+            raise self._trouble
+        if self._thread is None:
+            write()
+            return
+        behind = self._queued_until - self._written_until
+        if behind > BEHIND or self._waiting.qsize() >= _MOST_WAITING:
+            self._trouble = Fault(
+                f"the disk is {behind:.1f} s behind the run, allowed are {BEHIND:g} s",
+                where=str(self._folder.path),
+                why="it is too slow, or hangs",
+                next_step="choose a run folder on another disk",
+            )
+            raise self._trouble
+        self._waiting.put(write)
+
+    def _write(self) -> None:
+        while (write := self._waiting.get()) is not None:
+            try:
+                write()
+            except CdprError as error:
+                self._trouble = self._trouble or error
+            except Exception as error:
+                what = f"the record broke: {type(error).__name__}: {error}"
+                self._trouble = self._trouble or Fault(what, where=str(self._folder.path))
+
+
+#: Asks for a picture: time since the start of the run [s], the same moment on the monotonic clock
+#: [s], where the simulated platform is then, and where the drives' positions put it.
+FrameTrigger = Callable[[float, float, Pose | None, Pose | None], None]
+
+
+class Recorder:
+    """The record of one run while it goes on."""
+
+    def __init__(
+        self,
+        prepared: PreparedRun,
+        folder: RunFolder,
+        status: RunStatus,
+        *,
+        trigger: FrameTrigger | None,
+        every: int,
+        progress: Callable[[float], None],
+        announce: Callable[[str], None],
+        on_event: Callable[[RunEvent], None] | None = None,
+        own_thread: bool = False,
+    ) -> None:
+        """Nothing happened yet.
+
+        Args:
+            prepared: What is run.
+            folder: Where cycles and events are written as they happen.
+            status: Kept up to date for those who ask.
+            trigger: Called for every picture.
+            every: Cycles from one picture to the next.
+            progress: Called now and then with the number of rows that are done.
+            announce: Told in a sentence when a stop is reached and left.
+            on_event: Called with each event, after it is on record.
+            own_thread: The disk is waited for in a thread, which `writer` ends.
+        """
+        self.log = RunLog(prepared.rig, prepared.scene, prepared.checked)
+        self._announcements = stop_events(prepared.scene, prepared.checked.table.stands)
+        self._announce, self._on_event = announce, on_event
+        self.folder = folder
+        """Where events are written."""
+        self.writer = RecordWriter(folder, self.log, own_thread=own_thread)
+        """Writes them; whoever made this closes it."""
+        self._status = status
+        self._trigger, self._progress = trigger, progress
+        self.every = every
+        """Cycles from one picture to the next."""
+        self._began: float | None = None
+        self.last = 0.0
+        """When the last cycle began, on the loop's clock, [s]."""
+        self.state = State.READY
+        """Where the run was then."""
+
+    def wants_pose(self, cycle: int) -> bool:
+        """Whether a picture will be asked for in this cycle."""
+        return self._trigger is not None and cycle % self.every == 0
+
+    def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
+        """A cycle is over.
+
+        Args:
+            record: What happened in it.
+            true_pose: Where the simulated platform is, in cycles with a picture.
+
+        Raises:
+            CdprError: The record cannot be written; all else is done.
+        """
+        if self._began is None:
+            self._began = record.at
+        self.last, self.state = record.at, record.state
+        self.log.add(record)
+        self._status.take_cycle(record)
+        if record.state in ON_PATH:
+            for code, text in self._announcements.due(record.index):
+                self.take_event(LoopEvent(record.cycle, record.at, code, text))
+                self._announce(text)
+        if record.cycle % self.every == 0:
+            self._progress(record.index)
+            if self._trigger is not None:
+                by_drives = self.log.pose_by_drives(record)
+                self._trigger(record.at - self._began, record.at, true_pose, by_drives)
+        self.writer.take_cycles(record.at)
+
+    def take_event(self, event: LoopEvent) -> None:
+        """Something happened.
+
+        Raises:
+            CdprError: The record cannot be written; the event is known all the same.
+        """
+        time = 0.0 if self._began is None else event.at - self._began
+        told = RunEvent(round(time, 6), event.code, event.text)
+        self.log.events.append(told)
+        self._status.take_event(told)
+        self.writer.take_event(told)
+        if self._on_event is not None:
+            self._on_event(told)

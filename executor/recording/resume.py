@@ -1,0 +1,202 @@
+"""Where a run ended and what was left to do, from its folder alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from executor.recording.run_folder import PLAN, RunFolder
+from executor.recording.tables import CycleTable
+from executor.recording.verdict import NOT_ENDED
+from model.clearance import ClearanceModel
+from model.errors import BadInput, Refused
+from model.files.scene_file import Payload, StopDocument, payloads
+from model.kinematics import cable_lengths, forward_kinematics
+from model.plan import require_same_rig
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Scene
+from model.winches import WinchMap
+from planner.settings import CLEARANCE_RESERVE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunEnd:
+    """The end of a run.
+
+    Attributes:
+        rig: The rig that was run.
+        pose: Of the platform, ``world_from_platform``: the position by the drives, turned as
+            commanded.
+        payload: What was planned to hang on it.
+        done: Stops that were visited, by this run and by those that it went on from.
+        waiting_at: Name of the stop whose dwell was cut short; nothing otherwise.
+        finished: Whether the goal was reached.
+    """
+
+    rig: Rig
+    pose: Pose
+    payload: Payload
+    done: tuple[StopDocument, ...]
+    waiting_at: str
+    finished: bool
+
+
+def run_end(folder: RunFolder) -> RunEnd:
+    """The end of the run in a folder.
+
+    Raises:
+        BadInput: A file of the folder is missing or was changed.
+        Refused: The drives' positions do not tell where the platform is.
+    """
+    rig, plan, cycles = folder.rig(), folder.plan(), folder.cycles()
+    where = str(folder.path)
+    final_state = folder.summary()["final_state"]
+    if final_state == NOT_ENDED:
+        raise _unknown(
+            "the run did not come to its end, so its last cycles are not on record", where
+        )
+    if not len(cycles):
+        raise BadInput("the run has no cycle", where=where, next_step="plan with --start-mm")
+    stops, leg = plan.scene.document.stops, int(cycles.leg[-1])
+    if not 1 <= leg <= len(stops) + 1:
+        what = f"the run ended on leg {leg}, its plan has {len(stops) + 1}"
+        raise BadInput(what, where=where, why="a file was changed after the run")
+    waits = leg <= len(stops) and cycles.stop[-1] == stops[leg - 1].name
+    return RunEnd(
+        rig=rig,
+        pose=_pose(rig, cycles, where),
+        payload=payloads(plan.scene.document.load.payload(), stops)[leg - 1],
+        done=(*plan.document.done, *stops[: leg - 1]),
+        waiting_at=cycles.stop[-1] if waits else "",
+        finished=final_state == "finished",
+    )
+
+
+def continued(scene: Scene, end: RunEnd) -> tuple[Scene, tuple[StopDocument, ...]]:
+    """A scene from where a run ended, with what was carried and the stops not yet visited.
+
+    Returns:
+        The scene, and those of its stops that are behind it.
+
+    Raises:
+        BadInput: A stop of the scene was visited as another one, or out of order.
+    """
+    visited = {stop.name: stop for stop in end.done}
+    done = [stop for stop in scene.document.stops if stop.name in visited]
+    changed = [stop.name for stop in done if stop != visited[stop.name]]
+    if changed or done != scene.document.stops[: len(done)]:
+        names = changed or [stop.name for stop in done]
+        how = "as other stops than the scene's" if changed else "in another order"
+        raise BadInput(
+            f"the run visited {', '.join(map(repr, names))} {how}",
+            where=f"scene {scene.name}",
+            why="the scene's stops were changed since, or it is another task",
+            next_step="restore them; or give the stops of another task other names",
+        )
+    rest = scene.document.stops[len(done) :]
+    return scene.changed(start=end.pose, stops=rest, payload=end.payload), tuple(done)
+
+
+def _pose(rig: Rig, cycles: CycleTable, where: str) -> Pose:
+    """By forward kinematics of the drives' last positions; believed where the plan agrees."""
+    if cycles.missing[-1]:
+        raise _unknown(f"{cycles.missing[-1]} drives did not answer in the last cycle", where)
+    winches = WinchMap(rig)
+    measured, planned = cycles.tensions[-1], cycles.planned_tensions[-1]
+    tensions = np.where(np.isfinite(measured), measured, planned)
+    counts = cycles.actual_counts[-1].astype(np.float64)
+    lengths = winches.strained(winches.unstrained_from_counts(counts), tensions)
+    found = forward_kinematics(rig, lengths).pose
+    commanded = Pose.from_quaternion(cycles.planned[-1], cycles.planned_rotation[-1])
+    away, allowed = found.distance_to(commanded), rig.motion.following_error
+    if not away <= allowed:
+        raise _unknown(
+            f"by its drives the platform is {away * 1e3:.2f} mm from where it was told to be,"
+            f" allowed are {allowed * 1e3:g} mm",
+            where,
+        )
+    pose = Pose(found.position, commanded.rotation)
+    off = np.abs(cable_lengths(rig, pose) - lengths)
+    worst, allowed = int(np.argmax(off)), rig.motion.start_tolerance
+    if not off[worst] <= allowed:
+        raise _unknown(
+            f"cable {worst + 1} is {off[worst] * 1e3:.2f} mm longer or shorter than at the pose"
+            f" that fits the drives' positions best, allowed are {allowed * 1e3:g} mm",
+            where,
+        )
+    return pose
+
+
+def _unknown(what: str, where: str) -> Refused:
+    return Refused(
+        f"where the platform is cannot be told: {what}",
+        where=where,
+        why="a drive slipped, stood still while others moved, or was lost; or the run was killed",
+        next_step="look at the rig, reference the drives, and plan from where the platform is with"
+        " `cdpr plan --start-mm`",
+    )
+
+
+# A scene that begins where a run ended.
+
+
+SAME_PLACE_M, SAME_WAY_RAD = 1e-3, 1e-3
+"""Nearer to the goal than this, and turned from it by less, there is nothing left to do."""
+
+
+def scene_after(
+    scene: Scene, rig: Rig, folder: Path
+) -> tuple[Scene, tuple[StopDocument, ...], RunEnd]:
+    """The scene from where a run ended, its stops that are done, and that end.
+
+    Raises:
+        BadInput: The folder is no whole run, or of another rig or task; or nothing is left to do.
+        Refused: Where the platform is cannot be told.
+    """
+    opened = RunFolder.open(folder)
+    require_same_rig(opened.plan(), rig, folder / PLAN)
+    end = run_end(opened)
+    after, done = continued(scene, end)
+    if end.finished and not after.stops and _is_there(after):
+        raise BadInput(
+            "the run ended at the scene's goal: nothing is left to do",
+            where=str(folder),
+            next_step="give another scene, or another goal with --goal-mm",
+        )
+    return after, done, end
+
+
+def _is_there(scene: Scene) -> bool:
+    start, goal = scene.start, scene.goal
+    return start.distance_to(goal) <= SAME_PLACE_M and start.angle_to(goal) <= SAME_WAY_RAD
+
+
+def require_room(scene: Scene, rig: Rig) -> None:
+    """Says what to do where the platform stopped nearer to something than a plan may begin.
+
+    Raises:
+        BadInput: With the clearance to ask for.
+    """
+    model = ClearanceModel(rig, scene)
+    near, own = model.smallest(scene.start), model.self_clearance(scene.start)
+    pairs = [(own, scene.self_clearance, "set clearance.self_mm in the scene to")]
+    if near is not None:
+        pairs.insert(0, (near, scene.obstacle_clearance, "pass --clearance-mm"))
+    for nearest, asked, ask in pairs:
+        if nearest.distance >= asked + CLEARANCE_RESERVE:
+            continue
+        possible = math.floor((nearest.distance - CLEARANCE_RESERVE) * 1e5) / 100.0
+        step = "move the platform away by hand and plan from where it is with --start-mm"
+        if possible > 0.0:
+            step = f"{ask} {possible:g}, which the whole new plan then keeps; or {step}"
+        raise BadInput(
+            f"the platform stopped with {nearest.first} {nearest.distance * 1e3:.3f} mm from"
+            f" {nearest.second}; a plan that keeps {asked * 1e3:g} mm and"
+            f" {CLEARANCE_RESERVE * 1e3:g} mm in reserve cannot begin there",
+            where="start of the new plan",
+            next_step=step,
+        )

@@ -1,0 +1,447 @@
+"""The folder that a run leaves: made once, written while the run goes on, read by the report."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from executor.recording.clearance import ClearanceTable
+from executor.recording.fused import FusedTable
+from executor.recording.record_files import AGAIN, read_events, read_summary
+from executor.recording.run_course import RunCourse
+from executor.recording.tables import CycleTable, PoseTable, no_cycles
+from model.errors import BadInput, Fault, InvalidFile
+from model.files.documents import problems_of, write_atomic
+from model.files.plan_file import PlanDocument
+from model.files.reading import PICTURE_LIMIT, read_bytes, read_json, read_text
+from model.files.rig_file import RigDocument
+from model.plan import Plan, load_plan, save_plan
+from model.rig import Rig, rig_from_document
+
+PLAN, RIG, SUMMARY, EVENTS = "plan.json", "rig.json", "summary.json", "events.jsonl"
+COURSE = "run.json"
+CYCLES, POSES, CLEARANCE = "cycles.csv", "poses.csv", "clearance.csv"
+FUSED, POSES_OF = "fused.csv", "poses-{}.csv"
+MCAP, REPORT, PICTURES = "run.mcap", "report.html", "pictures"
+NEEDED = (PLAN, RIG, CYCLES, POSES, CLEARANCE, SUMMARY, EVENTS)
+#: Written before anything moves.
+BEGUN = (PLAN, RIG, COURSE, EVENTS)
+JPEG_QUALITY = 88
+
+
+@dataclass(frozen=True, slots=True)
+class RunEvent:
+    """Something that happened during a run.
+
+    Attributes:
+        time_s: Since the start of the run.
+        code: Stable short name, such as ``finished`` or ``following_error``.
+        text: One sentence.
+    """
+
+    time_s: float
+    code: str
+    text: str
+
+    @property
+    def line(self) -> str:
+        """In the file of events."""
+        return json.dumps(asdict(self), ensure_ascii=False) + "\n"
+
+
+class RunFolder:
+    """A run's folder; make one with `create` or `open`.
+
+    Args:
+        path: The folder, which exists.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, path: Path) -> RunFolder:
+        """Makes a new folder, empty but for its folder of pictures, and its missing parents.
+
+        Raises:
+            BadInput: The path exists, or it cannot be made or written to.
+        """
+        cls.require_free(path)
+        try:
+            path.mkdir(parents=True)
+        except OSError as error:
+            raise _not_made(path, error.strerror or str(error)) from None
+        folder = cls(path)
+        try:
+            (path / PICTURES).mkdir()
+            (path / EVENTS).touch()
+        except OSError as error:
+            folder.discard()
+            raise _not_made(path, error.strerror or str(error)) from None
+        return folder
+
+    @staticmethod
+    def require_free(path: Path) -> None:
+        """Says before a long preparation that a folder cannot be made there.
+
+        Raises:
+            BadInput: The path exists, or the folder above it is no folder or read-only.
+        """
+        if path.exists() or path.is_symlink():
+            raise BadInput(
+                "exists already",
+                where=str(path),
+                why="a run never writes into the folder of another",
+                next_step="choose another folder or remove this one",
+            )
+        above = next(folder for folder in path.absolute().parents if folder.exists())
+        if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+            raise _not_made(path, f"{above} is not a folder that you may write to")
+
+    @classmethod
+    def open(cls, path: Path) -> RunFolder:
+        """The folder of a run that ended.
+
+        Raises:
+            BadInput: There is no such folder, or a file of the run is missing; all are named.
+        """
+        if not path.is_dir():
+            raise BadInput(
+                "no such run folder",
+                where=str(path),
+                next_step="give the folder that `cdpr run -o` made",
+            )
+        missing = [name for name in NEEDED if not (path / name).is_file()]
+        if missing:
+            raise BadInput(
+                f"not a whole run folder: {', '.join(missing)} missing",
+                where=str(path),
+                why="the run was cut short, or this is another folder",
+                next_step="give a folder that `cdpr run -o` made, or run the plan again",
+            )
+        return cls(path)
+
+    @classmethod
+    def open_cut_short(cls, path: Path) -> RunFolder:
+        """The folder of a run that ended, or of one whose program was killed.
+
+        Raises:
+            BadInput: There is no such folder, it is no run's, or the run is still under way.
+        """
+        begun = all((path / name).is_file() for name in BEGUN)
+        if not begun or (path / SUMMARY).is_file():
+            return cls.open(path)  # it ended, or is of an earlier version, or says what is missing
+        folder = cls(path)
+        if folder.is_under_way():
+            raise BadInput(
+                "the run is still under way",
+                where=str(path),
+                next_step="wait for its end, or look at it with `cdpr monitor`",
+            )
+        return folder
+
+    def has(self, name: str) -> bool:
+        """Whether a file is there, and not cut in the middle of a line."""
+        try:
+            return (self.path / name).read_bytes().endswith(b"\n")
+        except OSError:
+            return False
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every file of a run that came to its end is there."""
+        return all((self.path / name).is_file() for name in NEEDED)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Shows others that the run is under way, until the block or this program ends."""
+        with (self.path / EVENTS).open("rb") as stream:
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+
+    def is_under_way(self) -> bool:
+        """Whether the program that writes into the folder still runs."""
+        with suppress(OSError), (self.path / EVENTS).open("rb") as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+        return False
+
+    def discard(self) -> None:
+        """Removes the folder: for a run that was refused before anything moved."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    @property
+    def mcap(self) -> Path:
+        """Where ``run.mcap`` is."""
+        return self.path / MCAP
+
+    @property
+    def report(self) -> Path:
+        """Where ``report.html`` is."""
+        return self.path / REPORT
+
+    def write_plan(self, document: PlanDocument) -> None:
+        """Keeps a copy of the plan.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        save_plan(document, self.path / PLAN)
+
+    def plan(self) -> Plan:
+        """The plan that was run.
+
+        Raises:
+            BadInput: The file was changed.
+        """
+        return load_plan(self.path / PLAN)
+
+    def write_rig(self, document: RigDocument) -> None:
+        """Keeps a copy of the rig file that the run used.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        self._write_json(RIG, document.model_dump(mode="json"))
+
+    def rig(self) -> Rig:
+        """The rig that was run.
+
+        Raises:
+            BadInput: The file was changed.
+        """
+        try:
+            document = RigDocument.model_validate(read_json(self.path / RIG, AGAIN))
+        except ValidationError as error:
+            problems = problems_of(error, RigDocument, {})
+            raise InvalidFile(str(self.path / RIG), problems) from None
+        return rig_from_document(document)
+
+    def write_cycles(self, table: CycleTable) -> None:
+        """Writes ``cycles.csv``."""
+        table.write_csv(self.path / CYCLES)
+
+    def cycles(self) -> CycleTable:
+        """Reads ``cycles.csv``."""
+        return CycleTable.read_csv(self.path / CYCLES)
+
+    def cycles_cut_short(self, cable_count: int) -> CycleTable:
+        """Reads what a killed program wrote of ``cycles.csv``: its whole lines, or none.
+
+        Raises:
+            BadInput: A whole line cannot be read.
+        """
+        if not (self.path / CYCLES).is_file():
+            return no_cycles(cable_count)
+        lines = self._whole_lines(CYCLES)
+        return CycleTable.of_lines(self.path / CYCLES, lines) if lines else no_cycles(cable_count)
+
+    def write_course(self, course: RunCourse) -> None:
+        """Writes ``run.json``, with room for its end.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        course.save(self.path / COURSE)
+
+    def write_end_of_course(self, course: RunCourse) -> None:
+        """As `write_course`; on a full disk in the room that is there.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        course.save_where_it_was(self.path / COURSE)
+
+    def course(self) -> RunCourse:
+        """Reads ``run.json``.
+
+        Raises:
+            BadInput: It was changed.
+        """
+        return RunCourse.load(self.path / COURSE)
+
+    def write_poses(self, table: PoseTable) -> None:
+        """Writes ``poses.csv``."""
+        table.write_csv(self.path / POSES)
+
+    def poses(self) -> PoseTable:
+        """Reads ``poses.csv``."""
+        return PoseTable.read_csv(self.path / POSES)
+
+    def write_poses_of(self, camera: str, table: PoseTable) -> None:
+        """Writes ``poses-<camera>.csv``: what one of several cameras measured alone."""
+        table.write_csv(self.path / POSES_OF.format(camera))
+
+    def poses_by_camera(self) -> dict[str, PoseTable]:
+        """Reads what each of several cameras measured alone; nothing of a run with one."""
+        begin, end = POSES_OF.split("{}")
+        names = [path.name for path in self.path.glob(POSES_OF.format("*"))]
+        return {
+            name.removeprefix(begin).removesuffix(end): PoseTable.read_csv(self.path / name)
+            for name in sorted(names)
+        }
+
+    def write_clearance(self, table: ClearanceTable) -> None:
+        """Writes ``clearance.csv``."""
+        table.write_csv(self.path / CLEARANCE)
+
+    def clearance(self) -> ClearanceTable:
+        """Reads ``clearance.csv``."""
+        return ClearanceTable.read_csv(self.path / CLEARANCE)
+
+    def write_fused(self, table: FusedTable) -> None:
+        """Writes ``fused.csv``."""
+        table.write_csv(self.path / FUSED)
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Writes ``summary.json`` (see `executor.recording.summary`)."""
+        self._write_json(SUMMARY, summary)
+
+    def summary(self) -> dict[str, Any]:
+        """Reads ``summary.json``.
+
+        Raises:
+            BadInput: It is no JSON, of another version, or damaged.
+        """
+        return read_summary(self.path / SUMMARY)
+
+    def append_event(self, event: RunEvent) -> None:
+        """Adds a line to ``events.jsonl``; it is on disk when this returns.
+
+        Raises:
+            Fault: The disk is full or gone.
+        """
+        self._append(EVENTS, event.line, fsync=True)
+
+    def append_cycles(self, lines: str, *, fsync: bool) -> None:
+        """Adds lines to ``cycles.csv``; with ``fsync`` they are on disk when this returns.
+
+        Raises:
+            Fault: The disk is full or gone.
+        """
+        self._append(CYCLES, lines, fsync=fsync)
+
+    def events(self) -> list[RunEvent]:
+        """Reads ``events.jsonl``; a last line that was cut by a crash is left out.
+
+        Raises:
+            BadInput: Another line cannot be read.
+        """
+        path = self.path / EVENTS
+        return [RunEvent(**dict(event)) for event in read_events(path, self._whole_lines(EVENTS))]
+
+    def write_events(self, events: Sequence[RunEvent]) -> None:
+        """Writes ``events.jsonl`` whole, where some could not be appended.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        write_atomic(self.path / EVENTS, "".join(event.line for event in events))
+
+    def write_picture(self, frame: int, image: NDArray[np.uint8], camera: str = "") -> str:
+        """Keeps a camera picture, grey or BGR, as JPEG.
+
+        Args:
+            frame: Number of the moment at which it was taken.
+            image: Shape (height, width) or (height, width, 3).
+            camera: Which of several cameras took it; each has a folder of its own.
+
+        Returns:
+            Its name inside the folder, ``pictures/frame_<frame>.jpg`` or
+            ``pictures/<camera>/frame_<frame>.jpg``.
+
+        Raises:
+            Fault: The disk is full or gone.
+        """
+        import cv2
+
+        name = "/".join([PICTURES, *([camera] if camera else []), f"frame_{frame:06d}.jpg"])
+        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        if not done:
+            raise ValueError(f"no picture: shape {image.shape}, type {image.dtype}")
+        try:
+            (self.path / name).parent.mkdir(exist_ok=True)
+            (self.path / name).write_bytes(data.tobytes())
+        except OSError as error:
+            raise self._not_written(name, error) from None
+        return name
+
+    def picture(self, name: str) -> bytes:
+        """The JPEG that `write_picture` named.
+
+        Raises:
+            BadInput: It is gone, or not in the folder of pictures.
+        """
+        try:
+            place = (self.path / name).resolve()
+            if not place.is_relative_to((self.path / PICTURES).resolve()):
+                raise FileNotFoundError(0, f"it is not in {PICTURES}")
+            return read_bytes(place, PICTURE_LIMIT)
+        except OSError as error:
+            raise BadInput(
+                "the picture cannot be read",
+                where=str(self.path / name),
+                why=error.strerror or str(error),
+            ) from None
+
+    def _append(self, name: str, text: str, *, fsync: bool) -> None:
+        """Adds whole lines or nothing."""
+        try:
+            with (self.path / name).open("ab", buffering=0) as stream:
+                before = os.fstat(stream.fileno()).st_size
+                try:
+                    data = memoryview(text.encode())
+                    while data:
+                        data = data[stream.write(data) :]
+                    if fsync:
+                        os.fsync(stream.fileno())
+                except OSError:
+                    with suppress(OSError):
+                        stream.truncate(before)  # the next line would be added to half a line
+                    raise
+        except OSError as error:
+            raise self._not_written(name, error) from None
+
+    def _whole_lines(self, name: str) -> list[str]:
+        """The lines of a file that was appended to; a last one that was cut is left out."""
+        path = self.path / name
+        try:
+            data = read_bytes(path)
+            return data[: data.rfind(b"\n") + 1].decode().split("\n")[:-1]
+        except UnicodeDecodeError:
+            return read_text(path).split("\n")  # says what is wrong with it
+
+    def _write_json(self, name: str, data: Any) -> None:
+        text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
+        write_atomic(self.path / name, text + "\n")
+
+    def _not_written(self, name: str, error: OSError) -> Fault:
+        return Fault(
+            "the run folder cannot be written to",
+            where=str(self.path / name),
+            why=error.strerror or str(error),
+            next_step="free some space; the motion does not depend on it, the record does",
+        )
+
+
+def _not_made(path: Path, why: str) -> BadInput:
+    return BadInput(
+        "the run folder cannot be made",
+        where=str(path),
+        why=why,
+        next_step="name another folder with -o, one with space that you may write to",
+    )

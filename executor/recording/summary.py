@@ -1,0 +1,217 @@
+"""``summary.json``: the verdict and the key figures of a run, made from its tables.
+
+Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, ``sentence``,
+``reasons`` (the sentences that decided), ``checks`` [{``name``, ``passed``, ``text``}], ``rig``,
+``scene``, ``plan_hash``, ``rig_hash``, ``interface``, ``simulated``, ``fast``, ``started`` (ISO
+8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``rejected_frames``,
+``error_frames``, ``path_length_mm``, ``travelled_mm``, ``stops`` [{``name``, ``kind``,
+``reached_s``, ``left_s``}], ``following_error_mm`` {``max``, ``rms``, ``limit``},
+``encoder_error_mm`` {``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``,
+``frames_without_pose``} or null without a camera, ``cameras`` [{``name``, ``source``, ``pictures``,
+``poses``, ``dropped``, ``measuring_ms`` (median), ``failed`` (why it gave no pictures any more, or
+nothing)}], ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
+``measured_uncertainty``, ``measured_at_most``, ``pair``, ``at_s``, ``source``} or null without
+obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``,
+``upper_limit``}, ``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time,
+``final_state`` (``not_ended`` where the program was killed), ``events`` [{``time_s``, ``code``,
+``text``}], ``versions``. A number that is not known is null.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.can_bus import IN_PROCESS
+from executor.cameras.client import CameraRecord
+from executor.recording.clearance import ClearanceTable
+from executor.recording.run_folder import RunEvent
+from executor.recording.tables import CycleTable, PoseTable
+from executor.recording.verdict import judge
+from model.plan import Plan
+from model.pose import Array
+from model.rig import Rig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunContext:
+    """What a run was, beside its tables.
+
+    Attributes:
+        plan: The plan that was run.
+        rig: The rig that was run.
+        interface: Of the bus, such as ``virtual`` or ``socketcan``.
+        simulated: The drives were simulated, here or by a program at the other end of the bus.
+        fast: Simulated time, so that lateness has no meaning.
+        started: When; must know its time zone.
+        duration: [s].
+        final_state: ``finished``, ``stopped`` or the state of a fault.
+        events: What happened, in order.
+        versions: Of the programs that took part, by name.
+        cause: Why the run did not finish; when left out, what the last event says.
+        cameras: What became of each camera's pictures.
+        troubles: What of the record is lost, a sentence each.
+    """
+
+    plan: Plan
+    rig: Rig
+    interface: str
+    simulated: bool
+    fast: bool
+    started: datetime
+    duration: float
+    final_state: str
+    events: tuple[RunEvent, ...]
+    versions: dict[str, str] = field(default_factory=dict)
+    cause: str = ""
+    cameras: tuple[CameraRecord, ...] = ()
+    troubles: tuple[str, ...] = ()
+
+
+def summarize(
+    context: RunContext, cycles: CycleTable, poses: PoseTable, clearance: ClearanceTable
+) -> dict[str, Any]:
+    """The content of ``summary.json``; see the head of this file."""
+    last = context.events[-1].text if context.events else ""
+    cause = context.cause or last
+    verdict = judge(
+        context.final_state,
+        cause,
+        context.simulated and context.interface == IN_PROCESS,
+        context.rig,
+        context.plan.scene,
+        cycles,
+        poses,
+        clearance,
+        context.cameras,
+        too_near=any(event.code == "clearance_low" for event in context.events),
+        silent=any(event.code == "drive_silent" for event in context.events),
+        troubles=context.troubles,
+    )
+    return {
+        "schema_version": 1,
+        "verdict": verdict.word,
+        "passed": verdict.passed,
+        "sentence": verdict.sentence,
+        "reasons": verdict.reasons,
+        "checks": [asdict(check) for check in verdict.checks],
+        "rig": context.rig.name,
+        "scene": context.plan.scene.name,
+        "plan_hash": context.plan.document.hash,
+        "rig_hash": context.rig.hash,
+        "interface": context.interface,
+        "simulated": context.simulated,
+        "fast": context.fast,
+        "started": context.started.astimezone(UTC).isoformat(timespec="milliseconds"),
+        "duration_s": round(context.duration, 6),
+        "cycles": len(cycles),
+        "cycle_ms": context.rig.document.bus.cycle_ms,
+        "lost_replies": int(cycles.missing.sum()),
+        "rejected_frames": int(cycles.rejected.max(initial=0)),
+        "error_frames": int(cycles.error_frames.max(initial=0)),
+        "path_length_mm": context.plan.document.quality.length_mm,
+        "travelled_mm": _last(cycles.travelled * 1e3),
+        "stops": [
+            {"name": stop.name, "kind": stop.kind, **_times_at(cycles, number, stop.name)}
+            for number, stop in enumerate(context.plan.scene.stops, start=1)
+        ],
+        "following_error_mm": {
+            **_size(cycles.following_error * 1e3),
+            "limit": context.rig.motion.following_error * 1e3,
+        },
+        "encoder_error_mm": _size(cycles.encoder_error * 1e3),
+        "tag_error_mm": _tag_error(poses),
+        "cameras": [asdict(camera) for camera in context.cameras],
+        "clearance_mm": _clearance(clearance, context.plan.scene.obstacle_clearance),
+        "tension_n": _tension(cycles, context.rig),
+        "lateness_ms": None if context.fast else _lateness(cycles.lateness * 1e3),
+        "final_state": context.final_state,
+        "events": [asdict(event) for event in context.events],
+        "versions": dict(context.versions),
+    }
+
+
+def _times_at(cycles: CycleTable, number: int, name: str) -> dict[str, float | None]:
+    """When the stop that ends a leg was reached and left; null for never."""
+    left = cycles.leg > number
+    reached = left | (np.array(cycles.stop, dtype=str) == name)
+    return {"reached_s": _first(cycles, reached), "left_s": _first(cycles, left)}
+
+
+def _first(cycles: CycleTable, chosen: NDArray[np.bool_]) -> float | None:
+    return _number(cycles.time[int(np.argmax(chosen))]) if chosen.any() else None
+
+
+def _number(value: float, digits: int = 6) -> float | None:
+    return round(float(value), digits) if np.isfinite(value) else None
+
+
+def _last(values: Array) -> float | None:
+    return _number(values[-1]) if len(values) else None
+
+
+def _size(values: Array) -> dict[str, float | None]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return {"max": None, "rms": None}
+    return {"max": _number(known.max()), "rms": _number(np.sqrt(np.mean(known**2)))}
+
+
+def _tag_error(poses: PoseTable) -> dict[str, float | int | None] | None:
+    if not len(poses):
+        return None
+    return {
+        **_size(poses.error[poses.ok] * 1e3),
+        "frames": len(poses),
+        "frames_without_pose": int(len(poses) - poses.ok.sum()),
+    }
+
+
+def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | None:
+    """The smallest clearance by the camera where it saw something, else by the drives."""
+    for source in ("tag", "encoder"):
+        rows = clearance.of(source)
+        if len(rows) and np.isfinite(rows.distance).any():
+            at = int(np.nanargmin(rows.distance))
+            return {
+                "required": _number(required * 1e3),
+                "planned_min": _number(np.nanmin(clearance.planned_distance) * 1e3),
+                "measured_min": _number(rows.distance[at] * 1e3),
+                "measured_uncertainty": _number(rows.uncertainty[at] * 1e3),
+                "measured_at_most": _number(rows.at_most[at] * 1e3),
+                "pair": [rows.body[at], rows.obstacle[at]],
+                "at_s": _number(rows.time[at]),
+                "source": source,
+            }
+    return None
+
+
+def _tension(cycles: CycleTable, rig: Rig) -> dict[str, float | None]:
+    low, high = _range(cycles.tensions)
+    planned_low, planned_high = _range(cycles.planned_tensions)
+    return {
+        "min": low,
+        "max": high,
+        "planned_min": planned_low,
+        "planned_max": planned_high,
+        "lower_limit": rig.min_tension,
+        "upper_limit": rig.max_tension,
+    }
+
+
+def _range(values: Array) -> tuple[float | None, float | None]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return None, None
+    return _number(known.min(), 4), _number(known.max(), 4)
+
+
+def _lateness(values: Array) -> dict[str, float | None]:
+    if not len(values):
+        return {"p50": None, "p99": None, "max": None}
+    middle, high = np.percentile(values, [50.0, 99.0])
+    return {"p50": _number(middle, 4), "p99": _number(high, 4), "max": _number(values.max(), 4)}

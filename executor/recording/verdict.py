@@ -1,0 +1,359 @@
+"""Whether a run was good: single checks, each a sentence with its numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import executor
+from executor.cameras.client import CameraRecord
+from executor.recording.clearance import ClearanceTable
+from executor.recording.tables import CycleTable, PoseTable
+from executor.safety.limits import tension_limits
+from executor.state_machine import ON_PATH
+from model.rig import Rig
+from model.scene import Scene
+
+PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
+#: The final state of a run whose end is not on record: its program was killed, or the disk full.
+NOT_ENDED = "not_ended"
+_ON_PATH = {state.value for state in ON_PATH}
+#: What the rounding of the tables may cost, [m].
+ROUNDING = 2e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One question about a run and its answer.
+
+    Attributes:
+        name: Short stable name.
+        passed: The answer.
+        text: One sentence with the numbers behind it.
+    """
+
+    name: str
+    passed: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The answer for the whole run.
+
+    Attributes:
+        word: ``PASSED``, ``FAILED`` or ``STOPPED``.
+        sentence: What happened, in one sentence.
+        checks: Every single check.
+    """
+
+    word: str
+    sentence: str
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """True only for a run that reached the goal and met every check."""
+        return self.word == PASSED
+
+    @property
+    def reasons(self) -> list[str]:
+        """The sentences of the checks that failed; of all checks when none did."""
+        failed = [check.text for check in self.checks if not check.passed]
+        return failed or [check.text for check in self.checks]
+
+
+def judge(
+    final_state: str,
+    cause: str,
+    simulated: bool,
+    rig: Rig,
+    scene: Scene,
+    cycles: CycleTable,
+    poses: PoseTable,
+    clearance: ClearanceTable,
+    cameras: Sequence[CameraRecord] = (),
+    *,
+    too_near: bool = False,
+    silent: bool = False,
+    troubles: Sequence[str] = (),
+) -> Verdict:
+    """The verdict over a run.
+
+    Args:
+        final_state: ``finished``, ``stopped`` or any other for a fault.
+        cause: Why it did not finish, if it did not.
+        simulated: The drives were simulated in the run's own process, so that no reply may be lost.
+        rig: The rig that was run.
+        scene: Its scene.
+        cycles: What the drives did.
+        poses: What the cameras saw together.
+        clearance: How near it came.
+        cameras: What became of each camera's pictures.
+        too_near: It was stopped for what the cameras measured, and not by the operator.
+        silent: It was stopped for drives that did not answer.
+        troubles: What of its record is lost, a sentence each.
+    """
+    measured = [
+        following(cycles, rig.motion.following_error),
+        replies(cycles, simulated, silent),
+        *tensions(cycles, rig),
+        *distances(clearance, scene.obstacle_clearance, cameras),
+        *camera(poses, cameras),
+        *(Check("record", False, f"{trouble}.") for trouble in troubles),
+    ]
+    failures = [check for check in measured if not check.passed]
+    at = f"after {_time(cycles):.1f} s and {_travelled(cycles):.0f} mm"
+    if final_state == "finished":
+        end = Check("finished", True, f"The platform reached the goal {at}.")
+        if failures:
+            many = f"{len(failures)} checks" if len(failures) > 1 else "one check"
+            sentence = f"The run reached the goal, but {many} failed."
+            return Verdict(FAILED, sentence, (end, *measured))
+        sentence = "The run reached the goal within every limit that was measured."
+        return Verdict(PASSED, sentence, (end, *measured))
+    if final_state == NOT_ENDED:
+        end = Check("finished", False, f"Its record ends {at}. {_KILLED}")
+        return Verdict(FAILED, "The run did not come to its end.", (end, *measured))
+    told = cause.rstrip(".") or f"the final state is {final_state!r}"
+    end = Check("finished", False, f"The run ended {at}, before the goal: {told}.")
+    if final_state == "stopped" and not failures and not too_near:
+        return Verdict(STOPPED, "The run was stopped before the goal.", (end, *measured))
+    word = "was stopped" if final_state == "stopped" else "ended with a fault"
+    return Verdict(FAILED, f"The run {word} before the goal.", (end, *measured))
+
+
+_KILLED = (
+    "Its program was killed, the computer stopped, or its end could not be written:"
+    " what came after that is not known."
+)
+
+
+def judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
+    """The verdict over a run of which no table could be made.
+
+    Args:
+        final_state: As for `judge`.
+        cause: Likewise.
+        trouble: Why there are no tables.
+    """
+    known = Check("evaluated", False, f"What was measured could not be evaluated: {trouble}.")
+    if final_state == "finished":
+        end = Check("finished", True, "The platform reached the goal.")
+        return Verdict(FAILED, "The run reached the goal, but was not evaluated.", (end, known))
+    word = "was stopped" if final_state == "stopped" else "ended with a fault"
+    told = cause.rstrip(".") or f"the final state is {final_state!r}"
+    end = Check("finished", False, f"The run ended before the goal: {told}.")
+    return Verdict(FAILED, f"The run {word} before the goal.", (end, known))
+
+
+def _time(cycles: CycleTable) -> float:
+    return float(cycles.time[-1]) if len(cycles) else 0.0
+
+
+def _travelled(cycles: CycleTable) -> float:
+    return float(cycles.travelled[-1]) * 1e3 if len(cycles) else 0.0
+
+
+def following(cycles: CycleTable, limit: float) -> Check:
+    """Every cable within ``limit`` [m] of its set-point, in every cycle."""
+    known = np.flatnonzero(np.isfinite(cycles.following_error))
+    if not known.size and not _ON_PATH & {*cycles.state}:
+        text = "The platform never moved along the path, so no following error was measured."
+        return Check("following_error", True, text)
+    if not known.size:
+        return Check("following_error", False, _never_followed(cycles))
+    worst = known[np.argmax(cycles.following_error[known])]
+    value = float(cycles.following_error[worst])
+    passed = value <= limit
+    text = (
+        f"No cable was more than {_rounded_up(value):.3f} mm off its set-point"
+        f" (limit {limit * 1e3:g} mm)."
+        if passed
+        else f"A cable was {value * 1e3:.3f} mm off its set-point at {cycles.time[worst]:.2f} s;"
+        f" the limit is {limit * 1e3:g} mm."
+    )
+    return Check("following_error", passed, text)
+
+
+def _never_followed(cycles: CycleTable) -> str:
+    """Why there is no following error: no replies, or drives that were not to follow yet."""
+    asked = len(cycles) * cycles.cable_count
+    received = asked - int(cycles.missing.sum())
+    if not received:
+        return "No drive position was ever received."
+    return (
+        f"The drives never followed set-points: {received} of {asked} replies with a position"
+        " arrived, and no following error was measured."
+    )
+
+
+def _rounded_up(length: float) -> float:
+    """A length [m] in mm, rounded up to a micrometre and never nothing at all."""
+    return max(math.ceil(round(length * 1e6, 3)), 1) / 1e3
+
+
+def replies(cycles: CycleTable, simulated: bool, silent: bool = False) -> Check:
+    """No reply lost on simulated drives; on a real bus none for which the loop had to stop."""
+    lost = int(cycles.missing.sum())
+    asked = len(cycles) * cycles.cable_count
+    if not lost:
+        return Check("lost_replies", True, f"All {asked} replies of the drives arrived.")
+    text = f"{lost} of {asked} replies of the drives were lost"
+    if silent:
+        return Check("lost_replies", False, f"{text}, and the run was stopped for it.")
+    if simulated:
+        return Check("lost_replies", False, f"{text}; simulated drives lose none.")
+    return Check("lost_replies", True, f"{text}, never so many that the run had to stop.")
+
+
+def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
+    """No slack and no overloaded cable; nothing when the drives report no torque."""
+    if not np.isfinite(cycles.tensions).any():
+        return []
+    low, high = float(np.nanmin(cycles.tensions)), float(np.nanmax(cycles.tensions))
+    limits = f"limits {rig.min_tension:g} and {rig.max_tension:g} N"
+    slack, overload = tension_limits(rig)
+    if low < slack:
+        at, cable = _where(cycles.tensions, low)
+        text = f"Cable {cable} went slack: {low:.2f} N at {cycles.time[at]:.2f} s ({limits})."
+        return [Check("tension", False, text)]
+    if high > overload:
+        at, cable = _where(cycles.tensions, high)
+        text = f"Cable {cable} pulled {high:.2f} N at {cycles.time[at]:.2f} s ({limits})."
+        return [Check("tension", False, text)]
+    return [Check("tension", True, f"Tensions stayed in {low:.1f} to {high:.1f} N ({limits}).")]
+
+
+def _where(
+    values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], value: float
+) -> tuple[int, int]:
+    row, column = np.argwhere(values == value)[0]
+    return int(row), int(column) + 1
+
+
+def distances(
+    clearance: ClearanceTable, required: float, cameras: Sequence[CameraRecord] = ()
+) -> list[Check]:
+    """Nowhere nearer than the scene allows, and nowhere nearer than planned by the camera.
+
+    A distance is too small only when it is so by more than its own uncertainty.
+    """
+    checks = []
+    for source, teller in (("tag", _who(cameras)), ("encoder", "the drives")):
+        rows = clearance.of(source)
+        if len(rows) and np.isfinite(rows.distance).any():
+            checks.append(_against_required(rows, required, teller))
+            if source == "tag":
+                checks.append(_against_plan(rows))
+    return checks
+
+
+def _against_required(rows: ClearanceTable, required: float, teller: str) -> Check:
+    passed = not bool(np.any(rows.at_most < required - ROUNDING))
+    worst = int(np.nanargmin(rows.distance if passed else rows.at_most))
+    distance, high = rows.distance[worst] * 1e3, rows.at_most[worst] * 1e3
+    low = distance - rows.uncertainty[worst] * 1e3
+    bounds = f"bounds {low:.1f} to {high:.1f} mm" if passed else f"upper bound {high:.1f} mm"
+    text = (
+        f"The smallest clearance seen by {teller} was {distance:.1f} mm, {bounds}"
+        f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
+        f" the scene asks for {required * 1e3:g} mm."
+    )
+    return Check(f"clearance_{rows.source[worst]}", passed, text)
+
+
+def _against_plan(rows: ClearanceTable) -> Check:
+    shortfall = rows.planned_distance - rows.distance
+    beyond = rows.planned_distance - rows.at_most
+    passed = not bool(np.any(beyond > ROUNDING))
+    worst = int(np.nanargmax(shortfall if passed else beyond))
+    short, at_most = shortfall[worst] * 1e3, rows.at_most[worst] * 1e3
+    text = (
+        f"Measured clearance was at most {max(short, 0.0):.2f} mm below the planned one,"
+        f" within its uncertainty of {at_most - rows.distance[worst] * 1e3:.2f} mm there."
+        if passed
+        else f"Measured clearance was {short:.2f} mm below the planned one at"
+        f" {rows.time[worst]:.1f} s: upper bound {at_most:.2f} mm,"
+        f" planned {rows.planned_distance[worst] * 1e3:.2f} mm."
+    )
+    return Check("clearance_plan", passed, text)
+
+
+def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
+    """A camera saw the platform, and not all failed; nothing for a run without a camera."""
+    failed = [one for one in cameras if one.failed]
+    if failed and len(failed) == len(cameras):
+        text = " ".join(f"Camera {one.name} failed: {one.failed}." for one in failed)
+        return [Check("camera", False, text)]
+    if not len(poses):
+        return []
+    seen = int(poses.ok.sum())
+    if not seen:
+        text = f"None of {len(poses)} pictures gave a pose: {poses.status[0]}."
+        return [Check("camera", False, text)]
+    error = poses.error[poses.ok] * 1e3
+    rms = float(np.sqrt(np.mean(error**2)))
+    text = (
+        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} pictures,"
+        f" {rms:.2f} mm RMS from the plan (largest {error.max():.2f} mm)."
+    )
+    if len(cameras) > 1:
+        text += f" Alone: {', '.join(map(_of_one, cameras))}."
+    return [Check("camera", True, text)]
+
+
+def _who(cameras: Sequence[CameraRecord]) -> str:
+    return f"{len(cameras)} cameras together" if len(cameras) > 1 else "the camera"
+
+
+def _of_one(record: CameraRecord) -> str:
+    """How often one of several cameras saw the platform, and why it saw it no more."""
+    failed = f" ({record.failed})" if record.failed else ""
+    return f"{record.name} {record.poses} of {record.pictures}{failed}"
+
+
+# What the documentation says about each fault: a page for every code of an event that is one.
+
+
+#: Codes of events that belong to a run that goes well, or to what the operator wants.
+ORDINARY = frozenset(
+    {
+        *("enabled", "moving", "hold", "resume", "speed", "stop", "held"),
+        *("pass", "pick", "place", "leaving", "simulated", "traceback"),
+    }
+)
+
+
+def page_of(code: str) -> str:
+    """The page about a fault; nothing for an event that is none, or is not known."""
+    return f"docs/faults/{code}.md" if code in fault_codes() else ""
+
+
+def fault_codes() -> list[str]:
+    """Codes of all faults that have a page."""
+    return sorted(path.stem for path in _folder().glob("*.md") if path.stem != "index")
+
+
+def faults_among(codes: Iterable[str]) -> list[str]:
+    """Those of some events that are faults, each once, in order."""
+    known = fault_codes()
+    return [code for code in dict.fromkeys(codes) if code in known]
+
+
+def page_text(code: str) -> str:
+    """The page about a fault of `fault_codes`, as Markdown without links."""
+    text = (_folder() / f"{code}.md").read_text(encoding="utf-8")
+    return re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", text)
+
+
+def _folder() -> Path:
+    """In a wheel beside the package, in the repository among its documents."""
+    package = Path(executor.__file__).resolve().parent
+    inside = package / "faults"
+    return inside if inside.is_dir() else package.parent / "docs" / "faults"

@@ -1,0 +1,219 @@
+"""Says something to the runs that are under way, and hears how they stand."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from executor.remote.protocol import make_line
+from executor.remote.registry import Reached, find_runs
+from model.errors import BadInput, Fault
+
+#: A run answers within this, [s]: its socket has a thread of its own.
+ANSWER_TIMEOUT = 2.0
+_CHUNK = 65536
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one run said.
+
+    Attributes:
+        process: Its number.
+        status: See `executor.remote.status`; None when it did not tell.
+        what: Why it did not tell, in its own words; nothing when it was silent.
+        ended: It is gone, so that nothing more will be heard of it.
+    """
+
+    process: int
+    status: dict[str, Any] | None
+    what: str = ""
+    ended: bool = False
+
+
+def ask_all(runs: Sequence[Reached], command: str, percent: int | None = None) -> list[Answer]:
+    """Says the same to all runs, to all of them before any answer is waited for."""
+    line = make_line(command, percent)
+    told = [_told(run, line) for run in runs]
+    return [
+        _heard(run) if taken else Answer(run.process, None, ended=True)
+        for run, taken in zip(runs, told, strict=True)
+    ]
+
+
+def _told(run: Reached, line: bytes) -> bool:
+    run.link.settimeout(ANSWER_TIMEOUT)
+    try:
+        run.link.sendall(line)
+    except OSError:  # it ended meanwhile
+        return False
+    return True
+
+
+def _heard(run: Reached) -> Answer:
+    """What it answers; a run that hangs is told apart from one that ended."""
+    try:
+        answer = json.loads(_line(run.link))
+    except TimeoutError:
+        return Answer(run.process, None)
+    except OSError:
+        return Answer(run.process, None, ended=True)
+    except ValueError as error:
+        return Answer(run.process, None, f"its answer cannot be read: {error}")
+    status = answer.get("status") if isinstance(answer, dict) else None
+    if isinstance(status, dict):
+        return Answer(run.process, status)
+    what = answer.get("what") if isinstance(answer, dict) else None
+    return Answer(run.process, None, str(what or "its answer says nothing"))
+
+
+def last_word(run: Reached) -> dict[str, Any] | None:
+    """What a run that ended said when it did; None when it could not say anything."""
+    return _heard(run).status
+
+
+def _line(link: socket.socket) -> bytes:
+    """The newest line: a run that ends says once more how it stands."""
+    got = b""
+    while not got.endswith(b"\n"):
+        chunk = link.recv(_CHUNK)
+        if not chunk:
+            raise ConnectionError("the run ended")
+        got += chunk
+    return got.splitlines()[-1]
+
+
+def the_one(runs: Sequence[Reached], process: int | None, verb: str) -> Reached:
+    """The run that is meant.
+
+    Raises:
+        Fault: No run is under way.
+        BadInput: There are several and none was named, or the named one is none of them.
+    """
+    numbers = ", ".join(str(run.process) for run in runs)
+    if not runs:
+        raise no_run(verb)
+    if process is None and len(runs) > 1:
+        raise BadInput(
+            f"{len(runs)} runs are under way",
+            where=f"cdpr {verb}",
+            next_step=f"name one of them with --process: {numbers}",
+        )
+    for run in runs:
+        if process is None or run.process == process:
+            return run
+    raise BadInput(
+        f"process {process} is no run of yours",
+        where=f"cdpr {verb}",
+        next_step=f"name one of these: {numbers}",
+    )
+
+
+def no_run(verb: str) -> Fault:
+    """Nothing was reached."""
+    return Fault(
+        "no run of yours is going on, so nothing was told to anybody",
+        where=f"cdpr {verb}",
+        why="it ended already, or another user started it",
+        next_step="press the emergency stop if something moves; a run of another user is"
+        f" reached by that user, or by `sudo cdpr {verb}`",
+    )
+
+
+def no_answer(verb: str, answers: Sequence[Answer]) -> Fault:
+    """Runs that were told something and do not say how they stand."""
+    numbers = ", ".join(str(answer.process) for answer in answers)
+    words = [answer.what for answer in answers if answer.what]
+    if words:
+        return Fault(
+            f"process {numbers} did not do it, or cannot tell: {'; '.join(words)}",
+            where=f"cdpr {verb}",
+            next_step="press the emergency stop if something moves that must not",
+        )
+    if all(answer.ended for answer in answers):
+        return Fault(
+            f"process {numbers} ended before it could be told",
+            where=f"cdpr {verb}",
+            next_step="see what its run folder says; press the emergency stop if something moves",
+        )
+    return Fault(
+        f"process {numbers} did not answer within {ANSWER_TIMEOUT:g} s",
+        where=f"cdpr {verb}",
+        why="it is ending, was suspended, or hangs; what moves the drives stops by itself when"
+        " nobody supervises it",
+        next_step="press the emergency stop if something still moves",
+    )
+
+
+def request_run(
+    command: str, process: int | None = None, percent: int | None = None, *, verb: str = ""
+) -> dict[str, Any]:
+    """Sends a command to the run that is meant; its status.
+
+    Args:
+        command: As `executor.remote.protocol` has it: ``hold``, ``resume``, ``speed``, ``status``.
+        process: Number of the run; None for the only one.
+        percent: Of the planned speed.
+        verb: What the user typed, where that is another word than the command.
+
+    Raises:
+        Fault: No run is under way, or it does not answer.
+        BadInput: It is not clear which run is meant.
+    """
+    with find_runs() as runs:
+        (answer,) = ask_all([the_one(runs, process, verb or command)], command, percent)
+    if answer.status is None:
+        raise no_answer(verb or command, [answer])
+    return answer.status
+
+
+@dataclass(frozen=True, slots=True)
+class StopResult:
+    """Which runs were stopped.
+
+    Attributes:
+        stopped: Numbers of those that answered.
+        silent: What the others said, if anything.
+    """
+
+    stopped: tuple[int, ...]
+    silent: tuple[Answer, ...]
+
+
+def stop_runs() -> StopResult:
+    """Stops every run of this user: all drives slow down together along the path, then hold."""
+    with find_runs() as runs:
+        answers = ask_all(runs, "stop")
+    return StopResult(
+        tuple(answer.process for answer in answers if answer.status is not None),
+        tuple(answer for answer in answers if answer.status is None),
+    )
+
+
+def follow_run(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
+    """The status of a run, again and again, on one connection; until it ends.
+
+    Args:
+        process: Number of the run; None for the only one.
+        rate: Reads a second, [Hz].
+
+    Raises:
+        Fault: It is still there and does not answer.
+    """
+    with find_runs() as runs:
+        run = the_one(runs, process, "monitor")
+        while True:
+            (answer,) = ask_all([run], "status")
+            if answer.ended:
+                last = last_word(run)
+                if last is not None:
+                    yield last
+                return
+            if answer.status is None:
+                raise no_answer("monitor", [answer])
+            yield answer.status
+            time.sleep(1.0 / rate)

@@ -1,0 +1,237 @@
+"""How a run stands at this moment, for `cdpr monitor` and the programs that read its JSON.
+
+Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, ``cause``,
+``elapsed_s``, ``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``feed_percent`` (of
+the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
+``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``rejected_frames``,
+``error_frames``, ``cameras`` [{``name``, ``source``, ``pictures``, ``poses``, ``dropped``,
+``pictures_per_second`` (of the run's time), ``measuring_ms``, ``tags`` (seen last), ``trouble``
+(what keeps it from measuring, or nothing)}], ``drives`` [{``node``, ``state``,
+``position_counts``, ``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``,
+``text``}], the newest last. A number that is not known is null; before the first cycle ``state``
+is ``preparing`` (while `cdpr release` takes the torque off ``releasing``) and ``drives`` is empty;
+at the end ``cause`` says why it did not end well. Winches that move without a path (`cdpr home`,
+`cdpr jog --cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a
+percentage.
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.factory import drive_states
+from executor.operator_requests import RequestBoard
+from executor.recording.run_folder import RunEvent
+from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.trajectory.prepare import PreparedRun
+from model.rig import Rig
+
+#: So many of the newest events are told.
+EVENTS_TOLD = 12
+
+
+class CyclesSoFar:
+    """What the cycles tell, whatever they are sent for."""
+
+    def __init__(self, rig: Rig, *, simulated_time: bool) -> None:
+        """None so far."""
+        self.began = 0.0
+        """Time of the first one, [s]."""
+        self.last: CycleRecord | None = None
+        self._rig, self._simulated_time = rig, simulated_time
+        self._worst_lateness = 0.0
+        self._lost = 0
+        self._end: tuple[State, str] | None = None
+        self.before = "preparing"
+        """What is told as state as long as there is no cycle."""
+
+    def take(self, record: CycleRecord) -> None:
+        """One more is over."""
+        if self.last is None:
+            self.began = record.at
+        self._worst_lateness = max(self._worst_lateness, record.lateness)
+        self._lost += record.missing
+        self.last = record
+
+    def take_end(self, state: State, cause: str) -> None:
+        """The motion is over; nothing is told of it but this."""
+        self._end = state, cause
+
+    def as_dict(self) -> dict[str, Any]:
+        """State, times, replies and drives; see the head of this file."""
+        state, cause = self._end or (self.last.state if self.last else None, None)
+        told = {
+            "state": state.value if state else self.before,
+            "cause": cause or None,
+            "simulated_time": self._simulated_time,
+            "lost_replies": self._lost,
+            "rejected_frames": self.last.rejected if self.last else 0,
+            "error_frames": self.last.error_frames if self.last else 0,
+        }
+        record = self.last
+        if record is None:
+            unknown = ("elapsed_s", "cycle", "feed_percent", "lateness_ms", "worst_lateness_ms")
+            nothing = dict.fromkeys((*unknown, "following_error_mm"))
+            return {**told, **nothing, "drives": []}
+        error = record.following_error * 1e3
+        return {
+            **told,
+            "elapsed_s": round(record.at - self.began, 3),
+            "cycle": record.cycle,
+            "feed_percent": round(record.rate * 100.0, 1),
+            "lateness_ms": self._lateness_ms(record.lateness),
+            "worst_lateness_ms": self._lateness_ms(self._worst_lateness),
+            "following_error_mm": round(error, 4) if np.isfinite(error) else None,
+            "drives": self._drives(record),
+        }
+
+    def _lateness_ms(self, cycles: float) -> float | None:
+        late = round(cycles * self._rig.document.bus.cycle_ms, 3)
+        return None if self._simulated_time else late
+
+    def _drives(self, record: CycleRecord) -> list[dict[str, Any]]:
+        columns = zip(
+            self._rig.winches,
+            drive_states(self._rig, record.words),
+            record.actual,
+            record.targets,
+            self._rig.tensions_by(record.torques).tolist(),
+            strict=True,
+        )
+        return [
+            {
+                "node": winch.node_id,
+                "state": state,
+                "position_counts": actual,
+                "set_counts": target,
+                "tension_n": round(tension, 2),
+            }
+            for winch, state, actual, target, tension in columns
+        ]
+
+
+def whose(rig: Rig, folder: Path | None) -> dict[str, Any]:
+    """What is moved, by whom, and where it is on record."""
+    bus = rig.document.bus
+    return {
+        "process": os.getpid(),
+        "rig": rig.name,
+        "bus": f"{bus.interface} {bus.channel}".strip(),
+        "folder": "" if folder is None else str(folder),
+    }
+
+
+def wished(board: RequestBoard) -> dict[str, Any]:
+    """What the operator wants."""
+    wishes = board.read()
+    speed = round(wishes.speed * 100.0)
+    return {"wished": {"stop": wishes.stop, "hold": wishes.hold, "speed_percent": speed}}
+
+
+class MotionStatus(ABC):
+    """Takes in what happens; tells it to whoever asks, from any thread."""
+
+    def __init__(self, rig: Rig, board: RequestBoard, *, simulated_time: bool) -> None:
+        """A motion that is being prepared."""
+        self._rig, self._board = rig, board
+        self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
+        self._cameras: list[dict[str, Any]] = []
+        self.folder: Path | None = None
+        """Where it is on record, if anywhere."""
+
+    def take_release(self) -> None:
+        """The torque is being taken off; nothing moves, and no cycle is told."""
+        self._cycles.before = "releasing"
+
+    def take_end(self, state: State, cause: str) -> None:
+        """The motion is over."""
+        self._cycles.take_end(state, cause)
+
+    def as_dict(self) -> dict[str, Any]:
+        """See the head of this file."""
+        return {
+            **whose(self._rig, self.folder),
+            **self._cycles.as_dict(),
+            **self._place(),
+            "cameras": self._cameras,
+            **wished(self._board),
+            "events": self._told(),
+        }
+
+    @abstractmethod
+    def _place(self) -> dict[str, Any]:
+        """How far the motion is."""
+
+    @abstractmethod
+    def _told(self) -> list[dict[str, Any]]:
+        """The newest events."""
+
+
+class RunStatus(MotionStatus):
+    """Of a run along a path."""
+
+    def __init__(
+        self, prepared: PreparedRun, folder: Path, board: RequestBoard, *, simulated_time: bool
+    ) -> None:
+        """A run that is being prepared."""
+        super().__init__(prepared.rig, board, simulated_time=simulated_time)
+        self._prepared, self.folder = prepared, folder
+        self._events: deque[RunEvent] = deque(maxlen=EVENTS_TOLD)
+
+    def take_cycle(self, record: CycleRecord) -> None:
+        """A cycle is over."""
+        self._cycles.take(record)
+
+    def take_cameras(self, cameras: list[dict[str, Any]]) -> None:
+        """How each camera does now."""
+        self._cameras = cameras
+
+    def take_event(self, event: RunEvent) -> None:
+        """Something happened."""
+        self._events.append(event)
+
+    def _place(self) -> dict[str, Any]:
+        table, record = self._prepared.checked.table, self._cycles.last
+        whole = {"rows": len(table), "path_length_mm": round(self._prepared.length * 1e3, 3)}
+        if record is None:
+            return {"row": None, "path_mm": None, **whole}
+        path = float(np.interp(record.index, np.arange(len(table)), table.travelled))
+        return {"row": round(record.index, 2), "path_mm": round(path * 1e3, 3), **whole}
+
+    def _told(self) -> list[dict[str, Any]]:
+        return [asdict(event) for event in list(self._events)]
+
+
+class WinchStatus(MotionStatus):
+    """Of winches that move without a path."""
+
+    def __init__(self, rig: Rig, board: RequestBoard, *, simulated_time: bool) -> None:
+        """A motion that is being prepared."""
+        super().__init__(rig, board, simulated_time=simulated_time)
+        self._events: deque[LoopEvent] = deque(maxlen=EVENTS_TOLD)
+
+    def take_cycle(self, record: CycleRecord) -> None:
+        """A cycle is over."""
+        self._cycles.take(record)
+
+    def take_event(self, event: LoopEvent) -> None:
+        """Something happened."""
+        self._events.append(event)
+
+    def _place(self) -> dict[str, Any]:
+        row = None if self._cycles.last is None else round(self._cycles.last.index, 1)
+        return {"row": row, "rows": 100, "path_mm": None, "path_length_mm": None}
+
+    def _told(self) -> list[dict[str, Any]]:
+        began = self._cycles.began
+        return [
+            {"time_s": max(0.0, round(event.at - began, 3)), "code": event.code, "text": event.text}
+            for event in list(self._events)
+        ]

@@ -1,0 +1,126 @@
+"""How a run ended, for the caller: verdict, files, and its tables as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from executor.recording.csv import TableFile
+from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
+from model.display import html_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Columns = dict[str, NDArray[Any]]
+"""A table of a run folder: arrays of one length by column name, with the unit in the name."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """How a run ended; its tables are read from its folder when they are first asked for.
+
+    Attributes:
+        folder: Where everything about it is.
+        summary: The content of ``summary.json``.
+        missing: Files of the folder that could not be written, and why.
+        report: The page about the run; None where it could not be made.
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+    missing: Mapping[str, str] = field(default_factory=dict)
+    report: Path | None = None
+
+    @property
+    def verdict(self) -> str:
+        """``PASSED``, ``STOPPED`` or ``FAILED``."""
+        return str(self.summary["verdict"])
+
+    @property
+    def passed(self) -> bool:
+        """Whether the run came to its end within all limits."""
+        return bool(self.summary["passed"])
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in a sentence."""
+        return str(self.summary["sentence"])
+
+    @property
+    def exit_code(self) -> int:
+        """0 for a run that passed, 130 when the operator stopped it, 1 otherwise."""
+        if self.passed:
+            return 0
+        return 130 if self.verdict == "STOPPED" else 1
+
+    @cached_property
+    def cycles(self) -> Columns:
+        """Every cycle of the loop: the columns of ``cycles.csv``."""
+        return self._table(CYCLES)
+
+    @cached_property
+    def poses(self) -> Columns:
+        """What the cameras measured together: the columns of ``poses.csv``."""
+        return self._table(POSES)
+
+    @cached_property
+    def clearance(self) -> Columns:
+        """Distances to obstacles: the columns of ``clearance.csv``."""
+        return self._table(CLEARANCE)
+
+    def _table(self, name: str) -> Columns:
+        return TableFile(self.folder / name).columns()
+
+    @property
+    def smallest_clearance(self) -> float:
+        """The smallest measured clearance, [m]; NaN where none was measured."""
+        known = self.summary.get("clearance_mm")
+        return float("nan") if known is None else float(known["measured_min"]) / 1e3
+
+    @property
+    def clearance_interval(self) -> tuple[float, float]:
+        """3σ bounds of the true clearance where the smallest was measured, [m]; else NaN."""
+        known = self.summary.get("clearance_mm")
+        if known is None:
+            return float("nan"), float("nan")
+        low = known["measured_min"] - known["measured_uncertainty"]
+        return low / 1e3, known["measured_at_most"] / 1e3
+
+    def plot(self) -> Figure:
+        """A figure of error, tensions and clearance over time."""
+        from executor.report.figures import run_figure  # loads matplotlib
+
+        return run_figure(self.cycles, self.clearance)
+
+    def __repr__(self) -> str:
+        """Verdict and folder."""
+        return f"<RunResult {self.verdict} in {self.folder}: {self.sentence}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        low, high = (bound * 1e3 for bound in self.clearance_interval)
+        least = f"{self.smallest_clearance * 1e3:.2f} mm (3σ bounds {low:.2f}–{high:.2f} mm)"
+        rows = [
+            ("verdict", self.verdict),
+            ("why", self.sentence),
+            ("folder", str(self.folder)),
+            ("clearance", least if self.summary.get("clearance_mm") else "not measured"),
+        ]
+        return html_table(f"Run {self.folder.name}", rows)
+
+
+def load_run(folder: str | Path) -> RunResult:
+    """The result of a run that is over, from its folder.
+
+    Raises:
+        BadInput: There is no such folder, or a file of the run is missing or was changed.
+    """
+    opened = RunFolder.open(Path(folder))
+    page = opened.report if opened.report.is_file() else None
+    return RunResult(opened.path, opened.summary(), report=page)

@@ -1,0 +1,425 @@
+"""Runs a plan: proves it, arms the drives, moves, measures, decides the verdict, writes the record.
+
+Once something moved, the verdict rests on what the drives did alone. Neither a file that cannot be
+written nor an interrupt while the report is made changes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+from executor.cameras.multi_camera import CameraRecords, RunWatch
+from executor.cameras.open import asked_rate, open_cameras, require_no_stop
+from executor.cameras.sources import CameraChoice, require_simulated_pictures, resolve_cameras
+from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
+from executor.drives import drives_of, is_simulated, open_drives, require_own_time
+from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
+from executor.interlock.interlock import MotionInterlock
+from executor.kernels import ready_for_simulating_process
+from executor.operator_requests import LocalRequests
+from executor.realtime.clock import SimulatedClock
+from executor.realtime.shared_memory import SharedRequests
+from executor.recording.recorder import Recorder
+from executor.recording.run_course import RunCourse, dated_folder
+from executor.recording.run_folder import REPORT, RunEvent, RunFolder
+from executor.remote.registry import announced
+from executor.remote.server import serving
+from executor.remote.status import RunStatus
+from executor.run_result import RunResult
+from executor.state_machine import LoopEvent, State
+from executor.supervision import Supervisor, require_confirmed
+from executor.trajectory.prepare import PreparedRun, prepare
+from model.errors import BadInput, CdprError
+from model.plan import Plan, require_same_rig
+from model.pose import Pose
+from model.progress import SILENT, Listener
+from model.rig import Camera, Rig
+from planner.check import verify
+
+__all__ = [
+    "MotionProposal",
+    "RunOptions",
+    "RunResult",
+    "prepare_plan",
+    "run",
+    "run_prepared",
+]
+
+#: Without a camera the progress is reported this often, [Hz].
+PROGRESS_RATE = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionProposal:
+    """A run that is about to move the platform; see `executor.supervision.Proposal`.
+
+    Attributes:
+        prepared: The checked run.
+        cameras: Those that measure it, with their sources.
+        clearance_stop: Whether too little measured clearance stops it.
+    """
+
+    question: ClassVar[str] = "Move the platform now?"
+    otherwise: ClassVar[str] = "nothing was moved"
+
+    prepared: PreparedRun
+    cameras: Mapping[Camera, str]
+    clearance_stop: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class RunOptions:
+    """How a run is done; see `run`."""
+
+    realtime: bool = True
+    start: Pose | None = None
+    clearance_stop: bool = True
+    need_real_time_rights: bool = True
+    listener: Listener = SILENT
+    confirm: Callable[[MotionProposal], bool] | None = None
+    on_event: Callable[[RunEvent], None] | None = None
+    supervisor: Supervisor = field(default_factory=Supervisor)
+
+
+def run(
+    plan: Plan,
+    rig: Rig,
+    *,
+    folder: Path | str | None = None,
+    cameras: CameraChoice = None,
+    realtime: bool = True,
+    start: Pose | None = None,
+    clearance_stop: bool = True,
+    need_real_time_rights: bool = True,
+    listener: Listener = SILENT,
+    confirm: Callable[[MotionProposal], bool] | None = None,
+    on_event: Callable[[RunEvent], None] | None = None,
+    supervisor: Supervisor | None = None,
+    plan_file: Path | str = "plan",
+) -> RunResult:
+    """Proves a plan, makes its set-points, arms the drives, moves, measures and reports.
+
+    On the interface ``virtual`` drives, platform and camera are simulated in this process. Ctrl-C
+    and `cdpr stop` stop all drives together along the path; they then hold.
+
+    Args:
+        plan: What to run.
+        rig: The robot, and the bus of its drives.
+        folder: Of the run, which is made; None for a dated one in ``runs``.
+        cameras: Those that measure the platform.
+        realtime: False for simulated time, as fast as the computer can.
+        start: Where the simulated platform is, ``world_from_platform``; None at the plan's start.
+        clearance_stop: Stop along the path when the cameras measure too little clearance.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
+        listener: Receives progress.
+        confirm: Called once, before anything is opened for the motion; False cancels it. Without
+            it the call itself is the decision to move.
+        on_event: Receives each event of the run. It is called by the thread that supervises the
+            motion and has to return at once; an error that it raises stops the run.
+        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        plan_file: Names the plan in messages.
+
+    Returns:
+        How it ended; a run that was stopped or failed is a result too.
+
+    Raises:
+        BadInput: An argument cannot be used, or the plan was made for another rig.
+        Refused: The plan does not pass the checks, the bus is latched, or the drives cannot be
+            armed; nothing moved.
+        HardwareMissing: A drive or a camera does not answer; nothing moved.
+        StoppedByOperator: It was cancelled before anything moved.
+        KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
+    """
+    chosen = resolve_cameras(rig, cameras, is_simulated(rig))
+    require_simulated_pictures(chosen.values(), not realtime)
+    require_own_time(rig, realtime)
+    if start is not None and not is_simulated(rig):
+        raise BadInput(
+            "only a platform that is simulated in this process can be placed",
+            where="--simulated-start-mm",
+            next_step="leave it out, or use the interface 'virtual'",
+        )
+    output = dated_folder() if folder is None else Path(folder)
+    RunFolder.require_free(output)
+    interlock = MotionInterlock(rig)
+    interlock.require_free()
+    referenced = interlock.referenced_rig()
+    require_same_rig(plan, referenced, plan_file)
+    options = RunOptions(
+        realtime=realtime,
+        start=start,
+        clearance_stop=clearance_stop,
+        need_real_time_rights=need_real_time_rights,
+        listener=listener,
+        confirm=confirm,
+        on_event=on_event,
+        supervisor=supervisor or Supervisor(),
+    )
+    return run_prepared(prepare_plan(plan, referenced, listener), output, chosen, options)
+
+
+def prepare_plan(plan: Plan, rig: Rig, listener: Listener = SILENT) -> PreparedRun:
+    """The checked set-points of a plan, for a rig.
+
+    Raises:
+        Refused: The plan, or the curve it would be run on, does not pass the checks.
+    """
+    with listener.waiting("checking the plan and its set-points"):
+        return prepare(verify(plan, rig), rig)
+
+
+def run_prepared(
+    prepared: PreparedRun, output: Path, cameras: Mapping[Camera, str], options: RunOptions
+) -> RunResult:
+    """Asks, arms, moves, measures, decides the verdict, then writes the files of the run's end.
+
+    A run that is refused before anything moved leaves no folder.
+
+    Args:
+        prepared: The checked run.
+        output: The run folder to make.
+        cameras: From `resolve_cameras`; empty for none.
+        options: How it is done.
+
+    Raises:
+        CdprError: As for `run`.
+    """
+    proposal = MotionProposal(prepared, cameras, options.clearance_stop)
+    require_confirmed(options.confirm, proposal)
+    with options.listener.waiting("loading what the end of the run needs"):
+        _load_what_the_end_needs()
+    interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
+    course = RunCourse(datetime.now(UTC), interface, simulated, not options.realtime)
+    folder = RunFolder.create(output)
+    job, moved = _Job(prepared, folder, cameras, options), _Moved()
+    try:
+        folder.write_plan(prepared.plan.plan.document)
+        folder.write_rig(prepared.rig.document)
+        folder.write_course(course)
+        with folder.held():
+            _move_and_measure(job, moved)
+            result = _conclude(job, moved, course)
+    finally:
+        moved.close()
+        if not moved.begun:
+            folder.discard()
+    options.supervisor.finish()
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """One run and how it is to be done."""
+
+    prepared: PreparedRun
+    folder: RunFolder
+    cameras: Mapping[Camera, str]
+    options: RunOptions
+
+
+@dataclass(slots=True, eq=False)
+class _Moved:
+    """What the motion left behind, as far as it came.
+
+    Attributes:
+        begun: The platform was about to move.
+        recorder: Took in what happened.
+        outcome: How the motion ended.
+        seen: What the cameras saw.
+        troubles: What of it is lost, a sentence each.
+    """
+
+    begun: bool = False
+    recorder: Recorder | None = None
+    outcome: Outcome | None = None
+    seen: CameraRecords | None = None
+    troubles: list[str] = field(default_factory=list)
+
+    def take_event(self, code: str, text: str, at: float) -> None:
+        """Takes in an event that is not the loop's.
+
+        Raises:
+            CdprError: It cannot be written, which stops a platform that moves.
+        """
+        assert self.recorder is not None
+        try:
+            self.recorder.take_event(LoopEvent(0, at, code, text))
+        except CdprError:
+            if self.outcome is None:
+                raise
+
+    def close(self) -> None:
+        """Waits until the disk has what was recorded."""
+        if self.recorder is not None:
+            self.recorder.writer.close()
+
+
+def _load_what_the_end_needs() -> None:
+    """What is loaded now can neither be missing nor want memory once the platform has moved."""
+    import cv2  # noqa: F401
+    import scipy.spatial  # noqa: F401
+
+    import executor.report.page
+    import executor.report.run_data  # noqa: F401
+
+
+def _move_and_measure(job: _Job, moved: _Moved) -> None:
+    """The motion and its pictures; what fails once something moved is part of how it ended."""
+    board = SharedRequests() if job.options.realtime else LocalRequests()
+    try:
+        try:
+            job.options.supervisor.during(board, partial(_with_listeners, job, board, moved))
+        finally:
+            if isinstance(board, SharedRequests):
+                board.close()
+    except Exception as error:
+        if not moved.begun or moved.recorder is None:
+            raise
+        text = f"{type(error).__name__}: {error}".rstrip(": ")
+        if moved.outcome is None:
+            text = f"the program broke while the platform moved: {text}"
+            log = moved.recorder.log
+            moved.outcome = Outcome(State.LATCHED, text, log, False, datetime.now(UTC))
+        else:
+            moved.troubles.append(f"the end of the run broke: {text}")
+
+
+def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Moved) -> None:
+    """`cdpr stop` and its like reach the run all the time."""
+    prepared, options = job.prepared, job.options
+    listener, fast = options.listener, not options.realtime
+    rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
+    rate = asked_rate(job.cameras) if job.cameras else PROGRESS_RATE
+    pictures = int(prepared.duration * rate)
+    status = RunStatus(prepared, job.folder.path, board, simulated_time=fast)
+    opening = partial(
+        open_cameras, prepared.rig, prepared.scene, job.cameras, job.folder.path, pictures, board
+    )
+    with ExitStack() as stack:
+        listeners = stack.enter_context(announced())
+        stack.enter_context(serving(listeners, board, status))
+        cameras = stack.enter_context(opening(simulated_time=fast, listener=listener))
+        with listener.progress("preparing, row", rows) as advance:
+            watch = (
+                RunWatch(
+                    cameras, status, board, moved.take_event,
+                    clearance_stop=options.clearance_stop, listener=listener,
+                )
+                if cameras
+                else None
+            )  # fmt: skip
+            recorder = moved.recorder = Recorder(
+                prepared,
+                job.folder,
+                status,
+                trigger=watch.trigger if watch else None,
+                every=max(1, round(1.0 / (rate * cycle))),
+                progress=lambda row: advance(
+                    row, watch.rates if watch else "", f"{recorder.state.value}, row"
+                ),
+                announce=listener.note,
+                on_event=options.on_event,
+                own_thread=options.realtime,
+            )
+            moved.outcome = _move(job, board, recorder, moved)
+            status.take_end(moved.outcome.state, moved.outcome.cause)
+        moved.seen = watch.finish(recorder.last) if watch else CameraRecords()
+
+
+def _move(
+    job: _Job, board: LocalRequests | SharedRequests, recorder: Recorder, moved: _Moved
+) -> Outcome:
+    """Arms the drives and runs the loop: here in simulated time, else in a process of its own."""
+
+    def before_motion() -> None:
+        moved.begun = True
+        job.options.supervisor.on_motion()
+
+    if isinstance(board, SharedRequests):
+        return _move_in_real_time(job, board, recorder, before_motion)
+
+    def last_chance() -> None:
+        require_no_stop(board)
+        before_motion()
+
+    prepared = job.prepared
+    start, load = job.options.start or prepared.scene.start, prepared.scene.load
+    with open_drives(prepared.rig, start, load, listener=job.options.listener) as drives:
+        return run_in_process(
+            prepared,
+            drives.group,
+            SimulatedClock(prepared.checked.table.cycle),
+            board,
+            recorder,
+            true_pose=drives.true_pose,
+            carry=drives.carry,
+            before_motion=last_chance,
+        )
+
+
+def _move_in_real_time(
+    job: _Job, board: SharedRequests, recorder: Recorder, before_motion: Callable[[], None]
+) -> Outcome:
+    prepared, options = job.prepared, job.options
+
+    def armed(denied: str) -> None:
+        if denied:
+            recorder.take_event(LoopEvent(0, 0.0, "no_real_time", denied))
+            options.listener.remark(denied)
+        before_motion()
+
+    simulated = is_simulated(prepared.rig)
+    if simulated:
+        ready_for_simulating_process(options.listener)
+    start, load = options.start or prepared.scene.start, prepared.scene.load
+    return run_in_real_time(
+        prepared,
+        partial(drives_of, prepared.rig.document, start, load),
+        board,
+        recorder,
+        pose_every=recorder.every if simulated else 0,
+        need_real_time=options.need_real_time_rights and not simulated,
+        before_motion=armed,
+        listener=options.listener,
+    )
+
+
+def _conclude(job: _Job, moved: _Moved, course: RunCourse) -> RunResult:
+    """Decides the verdict, reports it, then writes the files of the end."""
+    outcome, supervisor = moved.outcome, job.options.supervisor
+    assert outcome is not None
+    course = replace(
+        course,
+        started=outcome.started,
+        final_state=outcome.state.value,
+        cause=outcome.cause,
+        cycles=len(outcome.log),
+    )
+    evaluated, summary = _evaluated(job.prepared, moved, outcome, course)
+    result = RunResult(job.folder.path, summary)
+    supervisor.on_verdict(result)
+    with job.options.listener.waiting("writing the run folder and its report"):
+        moved.close()
+        events, left_out = outcome.log.events, supervisor.leaves_files_out
+        missing = write_end(job.folder, course, evaluated, events, left_out)
+    has_report = evaluated is not None and REPORT not in missing
+    return replace(result, missing=missing, report=job.folder.report if has_report else None)
+
+
+def _evaluated(
+    prepared: PreparedRun, moved: _Moved, outcome: Outcome, course: RunCourse
+) -> tuple[EvaluatedRun | None, dict[str, Any]]:
+    """The run and its summary; without memory, or after a defect, a summary of what is known."""
+    try:
+        seen = moved.seen or CameraRecords()
+        evaluated = evaluate(prepared, outcome, seen, course, moved.troubles)
+    except Exception as error:
+        trouble = f"{type(error).__name__}: {error}".rstrip(": ")
+        return None, not_evaluated(prepared, outcome, course, trouble)
+    return evaluated, evaluated.summary

@@ -1,0 +1,204 @@
+"""Watches what the drives report and says when, and how, the rig must stop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from executor.safety.sync_age import LATE_AGE, SyncAge
+
+#: Missing replies in a row that are one too many.
+MISSING_CYCLES = 2
+
+
+class StopReaction(IntEnum):
+    """What a finding asks for; of several the larger one is done."""
+
+    NOTE = 0
+    PATH_STOP = 1
+    QUICK_STOP = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """Something that the watch saw.
+
+    Attributes:
+        reaction: What must happen.
+        code: Stable name.
+        text: What, where, measured value and limit.
+        drive: Which cable and drive it is about, counted from 1 as in the rig file; 0 for all.
+    """
+
+    reaction: StopReaction
+    code: str
+    text: str
+    drive: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class WatchLimits:
+    """When the watch speaks up.
+
+    Attributes:
+        following_error: Cable length, [m].
+        min_tension: Slack below this, [N].
+        max_tension: Over-tension above this, [N].
+        no_tension: Below this a cable is torn or hangs loose, [N].
+        slack_cycles: Cycles of slack or over-tension that are one too many.
+        loose_cycles: Cycles without tension that are one too many.
+        missing_cycles: Missing replies in a row that are one too many.
+        late_periods: Lateness, in cycles, from which on the path stops.
+        gone_periods: Lateness, in cycles, from which on drives may have stopped by themselves, as
+            SYNC stayed away: no set-point may follow. See `executor.safety.sync_age`.
+    """
+
+    following_error: float
+    min_tension: float
+    max_tension: float
+    no_tension: float
+    slack_cycles: int = 5
+    loose_cycles: int = 3
+    missing_cycles: int = MISSING_CYCLES
+    late_periods: float = LATE_AGE - 1.0
+    gone_periods: float = SyncAge().limit - 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One cycle as it came back; one entry a drive.
+
+    Attributes:
+        following: True when the drives follow their set-points; otherwise following errors and
+            tensions say nothing and are not judged.
+        following_errors: Signed, in cable length, [m].
+        tensions: From the drives' torque, [N].
+        missing: True where a drive did not answer.
+        faults: What drives reported as wrong: which drive, counted from 1, or 0 for the bus, and
+            the text.
+        lateness: How late the cycle began, in cycles.
+        warnings: What drives that stay enabled reported: which drive, counted from 1, the text, and
+            whether the path must stop for it.
+    """
+
+    following: bool
+    following_errors: Sequence[float]
+    tensions: Sequence[float]
+    missing: Sequence[bool]
+    faults: Sequence[tuple[int, str]]
+    lateness: float
+    warnings: Sequence[tuple[int, str, bool]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Monitor:
+    """Counts in a row, per drive; `look` returns the next watch and what was found."""
+
+    limits: WatchLimits
+    names: tuple[str, ...]
+    missing: tuple[int, ...]
+    slack: tuple[int, ...]
+    loose: tuple[int, ...]
+    over: tuple[int, ...]
+
+    @classmethod
+    def fresh(cls, limits: WatchLimits, names: Sequence[str]) -> Monitor:
+        """A watch that has seen nothing, of drives that are called so."""
+        zeros = (0,) * len(names)
+        return cls(limits, tuple(names), zeros, zeros, zeros, zeros)
+
+    def look(self, seen: Observation) -> tuple[Monitor, tuple[Alarm, ...]]:
+        """Takes in one cycle.
+
+        Raises:
+            ValueError: Not one entry for every drive; one that is missing would hide a fault.
+        """
+        limits = self.limits
+        counts = {len(seen.following_errors), len(seen.tensions), len(seen.missing)}
+        if counts != {len(self.missing)}:
+            raise ValueError(f"the watch was shown {counts} entries for {len(self.missing)} drives")
+        # "Not at least" and "not at most", so that a tension that is no number counts as wrong.
+        slack = [seen.following and not t >= limits.min_tension for t in seen.tensions]
+        loose = [seen.following and not t >= limits.no_tension for t in seen.tensions]
+        over = [seen.following and not t <= limits.max_tension for t in seen.tensions]
+        # A drive that did not answer says nothing new about its tension.
+        watch = Monitor(
+            limits,
+            self.names,
+            _counted(self.missing, seen.missing, [False] * len(seen.missing)),
+            _counted(self.slack, slack, seen.missing),
+            _counted(self.loose, loose, seen.missing),
+            _counted(self.over, over, seen.missing),
+        )
+        return watch, (
+            *watch._replies(seen),
+            *watch._following(seen),
+            *watch._tensions(seen),
+            *watch.lateness(seen.lateness),
+        )
+
+    def _replies(self, seen: Observation) -> list[Alarm]:
+        found = [
+            Alarm(StopReaction.QUICK_STOP, "drive_fault", text, number)
+            for number, text in seen.faults
+        ]
+        for number, text, stops in seen.warnings:
+            reaction = StopReaction.PATH_STOP if stops else StopReaction.NOTE
+            found.append(Alarm(reaction, "drive_warning", text, number))
+        for drive, count in enumerate(self.missing, start=1):
+            name = self.names[drive - 1]
+            text = f"{name} did not answer for {count} cycle{'s' if count > 1 else ''}"
+            if count >= self.limits.missing_cycles:
+                found.append(Alarm(StopReaction.QUICK_STOP, "drive_silent", text, drive))
+            elif count:
+                found.append(Alarm(StopReaction.NOTE, "reply_lost", text, drive))
+        return found
+
+    def _following(self, seen: Observation) -> list[Alarm]:
+        found = []
+        for drive, error in enumerate(seen.following_errors, start=1):
+            if not seen.following or seen.missing[drive - 1]:
+                continue
+            # "Not at most", so that an error that is no number counts as too large.
+            if not abs(error) <= self.limits.following_error:
+                text = (
+                    f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
+                    f" allowed {self.limits.following_error * 1000:.2f} mm"
+                )
+                found.append(Alarm(StopReaction.QUICK_STOP, "following_error", text, drive))
+        return found
+
+    def _tensions(self, seen: Observation) -> list[Alarm]:
+        found = []
+        for drive, tension in enumerate(seen.tensions):
+            text = f"cable {drive + 1} carries {tension:.1f} N,"
+            if self.loose[drive] >= self.limits.loose_cycles:
+                loose = f"{text} no tension: it is torn or hangs loose"
+                found.append(Alarm(StopReaction.QUICK_STOP, "cable_loose", loose, drive + 1))
+            elif self.slack[drive] >= self.limits.slack_cycles:
+                slack = f"{text} less than {self.limits.min_tension:.1f} N: it may be slack"
+                found.append(Alarm(StopReaction.PATH_STOP, "slack", slack, drive + 1))
+            if self.over[drive] >= self.limits.slack_cycles:
+                over = f"{text} more than {self.limits.max_tension:.1f} N"
+                found.append(Alarm(StopReaction.PATH_STOP, "over_tension", over, drive + 1))
+        return found
+
+    def lateness(self, cycles: float) -> list[Alarm]:
+        """What a cycle that begins so late asks for, before anything is sent in it."""
+        text = f"a cycle began {cycles:.1f} cycles late"
+        if not cycles < self.limits.gone_periods:  # also when it is no number
+            return [Alarm(StopReaction.QUICK_STOP, "late", text)]
+        if cycles >= self.limits.late_periods:
+            return [Alarm(StopReaction.PATH_STOP, "late", text)]
+        return []
+
+
+def _counted(
+    before: Sequence[int], now: Sequence[bool], unknown: Sequence[bool]
+) -> tuple[int, ...]:
+    """Counts in a row; where nothing is known the count stays."""
+    return tuple(
+        count if hidden else (count + 1 if hit else 0)
+        for count, hit, hidden in zip(before, now, unknown, strict=True)
+    )

@@ -1,0 +1,401 @@
+"""The service of a rig: its status, the reset of a latched fault, the release of its drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.can_bus import BusSettings, open_bus
+from drivers.drive_group import CycleStatus
+from drivers.factory import drive_states, read_drives
+from executor.control.standstill import FaultReset, Release, StandstillMotion
+from executor.current_pose import standing_pose
+from executor.drives import require_other_process, resting_drives_of
+from executor.interlock.fault_latch import FaultLatch, LatchedFault
+from executor.interlock.interlock import MotionInterlock
+from executor.interlock.locks import SetUpLock
+from executor.realtime.process import real_time_process
+from executor.realtime.shared_memory import SharedRequests
+from executor.remote.registry import announced
+from executor.remote.server import serving
+from executor.remote.status import WinchStatus
+from executor.standstill_runs import is_braked, release_drives, reset_drives
+from executor.state_machine import State
+from executor.supervision import Supervisor, require_confirmed
+from model.errors import CdprError, Refused
+from model.pose import Pose
+from model.progress import SILENT, Listener
+from model.rig import Rig
+from model.scene import nothing_in_the_way
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceStatus:
+    """The homing reference of a bus.
+
+    Attributes:
+        counts: Whether the drives still count from it.
+        why_not: Why they do not.
+        made: When it was made; None where none is kept.
+        how: The pose was known.
+        file: Where it is kept.
+    """
+
+    counts: bool
+    why_not: str | None
+    made: str | None
+    how: str | None
+    file: str | None
+
+
+def reference_status(
+    interlock: MotionInterlock, positions: Sequence[int] | None = None
+) -> ReferenceStatus:
+    """The reference of a bus.
+
+    Args:
+        interlock: Of the bus.
+        positions: Of its drives, [counts]; None where they were not asked.
+    """
+    why = interlock.why_unreferenced(positions)
+    try:
+        kept = interlock.kept_reference()
+    except Refused:  # the reason says so
+        kept = None
+    path = interlock.file.path
+    return ReferenceStatus(
+        counts=not why,
+        why_not=why or None,
+        made=kept.made if kept else None,
+        how=kept.how if kept else None,
+        file=str(path) if path.exists() else None,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class DriveStatus:
+    """One drive, as it reports itself.
+
+    Attributes:
+        node: Its node ID.
+        state: Of its state machine, in words.
+        position: Of its encoder, [counts].
+        tension: Of its cable, by the drive's torque, [N].
+        set_up: It keeps this program's set-up: it was not switched off since.
+    """
+
+    node: int
+    state: str
+    position: int
+    tension: float
+    set_up: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StatusResult:
+    """The state of a rig; what was not asked or is not known is None.
+
+    Attributes:
+        rig: Its name.
+        bus: Interface and channel.
+        run: Number of the process that moves or resets it.
+        latched: Cause of a latched fault.
+        being_set_up: Another program sets the drives up or reads them.
+        reference: Of the drives' counts.
+        drives: All of them, in the order of the rig file.
+        pose: By forward kinematics of the empty platform, ``world_from_platform``.
+        why_no_pose: Why there is none, though the drives were read.
+        missing: Why the drives could not be read.
+    """
+
+    rig: str
+    bus: str
+    run: int | None
+    latched: str | None
+    being_set_up: bool
+    reference: ReferenceStatus
+    drives: tuple[DriveStatus, ...] | None = None
+    pose: Pose | None = None
+    why_no_pose: str | None = None
+    missing: CdprError | None = None
+
+
+def status(rig: Rig) -> StatusResult:
+    """The state of a rig: faults, reference, drives, tensions, pose. Moves and writes nothing.
+
+    While a run is under way, or being prepared, the drives are not asked.
+
+    Args:
+        rig: The robot and its bus.
+
+    Raises:
+        BadInput: The interface is ``virtual``, which reaches no other process.
+    """
+    require_other_process(rig)
+    settings = BusSettings.of(rig)
+    interlock = MotionInterlock(rig)
+    latched, under_way = _latch_of(FaultLatch(settings))
+    known = StatusResult(
+        rig=rig.name,
+        bus=str(settings),
+        run=latched.process if latched and under_way else None,
+        latched=latched.cause if latched and not under_way else None,
+        being_set_up=False,
+        reference=reference_status(interlock),
+    )
+    if under_way:
+        return known
+    try:
+        with SetUpLock(settings).tried() as alone:
+            return _read(rig, interlock, known) if alone else replace(known, being_set_up=True)
+    except CdprError as error:  # what is on file is reported all the same
+        return replace(known, missing=error)
+
+
+def _latch_of(latch: FaultLatch) -> tuple[LatchedFault | None, bool]:
+    """What is latched, and whether a motion is under way, both of one moment."""
+    latched = latch.read()
+    while True:
+        under_way = latch.held_by_another()
+        again = latch.read()
+        if again == latched:
+            return latched, latched is not None and under_way
+        latched = again
+
+
+def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusResult:
+    """What the drives report, and the pose that follows from it.
+
+    Raises:
+        CdprError: A drive does not answer, or the bus cannot be opened.
+    """
+    bus = open_bus(BusSettings.of(rig))
+    try:
+        seen = read_drives(rig, bus)
+    finally:
+        bus.shutdown()
+    positions = seen.positions.tolist()
+    reference = reference_status(interlock, positions)
+    forgot = [w.node_id for w in rig.winches if not w.absolute and w.node_id in seen.restarted]
+    if reference.counts and forgot:
+        names = ", ".join(rig.drive_names[node] for node in forgot)
+        why = f"{names}: switched on since it was made"
+        reference = replace(reference, counts=False, why_not=why)
+    columns = zip(
+        rig.winches,
+        drive_states(rig, seen.status_words.tolist()),
+        positions,
+        rig.tensions_by(seen.torques).tolist(),
+        strict=True,
+    )
+    drives = tuple(
+        DriveStatus(w.node_id, state, position, tension, w.node_id not in seen.restarted)
+        for w, state, position, tension in columns
+    )
+    read = replace(known, reference=reference, drives=drives)
+    if not reference.counts:
+        return read
+    as_referenced = interlock.referenced_rig()
+    load = nothing_in_the_way(as_referenced).load
+    try:
+        pose = standing_pose(as_referenced, np.array(positions, dtype=np.float64), load)
+    except CdprError as error:
+        return replace(read, why_no_pose=error.what)
+    return replace(read, pose=pose)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResetProposal:
+    """A fault that is about to be taken off; see `executor.supervision.Proposal`.
+
+    Attributes:
+        bus: Interface and channel.
+        latched: What is latched, if anything.
+    """
+
+    question: ClassVar[str] = "Is the cause gone and the platform safe?"
+    otherwise: ClassVar[str] = "nothing was reset"
+
+    bus: str
+    latched: LatchedFault | None
+
+
+@dataclass(frozen=True, slots=True)
+class ResetResult:
+    """How a rig is after a reset.
+
+    Attributes:
+        was_latched: Whether a fault was.
+        cause: Of that fault.
+        drives: State of each drive, in words.
+        restarted: Nodes that were found switched on since their last set-up.
+        reference: Of the drives' counts.
+    """
+
+    was_latched: bool
+    cause: str | None
+    drives: tuple[str, ...]
+    restarted: tuple[int, ...]
+    reference: ReferenceStatus
+
+
+def reset(
+    rig: Rig,
+    *,
+    confirm: Callable[[ResetProposal], bool] | None = None,
+    listener: Listener = SILENT,
+) -> ResetResult:
+    """Takes a latched fault off, after its cause is gone: resets drives in fault; moves nothing.
+
+    Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
+    Afterwards a run starts only from where the platform is.
+
+    Args:
+        rig: The robot and its bus.
+        confirm: Called once, before anything is reset; False cancels it.
+        listener: Receives what the drives cannot do.
+
+    Raises:
+        StoppedByOperator: It was cancelled.
+        CdprError: A run is under way; or a drive does not answer, may not be reset now, or stays
+            in fault.
+    """
+    require_other_process(rig)
+    settings = BusSettings.of(rig)
+    latch = FaultLatch(settings)
+    latched = latch.read()
+    latch.require_no_run()
+    require_confirmed(confirm, ResetProposal(str(settings), latched))
+    interlock, motion = MotionInterlock(rig), StandstillMotion.of(FaultReset, rig)
+    make_drives = partial(resting_drives_of, rig.document, to_reset=True)
+    with latch.held_for_reset(rig.name, latched):
+        with (
+            closing(SharedRequests()) as board,
+            real_time_process(
+                motion, make_drives, board, need_real_time=False, listener=listener
+            ) as process,
+        ):
+            done = reset_drives(interlock, process)
+        return ResetResult(
+            was_latched=latched is not None,
+            cause=latched.cause if latched else None,
+            drives=tuple(drive_states(rig, done.left.status_words.tolist())),
+            restarted=done.restarted,
+            reference=reference_status(interlock, done.left.positions.tolist()),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReleaseProposal:
+    """Drives that are about to lose their torque; see `executor.supervision.Proposal`.
+
+    Attributes:
+        rig: The robot.
+        bus: Interface and channel.
+        braked: Whether brakes hold the drums afterwards.
+        reference: Of the drives' counts, which is given up without brakes.
+    """
+
+    question: ClassVar[str] = "Does the platform stand on something, so that no cable carries it?"
+    otherwise: ClassVar[str] = "the drives hold as before"
+
+    rig: Rig
+    bus: str
+    braked: bool
+    reference: ReferenceStatus
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseResult:
+    """How a rig is after its drives were released.
+
+    Attributes:
+        drives: State of each drive, in words.
+        reference: Of the drives' counts.
+    """
+
+    drives: tuple[str, ...]
+    reference: ReferenceStatus
+
+
+def release(
+    rig: Rig,
+    *,
+    need_real_time_rights: bool = True,
+    listener: Listener = SILENT,
+    confirm: Callable[[ReleaseProposal], bool] | None = None,
+    supervisor: Supervisor | None = None,
+) -> ReleaseResult:
+    """With the platform on a support, closes the brakes and takes the torque off all drives.
+
+    Winches without brakes let their cables go, so that the drives have to be referenced again.
+
+    Args:
+        rig: The robot and its bus.
+        need_real_time_rights: Refuse without real-time scheduling.
+        listener: Receives what the system denies and what the drives cannot do.
+        confirm: Called once, before anything is released; False cancels it. Without it the call
+            itself is the decision.
+        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+
+    Raises:
+        StoppedByOperator: It was cancelled, or stopped.
+        CdprError: The bus is latched, or the drives could not be set up; or they were not released,
+            and a fault is latched.
+    """
+    require_other_process(rig)
+    interlock = MotionInterlock(rig)
+    interlock.require_free()
+    bus, braked = str(BusSettings.of(rig)), is_braked(rig)
+    proposal = ReleaseProposal(rig, bus, braked, reference_status(interlock))
+    require_confirmed(confirm, proposal)
+    operator = supervisor or Supervisor()
+    with closing(SharedRequests()) as board:
+        left = operator.during(
+            board, lambda: _released(rig, interlock, board, need_real_time_rights, listener)
+        )
+    operator.finish()
+    return ReleaseResult(
+        drives=tuple(drive_states(rig, left.status_words.tolist())),
+        reference=reference_status(interlock, left.positions.tolist()),
+    )
+
+
+def _released(
+    rig: Rig,
+    interlock: MotionInterlock,
+    board: SharedRequests,
+    need_real_time_rights: bool,
+    listener: Listener,
+) -> CycleStatus:
+    """The drives' last word, without torque; errors as `release_drives`."""
+    status = WinchStatus(rig, board, simulated_time=False)
+
+    def on_armed(denied: str) -> None:
+        if denied:
+            listener.remark(denied)
+        status.take_release()
+
+    with ExitStack() as stack:
+        stack.enter_context(serving(stack.enter_context(announced()), board, status))
+        process = stack.enter_context(
+            real_time_process(
+                StandstillMotion.of(Release, rig),
+                partial(resting_drives_of, rig.document),
+                board,
+                need_real_time=need_real_time_rights,
+                listener=listener,
+            )
+        )
+        try:
+            left = release_drives(rig, interlock, process, on_armed)
+        except CdprError as error:
+            status.take_end(State.LATCHED, error.what)
+            raise
+        status.take_end(State.FINISHED, "")
+        return left

@@ -1,0 +1,282 @@
+"""Measures the platform in folders of pictures, videos, live and synthetic cameras."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from itertools import islice, takewhile
+from pathlib import Path
+
+from drivers.cameras.files import ImageFolder, PictureOutput
+from drivers.cameras.live import Frame, LiveCamera, VideoFile
+from executor.cameras.sources import SYNTHETIC, require_camera_source
+from executor.kernels import ready_to_measure
+from executor.recording.mcap import write_track_mcap
+from executor.trajectory.prepare import prepare
+from model.clearance import ClearanceModel
+from model.errors import BadInput
+from model.plan import Plan, require_same_rig
+from model.pose import Pose
+from model.progress import SILENT, Listener
+from model.rig import Camera, Rig
+from model.scene import Scene
+from planner.check import verify
+from simulation.camera.camera import Film
+from simulation.factory import make_synthetic_camera
+from tracking.measurement import PoseMeasurement
+from tracking.overlay import drawn_over
+from tracking.pose_log import LoggedPicture, write_pose_log
+from tracking.track import FrameRate, Picture, TogetherCount, TrackCount, track, track_together
+from tracking.tracker import Tracker
+
+#: A live camera that shows no tag for this number of pictures is given up.
+PATIENCE = 50
+
+
+@dataclass(slots=True)
+class TrackResult:
+    """What was measured.
+
+    Attributes:
+        pictures: Of all cameras together, in order of time.
+        by_camera: Of each of several cameras alone, by its name; empty for one camera.
+        count: How many pictures were measured, and how long each took.
+        together: Of several cameras, what was not taken together; None for one camera.
+        unused: Why files were not used, by camera and name.
+        with_clearance: Whether obstacles are known.
+        began: [ns since 1970].
+        seconds: How long all of it took, [s].
+    """
+
+    pictures: list[LoggedPicture] = field(default_factory=list)
+    by_camera: dict[str, list[LoggedPicture]] = field(default_factory=dict)
+    count: TrackCount = field(default_factory=TrackCount)
+    together: TogetherCount | None = None
+    unused: dict[str, dict[str, str]] = field(default_factory=dict)
+    with_clearance: bool = False
+    began: int = field(default_factory=time.time_ns)
+    seconds: float = 0.0
+
+    @property
+    def poses(self) -> list[PoseMeasurement]:
+        """Those that were found."""
+        found = (logged.observation for logged in self.pictures)
+        return [one for one in found if isinstance(one, PoseMeasurement)]
+
+    def __repr__(self) -> str:
+        """Numbers of images and poses."""
+        return f"<TrackResult {len(self.poses)} poses in {len(self.pictures)} images>"
+
+    def save(self, path: Path | str, mcap: Path | str | None = None) -> None:
+        """Writes the pose log, one for each of several cameras beside it, and MCAP.
+
+        Raises:
+            BadInput: A file cannot be written.
+            Fault: The disk is full or gone.
+        """
+        path = Path(path)
+        for name, logged in self.by_camera.items():
+            write_pose_log(own_file(path, name), logged, with_clearance=self.with_clearance)
+        write_pose_log(path, self.pictures, with_clearance=self.with_clearance)
+        if mcap is not None:
+            write_track_mcap(Path(mcap), self.pictures, self.by_camera, self.began)
+
+
+def own_file(path: Path, name: str) -> Path:
+    """The file of one of several cameras: ``poses-front.csv`` beside ``poses.csv``."""
+    return path.with_name(f"{path.stem}-{name}{path.suffix}")
+
+
+def own_drawing(overlay: Path, name: str) -> Path:
+    """Where one of several cameras' pictures are drawn: a video like a log, or a folder inside."""
+    is_folder = overlay.is_dir() or not overlay.suffix
+    return overlay / name if is_folder else own_file(overlay, name)
+
+
+def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
+    """Refuses a plan where no source renders pictures of it.
+
+    Raises:
+        BadInput: No source is ``synthetic``.
+    """
+    named = list(sources)
+    if plan is not None and SYNTHETIC not in named:
+        raise BadInput(
+            "--plan is for the synthetic camera",
+            where="track",
+            why=f"pictures come from {', '.join(named)}",
+            next_step="name the obstacles with --scene, or the source 'synthetic'",
+        )
+
+
+def track_sources(
+    rig: Rig,
+    sources: Mapping[Camera, str],
+    *,
+    scene: Scene | None = None,
+    plan: Plan | None = None,
+    pictures: int | None = None,
+    overlay: Path | None = None,
+    replace_overlay: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+    listener: Listener = SILENT,
+) -> TrackResult:
+    """Measures the platform's pose picture by picture, by one camera or several together.
+
+    Args:
+        rig: The robot.
+        sources: A folder, a video file, a camera's index or address, or ``synthetic``, for each
+            camera; see `executor.cameras.sources.parse_camera_sources`.
+        scene: Its obstacles, to which the clearance is measured; the plan's when left out.
+        plan: Followed by the platform that synthetic cameras see.
+        pictures: How many of each camera at most.
+        overlay: Folder or video into which the pictures are drawn with what was measured.
+        replace_overlay: It may exist.
+        stopped: Whether to end; asked before each picture.
+        listener: Receives how far it is, and which files are not used.
+
+    Raises:
+        NoPlatformSeen: No picture gave a pose.
+        BadInput: A source cannot be used, or a picture is of another size.
+        HardwareMissing: A camera does not open.
+        CameraMoved: Frame tags are not where they should be.
+    """
+    require_plan_used(sources.values(), plan)
+    the_scene = plan.scene if scene is None and plan is not None else scene
+    ready_to_measure(listener)
+    several = len(sources) > 1
+    model = ClearanceModel(rig, the_scene) if the_scene and the_scene.obstacles else None
+    result = TrackResult(
+        by_camera={camera.name: [] for camera in sources} if several else {},
+        together=TogetherCount() if several else None,
+        unused={camera.name: {} for camera in sources},
+        with_clearance=model is not None,
+    )
+    opened = [
+        _opened(rig, the_scene, camera, source, plan, result.unused[camera.name], listener)
+        for camera, source in sources.items()
+    ]
+    totals = [total for _, total in opened if total is not None]
+    total = max(totals) if len(totals) == len(opened) else None
+    result.began = time.time_ns()
+    with ExitStack() as drawing, listener.progress("tracking", pictures or total) as advance:
+        streams: dict[str, Iterator[LoggedPicture]] = {}
+        for camera, (frames, length) in zip(sources, opened, strict=True):
+            place = own_drawing(overlay, camera.name) if overlay and several else overlay
+            streams[camera.name] = track(
+                takewhile(lambda _: not stopped(), islice(frames, pictures)),
+                Tracker(rig, camera),
+                result.count,
+                give_up_after=PATIENCE if length is None and not several else None,
+                model=model,
+                on_picture=drawing.enter_context(_overlay(place, rig, camera, replace_overlay)),
+            )
+        # The fastest camera defines how close in time pictures belong together.
+        within = 0.5 / max(camera.rate for camera in sources)
+        _measure(_together(streams, within, result.together, model), result, advance)
+    result.seconds = (time.time_ns() - result.began) * 1e-9
+    return result
+
+
+def _measure(
+    measured: Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]],
+    result: TrackResult,
+    advance: Callable[[float, str], None],
+) -> None:
+    """Takes all pictures into the result."""
+    pace = FrameRate()
+    for found, alone in measured:
+        result.pictures.append(found)
+        for name, own in result.by_camera.items():
+            if name in alone:
+                own.append(alone[name])
+        pace.take(time.monotonic(), result.count.seconds[-1])
+        seen = found.observation
+        tags = len(seen.tags) if isinstance(seen, PoseMeasurement) else 0
+        advance(len(result.pictures), pace.text(tags))
+
+
+def _together(
+    streams: dict[str, Iterator[LoggedPicture]],
+    within: float,
+    count: TogetherCount | None,
+    model: ClearanceModel | None,
+) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
+    """What is measured together and by each camera alone."""
+    if count is not None:
+        yield from track_together(streams, within, count, model)
+        return
+    for name, stream in streams.items():
+        for found in stream:
+            yield found, {name: found}
+
+
+@contextmanager
+def _overlay(
+    place: Path | None, rig: Rig, camera: Camera, replace: bool
+) -> Iterator[Callable[[Picture, LoggedPicture], None] | None]:
+    """What draws each picture's measurement into it; None without a place for it."""
+    if place is None:
+        yield None
+        return
+    with PictureOutput(place, camera.rate, replace) as out:
+
+        def draw(picture: Picture, logged: LoggedPicture) -> None:
+            found = logged.observation
+            out.write(drawn_over(picture.image, rig, camera, found, logged.clearance), picture.name)
+
+        yield draw
+
+
+def _opened(
+    rig: Rig,
+    scene: Scene | None,
+    camera: Camera,
+    source: str,
+    plan: Plan | None,
+    unused: dict[str, str],
+    listener: Listener,
+) -> tuple[Iterable[Picture], int | None]:
+    """The pictures of a source, and how many there are where that is known."""
+    if source == SYNTHETIC:
+        if plan is None or scene is None:
+            raise BadInput(
+                "the synthetic camera needs a path to look at",
+                where=f"track, camera {camera.name!r}",
+                next_step="pass --plan plan.json",
+            )
+        looks = _poses_in_time(rig, camera, plan)
+        return _rendered(rig, scene, camera, looks), len(looks)
+    path = Path(source)
+    if path.is_dir():
+
+        def skipped(name: str, why: str) -> None:
+            unused[name] = why
+            listener.remark(f"skipped: {name} {why}")
+
+        folder = ImageFolder(path, camera, on_unused=skipped)
+        return folder, len(folder)
+    if path.is_file():
+        video = VideoFile(path, camera)
+        return video, len(video)
+    require_camera_source(source)
+    return LiveCamera(source, camera), None
+
+
+def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Pose]]:
+    """Times and poses at which the synthetic camera takes pictures: those of a run of the plan."""
+    require_same_rig(plan, rig, f"plan for {plan.rig.name}")
+    table = prepare(verify(plan, rig), rig).checked.table
+    poses = table.poses()
+    every = max(1, round(1.0 / (camera.rate * table.cycle)))
+    return [(row * table.cycle, poses[row]) for row in range(0, len(table), every)]
+
+
+def _rendered(
+    rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
+) -> Iterable[Picture]:
+    film = Film(make_synthetic_camera(rig, scene, camera))
+    for number, (at, pose) in enumerate(looks):
+        yield Frame(at, film.picture(at, pose, number), f"rendered {number}")

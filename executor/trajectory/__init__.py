@@ -1,0 +1,1 @@
+"""From a verified plan to checked set-points."""

@@ -1,0 +1,233 @@
+"""The geometric path: straight segments and rounded corners, by travelled length.
+
+Every segment is a Bézier curve in the chart of one rotation R₀: a point (p, r) of R⁶ stands for the
+pose (p, R₀ exp[r]). Straight moves with a constant axis of rotation are straight lines there, so a
+corner's curve meets its two neighbours with the same direction and with zero curvature.
+
+Length is measured as √(|dp|² + (ρ |dr|)²) with ρ the RMS distance of the anchors from the
+platform's origin, so that the speed along the path bounds translation and rotation together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+
+CORNER_SAMPLES = 257
+#: Where the control points of a corner stand on its two legs, in shares of the leg.
+_SHARES = (1.0, 0.6, 0.2)
+#: Distance from a corner's point to the middle of its curve: this share of the sum of its legs,
+#: (1·1 + 5·0.6 + 10·0.2)/32, the legs' weights at the middle of a quintic.
+MIDDLE_SHARE = 6.0 / 32.0
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """One curve of the path.
+
+    Attributes:
+        chart: Rotation R₀, shape (3, 3).
+        control: Control points (position [m], rotation vector [rad]), shape (2 or 6, 6).
+        weight: ρ, metres of path for a radian of rotation.
+    """
+
+    chart: Array
+    control: Array
+    weight: float
+
+    @property
+    def straight(self) -> bool:
+        """True for a line, False for a rounded corner."""
+        return len(self.control) == 2
+
+    @cached_property
+    def _metric(self) -> Array:
+        return metric(self.weight)
+
+    @cached_property
+    def _even(self) -> Array:
+        return np.linspace(0.0, 1.0, CORNER_SAMPLES)
+
+    @cached_property
+    def _speeds(self) -> Array:
+        """Length for a unit of the parameter at even parameters, shape (CORNER_SAMPLES,), [m]."""
+        speeds: Array = np.linalg.norm(self._derivative(1, self._even), axis=1)
+        return speeds
+
+    @cached_property
+    def _travelled(self) -> Array:
+        """Length from the start at even parameters (Simpson), shape (CORNER_SAMPLES,), [m]."""
+        between = (self._even[:-1] + self._even[1:]) / 2.0
+        middle = np.linalg.norm(self._derivative(1, between), axis=1)
+        steps = (self._speeds[:-1] + 4.0 * middle + self._speeds[1:]) / 6.0 / (CORNER_SAMPLES - 1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @cached_property
+    def length(self) -> float:
+        """[m]."""
+        if self.straight:
+            return float(np.linalg.norm((self.control[1] - self.control[0]) * self._metric))
+        return float(self._travelled[-1])
+
+    @cached_property
+    def bends(self) -> tuple[float, float]:
+        """Largest second and third derivative of the curve by its length, [1/m] and [1/m²].
+
+        At a speed v along it they make an acceleration of v² times the first and a jerk of v³
+        times the second, translation and rotation together.
+        """
+        if self.straight:
+            return 0.0, 0.0
+        first, second, third = (self._derivative(order, self._even) for order in (1, 2, 3))
+        speed = self._speeds[:, None]
+        along = _dot(first, second) / speed
+        along_change = (_dot(second, second) + _dot(first, third) - along**2) / speed
+        by_length = (second - first / speed * along) / speed**2
+        change = (third - 3.0 * by_length * speed * along - first / speed * along_change) / speed**3
+        norms = (np.linalg.norm(values, axis=1).max() for values in (by_length, change))
+        curvature, curvature_change = map(float, norms)
+        return curvature, curvature_change
+
+    def _derivative(self, order: int, parameters: Array) -> Array:
+        """Derivative of the curve by its parameter, rotation in metres, shape (n, 6), [m]."""
+        control = self.control * self._metric
+        for _ in range(order):
+            control = (len(control) - 1) * np.diff(control, axis=0)
+        return _bezier(control, parameters)
+
+    def _parameters(self, travelled: Array) -> Array:
+        """Where on the curve a length is reached: cubic between even parameters, slopes exact."""
+        if self.length == 0.0:
+            return np.zeros_like(travelled)
+        if self.straight:
+            return travelled / self.length
+        ends = np.searchsorted(self._travelled, travelled, "right")
+        right = np.clip(ends, 1, CORNER_SAMPLES - 1)
+        left = right - 1
+        step = self._travelled[right] - self._travelled[left]
+        x = (travelled - self._travelled[left]) / step
+        slopes = step / self._speeds[left], step / self._speeds[right]
+        rise = self._even[right] - self._even[left]
+        cubic = x * x * (3.0 - 2.0 * x) * rise
+        cubic += x * (1.0 - x) ** 2 * slopes[0] - x * x * (1.0 - x) * slopes[1]
+        return self._even[left] + cubic
+
+    def at(self, travelled: Array) -> tuple[Array, Array]:
+        """Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3), after given lengths [m]."""
+        points = _bezier(self.control, self._parameters(travelled))
+        return points[:, :3], _rotations(self.chart, points[:, 3:])
+
+
+def metric(weight: float) -> Array:
+    """Metres of path for each coordinate of (position, rotation vector), shape (6,)."""
+    return np.array([1.0, 1.0, 1.0, weight, weight, weight])
+
+
+def _bezier(control: Array, parameters: Array) -> Array:
+    degree = len(control) - 1
+    powers = np.arange(degree + 1)
+    binomials = np.array([math.comb(degree, k) for k in powers], dtype=np.float64)
+    t = parameters[:, None]
+    points: Array = (binomials * t**powers * (1.0 - t) ** (degree - powers)) @ control
+    return points
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Row by row, shape (n, 1)."""
+    product: Array = np.sum(a * b, axis=1, keepdims=True)
+    return product
+
+
+def _rotations(chart: Array, vectors: Array) -> Array:
+    if not vectors.any():
+        return np.broadcast_to(chart, (len(vectors), 3, 3))
+    return np.array([chart @ matrix_from_rotation_vector(v) for v in vectors])
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Segments end to end."""
+
+    segments: tuple[Segment, ...]
+
+    @cached_property
+    def starts(self) -> Array:
+        """Travelled length at the start of each segment and at the end, shape (n + 1,), [m]."""
+        return np.concatenate([[0.0], np.cumsum([s.length for s in self.segments])])
+
+    @property
+    def length(self) -> float:
+        """[m]."""
+        return float(self.starts[-1])
+
+    def at(self, travelled: Array) -> tuple[Array, Array]:
+        """Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3), after given lengths [m]."""
+        travelled = np.clip(np.asarray(travelled, dtype=np.float64), 0.0, self.length)
+        which = np.clip(np.searchsorted(self.starts, travelled, "right") - 1, 0, None)
+        which = np.minimum(which, len(self.segments) - 1)
+        positions = np.empty((len(travelled), 3))
+        rotations = np.empty((len(travelled), 3, 3))
+        for index in np.unique(which):
+            chosen = which == index
+            inside = travelled[chosen] - self.starts[index]
+            positions[chosen], rotations[chosen] = self.segments[index].at(inside)
+        return positions, rotations
+
+
+def line(start: Pose, end: Pose, weight: float) -> Segment:
+    """The straight move between two poses."""
+    return Segment(
+        start.rotation, np.array([_in_chart(start, start), _in_chart(start, end)]), weight
+    )
+
+
+def corner(before: Pose, at: Pose, after: Pose, weight: float) -> Segment:
+    """The rounded corner from ``before`` to ``after``, points of the two lines that meet at ``at``.
+
+    Its middle is `MIDDLE_SHARE` of the sum of the two legs away from the corner point; with legs
+    of the same length no point of it is farther from the two lines.
+
+    Raises:
+        ValueError: The path turns straight back, so that no smooth curve follows it.
+    """
+    corner_point = _in_chart(at, at)
+    legs = [_in_chart(at, end) - corner_point for end in (before, after)]
+    apart, *sizes = np.linalg.norm([legs[0] - legs[1], *legs] * metric(weight), axis=1)
+    if apart <= 1e-6 * sum(sizes):
+        raise ValueError("a path that turns straight back cannot be rounded")
+    control = [corner_point + share * legs[0] for share in _SHARES]
+    control += [corner_point + share * legs[1] for share in reversed(_SHARES)]
+    return Segment(at.rotation, np.array(control), weight)
+
+
+def direction(at: Pose, towards: Pose, weight: float) -> Array:
+    """Unit vector of the straight move from a pose to another, in the chart of the first.
+
+    Returns:
+        (Position, rotation vector) in metres of path, shape (6,).
+    """
+    leg = (_in_chart(at, towards) - _in_chart(at, at)) * metric(weight)
+    unit: Array = leg / np.linalg.norm(leg)
+    return unit
+
+
+def _in_chart(origin: Pose, pose: Pose) -> Array:
+    turn = rotation_vector_from_matrix(origin.rotation.T @ pose.rotation)
+    return np.array([*pose.position, *turn])
+
+
+def poses_of(positions: Array, rotations: Array) -> list[Pose]:
+    """The rows of `Path.at` as poses."""
+    return [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
+
+
+def polyline(waypoints: Sequence[Pose], weight: float) -> Path:
+    """The path with sharp corners."""
+    return Path(tuple(line(a, b, weight) for a, b in pairwise(waypoints)))

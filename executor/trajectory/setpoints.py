@@ -1,0 +1,340 @@
+"""The set-point table: a whole run as int32 drive positions, checked before anything is armed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from executor.trajectory.dwell import (
+    Dwell,
+    load_violations,
+    order_violations,
+    rows_of,
+    stand_violations,
+)
+from executor.trajectory.path import Path, poses_of
+from executor.trajectory.time_scaling import TimeLaw
+from model.errors import Refused
+from model.kinematics import cables_to
+from model.pose import Array, Pose, read_only
+from model.rig import Rig
+from model.scene import Load, Scene, legs_of
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
+from planner.check import check_path
+from planner.check_report import CheckReport
+
+# What the loop sends: checked set-points and their fingerprint.
+#
+# A `CheckedTrajectory` has the poses and the proof; the loop needs only this part of it, which can
+# also be handed to another process and be compared there with what was checked.
+
+
+Setpoints = NDArray[np.int32]
+
+
+def fingerprint(cycle: float, setpoints: Setpoints) -> str:
+    """SHA-256 over set-points and their cycle [s]."""
+    digest = hashlib.sha256(repr(cycle).encode())
+    digest.update(np.ascontiguousarray(setpoints).tobytes())
+    return "sha256:" + digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedSetpoints:
+    """Set-points for the loop.
+
+    Attributes:
+        rig: The rig they were checked for.
+        cycle: Time of a cycle, [s].
+        setpoints: One row a cycle, shape (n, m), [counts]; read-only.
+        hash: Their fingerprint when they were checked; arming compares.
+    """
+
+    rig: Rig
+    cycle: float
+    setpoints: Setpoints
+    hash: str
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.setpoints)
+
+    @property
+    def unchanged(self) -> bool:
+        """The set-points are still those that were checked; computed anew every time."""
+        return fingerprint(self.cycle, self.setpoints) == self.hash
+
+
+def checked_setpoints_of(checked: CheckedTrajectory) -> CheckedSetpoints:
+    """The course of a checked table."""
+    return CheckedSetpoints(checked.rig, checked.table.cycle, checked.table.setpoints, checked.hash)
+
+
+INT32_MAX = 2**31 - 1
+_ARRAYS = ("travelled", "positions", "rotations", "lengths", "tensions", "counts")
+#: Tensions are solved to this accuracy, [N].
+TENSION_ACCURACY = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One row a cycle, from rest at the start to rest at the goal; arrays are read-only.
+
+    Attributes:
+        cycle: Time of a cycle, [s].
+        travelled: Path length, shape (n,), [m].
+        positions: Of the platform's origin, world frame, shape (n, 3), [m].
+        rotations: ``world_from_platform``, shape (n, 3, 3).
+        lengths: Free cable lengths, shape (n, m), [m].
+        tensions: Planned tensions, shape (n, m), [N].
+        counts: Drive positions, not yet rounded, shape (n, m).
+        stands: Rows at the scene's stops.
+    """
+
+    cycle: float
+    travelled: Array
+    positions: Array
+    rotations: Array
+    lengths: Array
+    tensions: Array
+    counts: Array
+    stands: tuple[Dwell, ...]
+
+    def __post_init__(self) -> None:
+        """Copies the arrays and makes them read-only, so that what was checked is what is sent."""
+        for name in _ARRAYS:
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.travelled)
+
+    @cached_property
+    def setpoints(self) -> NDArray[np.int32]:
+        """What is sent, shape (n, m); meaningful for a table that passed `check_table`."""
+        rounded = np.rint(self.counts).astype(np.int32)
+        rounded.setflags(write=False)
+        return rounded
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 over the set-points and their cycle, computed anew every time."""
+        return fingerprint(self.cycle, self.setpoints)
+
+    def poses(self) -> list[Pose]:
+        """The executed poses, one a row."""
+        return poses_of(self.positions, self.rotations)
+
+
+_PROOF = object()
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedTrajectory:
+    """A table that `check_table` passed; nothing else makes one, and the loop takes nothing else.
+
+    Attributes:
+        table: The set-points.
+        rig: The rig they were checked for.
+        hash: Its hash when it was checked.
+        report: The independent check of the executed curve.
+        winches: The map between cable lengths and counts that made it.
+    """
+
+    table: Trajectory
+    rig: Rig
+    hash: str
+    report: CheckReport
+    winches: WinchMap
+    proof: object
+
+    def __post_init__(self) -> None:
+        """Refuses to exist without the check."""
+        if self.proof is not _PROOF:
+            raise TypeError(
+                "a CheckedTrajectory comes only from executor.trajectory.setpoints.check_table"
+            )
+
+
+def build_table(
+    rig: Rig, scene: Scene, legs: Sequence[tuple[Path, TimeLaw]], cycle: float
+) -> Trajectory:
+    """Samples the run at every cycle and turns poses into drive positions.
+
+    Tensions are the rig's working tensions under the load of each leg; the cables' stretch under
+    them is fed forward.
+
+    Args:
+        rig: The robot.
+        scene: Its stops, dwells and loads.
+        legs: The curve of each leg between stops, and how fast it is run.
+        cycle: [s].
+
+    Raises:
+        TensionInfeasible: A pose cannot be held.
+    """
+    parts: list[list[Array]] = []
+    stands: list[Dwell] = []
+    reached: list[Array] = []
+    for (path, law), leg in zip(legs, legs_of(scene), strict=True):
+        part = _leg_rows(rig, leg.scene.load, path, law, cycle)
+        if parts:
+            part[0] += reached[0]
+            first = sum(len(rows[0]) for rows in parts) - 1
+            waiting = rows_of(scene.stops[len(stands)].dwell, cycle)
+            stands.append(Dwell(first, first + waiting))
+            parts.append(_standing_rows(reached, part, max(waiting - 1, 0)))
+        reached = [values[-1] for values in part]
+        parts.append(part if not stands or waiting else [values[1:] for values in part])
+    travelled, positions, rotations, tensions = map(np.concatenate, zip(*parts, strict=True))
+    anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
+    lengths = cables_to(rig, anchors).lengths
+    winches = WinchMap(rig)
+    return Trajectory(
+        cycle=cycle,
+        travelled=travelled,
+        positions=positions,
+        rotations=rotations,
+        lengths=lengths,
+        tensions=tensions,
+        counts=winches.counts(winches.unstrained(lengths, tensions)),
+        stands=tuple(stands),
+    )
+
+
+def _leg_rows(rig: Rig, load: Load, path: Path, law: TimeLaw, cycle: float) -> list[Array]:
+    """Travelled lengths, positions, rotations and tensions of a leg, from rest to rest."""
+    times = np.arange(int(np.ceil(law.duration / cycle)) + 1) * cycle
+    travelled = np.array([law.at(float(t))[0] for t in times])
+    positions, rotations = path.at(travelled)
+    poses = poses_of(positions, rotations)
+    tensions = np.array([working_tensions(rig, pose, load).tensions for pose in poses])
+    return [travelled, positions, rotations, tensions]
+
+
+def _standing_rows(reached: list[Array], after: list[Array], count: int) -> list[Array]:
+    """Rows between the last of a leg and the first of the next, which stand at the same pose."""
+    travelled, positions, rotations = (np.repeat(v[None], count, axis=0) for v in reached[:3])
+    shares = np.linspace(0.0, 1.0, count + 2)[1:-1, None]
+    tensions = reached[3] + shares * (after[3][0] - reached[3])
+    return [travelled, positions, rotations, tensions]
+
+
+def check_table(rig: Rig, scene: Scene, table: Trajectory) -> CheckedTrajectory:
+    """Passes a table on, or refuses it with everything that is wrong.
+
+    Raises:
+        Refused: A value is not finite or no int32; a winch is too fast; a tension is outside the
+            rig's limits or tensions do not hold the load; drive positions are not those of the
+            poses; ends and stands are not the scene's start, stops and goal; or the executed curve
+            fails the independent check.
+    """
+    found = _number_violations(rig, table) or order_violations(scene, table.stands, len(table))
+    poses = [] if found else table.poses()
+    if not found:
+        found = [
+            *_end_violations(scene, table),
+            *stand_violations(scene, table.stands, poses, table.cycle),
+            *load_violations(rig, scene, table.stands, poses, table.tensions),
+            *_speed_violations(rig, table),
+            *_tension_violations(rig, table),
+            *_count_violations(rig, table),
+        ]
+    if found:
+        raise _refusal(found)
+    report = check_path(rig, scene, poses, [stand.first for stand in table.stands])
+    if not report.passed:
+        raise _refusal(
+            [violation.sentence() for violation in report.violations],
+            "plan again, with a larger clearance where that is what is missing",
+        )
+    return CheckedTrajectory(table, rig, table.hash, report, WinchMap(rig), _PROOF)
+
+
+def _refusal(
+    found: list[str], next_step: str = "correct the rig file, or plan again for it"
+) -> Refused:
+    return Refused(
+        "; ".join(found),
+        where="set-point table",
+        why="the executed curve is not what the plan and the rig file allow",
+        next_step=f"{next_step}; nothing was armed",
+    )
+
+
+def _number_violations(rig: Rig, table: Trajectory) -> list[str]:
+    cycle = rig.document.bus.cycle_ms / 1000.0
+    if not abs(table.cycle - cycle) <= 1e-9:
+        return [f"the table is for a cycle of {table.cycle} s, the bus has {cycle} s"]
+    rows, cables = len(table), rig.cable_count
+    shapes = [(rows,), (rows, 3), (rows, 3, 3), *[(rows, cables)] * 3]
+    for name, shape in zip(_ARRAYS, shapes, strict=True):
+        values: Array = getattr(table, name)
+        if values.shape != shape or rows == 0:
+            return [f"{name} have the shape {values.shape}, not {shape}"]
+        if not np.isfinite(values).all():
+            row = int(np.argwhere(~np.isfinite(values))[0][0])
+            return [f"row {row} holds {name} that are no numbers"]
+    if np.abs(table.counts).max() > INT32_MAX - 1:
+        largest = int(np.abs(table.counts).argmax())
+        row, cable = divmod(largest, table.counts.shape[1])
+        value = table.counts[row, cable]
+        return [f"row {row}, cable {cable + 1}: {value:.0f} counts do not fit into 32 bits"]
+    return []
+
+
+def _end_violations(scene: Scene, table: Trajectory) -> list[str]:
+    found = []
+    for name, pose, row in (("start", scene.start, 0), ("goal", scene.goal, -1)):
+        end = Pose(table.positions[row], table.rotations[row])
+        off = end.distance_to(pose)
+        if off > 1e-6 or end.angle_to(pose) > 1e-6:
+            found.append(
+                f"the {name} of the table is {off * 1000:.4f} mm and"
+                f" {np.degrees(end.angle_to(pose)):.4f}° off the scene's"
+            )
+    return found
+
+
+def _tension_violations(rig: Rig, table: Trajectory) -> list[str]:
+    low, high = float(table.tensions.min()), float(table.tensions.max())
+    if low >= rig.min_tension - TENSION_ACCURACY and high <= rig.max_tension + TENSION_ACCURACY:
+        return []
+    return [
+        f"planned tensions run from {low:.3f} to {high:.3f} N,"
+        f" the rig allows {rig.min_tension:g} to {rig.max_tension:g} N"
+    ]
+
+
+def _count_violations(rig: Rig, table: Trajectory) -> list[str]:
+    """The check of the executed curve looks at poses, the drives get counts: they must agree."""
+    winches = WinchMap(rig)
+    unstrained = winches.unstrained_from_counts(table.setpoints.astype(np.float64))
+    anchors = [pose.apply(rig.anchors) for pose in table.poses()]
+    off = winches.strained(unstrained, table.tensions) - cables_to(rig, np.array(anchors)).lengths
+    row, cable = np.unravel_index(int(np.abs(off).argmax()), off.shape)
+    worst = float(abs(off[row, cable]))
+    if worst <= 1.0 / abs(rig.winches[int(cable)].counts_per_metre):
+        return []
+    return [f"row {row}: the set-point of cable {cable + 1} is {worst * 1000:.4f} mm off its pose"]
+
+
+def _speed_violations(rig: Rig, table: Trajectory) -> list[str]:
+    found = []
+    per_metre = np.abs([w.counts_per_metre for w in rig.winches])
+    speeds = np.abs(np.diff(table.setpoints.astype(np.int64), axis=0)) / per_metre / table.cycle
+    rounding = 1.0 / per_metre / table.cycle  # a set-point is off by at most half a count
+    for cable, winch in enumerate(rig.winches):
+        fastest = float(speeds[:, cable].max(initial=0.0))
+        if not fastest <= winch.max_speed + rounding[cable]:
+            found.append(
+                f"cable {cable + 1} would run at {fastest * 1000:.1f} mm/s,"
+                f" its winch allows {winch.max_speed * 1000:.1f} mm/s"
+            )
+    return found

@@ -1,0 +1,207 @@
+"""Moves winches without a path: what homing and jogging one cable have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from executor.control.winch_loop import LawMotion, MakeLaw, WinchesHere, WinchMover
+from executor.control.winch_motion import WinchesStand, WinchRecord, move_winches, recording
+from executor.drives import is_simulated, unreferenced_drives_of
+from executor.interlock.interlock import MotionInterlock
+from executor.interlock.reference import HomingReference
+from executor.kernels import ready_for_simulating_process
+from executor.operator_requests import LocalRequests, RequestBoard
+from executor.realtime.clock import SimulatedClock
+from executor.realtime.process import real_time_process
+from executor.realtime.shared_memory import SharedRequests
+from executor.recording.run_course import free_folder
+from executor.remote.registry import announced
+from executor.remote.server import serving
+from executor.remote.status import WinchStatus
+from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import Supervisor
+from model.errors import Fault, Refused, StoppedByOperator
+from model.pose import Pose
+from model.progress import Advance, Listener
+from model.rig import Rig
+
+if TYPE_CHECKING:  # a real bus loads no simulator
+    from simulation.ground_truth import PowerLoss
+
+#: Where the limit lies between the smallest and the largest tension, unless one is named.
+LIMIT_SHARE = 0.6
+#: Events of every motion, and one for the report of a defect alone.
+_OF_COURSE = frozenset({"enabled", "moving", "held", "traceback"})
+
+AtRest = Callable[[WinchesStand, Pose | None, RequestBoard], HomingReference | None]
+"""Called after a motion that came to its end, with where the simulated platform is and where a stop
+is wished; the drives must have held all the while before the reference that it makes is kept."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class WinchMotion:
+    """A motion that is wished for.
+
+    Attributes:
+        rig: The robot and its bus.
+        pose: Where its platform is about, ``world_from_platform``.
+        limit: Largest tension, [N].
+        speed: Fastest winch, [m/s].
+        make_law: From the rig as its drives count, limited, and where they stand, [counts]; it can
+            be sent to another process.
+        lost_power: What became of drives that are simulated in this process.
+        realtime: False for simulated time.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
+        rehome: The drives are referenced again afterwards.
+        name: Of the folder below ``runs`` where a motion on a bus is on record.
+        listener: Receives progress.
+        supervisor: Turns interrupts into stops.
+    """
+
+    rig: Rig
+    pose: Pose
+    limit: float
+    speed: float
+    make_law: MakeLaw
+    lost_power: PowerLoss | None
+    realtime: bool
+    need_real_time_rights: bool
+    rehome: bool
+    name: str
+    listener: Listener
+    supervisor: Supervisor
+
+
+def limit_of(rig: Rig, limit: float | None) -> float:
+    """The largest tension of a motion, [N]; None for `LIMIT_SHARE` of the rig's range.
+
+    Raises:
+        Refused: It is more than the rig's own, or nothing.
+    """
+    if limit is None:
+        return rig.min_tension + LIMIT_SHARE * (rig.max_tension - rig.min_tension)
+    if not rig.min_tension < limit <= rig.max_tension:
+        raise Refused(
+            f"a limit of {limit:g} N is not above {rig.min_tension:g} and up to"
+            f" {rig.max_tension:g} N",
+            where="--limit-n",
+            why="the rig file allows such tensions only",
+            next_step="name another limit",
+        )
+    return limit
+
+
+def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
+    """Moves, in a process of its own or in simulated time; in the end drives hold by themselves.
+
+    Args:
+        motion: What is wished.
+        at_rest: See `AtRest`.
+
+    Raises:
+        Fault: It ended with a fault, which is latched; with its cause.
+        StoppedByOperator: The operator stopped it.
+        KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
+        CdprError: Nothing was enabled, for the reason told.
+    """
+    board = SharedRequests() if motion.realtime else LocalRequests()
+    try:
+        stand = motion.supervisor.during(board, partial(_supervised, motion, board, at_rest))
+    finally:
+        if isinstance(board, SharedRequests):
+            board.close()
+    if stand.state in (State.STOPPED, State.FINISHED):
+        motion.supervisor.finish()
+    if stand.state is State.STOPPED:
+        raise StoppedByOperator("stopped; the drives hold", next_step="begin anew when all is well")
+    if stand.state is not State.FINISHED:
+        raise Fault(
+            stand.cause,
+            where="winches",
+            why="the motion was stopped, all drives together; they hold",
+            next_step="find the cause; simulated drives begin anew"
+            if is_simulated(motion.rig)
+            else "find the cause and look at the platform, then `cdpr reset RIG`",
+        )
+    return stand
+
+
+def _supervised(
+    motion: WinchMotion, board: LocalRequests | SharedRequests, at_rest: AtRest
+) -> WinchesStand:
+    """`cdpr stop` and its like reach the motion all the time."""
+    rig, interlock = motion.rig, MotionInterlock(motion.rig)
+    status = WinchStatus(rig, board, simulated_time=not motion.realtime)
+    with ExitStack() as stack:
+        listeners = stack.enter_context(announced())
+        stack.enter_context(serving(listeners, board, status))
+        mover = stack.enter_context(_mover(motion, board))
+        kept = stack.enter_context(
+            nullcontext() if is_simulated(rig) else recording(free_folder(motion.name))
+        )
+        status.folder = None if kept is None else kept.folder
+        advance = stack.enter_context(motion.listener.progress("moving, %", 100.0))
+        stand = move_winches(
+            mover,
+            rig,
+            interlock,
+            _EventSink(status, kept, advance, motion.listener),
+            record=kept.folder if kept is not None else interlock.file.path,
+            anew=motion.rehome,
+            at_rest=lambda stand, true_pose: at_rest(stand, true_pose, board),
+        )
+        status.take_end(stand.state, stand.cause)
+    return stand
+
+
+@contextmanager
+def _mover(motion: WinchMotion, board: LocalRequests | SharedRequests) -> Iterator[WinchMover]:
+    """In real time the drives are opened and moved in a process of its own."""
+    document, listener = motion.rig.document, motion.listener
+    cycle = document.bus.cycle_ms / 1000.0
+    law = LawMotion(motion.rig.cable_count, cycle, motion.make_law, motion.limit, motion.speed)
+    make_drives = partial(
+        unreferenced_drives_of, document, motion.pose, motion.limit, motion.lost_power
+    )
+    if isinstance(board, LocalRequests):
+        with make_drives(listener=listener) as drives:
+            yield WinchesHere(law, drives, SimulatedClock(cycle), board)
+        return
+    simulated = is_simulated(motion.rig)
+    if simulated:
+        ready_for_simulating_process(listener)
+    needed = motion.need_real_time_rights and not simulated
+    with real_time_process(
+        law, make_drives, board, need_real_time=needed, listener=listener
+    ) as process:
+        yield process
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _EventSink:
+    """Forwards what happens to the status, the record and the listener."""
+
+    status: WinchStatus
+    kept: WinchRecord | None
+    advance: Advance
+    listener: Listener
+
+    def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
+        self.status.take_cycle(record)
+        if self.kept is not None:
+            self.kept.take_cycle(record)
+        if record.cycle % 10 == 0:
+            self.advance(record.index)
+
+    def take_event(self, event: LoopEvent) -> None:
+        self.status.take_event(event)
+        if self.kept is not None:
+            self.kept.take_event(event)
+        if event.code == "no_real_time":
+            self.listener.remark(event.text)
+        elif event.code not in _OF_COURSE:
+            self.listener.note(f"{event.code}: {event.text}")

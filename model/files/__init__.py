@@ -1,0 +1,1 @@
+"""Files at the border: pydantic documents, limits on reading, and messages about their faults."""

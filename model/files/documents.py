@@ -1,0 +1,368 @@
+"""Reading and writing the project's files: all problems at once, content hashes, atomic writes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from model.errors import BadInput, InvalidFile, Problem
+from model.files.reading import YAML_LIMIT, read_text
+from model.files.validation import (
+    KeyPath,
+    Places,
+    YamlSyntaxError,
+    YamlTree,
+    key_path,
+    model_in,
+    parse_yaml,
+    place_of,
+    problems_of,
+)
+from model.pose import Pose
+
+# The parts that rig, scene and plan files share: strict models, vectors, poses.
+
+
+LARGEST, SMALLEST = 1e12, 1e-12
+"""No size, force or count of a robot is beyond these, whatever its unit; sums and squares of what
+is within them stay finite."""
+WHOLE_LARGEST = 2**31 - 1
+"""Of a drive position, and of other whole numbers."""
+SEED_LARGEST = 2**63 - 1
+NAME_BYTES = 100
+"""Of a name, in UTF-8: it becomes part of file names."""
+
+
+def _within_reason(value: float) -> float:
+    if abs(value) > LARGEST:
+        raise ValueError(f"must be within ±{LARGEST:g}; it is {value:g}")
+    return value
+
+
+def _not_next_to_nothing(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"must be {SMALLEST:g} or more; it is {value:g}")
+    return value
+
+
+def _is_name(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError(f"must be a name on one line; it is {text[:60]!r}")
+    if len(text.encode()) > NAME_BYTES:
+        raise ValueError(f"must be a name of {NAME_BYTES} bytes at most; it has {len(text)} signs")
+    return text
+
+
+_reason = AfterValidator(_within_reason)
+Number = Annotated[float, Field(allow_inf_nan=False), _reason]
+Positive = Annotated[
+    float, Field(gt=0, allow_inf_nan=False), _reason, AfterValidator(_not_next_to_nothing)
+]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), _reason]
+AnyNumber = Annotated[float, Field(allow_inf_nan=False)]
+"""What a calibration found: of what cannot be identified, intervals are as wide as they are."""
+AnyNonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1), AfterValidator(_is_name)]
+Seed = Annotated[int, Field(ge=0, le=SEED_LARGEST)]
+
+
+def _exactly(count: int) -> BeforeValidator:
+    """Says how many entries a list needs; pydantic alone would say "at least"."""
+
+    def check(value: object) -> object:
+        if isinstance(value, list) and len(value) != count:
+            raise ValueError(f"needs {count} entries, it has {len(value)}")
+        return value
+
+    return BeforeValidator(check)
+
+
+_three = (Field(min_length=3, max_length=3), _exactly(3))
+Vector = Annotated[list[Number], *_three]
+PositiveVector = Annotated[list[Positive], *_three]
+NonNegativeVector = Annotated[list[NonNegative], *_three]
+Triple = Annotated[list[Annotated[int, Field(ge=-WHOLE_LARGEST, le=WHOLE_LARGEST)]], *_three]
+
+
+def _is_unit(quaternion: list[float]) -> list[float]:
+    norm = math.sqrt(sum(q * q for q in quaternion))
+    if abs(norm - 1.0) > 1e-6:
+        raise ValueError(f"must be a unit quaternion [w, x, y, z]; its length is {norm:.8g}")
+    return quaternion
+
+
+Quaternion = Annotated[
+    list[Number], Field(min_length=4, max_length=4), _exactly(4), AfterValidator(_is_unit)
+]
+
+
+def _has_length_one(vector: list[float]) -> list[float]:
+    length = math.sqrt(sum(x * x for x in vector))
+    if abs(length - 1.0) > 1e-6:
+        raise ValueError(f"must be a direction of length 1; its length is {length:.8g}")
+    return vector
+
+
+UnitVector = Annotated[Vector, AfterValidator(_has_length_one)]
+
+Finding = tuple[tuple[str | int, ...], str]
+"""Path of a key, and a sentence about what is wrong with it."""
+
+
+class Document(BaseModel):
+    """A strict part of a file: unknown keys, wrong types, NaN and infinity are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    def rules(self) -> Sequence[Callable[[], list[Finding]]]:
+        """Checks between the document's parts; each reads as few of them as it can.
+
+        Of a file with other problems only the rules are asked whose parts are sound, so that one
+        reading tells everything.
+        """
+        return ()
+
+    def findings(self) -> list[Finding]:
+        """What is wrong between the parts of the document."""
+        return [finding for rule in self.rules() for finding in rule()]
+
+
+class PoseDocument(Document):
+    """Where something is: position in mm and a unit quaternion (level when left out)."""
+
+    position_mm: Vector
+    rotation_wxyz: Quaternion = [1.0, 0.0, 0.0, 0.0]
+
+    def pose(self) -> Pose:
+        """The same pose in metres."""
+        quaternion = np.asarray(self.rotation_wxyz)
+        unit = quaternion / np.linalg.norm(quaternion)
+        return Pose.from_quaternion(np.asarray(self.position_mm) / 1000.0, unit)
+
+    def bare(self) -> PoseDocument:
+        """The pose alone, without what else the document tells."""
+        return PoseDocument(position_mm=self.position_mm, rotation_wxyz=self.rotation_wxyz)
+
+    @staticmethod
+    def of(pose: Pose) -> PoseDocument:
+        """The document of a pose; positions to a nanometre, and no negative zero among them."""
+        return PoseDocument(
+            position_mm=[round(float(x) * 1000.0, 6) + 0.0 for x in pose.position],
+            rotation_wxyz=[float(q) for q in pose.quaternion],
+        )
+
+
+def millimetres(
+    values: list[float],
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """A list in mm as an array in m."""
+    return np.asarray(values, dtype=np.float64) / 1000.0
+
+
+__all__ = [
+    "check_version",
+    "content_hash",
+    "document_hash",
+    "key_path",
+    "load_yaml",
+    "problems_of",
+    "read_text",
+    "read_yaml",
+    "write_atomic",
+    "write_bytes_atomic",
+]
+
+Model = TypeVar("Model", bound=Document)
+
+
+def read_yaml(path: Path) -> YamlTree:
+    """The plain data of a YAML file, with the place of every key.
+
+    Raises:
+        BadInput: The file cannot be read.
+        InvalidFile: It is not YAML.
+    """
+    try:
+        return parse_yaml(read_text(path, YAML_LIMIT))
+    except YamlSyntaxError as error:
+        problem = Problem("", error.what, error.line, error.column)
+        raise InvalidFile(str(path), [problem], error.next_step) from None
+
+
+def load_yaml(path: Path, model: type[Model]) -> Model:
+    """Reads a YAML file into ``model``, or tells every problem with file:line:column.
+
+    Raises:
+        BadInput: The file cannot be read.
+        InvalidFile: It is not YAML, has a key twice, or does not fit the model.
+    """
+    tree = read_yaml(path)
+    problems = [Problem(key_path(f.key), f.what, f.line, f.column) for f in tree.faults]
+    if isinstance(tree.data, dict):
+        check_version(tree.data, model, path, tree.places)
+        document, found = _validated(tree.data, model, tree.places)
+        problems += found
+        if document is not None and not problems:
+            return document
+    elif not problems:
+        empty = tree.data is None
+        what = "the file is empty" if empty else "the file must hold keys and values"
+        problems.append(Problem("", what, 1, 1))
+    raise InvalidFile(str(path), sorted(problems, key=lambda p: (p.line, p.column)))
+
+
+def check_version(
+    data: Mapping[str, Any], model: type[Document], path: Path, places: Places, next_step: str = ""
+) -> None:
+    """Refuses a file of another schema version before anything else in it is judged.
+
+    Raises:
+        InvalidFile: With that one problem.
+    """
+    field, key = model.model_fields.get("schema_version"), "schema_version"
+    version = data.get(key)
+    if field is None or type(version) is not int:
+        return
+    (known,) = field.annotation.__args__  # type: ignore[union-attr]
+    if version != known:
+        what = f"the file is of schema version {version}; this program reads version {known}"
+        hint = next_step or f"bring the file to version {known}, or use the program it was made for"
+        raise InvalidFile(str(path), [Problem(key, what, *place_of((key,), places))], hint)
+
+
+def _validated(
+    data: dict[str, Any], model: type[Model], places: Places
+) -> tuple[Model | None, list[Problem]]:
+    document: Model | None = None
+    problems: list[Problem] = []
+    try:
+        document = model.model_validate(data)
+        found = document.findings()
+    except ValidationError as error:
+        problems = problems_of(error, model, places)
+        found = _findings_of_sound_parts(data, model, error)
+    problems += [Problem(key_path(parts), what, *place_of(parts, places)) for parts, what in found]
+    return (document if not problems else None), problems
+
+
+def _findings_of_sound_parts(
+    data: dict[str, Any], model: type[Document], error: ValidationError
+) -> list[Finding]:
+    """What the rules between parts find, where the parts they read are sound."""
+    unsound = {
+        item["loc"]
+        for item in error.errors(include_url=False)
+        if item["type"] not in ("missing", "extra_forbidden")
+    }
+    partial: Any = _unchecked(model, data, (), unsound)
+    found: list[Finding] = []
+    for rule in partial.rules():
+        # The rule reads a part that is not sound, such as a point of two numbers.
+        with suppress(AttributeError, TypeError, ValueError, ArithmeticError, LookupError):
+            found += rule()
+    return found
+
+
+def _unchecked(annotation: Any, value: Any, path: KeyPath, unsound: set[KeyPath]) -> Any:
+    """Documents of plain data; in place of an unsound value an object that nothing can use."""
+    if path in unsound:
+        return object()
+    model = model_in(annotation)
+    if isinstance(value, dict) and model is not None:
+        fields = model.model_fields
+        parts = {
+            key: _unchecked(fields[key].annotation, part, (*path, key), unsound)
+            for key, part in value.items()
+            if key in fields
+        }
+        return model.model_construct(**parts)
+    if isinstance(value, list):
+        return [_unchecked(annotation, v, (*path, i), unsound) for i, v in enumerate(value)]
+    return value
+
+
+def content_hash(document: Any) -> str:
+    """SHA-256 of a JSON-like document, whatever the order of its keys or its layout."""
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
+
+
+def document_hash(document: BaseModel, without: Collection[str] = ()) -> str:
+    """SHA-256 of what a document says.
+
+    A key that stands at its default counts as left out. So a key that a later version of the
+    program adds changes no hash, and a default that it changes does.
+
+    Args:
+        document: Read or made.
+        without: Keys at its top that do not count.
+    """
+    said = document.model_dump(mode="json", exclude_defaults=True)
+    return content_hash({key: value for key, value in said.items() if key not in without})
+
+
+def write_atomic(path: Path, text: str) -> None:
+    """Writes a whole text file or nothing.
+
+    Raises:
+        BadInput: The folder is missing, cannot be written to or is full.
+    """
+    write_bytes_atomic(path, text.encode(errors="backslashreplace"))
+
+
+def write_bytes_atomic(path: Path, data: bytes) -> None:
+    """Writes a whole file or nothing.
+
+    Raises:
+        BadInput: The folder is missing, cannot be written to or is full.
+    """
+    try:
+        if path.is_dir():
+            raise BadInput("this is a folder", where=str(path), next_step="name a file")
+        if path.exists() and not path.is_file():
+            what = "this is no plain file but a device, a pipe or a socket"
+            raise BadInput(what, where=str(path), next_step="name a file")
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:40]}.")
+    except OSError as error:
+        hint = "choose a folder that exists and that you may write to"
+        raise _not_written(path, error, hint) from None
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(handle)  # or a power cut could leave the new name on an empty file
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+        _keep_names(path.parent)
+    except OSError as error:
+        raise _not_written(path, error, "free some space or choose another folder") from None
+    finally:
+        Path(temporary).unlink(missing_ok=True)  # gone already when all went well
+
+
+def _keep_names(folder: Path) -> None:
+    """A new name outlives a power cut only once its folder is on disk."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _not_written(path: Path, error: OSError, next_step: str) -> BadInput:
+    return BadInput(
+        "the file cannot be written",
+        where=str(path),
+        why=error.strerror or str(error),
+        next_step=next_step,
+    )

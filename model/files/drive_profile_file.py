@@ -1,0 +1,192 @@
+"""The drive profile file: what drives of one make have, and what differs from the standard's.
+
+It says what is so; `drivers.cia402.object_dictionary` makes of it what is written. Every fact in it
+comes from the maker's manual or EDS file, which ``sources`` names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from model.files.documents import Document, Finding
+
+OBJECTS: Mapping[str, str] = {
+    "1006h:00": "communication cycle period",
+    "1007h:00": "synchronous window length",
+    "1016h:01": "consumer heartbeat time",
+    "1017h:00": "producer heartbeat time",
+    "1029h:01": "communication error behaviour",
+    "1400h:05": "RPDO1 deadline",
+    "1800h:03": "TPDO1 inhibit time",
+    "6007h:00": "abort connection option code",
+    "605Ah:00": "quick stop option code",
+    "605Ch:00": "disable operation option code",
+    "605Eh:00": "fault reaction option code",
+    "6060h:00": "modes of operation",
+    "6065h:00": "following error window",
+    "6066h:00": "following error time out",
+    "6072h:00": "max torque",
+    "607Dh:01": "min position limit",
+    "607Dh:02": "max position limit",
+    "6085h:00": "quick stop deceleration",
+    "60C2h:01": "interpolation time period value",
+    "60C2h:02": "interpolation time index",
+}
+"""What a profile may say something about: the objects that are set up, less the PDOs' mapping."""
+
+NEEDED = ("1017h:00", "6007h:00", "605Ah:00", "6060h:00", "6065h:00", "607Dh:01", "607Dh:02")
+"""Without these no run is safe, whatever a profile says."""
+
+_OBJECT = re.compile(r"[0-9A-F]{4}h:[0-9A-F]{2}")
+_CODE = re.compile(r"[0-9A-Fx]{4}h")
+
+
+def _is_object(text: str) -> str:
+    if not _OBJECT.fullmatch(text):
+        raise ValueError(f"must be an object such as 6072h:00; it is {text!r}")
+    return text
+
+
+def _is_known(text: str) -> str:
+    if text not in OBJECTS:
+        there = ", ".join(OBJECTS)
+        raise ValueError(f"this program sets no object {text!r} up; those it does: {there}")
+    return text
+
+
+def _is_code(text: str) -> str:
+    if not _CODE.fullmatch(text):
+        raise ValueError(f"must be an error code such as 3180h or 33xxh; it is {text!r}")
+    return text
+
+
+ObjectName = Annotated[str, AfterValidator(_is_object)]
+KnownObject = Annotated[str, AfterValidator(_is_known)]
+CodePattern = Annotated[str, AfterValidator(_is_code)]
+Text = Annotated[str, Field(min_length=1)]
+
+
+class Range(Document):
+    """Smallest and largest value that an object takes."""
+
+    low: int
+    high: int
+
+    def holds(self, value: int) -> bool:
+        """Whether a value is within."""
+        return self.low <= value <= self.high
+
+
+class Expected(Document):
+    """An object that is read, and must hold a value that the program does not write."""
+
+    object: ObjectName
+    value: Annotated[int, Field(ge=0)]
+    name: Text
+    why: Text = Field(description="what it is needed for, and how it is set")
+
+
+class TorqueLimit(Document):
+    """The object that limits torque where there is no 6072h; it holds a current."""
+
+    object: ObjectName = Field(description="32 bits; the current limit")
+    rated: ObjectName = Field(description="32 bits; the current at rated torque, in the same unit")
+
+
+class ProfileDocument(Document):
+    """What drives of one make have, and what of it differs from the standard's."""
+
+    name: Text = Field(description="maker and type, as people name them")
+    sources: Annotated[list[Text], Field(min_length=1)] = Field(
+        description="where every fact of this file comes from"
+    )
+    absent: list[KnownObject] = Field(default=[], description="objects that the drive has not")
+    ranges: dict[KnownObject, Range] = Field(
+        default={}, description="values that objects take, where they are fewer than the standard's"
+    )
+    expect: list[Expected] = Field(
+        default=[], description="objects that are read and must hold a value, such as units"
+    )
+    heartbeat_entries: Annotated[int, Field(ge=1, le=127)] | None = Field(
+        default=None, description="entries of 1016h; left out, as many as the drive says"
+    )
+    monitoring: Literal["sync", "heartbeat"] = Field(
+        default="sync",
+        description="what stops a drive whose master is gone; heartbeat: it has no 1006h",
+    )
+    sync_timeout_periods: Annotated[float, Field(ge=1.1, le=10.0)] = Field(
+        default=3.0,
+        description="periods of 1006h without SYNC after which a drive stops by itself; with"
+        " monitoring heartbeat, the age of SYNC from which on nothing is enabled",
+    )
+    acceleration_unit: Literal["counts/s^2", "rpm/s"] = Field(
+        default="counts/s^2", description="of 6085h; rpm is of the motor shaft"
+    )
+    torque_limit: TorqueLimit | None = Field(
+        default=None, description="left out, 6072h limits the torque"
+    )
+    warnings: list[CodePattern] = Field(
+        default=[],
+        description="EMCY codes of mere warnings while the drive stays enabled; x is any digit",
+    )
+    mode_display_when_enabled: bool = Field(
+        default=False, description="6061h shows the mode only once the drive is enabled"
+    )
+    sdo_timeout_ms: Annotated[int, Field(ge=50, le=30_000)] = Field(
+        default=2000, description="the longest that one SDO answer takes"
+    )
+
+    def rules(self) -> Sequence[Callable[[], list[Finding]]]:
+        """Checks between the keys."""
+        return (self._monitoring, self._torque, self._needed)
+
+    def _monitoring(self) -> list[Finding]:
+        absent = "1006h:00" in self.absent
+        if absent == (self.monitoring == "heartbeat"):
+            return []
+        what = "monitoring must be heartbeat where 1006h:00 is absent, and sync where it is there"
+        return [(("absent",) if absent else ("monitoring",), what)]
+
+    def _torque(self) -> list[Finding]:
+        absent = "6072h:00" in self.absent
+        if absent == (self.torque_limit is not None):
+            return []
+        what = "torque_limit is needed where 6072h:00 is absent, and only there"
+        return [(("absent",) if absent else ("torque_limit",), what)]
+
+    def _needed(self) -> list[Finding]:
+        return [
+            (("absent", place), f"no run is safe without {name} {OBJECTS[name]}")
+            for place, name in enumerate(self.absent)
+            if name in NEEDED
+        ]
+
+    def has(self, index: int, sub: int) -> bool:
+        """Whether the drive has an object, as far as the profile says."""
+        return object_name(index, sub) not in self.absent
+
+    def range_of(self, index: int, sub: int) -> Range | None:
+        """What values an object takes; None where the profile says nothing of it."""
+        return self.ranges.get(object_name(index, sub))
+
+    def is_warning(self, code: int) -> bool:
+        """Whether an EMCY code is a mere warning of a drive that stays enabled."""
+        text = f"{code:04X}h"
+        return any(
+            all(want in ("x", digit) for want, digit in zip(pattern, text, strict=True))
+            for pattern in self.warnings
+        )
+
+
+def object_name(index: int, sub: int) -> str:
+    """As profiles name an object: ``6072h:00``."""
+    return f"{index:04X}h:{sub:02X}"
+
+
+def object_key(name: str) -> tuple[int, int]:
+    """The inverse of `object_name`."""
+    return int(name[:4], 16), int(name[6:], 16)

@@ -1,0 +1,130 @@
+"""The rigs, scenes and recorded sessions that come with the program: what there is, and copies."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from model.errors import BadInput
+from model.files.documents import write_bytes_atomic
+from model.files.reading import read_bytes, read_text, shown, unreadable
+
+_KIND = re.compile(r"\$schema=.*/(rig|scene)\.schema\.json")
+_DESCRIPTION = re.compile(r"^description: *(.+)$", re.MULTILINE)
+_ABOUT = "README.md"
+
+
+@dataclass(frozen=True)
+class Example:
+    """One ready file, or the folder of a recorded session.
+
+    Attributes:
+        name: What it is called on the command line.
+        kind: ``rig``, ``scene`` or ``session``.
+        about: One line for people.
+        source: The file or folder.
+        group: The folder in which a clone of the repository has it.
+    """
+
+    name: str
+    kind: str
+    about: str
+    source: Path
+    group: str
+
+    @property
+    def file_name(self) -> str:
+        """Of a copy."""
+        return self.source.name
+
+
+def find_examples(configs: Path, sessions: Path) -> list[Example]:
+    """All examples: rigs, then scenes, then sessions, each by name.
+
+    Args:
+        configs: The folder of the ready rigs and scenes.
+        sessions: The folder of the recorded sessions.
+    """
+    files = [_ready_file(path) for path in configs.glob("*.yaml")]
+    folders = [_session(path) for path in sessions.iterdir() if (path / _ABOUT).is_file()]
+    order = ("rig", "scene", "session")
+    return sorted([*files, *folders], key=lambda example: (order.index(example.kind), example.name))
+
+
+def _ready_file(path: Path) -> Example:
+    text = read_text(path)
+    lines = text.splitlines()
+    kind = _KIND.search(lines[0])
+    if kind is None:
+        raise BadInput(f"{path.name} names no schema in its first line", where=str(path))
+    described = _DESCRIPTION.search(text)
+    about = described.group(1) if described else lines[1].removeprefix("# ")
+    return Example(path.stem, kind.group(1), about, path, "configs")
+
+
+def _session(path: Path) -> Example:
+    title = read_text(path / _ABOUT).splitlines()[0].removeprefix("# ")
+    return Example(path.name, "session", title, path, "examples")
+
+
+def select_examples(examples: Iterable[Example], names: Iterable[str]) -> list[Example]:
+    """The examples of these names.
+
+    Raises:
+        BadInput: There is none of a name; the message lists those there are.
+    """
+    by_name = {example.name: example for example in examples}
+    wanted = [name.removesuffix(".yaml") for name in names]
+    unknown = [name for name in wanted if name not in by_name]
+    if unknown:
+        raise BadInput(
+            f"there is no example {unknown[0]!r}",
+            where="cdpr examples",
+            next_step=f"name one of these: {', '.join(by_name)}",
+        )
+    return [by_name[name] for name in dict.fromkeys(wanted)]
+
+
+def copy_examples(
+    examples: Iterable[Example], folder: Path, *, grouped: bool, replace: bool
+) -> list[Path]:
+    """Copies examples; all or, when one exists already, none.
+
+    Args:
+        examples: Which.
+        folder: Where to; it is made with the folders above it.
+        grouped: In ``configs`` and ``examples`` below the folder, as in a clone.
+        replace: Replace files that exist.
+
+    Returns:
+        The copies.
+
+    Raises:
+        BadInput: A copy exists already, or a file cannot be written.
+    """
+    wanted = [(e, folder / (e.group if grouped else "") / e.file_name) for e in examples]
+    existing = [target for _, target in wanted if os.path.lexists(target)]
+    if existing and not replace:
+        raise BadInput(
+            "the file exists already",
+            where=shown(existing[0]),
+            why=f"{len(existing)} of the {len(wanted)} copies exist; nothing was copied",
+            next_step="pass --force to replace it, or name another folder with -o",
+        )
+    for example, target in wanted:
+        _copy(example.source, target)
+    return [target for _, target in wanted]
+
+
+def _copy(source: Path, target: Path) -> None:
+    files = [source] if source.is_file() else [path for path in source.rglob("*") if path.is_file()]
+    for path in files:
+        copy = target / path.relative_to(source)
+        try:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise unreadable(copy.parent, error) from None
+        write_bytes_atomic(copy, read_bytes(path))

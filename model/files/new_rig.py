@@ -1,0 +1,378 @@
+"""A new rig file: the questions that it answers, with units and defaults, and its commented text.
+
+`collect_answers` goes through the questions in order and asks by a callback;
+`model.files.rig_template` makes the file of the answers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from model.errors import BadInput
+from model.files.documents import Name, NonNegative, Number, Positive
+from model.files.reading import CsvFile
+
+Answers = Mapping[str, Any]
+CABLES_MOST = 64
+CSV_COLUMNS = tuple(f"{end}_{axis}_mm" for end in ("outlet", "anchor") for axis in "xyz")
+
+
+def _no_objection(_value: Any, _answers: Answers) -> str:
+    return ""
+
+
+@dataclass(frozen=True)
+class RigQuestion:
+    """One thing that a rig file needs to know.
+
+    Attributes:
+        key: Name of the answer, as in ``--key`` of the command line.
+        text: What is asked.
+        unit: Of the answer; empty where it has none.
+        parse: From the words of an answer to its value.
+        default: The value for no answer, from the answers before.
+        objection: Why a value cannot be, from the answers before; empty where it can.
+    """
+
+    key: str
+    text: str
+    unit: str
+    parse: Callable[[str], Any]
+    default: Callable[[Answers], Any]
+    objection: Callable[[Any, Answers], str] = _no_objection
+
+    def read(self, text: str, default: Any, answers: Answers) -> Any:
+        """The value of a typed answer; nothing typed is the default.
+
+        Raises:
+            ValueError: With the reason, for people.
+        """
+        value = self.parse(text) if text else default
+        if reason := self.objection(value, answers):
+            raise ValueError(reason)
+        return value
+
+
+def shown_value(value: Any) -> str:
+    """A value as it is typed."""
+    if isinstance(value, (list, tuple)):
+        return " ".join(shown_value(part) for part in value)
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _valid(kind: Any, value: Any) -> Any:
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise ValueError(reason[:1].lower() + reason[1:]) from None
+
+
+def _number(kind: Any = Positive) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise ValueError(f"{text[:40]!r} is not a number") from None
+        return float(_valid(kind, value))
+
+    return parse
+
+
+def _whole(lowest: int, highest: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        if not text.lstrip("+-").isdecimal() or not lowest <= int(text[:40]) <= highest:
+            raise ValueError(f"{text[:40]!r} is not a whole number from {lowest} to {highest}")
+        return int(text)
+
+    return parse
+
+
+def _point(kind: Any = Number) -> Callable[[str], list[float]]:
+    def parse(text: str) -> list[float]:
+        words = text.replace(",", " ").split()
+        if len(words) != 3:
+            raise ValueError(f"three numbers X Y Z are needed, {len(words)} were given")
+        return [_number(kind)(word) for word in words]
+
+    return parse
+
+
+def _one_of(*choices: str) -> Callable[[str], str]:
+    def parse(text: str) -> str:
+        if text not in choices:
+            raise ValueError(f"{text[:40]!r} is not one of {', '.join(choices)}")
+        return text
+
+    return parse
+
+
+def _name(text: str) -> str:
+    return str(_valid(Name, text))
+
+
+def _always(value: Any) -> Callable[[Answers], Any]:
+    return lambda _answers: value
+
+
+def _channel(answers: Answers) -> str:
+    known = {"virtual": "cdpr", "socketcan": "can0", "udp_multicast": "239.74.163.2"}
+    return known.get(answers["interface"], "can0")
+
+
+def _suggested_outlet(index: int, count: int) -> list[float]:
+    """High and low in pairs on a circle of 700 mm, 10 degrees apart so that cables do not cross."""
+    pair, low = divmod(index, 2)
+    aside = math.radians(5.0) * (-1.0) ** (pair + low)
+    angle = 2.0 * math.pi * (pair + 0.5) / math.ceil(count / 2) + aside
+    return [
+        round(700.0 * math.cos(angle), 1),
+        round(700.0 * math.sin(angle), 1),
+        80.0 if low else 860.0,
+    ]
+
+
+def _suggested_anchor(outlet: list[float], answers: Answers) -> list[float]:
+    """The nearest edge of the platform: below for a high outlet and above for a low one."""
+    x, y, z = (size / 2.0 for size in answers["platform_mm"])
+    middle = sum(point[2] for point in answers["outlets_mm"]) / len(answers["outlets_mm"])
+    return [
+        math.copysign(x, outlet[0]),
+        math.copysign(y, outlet[1]),
+        -z if outlet[2] > middle else z,
+    ]
+
+
+def _middle(answers: Answers) -> list[float]:
+    columns = list(zip(*answers["outlets_mm"], strict=True))
+    return [round((min(column) + max(column)) / 2.0, 1) for column in columns]
+
+
+def _box(answers: Answers, side: int) -> list[float]:
+    """Half-way from home to the outlets on that side, and at least 10 mm."""
+    columns = list(zip(*answers["outlets_mm"], strict=True))
+    ends = [(min(column), max(column))[side] for column in columns]
+    least = (-10.0, 10.0)[side]
+    return [
+        round(home + (min, max)[side](least, (end - home) / 2.0), 1)
+        for home, end in zip(answers["home_mm"], ends, strict=True)
+    ]
+
+
+def _box_around_home(value: list[float], answers: Answers, side: int) -> str:
+    for axis, bound, home in zip("xyz", value, answers["home_mm"], strict=True):
+        if (home - bound, bound - home)[side] < 0.0:
+            return f"{axis} = {home:g} mm of the home position would be outside"
+    if side and any(a >= b for a, b in zip(answers["lower_mm"], value, strict=True)):
+        return f"it must be above the lower corner {shown_value(answers['lower_mm'])} on all axes"
+    return ""
+
+
+def _above_least(value: float, answers: Answers) -> str:
+    least = answers["min_tension_n"]
+    return "" if value > least else f"it must be more than the least tension, {least:g} N"
+
+
+def coordinate_questions(answers: Answers) -> list[RigQuestion]:
+    """The questions about one end of the cables, once their number is known."""
+    count = answers["cables"]
+    if "outlets_mm" not in answers:
+        return [
+            RigQuestion(
+                f"outlet {i + 1}",
+                f"outlet of cable {i + 1}, X Y Z in the world frame",
+                "mm",
+                _point(),
+                _always(_suggested_outlet(i, count)),
+            )
+            for i in range(count)
+        ]
+    return [
+        RigQuestion(
+            f"anchor {i + 1}",
+            f"anchor of cable {i + 1}, X Y Z in the platform frame",
+            "mm",
+            _point(),
+            _always(_suggested_anchor(outlet, answers)),
+        )
+        for i, outlet in enumerate(answers["outlets_mm"])
+    ]
+
+
+BEFORE_COORDINATES = (
+    RigQuestion("name", "name of the rig", "", _name, lambda answers: answers["name"]),
+    RigQuestion("platform_mm", "platform size X Y Z", "mm", _point(Positive), _always([130.0] * 3)),
+    RigQuestion("mass_kg", "mass of the platform", "kg", _number(), _always(0.4)),
+    RigQuestion("cables", "number of cables", "", _whole(6, CABLES_MOST), _always(8)),
+)
+AFTER_COORDINATES = (
+    RigQuestion("home_mm", "home position of the platform X Y Z", "mm", _point(), _middle),
+    RigQuestion(
+        "lower_mm",
+        "lower corner of the workspace X Y Z, where the platform's origin may be",
+        "mm",
+        _point(),
+        lambda answers: _box(answers, 0),
+        lambda value, answers: _box_around_home(value, answers, 0),
+    ),
+    RigQuestion(
+        "upper_mm",
+        "upper corner of the workspace X Y Z",
+        "mm",
+        _point(),
+        lambda answers: _box(answers, 1),
+        lambda value, answers: _box_around_home(value, answers, 1),
+    ),
+    RigQuestion("radius_mm", "radius of the cables", "mm", _number(NonNegative), _always(0.5)),
+    RigQuestion(
+        "stiffness_n", "axial stiffness E·A of the cables", "N", _number(), _always(50000.0)
+    ),
+    RigQuestion("min_tension_n", "least tension of a cable", "N", _number(), _always(5.0)),
+    RigQuestion(
+        "max_tension_n",
+        "largest tension of a cable",
+        "N",
+        _number(),
+        lambda answers: 20.0 * answers["min_tension_n"],
+        _above_least,
+    ),
+    RigQuestion("drum_radius_mm", "radius of the drums", "mm", _number(), _always(32.8)),
+    RigQuestion("gear_ratio", "motor turns for one drum turn", "", _number(), _always(1.0)),
+    RigQuestion(
+        "counts_per_rev",
+        "encoder counts per motor turn",
+        "counts",
+        _whole(1, 2**31 - 1),
+        _always(131072),
+    ),
+    RigQuestion(
+        "encoder",
+        "encoders: absolute keep their position without power, incremental do not",
+        "",
+        _one_of("absolute", "incremental"),
+        _always("incremental"),
+    ),
+    RigQuestion("max_speed_mm_s", "largest cable speed", "mm/s", _number(), _always(100.0)),
+    RigQuestion(
+        "torque_constant_n",
+        "cable tension at the drives' rated torque",
+        "N",
+        _number(),
+        lambda answers: answers["max_tension_n"],
+    ),
+    RigQuestion(
+        "interface",
+        "bus: virtual for simulated drives, or python-can's name such as socketcan",
+        "",
+        _name,
+        _always("virtual"),
+    ),
+    RigQuestion("channel", "channel of the bus", "", _name, _channel),
+    RigQuestion("bitrate", "bit rate", "bit/s", _whole(10_000, 1_000_000), _always(1_000_000)),
+)
+OPTIONS = tuple(
+    q.key for q in (*BEFORE_COORDINATES, *AFTER_COORDINATES) if q.key not in ("name", "cables")
+)
+"""The answers that the command line takes as options."""
+
+
+def collect_answers(
+    name: str,
+    given: Answers,
+    ask: Callable[[RigQuestion, str], str] | None = None,
+    refuse: Callable[[str], None] = lambda _reason: None,
+) -> dict[str, Any]:
+    """The answers to all questions.
+
+    Args:
+        name: Of the rig, where no other is given.
+        given: Answers that need no question, by their keys.
+        ask: Asks a question with its default and returns what was typed; without it, every question
+            that is left has its default.
+        refuse: Gets the reason why an answer cannot be, before the question is asked again.
+
+    Raises:
+        BadInput: A given answer cannot be.
+    """
+    answers: dict[str, Any] = {"name": name}
+
+    def answer(question: RigQuestion) -> Any:
+        if question.key in given:
+            return _given(question, given[question.key], answers)
+        while ask is not None:
+            default = question.default(answers)
+            try:
+                return question.read(ask(question, shown_value(default)), default, answers)
+            except ValueError as error:
+                refuse(str(error))
+        return _default(question, answers)
+
+    for question in BEFORE_COORDINATES:
+        answers[question.key] = answer(question)
+    for ends in ("outlets_mm", "anchors_mm"):
+        questions = [] if ends in given else coordinate_questions(answers)
+        answers[ends] = given.get(ends) or [answer(question) for question in questions]
+    for question in AFTER_COORDINATES:
+        answers[question.key] = answer(question)
+    return answers
+
+
+def _given(question: RigQuestion, value: Any, answers: Answers) -> Any:
+    try:
+        return question.read(shown_value(value), value, answers)
+    except ValueError as error:
+        raise _impossible(question, error, "give another value") from None
+
+
+def _default(question: RigQuestion, answers: Answers) -> Any:
+    value = question.default(answers)
+    try:
+        return question.read("", value, answers)
+    except ValueError as error:
+        hint = "give it with its option: its default does not fit the other values"
+        raise _impossible(question, error, hint) from None
+
+
+def _impossible(question: RigQuestion, error: ValueError, hint: str) -> BadInput:
+    what = f"--{question.key.replace('_', '-')}: {error}"
+    return BadInput(what, where="cdpr new", next_step=hint)
+
+
+def read_coordinates(path: Path) -> dict[str, Any]:
+    """Outlets and anchors from a CSV file with a line a cable.
+
+    Args:
+        path: Its columns are `CSV_COLUMNS`; others are passed over.
+
+    Raises:
+        BadInput: The file cannot be read, a column is missing, or a value is not a number.
+    """
+    table = CsvFile(path)
+    hint = f"begin with the line {','.join(CSV_COLUMNS)}, then a line a cable"
+    header = [word.strip() for word in table.rows[0]] if table.rows else []
+    missing = [name for name in CSV_COLUMNS if name not in header]
+    if missing:
+        raise BadInput(f"the column {missing[0]} is missing", where=str(path), next_step=hint)
+    count = len(table.rows) - 1
+    if not 6 <= count <= CABLES_MOST:
+        what = f"{count} cables; a rig has from 6 to {CABLES_MOST}"
+        raise BadInput(what, where=str(path), next_step=hint)
+    places = [header.index(name) for name in CSV_COLUMNS]
+    points = []
+    for line, row in zip(table.lines[1:], table.rows[1:], strict=True):
+        try:
+            points.append([_number(Number)(row[place].strip()) for place in places])
+        except (IndexError, ValueError) as error:
+            what = "a value is missing" if isinstance(error, IndexError) else str(error)
+            raise BadInput(what, where=f"{path}:{line}", next_step=hint) from None
+    return {
+        "cables": count,
+        "outlets_mm": [point[:3] for point in points],
+        "anchors_mm": [point[3:] for point in points],
+    }

@@ -1,0 +1,74 @@
+"""Where results go: looked at before the work, as a result that cannot be written would be lost."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from model.errors import BadInput
+
+
+def require_new_file(path: Path, replace: bool = False) -> None:
+    """Refuses a file that cannot be written.
+
+    Args:
+        path: The file.
+        replace: It may exist.
+
+    Raises:
+        BadInput: The file exists, or its folder does not or is read-only.
+    """
+    if path.is_dir():
+        raise BadInput("this is a folder", where=str(path), next_step="name a file")
+    if path.exists() and not replace:
+        raise BadInput(
+            "the file exists already",
+            where=str(path),
+            next_step="choose another name, or pass --force to replace it",
+        )
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise BadInput(
+            "the file cannot be written there",
+            where=str(path),
+            why="the folder does not exist or is read-only",
+            next_step="choose a folder that you may write to",
+        )
+
+
+def make_folder(folder: Path, force: bool = False) -> None:
+    """Makes a folder for results; one that holds something only with ``force``.
+
+    Raises:
+        BadInput: The folder holds something and ``force`` is not set, or cannot be made.
+    """
+    make_place(folder)
+    if any(folder.iterdir()) and not force:
+        raise BadInput(
+            "the folder is not empty",
+            where=str(folder),
+            next_step="choose another name, or pass --force to write into it",
+        )
+
+
+def make_place(folder: Path) -> None:
+    """Makes a folder where there is none; one that holds something will do.
+
+    Raises:
+        BadInput: It cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        next(folder.iterdir(), None)
+    except OSError as error:
+        raise BadInput(
+            "the folder cannot be made",
+            where=str(folder),
+            why=str(error.strerror),
+            next_step="name a folder, not a file, in a place where you may write",
+        ) from error
+    if not os.access(folder, os.W_OK):
+        raise BadInput(
+            "the folder is read-only",
+            where=str(folder),
+            next_step="name a folder in a place where you may write",
+        )

@@ -1,0 +1,140 @@
+"""The plan file (JSON, version 1): a path with the scene and rig it was made for."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from model.files.documents import (
+    WHOLE_LARGEST,
+    Document,
+    NonNegative,
+    Number,
+    PoseDocument,
+    Positive,
+    Seed,
+    Vector,
+)
+from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument, StopDocument
+
+
+class ReadingsDocument(Document):
+    """How the paper's text was read where it is open (docs/paper.md)."""
+
+    failure_rate: Literal["k/(k+1)", "k/(k+2)", "tree", "node"]
+    focus: Literal["last-failed", "most-failed", "highest-rate"]
+    cone_draw: Literal["radius", "volume"]
+    steer: Literal["full-step", "to-sample"]
+    spacing_mm: NonNegative
+    goal_sight: bool
+
+
+class WeightsDocument(Document):
+    """What the path makes small (docs/plan-file.md); clearance and capacity are made large."""
+
+    length: NonNegative
+    kinematic: NonNegative
+    clearance: NonNegative
+    capacity: NonNegative
+
+
+class OptimalPlannerDocument(Document):
+    """How the path was searched for by the default planner; ``turning`` with `--free-rotation`."""
+
+    name: Literal["optimal", "turning"]
+    weights: WeightsDocument
+    seed: Seed
+    rounds: Annotated[list[Annotated[int, Field(ge=1, le=WHOLE_LARGEST)]], Field(min_length=1)]
+    budget_ms: Positive | None
+    longest_mm: Positive | None
+
+
+class PlannerDocument(Document):
+    """How the path was searched for by the paper's planner or its baseline."""
+
+    name: Literal["adaptive", "goal-bias"]
+    cost: Literal["kinematic", "length"]
+    mode: Literal["paper", "rewire"]
+    seed: Seed
+    step_mm: Positive
+    neighbour_radius_mm: Positive
+    goal_radius_mm: Positive
+    max_iterations: Annotated[int, Field(ge=1, le=WHOLE_LARGEST)]
+    readings: ReadingsDocument | None = None
+
+
+class WaypointsDocument(Document):
+    """A path that a planner of the user's own found; see `planner.planning.plan_from_waypoints`."""
+
+    name: Literal["waypoints"]
+    author: str = Field(default="", description="the planner, in its user's words")
+
+
+class StatisticsDocument(Document):
+    """What the search cost."""
+
+    nodes: Annotated[int, Field(ge=1, le=WHOLE_LARGEST)]
+    iterations: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
+    edge_checks: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
+    planning_time_s: NonNegative
+    search_time_s: NonNegative | None = None
+
+
+class NearestDocument(Document):
+    """The smallest distance along the path: which pair, and with the platform where."""
+
+    first: str
+    second: str
+    distance_mm: Number
+    position_mm: Vector
+
+
+class QualityDocument(Document):
+    """What the path is worth, as the planner found it; `cdpr check` finds it anew."""
+
+    length_mm: NonNegative
+    raw_length_mm: NonNegative
+    obstacle_clearance: NearestDocument | None
+    self_clearance: NearestDocument
+    mean_kinematic_cost: NonNegative
+    min_tension_n: Number
+    max_tension_n: Number
+
+
+class TreeDocument(Document):
+    """The search trees, for pictures: positions, and the parent of each node (-1: a root)."""
+
+    positions_mm: list[Vector]
+    parents: list[Annotated[int, Field(ge=-1, le=WHOLE_LARGEST)]]
+
+
+class StopMarkDocument(Document):
+    """Which waypoint is at a stop of the scene."""
+
+    name: str
+    waypoint: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
+
+
+class PlanDocument(Document):
+    """A path from start to goal; `hash` is over everything else in the file."""
+
+    kind: Literal["cdpr-plan"] = "cdpr-plan"
+    schema_version: Literal[1] = 1
+    hash: str
+    rig_hash: str
+    scene_hash: str
+    rig: RigDocument
+    scene: SceneDocument
+    planner: Annotated[
+        PlannerDocument | OptimalPlannerDocument | WaypointsDocument,
+        Field(discriminator="name"),
+    ]
+    waypoints: Annotated[list[PoseDocument], Field(min_length=2)]
+    stops: list[StopMarkDocument] = []
+    done: list[StopDocument] = []
+    raw_path: Annotated[list[PoseDocument], Field(min_length=2)]
+    tree: TreeDocument
+    statistics: StatisticsDocument
+    quality: QualityDocument

@@ -1,0 +1,213 @@
+"""One reader of input files, with limits: what is no plain file, too large or too deep is refused.
+
+Every file that a user names passes here, so that a device, a pipe, or a file that was made to hurt
+ends in one message before it costs memory or time.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import stat
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+from model.errors import BadInput
+
+MEGABYTE = 1_000_000
+TEXT_LIMIT = 256 * MEGABYTE
+"""Of a text file, [bytes]: some hours of a run's tables."""
+YAML_LIMIT = 1 * MEGABYTE
+"""Of a YAML file, [bytes]; its parser needs several seconds for that."""
+PICTURE_LIMIT = 256 * MEGABYTE
+"""Of a picture file, [bytes]."""
+
+
+def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
+    """The content of a plain file.
+
+    Args:
+        path: The file.
+        limit: Its largest size, [bytes].
+
+    Raises:
+        BadInput: The file is missing, a folder, a device or a pipe, unreadable or too large.
+    """
+    try:
+        # A pipe is opened without waiting for its writer, and refused.
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    except (OSError, ValueError) as error:
+        raise unreadable(path, error) from None
+    try:
+        with os.fdopen(handle, "rb") as stream:
+            _require_plain(path, os.fstat(handle), limit)
+            return stream.read(limit + 1)
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def _require_plain(path: Path, found: os.stat_result, limit: int) -> None:
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError
+    if not stat.S_ISREG(found.st_mode):
+        raise BadInput(
+            "this is no plain file but a device, a pipe or a socket",
+            where=str(path),
+            next_step="save its content to a file and name that",
+        )
+    if found.st_size > limit:
+        raise BadInput(
+            f"the file has {found.st_size / MEGABYTE:.1f} MB; at most {limit / MEGABYTE:.0f} MB"
+            " are read",
+            where=str(path),
+            why="such a file has no more than that; this is another one",
+            next_step="check the path",
+        )
+
+
+def unreadable(path: Path, error: Exception) -> BadInput:
+    """The message about a file that the operating system does not give."""
+    what, why, hint = "the file cannot be read", "", "check the path and who may read it"
+    match error:
+        case FileNotFoundError():
+            what, hint = "no such file", "check the path and its spelling"
+        case IsADirectoryError():
+            what, hint = "this is a folder", "name a file"
+        case OSError():
+            why = error.strerror or str(error)
+        case _:
+            why = str(error)  # such as a zero byte in its name
+    return BadInput(what, where=shown(path), why=why, next_step=hint)
+
+
+def shown(path: Path | str) -> str:
+    """A path for a message, without the middle of a very long one."""
+    text = str(path)
+    return text if len(text) <= 160 else f"{text[:80]} … {text[-60:]}"
+
+
+def read_text(path: Path, limit: int = TEXT_LIMIT) -> str:
+    """The text of a plain file.
+
+    Raises:
+        BadInput: As `read_bytes`, or it is not UTF-8.
+    """
+    data = read_bytes(path, limit)
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise BadInput(
+            f"the file is not UTF-8 text: byte 0x{error.object[error.start]:02x} in line {line}",
+            where=str(path),
+            why="it is no text file, or in another encoding",
+            next_step="save it as UTF-8",
+        ) from None
+
+
+def read_json(path: Path, next_step: str) -> Any:
+    """What a JSON file holds; finite numbers only, and no key twice.
+
+    Args:
+        path: The file.
+        next_step: What to do about a file that is damaged.
+
+    Raises:
+        BadInput: It cannot be read or is not such JSON.
+    """
+    text = read_text(path)
+    try:
+        return parse_json(text)
+    except json.JSONDecodeError as error:
+        what = f"not valid JSON: {error.msg}"
+        where = f"{path}:{error.lineno}:{error.colno}"
+        why = "the file was cut off or edited" if text.strip() else "the file is empty"
+        raise BadInput(what, where=where, why=why, next_step=next_step) from None
+    except ValueError as error:
+        raise BadInput(str(error), where=str(path), next_step=next_step) from None
+
+
+def parse_json(text: str) -> Any:
+    """What a JSON text holds.
+
+    Raises:
+        ValueError: It is not JSON, is nested too deeply, has a key twice, or a number that is
+            infinite, none, or of too many digits.
+    """
+    try:
+        return json.loads(
+            text,
+            parse_constant=_no_constant,
+            parse_float=_finite,
+            parse_int=_whole,
+            object_pairs_hook=_unique_keys,
+        )
+    except RecursionError:
+        raise ValueError("the file is nested too deeply") from None
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"the file holds {name}, which is no number")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"the file holds {text[:40]}, which is no finite number")
+    return value
+
+
+def _whole(text: str) -> int:
+    if len(text) > 40:
+        raise ValueError(f"the file holds a number of {len(text)} digits")
+    return int(text)
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    data = dict(pairs)
+    if len(data) != len(pairs):
+        (twice, _), *_ = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"the key {twice[:60]!r} stands twice")
+    return data
+
+
+class CsvFile:
+    """The rows of a CSV file, whatever its line ends.
+
+    Args:
+        path: The file.
+        text: Its content, where the caller has read it already.
+
+    Attributes:
+        rows: Lists of texts, empty lines left out as `csv` leaves them.
+        lines: The line in which each row ends, counted from 1.
+
+    Raises:
+        BadInput: It cannot be read, or is no CSV.
+    """
+
+    def __init__(self, path: Path, text: str | None = None) -> None:
+        text = (read_text(path) if text is None else text).replace("\r", "\n")
+        self.rows: list[list[str]] = []
+        self.lines: list[int] = []
+        for line, row in _rows(text, path):
+            self.rows.append(row)
+            self.lines.append(line)
+
+
+def _rows(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO(text))
+    try:
+        for row in reader:
+            yield reader.line_num, row
+    except csv.Error as error:
+        raise BadInput(
+            f"not valid CSV: {error}",
+            where=f"{path}:{reader.line_num}",
+            why="a quote is not closed, or this is no CSV file",
+            next_step="write a line of names, then lines of values with commas between",
+        ) from None

@@ -1,0 +1,387 @@
+"""The scene file: obstacles, clearances, start, stops and goal (YAML, strict, version 1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from model.files.documents import (
+    Document,
+    Finding,
+    Name,
+    NonNegative,
+    NonNegativeVector,
+    PoseDocument,
+    Positive,
+    PositiveVector,
+    Quaternion,
+    Triple,
+    Vector,
+)
+from model.rotation_limits import RotationLimits
+
+# What the platform carries, and what picking up and putting down make of it.
+#
+# In the units of the scene file, where it comes from and goes back to.
+
+
+NOTHING_KG = 1e-9
+"""Less than this is nothing."""
+SAME_PLACE_MM = 1e-3
+"""Centres nearer to each other than this are one."""
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """A mass on the platform.
+
+    Attributes:
+        mass_kg: [kg].
+        centre_mm: Its centre in the platform frame; the origin when there is no mass.
+    """
+
+    mass_kg: float
+    centre_mm: Point
+
+    def with_mass(self, mass_kg: float, centre_mm: Point) -> Payload:
+        """After a mass was taken up whose centre is there."""
+        whole = self.mass_kg + mass_kg
+        return Payload(whole, self._centre(mass_kg, centre_mm, whole))
+
+    def without_mass(self, mass_kg: float, centre_mm: Point | None) -> Payload:
+        """After a mass was put down whose centre was there, or where the whole payload's is.
+
+        Raises:
+            ValueError: It is more than is carried, or all of it with its centre elsewhere.
+        """
+        rest = self.mass_kg - mass_kg
+        if rest < -NOTHING_KG:
+            raise ValueError(f"puts down {mass_kg:g} kg, but {self.mass_kg:g} kg are carried then")
+        if rest > NOTHING_KG:
+            return Payload(rest, self._centre(-mass_kg, centre_mm or self.centre_mm, rest))
+        away = [
+            abs(a - b) for a, b in zip(centre_mm or self.centre_mm, self.centre_mm, strict=True)
+        ]
+        if max(away) > SAME_PLACE_MM:
+            x, y, z = self.centre_mm
+            raise ValueError(
+                f"puts down all that is carried, and its centre is at [{x:g}, {y:g}, {z:g}] mm"
+            )
+        return Payload(0.0, (0.0, 0.0, 0.0))
+
+    def _centre(self, mass_kg: float, centre_mm: Point, whole_kg: float) -> Point:
+        """Where the centre is with a mass more (or less); to a nanometre, as poses are written."""
+        x, y, z = (
+            round((self.mass_kg * own + mass_kg * other) / whole_kg, 6) + 0.0
+            for own, other in zip(self.centre_mm, centre_mm, strict=True)
+        )
+        return x, y, z
+
+
+# The stops of a scene file: poses that are passed exactly, and where a load is taken or left.
+
+
+class StopDocument(PoseDocument):
+    """A pose between start and goal, and what happens there."""
+
+    name: Name
+    kind: Literal["pass", "pick", "place"] = "pass"
+    dwell_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = Field(
+        default=0.0, description="the platform stands still for so long"
+    )
+    mass_kg: Positive | None = Field(
+        default=None, description="taken up at a pick, put down at a place"
+    )
+    mass_centre_mm: Vector | None = Field(
+        default=None,
+        description="its centre in the platform frame; left out, the origin for a pick and the"
+        " centre of the whole payload for a place",
+    )
+
+    def changed(self, payload: Payload) -> Payload:
+        """What is carried on from here.
+
+        Raises:
+            ValueError: More is put down than is carried.
+        """
+        if self.kind == "pass" or self.mass_kg is None:
+            return payload
+        x, y, z = self.mass_centre_mm or (0.0, 0.0, 0.0)
+        if self.kind == "pick":
+            return payload.with_mass(self.mass_kg, (x, y, z))
+        centre = None if self.mass_centre_mm is None else (x, y, z)
+        return payload.without_mass(self.mass_kg, centre)
+
+
+def payloads(first: Payload, stops: Sequence[StopDocument]) -> list[Payload]:
+    """What is carried to the first stop, from each stop to the next, and to the goal.
+
+    Raises:
+        ValueError: More is put down somewhere than is carried.
+    """
+    return list(accumulate(stops, lambda carried, stop: stop.changed(carried), initial=first))
+
+
+def misfits(stops: Sequence[StopDocument]) -> list[Finding]:
+    """Names given twice, and keys that do not fit a stop's kind."""
+    found: list[Finding] = []
+    names = [stop.name for stop in stops]
+    for i, stop in enumerate(stops):
+        if stop.name in names[:i]:
+            found.append((("stops", i, "name"), f"stop name {stop.name!r} stands twice"))
+        if stop.kind == "pass":
+            what = f"stop {stop.name!r} changes no load; say kind: pick or place"
+            keys = ("mass_kg", "mass_centre_mm")
+            found += [(("stops", i, k), what) for k in keys if getattr(stop, k) is not None]
+        if stop.kind in ("pick", "place"):
+            needs = f"{stop.kind} {stop.name!r} needs"
+            if stop.mass_kg is None:
+                found.append((("stops", i), f"{needs} mass_kg, by which the load changes"))
+            if stop.dwell_s == 0.0:
+                found.append((("stops", i), f"{needs} a dwell_s above 0, while it changes"))
+    return found
+
+
+def overdrawn(first: Payload, stops: Sequence[StopDocument]) -> list[Finding]:
+    """The first stop that puts down what is not carried."""
+    carried = first
+    for i, stop in enumerate(stops):
+        try:
+            carried = stop.changed(carried)
+        except ValueError as error:
+            return [(("stops", i, "mass_kg"), f"place {stop.name!r} {error}")]
+    return []
+
+
+FARTHEST_MM = 1e6
+"""No number of an obstacle is larger: distances are proved to 0.1 µm, for which the digits of
+numbers end at some ten kilometres."""
+
+SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
+
+
+class BoxDocument(Document):
+    """A box about its centre."""
+
+    size_mm: PositiveVector
+
+
+class SphereDocument(Document):
+    """A ball about its centre."""
+
+    radius_mm: Positive
+
+
+class RoundDocument(Document):
+    """A cylinder (length between its flat ends) or a capsule (length of its axis), along z."""
+
+    radius_mm: Positive
+    length_mm: Positive
+
+
+class HullDocument(Document):
+    """The convex hull of points."""
+
+    points_mm: Annotated[list[Vector], Field(min_length=4)]
+
+
+class MeshDocument(Document):
+    """A surface of triangles; each triangle names three points, counted from 0."""
+
+    points_mm: Annotated[list[Vector], Field(min_length=3)]
+    triangles: Annotated[list[Triple], Field(min_length=1)]
+
+
+class ObstacleDocument(Document):
+    """One obstacle: a name, exactly one shape, and where its centre is."""
+
+    name: Name
+    position_mm: Vector = [0.0, 0.0, 0.0]
+    rotation_wxyz: Quaternion = [1.0, 0.0, 0.0, 0.0]
+    box: BoxDocument | None = None
+    sphere: SphereDocument | None = None
+    cylinder: RoundDocument | None = None
+    capsule: RoundDocument | None = None
+    convex: HullDocument | None = None
+    mesh: MeshDocument | None = None
+
+    def shapes(self) -> dict[str, Document]:
+        """The shapes that were given, by key."""
+        given = {key: getattr(self, key) for key in SHAPES}
+        return {key: shape for key, shape in given.items() if shape is not None}
+
+
+class ClearanceDocument(Document):
+    """The distances that every pose of a plan keeps."""
+
+    obstacle_mm: NonNegative = Field(
+        default=10.0, description="cables and platform to every obstacle"
+    )
+    self_mm: NonNegative = Field(default=5.0, description="cable to cable and cable to platform")
+
+
+class LoadDocument(Document):
+    """What the cables must carry beside the platform's own weight."""
+
+    payload_kg: NonNegative = 0.0
+    payload_centre_mm: Vector = [0.0, 0.0, 0.0]
+    force_n: NonNegativeVector = Field(
+        default=[0.0, 0.0, 0.0], description="external force up to ± this, world axes"
+    )
+    moment_nm: NonNegativeVector = Field(
+        default=[0.0, 0.0, 0.0], description="external moment up to ± this, world axes"
+    )
+
+    def payload(self) -> Payload:
+        """What is carried at the start."""
+        x, y, z = self.payload_centre_mm
+        return Payload(self.payload_kg, (x, y, z))
+
+    def carrying(self, payload: Payload) -> LoadDocument:
+        """The same force and moment with another payload."""
+        given = {"payload_kg": payload.mass_kg, "payload_centre_mm": list(payload.centre_mm)}
+        return self.model_copy(update=given)
+
+
+class RotationLimitsDocument(Document):
+    """How far the platform may be tilted and turned, measured from level and not turned."""
+
+    tilt_deg: Annotated[float, Field(ge=0, le=90, allow_inf_nan=False)] = Field(
+        description="largest angle of the platform's z axis from the vertical"
+    )
+    turn_deg: Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)] = Field(
+        description="largest turn about the vertical, either way; 180 for any"
+    )
+
+
+class SceneDocument(Document):
+    """What a plan is made for."""
+
+    schema_version: Literal[1]
+    name: Name
+    description: str = ""
+    clearance: ClearanceDocument = ClearanceDocument()
+    load: LoadDocument = LoadDocument()
+    start: PoseDocument
+    stops: list[StopDocument] = []
+    goal: PoseDocument
+    rotation_limits: RotationLimitsDocument | None = None
+    obstacles: list[ObstacleDocument] = []
+
+    def rules(self) -> Sequence[Callable[[], list[Finding]]]:
+        """Obstacles without exactly one shape or past any room, names given twice, flat hulls.
+
+        And wrong triangles; stops whose load changes by too little or too much; and poses turned
+        too far.
+        """
+        return (
+            self._one_shape_each,
+            self._names_once,
+            self._within_reach,
+            self._shapes_whole,
+            lambda: misfits(self.stops),
+            self._ends_in_limits,
+            lambda: overdrawn(self.load.payload(), self.stops),
+        )
+
+    def _one_shape_each(self) -> list[Finding]:
+        found: list[Finding] = []
+        for i, obstacle in enumerate(self.obstacles):
+            given = list(obstacle.shapes())
+            if len(given) != 1:
+                has = f"it has {', '.join(given)}" if given else f"one of {', '.join(SHAPES)}"
+                what = f"obstacle {obstacle.name!r} needs exactly one shape: {has}"
+                found.append((("obstacles", i), what))
+        return found
+
+    def _names_once(self) -> list[Finding]:
+        names = [obstacle.name for obstacle in self.obstacles]
+        return [
+            (("obstacles", i, "name"), f"obstacle name {name!r} stands twice")
+            for i, name in enumerate(names)
+            if name in names[:i]
+        ]
+
+    def _within_reach(self) -> list[Finding]:
+        found: list[Finding] = []
+        for i, obstacle in enumerate(self.obstacles):
+            largest = max(abs(number) for number in _numbers(obstacle))
+            if largest > FARTHEST_MM:
+                what = (
+                    f"obstacle {obstacle.name!r} reaches {largest:g} mm, and distances are proved"
+                    f" up to {FARTHEST_MM:g} mm (1 km): make it as large as the room"
+                )
+                found.append((("obstacles", i), what))
+        return found
+
+    def _shapes_whole(self) -> list[Finding]:
+        found: list[Finding] = []
+        for i, obstacle in enumerate(self.obstacles):
+            if obstacle.convex is not None and _is_flat(obstacle.convex.points_mm):
+                what = "the points lie in a plane; a convex body needs a volume"
+                found.append((("obstacles", i, "convex", "points_mm"), what))
+            if obstacle.mesh is not None:
+                place = ("obstacles", i, "mesh", "triangles")
+                found += [((*place, t), what) for t, what in _wrong_triangles(obstacle.mesh)]
+        return found
+
+    def _ends_in_limits(self) -> list[Finding]:
+        limits = self.rotation_limits
+        if limits is None:
+            return []
+        allowed = RotationLimits(math.radians(limits.tilt_deg), math.radians(limits.turn_deg))
+        ends: list[tuple[str, tuple[str | int, ...], PoseDocument]] = [
+            ("start", ("start",), self.start),
+            ("goal", ("goal",), self.goal),
+            *((f"stop {stop.name!r}", ("stops", i), stop) for i, stop in enumerate(self.stops)),
+        ]
+        found: list[Finding] = []
+        for name, place, end in ends:
+            pose = end.pose()
+            excess = allowed.excess(pose, pose)
+            if excess is not None:
+                found.append(((*place, "rotation_wxyz"), f"the {name} is {excess.sentence()}"))
+        return found
+
+
+def _numbers(obstacle: ObstacleDocument) -> list[float]:
+    """All lengths and coordinates of an obstacle, [mm]."""
+    numbers = list(obstacle.position_mm)
+    if obstacle.box is not None:
+        numbers += obstacle.box.size_mm
+    if obstacle.sphere is not None:
+        numbers.append(obstacle.sphere.radius_mm)
+    for tube in (obstacle.cylinder, obstacle.capsule):
+        if tube is not None:
+            numbers += [tube.radius_mm, tube.length_mm]
+    for cloud in (obstacle.convex, obstacle.mesh):
+        if cloud is not None:
+            numbers += [value for point in cloud.points_mm for value in point]
+    return numbers
+
+
+def _is_flat(points_mm: list[list[float]]) -> bool:
+    points = np.asarray(points_mm, dtype=np.float64)
+    centred = points - points.mean(axis=0)
+    size = float(np.max(np.abs(centred)))
+    return size == 0.0 or int(np.linalg.matrix_rank(centred / size, tol=1e-9)) < 3
+
+
+def _wrong_triangles(mesh: MeshDocument) -> list[tuple[int, str]]:
+    """Triangles that name points which do not exist, or one point twice: number and sentence."""
+    count = len(mesh.points_mm)
+    found: list[tuple[int, str]] = []
+    for number, triangle in enumerate(mesh.triangles):
+        if not all(0 <= i < count for i in triangle):
+            found.append((number, f"{triangle} names a point outside 0..{count - 1}"))
+        elif len(set(triangle)) < 3:
+            found.append((number, f"{triangle} names one point twice"))
+    return found

@@ -1,0 +1,145 @@
+"""Obstacles as polygons, for pictures and logs; never for distances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.geometry.shapes import (
+    Box,
+    Capsule,
+    ConvexHull,
+    Cylinder,
+    Obstacle,
+    Shape,
+    Sphere,
+    TriangleMesh,
+)
+from model.pose import Array, Pose
+
+Face = tuple[int, ...]
+_SIDES = 24
+_STEP = 15.0  # degrees of a round profile to a ring
+#: Neighbouring faces that bend less than this are one smooth surface, whose edge is not drawn.
+_SMOOTH = np.cos(np.radians(20.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solid:
+    """A surface of flat faces.
+
+    Attributes:
+        vertices: World frame, shape (n, 3), [m].
+        faces: Convex polygons by vertex number.
+        edges: Pairs of vertex numbers: the edges worth drawing.
+    """
+
+    vertices: Array
+    faces: tuple[Face, ...]
+    edges: tuple[tuple[int, int], ...]
+
+    def triangles(self) -> Array:
+        """The faces cut into triangles, shape (t, 3, 3), [m]."""
+        cut = [(f[0], f[k], f[k + 1]) for f in self.faces for k in range(1, len(f) - 1)]
+        corners: Array = self.vertices[np.array(cut)]
+        return corners
+
+
+def solid_of(obstacle: Obstacle) -> Solid:
+    """The surface of an obstacle in the world; round shapes as polygons."""
+    vertices, faces = _surface(obstacle.shape)
+    world = obstacle.pose.apply(vertices)
+    return Solid(world, faces, _sharp_edges(world, faces))
+
+
+def box_solid(half_size: Array, pose: Pose | None = None) -> Solid:
+    """A box about its centre, ``pose`` is ``world_from_box``; at the origin when left out."""
+    return solid_of(Obstacle("box", Box(half_size), pose or Pose.level(np.zeros(3))))
+
+
+def _surface(shape: Shape) -> tuple[Array, tuple[Face, ...]]:
+    match shape:
+        case Box(half_size=half):
+            return _box(half)
+        case Sphere(radius=radius):
+            return _turned(_arc(radius, 0.0, -90.0, 90.0))
+        case Cylinder(radius=radius, length=length):
+            half_length = length / 2.0
+            return _turned(
+                [
+                    (0.0, -half_length),
+                    (radius, -half_length),
+                    (radius, half_length),
+                    (0.0, half_length),
+                ]
+            )
+        case Capsule(radius=radius, length=length):
+            below = _arc(radius, -length / 2.0, -90.0, 0.0)
+            return _turned([*below, *_arc(radius, length / 2.0, 0.0, 90.0)])
+        case ConvexHull(vertices=vertices, triangles=triangles):
+            return vertices, _as_faces(triangles)
+        case TriangleMesh(vertices=vertices, triangles=triangles):
+            return vertices, _as_faces(triangles)
+
+
+def _as_faces(triangles: NDArray[np.int64]) -> tuple[Face, ...]:
+    return tuple((int(a), int(b), int(c)) for a, b, c in triangles)
+
+
+def _box(half: Array) -> tuple[Array, tuple[Face, ...]]:
+    signs = [(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
+    faces = (
+        (0, 2, 3, 1),
+        (4, 5, 7, 6),
+        (0, 1, 5, 4),
+        (2, 6, 7, 3),
+        (0, 4, 6, 2),
+        (1, 3, 7, 5),
+    )
+    return np.array(signs) * half, faces
+
+
+def _arc(radius: float, height: float, start: float, end: float) -> list[tuple[float, float]]:
+    angles = np.radians(np.arange(start, end + _STEP / 2.0, _STEP))
+    return [(radius * float(np.cos(a)), height + radius * float(np.sin(a))) for a in angles]
+
+
+def _turned(profile: Sequence[tuple[float, float]]) -> tuple[Array, tuple[Face, ...]]:
+    """The surface of a profile of (radius, height), its ends on the axis, turned about z."""
+    angles = np.arange(_SIDES) * 2.0 * np.pi / _SIDES
+    rings = [
+        np.column_stack([r * np.cos(angles), r * np.sin(angles), np.full(_SIDES, h)])
+        for r, h in profile
+    ]
+    faces: list[Face] = []
+    for ring in range(1, len(profile) - 2):  # the first and the last ring are the poles
+        low, high = ring * _SIDES, (ring + 1) * _SIDES
+        for k in range(_SIDES):
+            after = (k + 1) % _SIDES
+            faces.append((low + k, low + after, high + after, high + k))
+    faces += _caps(profile)
+    return np.vstack(rings), tuple(faces)
+
+
+def _caps(profile: Sequence[tuple[float, float]]) -> list[Face]:
+    """The flat polygons that close a turned profile at the rings next to its two poles."""
+    last = (len(profile) - 2) * _SIDES
+    return [tuple(range(2 * _SIDES - 1, _SIDES - 1, -1)), tuple(range(last, last + _SIDES))]
+
+
+def _sharp_edges(vertices: Array, faces: tuple[Face, ...]) -> tuple[tuple[int, int], ...]:
+    beside: dict[tuple[int, int], list[Array]] = {}
+    for face in faces:
+        a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
+        normal = np.cross(b - a, c - a)
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-30)
+        for start, end in zip(face, (*face[1:], face[0]), strict=True):
+            beside.setdefault((min(start, end), max(start, end)), []).append(normal)
+    return tuple(
+        edge
+        for edge, normals in beside.items()
+        if len(normals) != 2 or float(normals[0] @ normals[1]) < _SMOOTH
+    )

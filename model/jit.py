@@ -1,0 +1,254 @@
+"""How kernels are compiled, and where the machine code is kept.
+
+Numba recompiles a cached function when its own file changes, not when a function it calls does. So
+the cache lies in a folder named after the content of all files beside the function, and of those in
+the folders of kernels that it calls: any change begins a new one. The folder is the user's
+(``NUMBA_CACHE_DIR``, else ``XDG_CACHE_HOME`` or ``~/.cache``), which lets a read-only installation
+work. Where no folder can be written, kernels live as long as the process.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import platform
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+from model.progress import Listener
+
+# Where machine code is kept between runs, and when old code is thrown away.
+#
+# Every state of the kernels has a folder of its own (`model.jit`). A process holds a
+# shared lock in each folder it uses until it ends; beginning a new one throws away those that
+# nobody holds and nobody began to use for two days. Folders that the user named
+# (``NUMBA_CACHE_DIR``) are left alone.
+
+
+UNUSED = 2 * 24 * 3600.0
+"""How long nobody must have begun to use a folder before it is thrown away, [s]."""
+_LOCK = "in-use"
+_OURS = re.compile(r"[0-9a-f]{16}|removed-\w+")
+"""Names of versions, and of what a process that was ended did not get to remove."""
+_ATTEMPTS = 10
+
+
+def use_folder(version: str) -> Path | None:
+    """The folder of a version, held until the process ends; None where none can be written."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    try:
+        if given:
+            folder = Path(given) / version
+            folder.mkdir(parents=True, exist_ok=True)
+        else:
+            folder = _own_folder() / version
+            is_new = not folder.exists()
+            _hold(folder)
+            if is_new:
+                throw_away_unused(folder.parent, time.time())
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:  # read-only or full: compiled code is then not kept
+        return None
+
+
+def throw_away_unused(parent: Path, now: float) -> None:
+    """Removes the folders of versions that no process holds and none used for `UNUSED`.
+
+    Args:
+        parent: Of the folders.
+        now: Seconds since the epoch.
+    """
+    for folder in parent.iterdir():
+        try:
+            if _OURS.fullmatch(folder.name) and now - folder.stat().st_mtime > UNUSED:
+                _throw_away(folder)
+        except OSError:  # another process was faster, or it is not ours to remove
+            continue
+
+
+def _own_folder() -> Path:
+    cache_home = os.environ.get("XDG_CACHE_HOME")
+    parent = Path(cache_home) if cache_home else Path.home() / ".cache"
+    return parent / "cdpr" / "kernels"
+
+
+def _hold(folder: Path) -> None:
+    """Makes the folder, marks it as used now, and holds it as long as the process lives.
+
+    Raises:
+        OSError: It cannot be made or locked.
+    """
+    for _ in range(_ATTEMPTS):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        if _is_same(lock, folder / _LOCK):
+            os.utime(folder)
+            return  # the file stays open, and the lock with it
+        os.close(lock)  # thrown away in between
+    raise OSError(f"{folder} is thrown away again and again")
+
+
+def _throw_away(folder: Path) -> None:
+    lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        away = Path(tempfile.mkdtemp(prefix="removed-", dir=folder.parent))
+        folder.rename(away / folder.name)
+        shutil.rmtree(away)
+    finally:
+        os.close(lock)
+
+
+def _is_same(lock: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(lock), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "fastmath": False}
+
+
+def compiled(
+    function: Function, *called: Path, counts_arrays: bool = True, is_inlined: bool = False
+) -> Function:
+    """Compiles a pure function when it is first called; exact IEEE arithmetic, no GIL.
+
+    Args:
+        function: What is compiled.
+        called: Folders of the kernels that it calls, beside its own.
+        counts_arrays: Whether it makes or keeps arrays, whose owners are then counted.
+        is_inlined: Whether it becomes part of its callers.
+    """
+    # All said, or they come from whichever caller was first.
+    options = {**_OPTIONS, "_nrt": counts_arrays, "forceinline": is_inlined}
+    folder = cache_folder(Path(function.__code__.co_filename).parent, *called)
+    if folder is None:
+        return cast(Function, numba.njit(**options)(function))
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(folder)  # read while the decorator runs, hence put back after it
+    try:
+        return cast(Function, numba.njit(cache=True, **options)(function))
+    finally:
+        config.CACHE_DIR = before
+
+
+@cache
+def cache_folder(sources: Path, *called: Path) -> Path | None:
+    """The folder of the machine code of kernels in ``sources`` that call those in ``called``.
+
+    None where none can be written.
+    """
+    return use_folder(_version(frozenset({sources, *called})))
+
+
+@cache
+def _version(folders: frozenset[Path]) -> str:
+    """Name of this state of the kernels in ``folders``, on this processor."""
+    digest = hashlib.sha256(f"{numba.__version__} {platform.machine()}".encode())
+    digest.update(Path(__file__).read_bytes())
+    for source in sorted(source for folder in folders for source in folder.glob("*.py")):
+        digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+# Whether the machine code that a task needs waits in the user's cache, or must be compiled first.
+#
+# Numba finds machine code by the path and the date of a kernel's file, in a folder that is named
+# after the content of all kernels. So another copy of the program, or a file that was only touched,
+# compiles anew; hence the stamp of a task is named after path, date and size of every kernel's
+# file.
+
+
+@dataclass(frozen=True, slots=True)
+class KernelSet:
+    """What runs kernels.
+
+    Attributes:
+        name: Of what was done once when its code is there.
+        kernels: Folders of the kernels; the code's stamp lies in their cache.
+    """
+
+    name: str
+    kernels: tuple[Path, ...]
+
+
+def can_be_kept(task: KernelSet) -> bool:
+    """Whether there is a folder in which a task's code outlives the process."""
+    return cache_folder(*task.kernels) is not None
+
+
+def is_compiled(task: KernelSet) -> bool:
+    """Whether a task was done before with the very files that lie here.
+
+    False too where no folder can be written: then every process compiles for itself.
+    """
+    stamp = _stamp(task)
+    return stamp is not None and stamp.exists()
+
+
+def note_compiled(task: KernelSet) -> None:
+    """Notes that a task was done, where that can be noted."""
+    stamp = _stamp(task)
+    if stamp is None:
+        return
+    try:
+        stamp.touch()
+    except OSError:  # read-only since it was made: the next process looks again
+        return
+
+
+@contextmanager
+def compilation(task: KernelSet, what: str, duration: str, listener: Listener) -> Iterator[bool]:
+    """Around what compiles the code of a task when it is done for the first time.
+
+    Args:
+        task: It uses the kernels.
+        what: That is compiled, such as ``the planner``.
+        duration: That it takes, such as ``about ten seconds``.
+        listener: Receives that it is compiled.
+
+    Yields:
+        Whether the code was there.
+    """
+    if is_compiled(task):
+        yield True
+        return
+    if can_be_kept(task):
+        listener.remark(f"compiling {what} for this machine, once; {duration} …")
+    else:
+        listener.remark(
+            f"compiling {what}, {duration}, and every time anew: no folder for it can be written;"
+            " name one by the variable NUMBA_CACHE_DIR"
+        )
+    with listener.waiting("compiling"):
+        yield False
+    note_compiled(task)
+
+
+def _stamp(task: KernelSet) -> Path | None:
+    folder = cache_folder(*task.kernels)
+    if folder is None:
+        return None
+    digest = hashlib.sha256()
+    for kernels in task.kernels:
+        for source in sorted(kernels.glob("*.py")):
+            state = source.stat()
+            digest.update(f"{source} {state.st_mtime_ns} {state.st_size}\n".encode())
+    return folder / f"compiled-{task.name}-{digest.hexdigest()[:16]}"

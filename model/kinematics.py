@@ -1,0 +1,283 @@
+"""Kinematics of the platform: cable lengths, structure matrix, pose from lengths.
+
+Source: paper, section 2, Eqs. 1–3 with the corrections of docs/paper.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import BadInput, Fault
+from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+
+if TYPE_CHECKING:
+    from model.rig import Rig
+
+# Cables between outlets and anchors: exit points, lengths and directions.
+#
+# Two kinds of outlet. A point exit is the outlet point itself (paper, Eq. 1). A swivelling pulley
+# of radius r turns about its feed direction k through the outlet A, where the cable enters it; the
+# cable wraps the pulley, leaves it tangentially at T and runs straight to the anchor B (A. Pott,
+# "Cable-Driven Parallel Robots", 2018, section 3.5). The length is then the wrapped arc and the
+# straight part; its derivative with respect to B is the unit vector from T to B, as for a point
+# exit.
+
+
+class NoCable(BadInput, ValueError):
+    """A pose at which a cable cannot run: its anchor lies at its outlet or inside its pulley."""
+
+    code = "no_cable"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cables:
+    """The m cables of a rig at one pose or a batch of poses.
+
+    Attributes:
+        exits: Where the straight part begins, world frame, shape (..., m, 3), [m].
+        anchors: Where it ends on the platform, world frame, shape (..., m, 3), [m].
+        directions: Unit vectors from anchor to exit, shape (..., m, 3).
+        lengths: From outlet to anchor, wrapped part included, shape (..., m), [m].
+    """
+
+    exits: Array
+    anchors: Array
+    directions: Array
+    lengths: Array
+
+
+def cables_at(rig: Rig, pose: Pose) -> Cables:
+    """The cables with the platform at ``pose`` (``world_from_platform``).
+
+    Raises:
+        NoCable: An anchor lies at its outlet, inside its pulley or on its swivel axis.
+    """
+    return cables_to(rig, pose.apply(rig.anchors))
+
+
+def cables_to(rig: Rig, anchors_in_world: Array) -> Cables:
+    """The cables that end at given anchors, world frame, shape (..., m, 3), [m].
+
+    Raises:
+        NoCable: An anchor lies at its outlet, inside its pulley or on its swivel axis.
+    """
+    if rig.pulley_radius == 0.0:
+        straight = rig.outlets - anchors_in_world
+        lengths = np.linalg.norm(straight, axis=-1)
+        _demand(lengths > 0.0, "its anchor lies at its outlet")
+        exits = np.broadcast_to(rig.outlets, anchors_in_world.shape)
+        return Cables(exits, anchors_in_world, straight / lengths[..., None], lengths)
+    return _over_pulleys(rig, anchors_in_world)
+
+
+def _over_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
+    radius, feed = rig.pulley_radius, rig.feed_directions
+    offset = anchors_in_world - rig.outlets
+    along = np.sum(offset * feed, axis=-1)
+    radial = offset - along[..., None] * feed
+    reach = np.linalg.norm(radial, axis=-1)
+    outward = reach - radius  # from the pulley's centre, in the pulley's plane
+    centre_distance = np.hypot(outward, along)
+    _demand(reach > 0.0, "its anchor lies on the swivel axis of its pulley")
+    _demand(centre_distance > radius, "its anchor lies inside its pulley")
+    swivel = radial / reach[..., None]
+    straight = np.sqrt(centre_distance**2 - radius**2)
+    # The tangent point, as an angle about the pulley's centre from the swivel direction to k.
+    angle = np.arctan2(along, outward) + np.arccos(radius / centre_distance)
+    wrap = np.mod(np.pi - angle, 2.0 * np.pi)
+    centre = rig.outlets + radius * swivel
+    exits = centre + radius * (np.cos(angle)[..., None] * swivel + np.sin(angle)[..., None] * feed)
+    directions = (exits - anchors_in_world) / straight[..., None]
+    return Cables(exits, anchors_in_world, directions, radius * wrap + straight)
+
+
+def _demand(sound: NDArray[np.bool_], what: str) -> None:
+    """Raises `NoCable` for the first cable, along the last axis, that is not sound."""
+    if sound.all():
+        return
+    number = int(np.argwhere(~sound)[0][-1]) + 1
+    raise NoCable(
+        f"cable {number} cannot run: {what}",
+        why="the pose is out of the rig's reach, or holds a value that is not a number",
+        next_step="choose a pose inside the workspace",
+        values={"cable": number},
+    )
+
+
+LEAST_DAMPING = 1e-12
+"""Keeps the steps of forward kinematics defined at poses where the platform is not held."""
+
+
+def cable_lengths(rig: Rig, pose: Pose) -> Array:
+    """Inverse kinematics: lengths from outlet to anchor, shape (m,), [m]."""
+    return cables_at(rig, pose).lengths
+
+
+def structure_matrix(rig: Rig, pose: Pose) -> Array:
+    """Matrix J of J t + w = 0 for tensions t and the wrench w on the platform; shape (6, m).
+
+    Column i is [u_i; (R b_i) × u_i], u_i from anchor to outlet; forces [N], moments about the
+    platform's origin [N·m]. Cable lengths change at the rate −Jᵀ (velocity, angular velocity).
+    """
+    return structure_matrix_of(cables_at(rig, pose), pose.position)
+
+
+def structure_matrix_of(cables: Cables, position: Array) -> Array:
+    """The structure matrices of cables; ``position`` shape (..., 3), [m]; shape (..., 6, m)."""
+    arms = cables.anchors - position[..., None, :]
+    moments = np.cross(arms, cables.directions)
+    columns = np.concatenate([cables.directions, moments], axis=-1)
+    matrix: Array = np.swapaxes(columns, -1, -2)
+    return matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForwardSolution:
+    """A pose found from cable lengths.
+
+    Attributes:
+        pose: ``world_from_platform``.
+        residual: Length of the pose's cables less the given lengths, shape (m,), [m].
+        iterations: Steps it took.
+    """
+
+    pose: Pose
+    residual: Array
+    iterations: int
+
+    @property
+    def worst(self) -> float:
+        """Largest disagreement of one cable, [m]."""
+        return float(np.max(np.abs(self.residual)))
+
+
+def forward_kinematics(
+    rig: Rig, lengths: Array, guess: Pose | None = None, *, tolerance: float = 1e-10
+) -> ForwardSolution:
+    """Pose whose cable lengths come nearest to the given ones (least squares).
+
+    Args:
+        rig: The robot, with point exits or pulleys.
+        lengths: Shape (m,), [m].
+        guess: A pose near the solution (warm); without one (cold) the search starts from several
+            poses of the workspace and the best solution is taken.
+        tolerance: Size of the last step at which the search ends, [m] and [rad].
+
+    Raises:
+        BadInput: Not a finite length for each cable.
+        Fault: No start led to a stationary pose.
+    """
+    wanted = np.asarray(lengths, dtype=np.float64)
+    if wanted.shape != (rig.cable_count,) or not np.all(np.isfinite(wanted)):
+        raise BadInput(
+            f"needs a finite length for each of {rig.cable_count} cables",
+            where="forward kinematics",
+        )
+    starts = [guess] if guess is not None else _cold_starts(rig)
+    best: ForwardSolution | None = None
+    for start in starts:
+        found = _levenberg_marquardt(rig, wanted, start, tolerance)
+        if found is None:
+            continue
+        if best is None or found.worst < best.worst:
+            best = found
+        if best.worst < 1e-7:
+            break
+    if best is None:
+        raise Fault(
+            "no pose fits the cable lengths",
+            where="forward kinematics",
+            why="the lengths are not those of this rig, or the guess is far off",
+            next_step="check the drive positions and the reference (home) counts",
+        )
+    return best
+
+
+def poses_near(
+    rig: Rig, lengths: Array, positions: Array, rotations: Array, *, steps: int = 4
+) -> tuple[Array, Array]:
+    """Forward kinematics of many poses at once, each near a known one (Gauss–Newton).
+
+    Args:
+        rig: The robot, with point exits or pulleys.
+        lengths: Shape (n, m), [m].
+        positions: Guesses, world frame, shape (n, 3), [m].
+        rotations: Guesses, ``world_from_platform``, shape (n, 3, 3).
+        steps: Gauss–Newton steps; each squares an error of millimetres, so four reach round-off.
+
+    Returns:
+        Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
+    """
+    scale = _step_scale(rig)
+    for _ in range(steps):
+        anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
+        cables = cables_to(rig, anchors)
+        matrices = structure_matrix_of(cables, positions) * scale[:, None]
+        residuals = cables.lengths - lengths
+        normal = matrices @ np.swapaxes(matrices, 1, 2)
+        right = matrices @ residuals[:, :, None]
+        twists = np.linalg.solve(normal, right)[:, :, 0] * scale
+        positions = positions + twists[:, :3]
+        turns = [matrix_from_rotation_vector(v) for v in twists[:, 3:]]
+        rotations = np.reshape(turns, (-1, 3, 3)) @ rotations
+    return positions, rotations
+
+
+def _cold_starts(rig: Rig) -> list[Pose]:
+    """Home first, then the centres of the eighths of the workspace."""
+    centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
+    quarter = (rig.workspace_upper - rig.workspace_lower) / 4.0
+    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+    return [
+        rig.home,
+        Pose.level(centre),
+        *(Pose.level(centre + c * quarter) for c in corners),
+    ]
+
+
+def _levenberg_marquardt(
+    rig: Rig, lengths: Array, start: Pose, tolerance: float
+) -> ForwardSolution | None:
+    """Damped Gauss–Newton on the pose; None when it does not settle."""
+    pose, damping = start, 1e-6
+    scale = _step_scale(rig)
+    residual = _residual(rig, pose, lengths)
+    if residual is None:
+        return None
+    for iteration in range(1, 101):
+        jacobian = -structure_matrix(rig, pose).T * scale
+        normal = jacobian.T @ jacobian
+        step = scale * np.linalg.solve(normal + damping * np.eye(6), -(jacobian.T @ residual))
+        candidate = _moved(pose, step)
+        trial = _residual(rig, candidate, lengths)
+        if trial is not None and trial @ trial <= residual @ residual:
+            pose, residual, damping = candidate, trial, max(damping / 10.0, LEAST_DAMPING)
+            if np.max(np.abs(step)) < tolerance:
+                return ForwardSolution(pose, read_only(residual), iteration)
+        elif np.max(np.abs(step)) < tolerance:
+            return ForwardSolution(pose, read_only(residual), iteration)
+        else:
+            damping *= 10.0
+    return None
+
+
+def _step_scale(rig: Rig) -> Array:
+    """Makes a unit of rotation move the anchors as far as a unit of translation."""
+    radius = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
+    return np.array([1.0, 1.0, 1.0, 1.0 / radius, 1.0 / radius, 1.0 / radius])
+
+
+def _residual(rig: Rig, pose: Pose, lengths: Array) -> Array | None:
+    try:
+        return cable_lengths(rig, pose) - lengths
+    except NoCable:  # the trial pose puts an anchor inside a pulley
+        return None
+
+
+def _moved(pose: Pose, step: Array) -> Pose:
+    """The pose after a small twist, shape (6,): translation [m], rotation in the world [rad]."""
+    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)

@@ -1,0 +1,333 @@
+"""Line charts as SVG that keeps its text size at any width, and the data for `charts.js`.
+
+The lines live in an inner SVG that stretches with the page; ticks and names are placed by shares of
+its size. Colours are the page's variables, which people with any colour vision can tell apart
+(Okabe and Ito's palette). The script adds zoom and values under the pointer; the page is complete
+without it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from model.pose import Array
+
+MOST_POINTS = 900
+_SIZE = 1000.0
+"""Width and height of the inner SVG's coordinates."""
+DASHED, DOTTED, DASH_DOTTED = "6 4", "1.5 3", "8 3 1.5 3"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChartLine:
+    """A line of a chart; NaN breaks it.
+
+    Attributes:
+        name: In the legend and beside values; a line without one is not in them.
+        x: Shape (n,), rising.
+        y: Shape (n,).
+        role: CSS variable of its colour, such as ``encoder``.
+        width: [px].
+        dash: SVG dash pattern; empty for a full line.
+        opacity: 1 for opaque.
+        band: Lower and upper edge of a band around it, each of shape (n,).
+        fits: Whether the chart is made high enough for it.
+    """
+
+    name: str
+    x: Array
+    y: Array
+    role: str
+    width: float = 1.5
+    dash: str = ""
+    opacity: float = 1.0
+    band: tuple[Array, Array] | None = None
+    fits: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A stretch of x that is shaded, and its name; empty for none."""
+
+    begin: float
+    end: float
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """One chart.
+
+    Attributes:
+        title: Plain text above it.
+        alternative: What a reader who does not see it should know; plain text.
+        quantity: What y is, and its unit.
+        unit: Of y; may be empty.
+        lines: In the order in which they are painted.
+        x_range: Both ends of x.
+        x_quantity: What x is.
+        x_unit: Of x.
+        spans: Shaded stretches of x.
+        from_zero: Whether y begins at 0 where no value is negative.
+        y_includes: Values that y reaches at least, so that charts can be compared.
+        logarithmic: Whether y holds decimal logarithms of what is meant.
+        names_at_ends: Whether lines are named at their right ends instead of in a legend.
+        height: [px].
+        group: Charts of one group are zoomed together.
+    """
+
+    title: str
+    alternative: str
+    quantity: str
+    unit: str
+    lines: tuple[ChartLine, ...]
+    x_range: tuple[float, float]
+    x_quantity: str = "time"
+    x_unit: str = "s"
+    spans: tuple[Span, ...] = ()
+    from_zero: bool = False
+    y_includes: tuple[float, ...] = ()
+    logarithmic: bool = False
+    names_at_ends: bool = False
+    height: int = 190
+    group: str = "time"
+
+
+def charts(*parts: Chart) -> str:
+    """Charts below each other; HTML."""
+    return "".join(map(_figure, parts))
+
+
+def chart_grid(parts: Iterable[Chart]) -> str:
+    """Small charts beside each other where there is room; HTML."""
+    return f'<div class="plots">{"".join(map(_figure, parts))}</div>'
+
+
+def _figure(chart: Chart) -> str:
+    low, high = _y_range(chart)
+    text = escape(chart.alternative, quote=True)
+    kind = "plot ends" if chart.names_at_ends else "plot"
+    inner = "".join(_mark(chart, span) for span in chart.spans)
+    inner += "".join(_drawn(line, chart.x_range, (low, high)) for line in chart.lines)
+    return (
+        f'<figure class="{kind}"><figcaption><b>{escape(chart.title)}</b>{_legend(chart)}'
+        f'</figcaption><div class="area" style="height:{chart.height}px">'
+        f'<svg role="img" aria-label="{text}" tabindex="0">'
+        f'<g class="ticks">{_ticks(chart, low, high)}</g>'
+        f'<svg class="lines" viewBox="0 0 {_SIZE:g} {_SIZE:g}" preserveAspectRatio="none"'
+        f' width="100%" height="100%">{inner}</svg>'
+        f'<g class="names">{_names(chart, low, high)}</g></svg></div>'
+        f'<script type="application/json">{_data(chart, low, high)}</script></figure>'
+    )
+
+
+def _legend(chart: Chart) -> str:
+    if chart.names_at_ends:
+        return ""
+    return "".join(
+        f'<span class="key"><svg width="26" height="10" aria-hidden="true"><path d="M1 5H25"'
+        f" {_stroke(line)}/></svg>{escape(line.name)}</span>"
+        for line in chart.lines
+        if line.name
+    )
+
+
+def _stroke(line: ChartLine) -> str:
+    dash = f";stroke-dasharray:{line.dash}" if line.dash else ""
+    return (
+        f'fill="none" vector-effect="non-scaling-stroke" style="stroke:var(--{line.role});'
+        f'stroke-width:{line.width:g}px;stroke-opacity:{line.opacity:g}{dash}"'
+    )
+
+
+def _y_range(chart: Chart) -> tuple[float, float]:
+    """From the smallest to the largest value with a little room."""
+    values = [a for line in chart.lines if line.fits for a in (line.y, *(line.band or ()))]
+    values.append(np.array(chart.y_includes))
+    known = np.concatenate([np.asarray(v)[np.isfinite(v)] for v in values])
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    at_zero = chart.from_zero and low >= 0.0
+    return (0.0 if at_zero else low - room), high + room
+
+
+def ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Round numbers between two ends, steps of 1, 2 or 5 times a power of ten."""
+    rough = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(f * power for f in (1.0, 2.0, 5.0, 10.0) if f * power >= rough * (1 - 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def _ticks(chart: Chart, low: float, high: float) -> str:
+    """Grid lines, numbers and names of both axes; `charts.js` draws the same after a zoom."""
+    begin, end = chart.x_range
+    across, up = ticks(begin, end), ticks(low, high, 5)
+    if chart.logarithmic:
+        up = [v for v in up if abs(v - round(v)) < 1e-9]
+    parts = []
+    for value in across:
+        at = f"{(value - begin) / (end - begin):.4%}"
+        parts.append(f'<line x1="{at}" x2="{at}" y1="0" y2="100%"/>')
+        parts.append(f'<text class="x" x="{at}" y="100%" dy="16">{value:.10g}</text>')
+    for value in up:
+        at = f"{(high - value) / (high - low):.4%}"
+        number = 10.0**value if chart.logarithmic else value
+        parts.append(f'<line x1="0" x2="100%" y1="{at}" y2="{at}"/>')
+        parts.append(f'<text class="y" x="0" dx="-6" y="{at}" dy="4">{number:.10g}</text>')
+    parts.append(f'<text class="unit" x="0" dx="-44" y="-7">{escape(_of(chart))}</text>')
+    x_name = escape(f"{chart.x_quantity} [{chart.x_unit}]")
+    parts.append(f'<text class="unit end" x="100%" y="100%" dy="31">{x_name}</text>')
+    for span in chart.spans:
+        at = f"{((span.begin + span.end) / 2.0 - begin) / (end - begin):.4%}"
+        parts.append(f'<text class="span" x="{at}" y="4">{escape(span.name)}</text>')
+    return "".join(parts)
+
+
+def _of(chart: Chart) -> str:
+    return f"{chart.quantity} [{chart.unit}]" if chart.unit else chart.quantity
+
+
+def _mark(chart: Chart, span: Span) -> str:
+    begin, end = chart.x_range
+    x, width = ((v / (end - begin)) * _SIZE for v in (span.begin - begin, span.end - span.begin))
+    return (
+        f'<rect class="span" x="{x:.2f}" width="{max(width, 1.0):.2f}" y="-9000" height="19000"/>'
+    )
+
+
+def _drawn(line: ChartLine, x_range: tuple[float, float], y_range: tuple[float, float]) -> str:
+    x = (line.x - x_range[0]) / (x_range[1] - x_range[0]) * _SIZE
+    scale = _SIZE / (y_range[1] - y_range[0])
+    y, text = (y_range[1] - line.y) * scale, ""
+    if line.band is not None:
+        low, high = ((y_range[1] - edge) * scale for edge in line.band)
+        for part in _unbroken(low + high):
+            points = [*zip(x[part], high[part], strict=True)]
+            points += [*zip(x[part][::-1], low[part][::-1], strict=True)]
+            text += f'<path d="{_polyline(points)}Z" style="fill:var(--{line.role})" opacity=".2"/>'
+    path = "".join(_polyline(zip(x[part], y[part], strict=True)) for part in _unbroken(y))
+    return f'{text}<path d="{path}" {_stroke(line)}/>' if path else text
+
+
+def _unbroken(values: Array) -> list[slice]:
+    """Where values are finite, stretch by stretch."""
+    known = np.concatenate([[False], np.isfinite(values), [False]])
+    ends = np.flatnonzero(known[1:] != known[:-1])
+    return [slice(int(a), int(b)) for a, b in ends.reshape(-1, 2)]
+
+
+def _polyline(points: Iterable[tuple[float, float]]) -> str:
+    text = "L".join(f"{x:.2f} {y:.2f}" for x, y in points)
+    return f"M{text}" if "L" in text else f"M{text}h.1"
+
+
+def _names(chart: Chart, low: float, high: float) -> str:
+    """Names at the right ends of lines, spread so that they do not cover each other."""
+    if not chart.names_at_ends:
+        return ""
+    lines = [line for line in chart.lines if line.name and np.isfinite(line.y).any()]
+    last = [float(line.y[np.isfinite(line.y)][-1]) for line in lines]
+    ends = [(high - value) / (high - low) for value in last]
+    places = spread(ends, 14.0 / chart.height)
+    return "".join(
+        f'<text x="100%" dx="6" y="{place:.2%}" dy="4" style="fill:var(--{line.role})">'
+        f"{escape(line.name)}</text>"
+        for line, place in zip(lines, places, strict=True)
+    )
+
+
+def _data(chart: Chart, low: float, high: float) -> str:
+    """What the script reads: JSON that cannot end its element."""
+    data: dict[str, Any] = {
+        "group": chart.group,
+        "x": [_rounded(v) for v in chart.x_range],
+        "y": [low, high],
+        "quantity": _of(chart),
+        "unit": chart.unit,
+        "xQuantity": f"{chart.x_quantity} [{chart.x_unit}]",
+        "xUnit": chart.x_unit,
+        "log": chart.logarithmic,
+        "zero": chart.from_zero,
+        "spans": [[s.begin, s.end, s.name] for s in chart.spans],
+        "lines": [_line_data(line) for line in chart.lines],
+    }
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c")
+
+
+def _line_data(line: ChartLine) -> dict[str, Any]:
+    found: dict[str, Any] = {"name": line.name, "role": line.role, "fits": line.fits}
+    found |= {"x": _column(line.x), "y": _column(line.y)}
+    if line.band is not None:
+        found |= {"low": _column(line.band[0]), "high": _column(line.band[1])}
+    return found
+
+
+def _column(values: Array) -> list[float | None]:
+    return [_rounded(v) if math.isfinite(v) else None for v in np.asarray(values).tolist()]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+# Fewer points, gaps, and names that keep apart.
+
+
+def thinned(time: Array, values: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
+    """A line with at most about ``most`` points that still shows every peak.
+
+    Keeps the first smallest and the first largest value of each of ``most / 2`` equal stretches.
+
+    Args:
+        time: Shape (n,).
+        values: Shape (n,); NaN is left out.
+        most: Points to keep.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) <= most:
+        return time[known], values[known]
+    keep: set[int] = {int(known[0]), int(known[-1])}
+    for stretch in np.array_split(known, most // 2):
+        keep.add(int(stretch[np.argmin(values[stretch])]))
+        keep.add(int(stretch[np.argmax(values[stretch])]))
+    chosen = np.array(sorted(keep))
+    return time[chosen], values[chosen]
+
+
+def with_gaps(time: Array, *columns: Array) -> tuple[Array, ...]:
+    """Puts a NaN where samples are missing, so that a line does not bridge the gap."""
+    if len(time) < 3:
+        return (time, *columns)
+    steps = np.diff(time)
+    gaps = np.flatnonzero(steps > 2.5 * np.median(steps)) + 1
+    between = (time[gaps - 1] + time[gaps]) / 2.0
+    return (np.insert(time, gaps, between), *(np.insert(c, gaps, np.nan) for c in columns))
+
+
+def spread(values: Sequence[float], gap: float) -> Array:
+    """Positions of labels: near their values, at least ``gap`` apart, in the same order."""
+    wanted = np.asarray(list(values), dtype=np.float64)
+    order = np.argsort(wanted)
+    places = wanted[order].copy()
+    for _ in range(200):
+        short = gap - np.diff(places)
+        close = np.flatnonzero(short > 1e-9 * gap)
+        if not close.size:
+            break
+        for i in close:
+            push = max(gap - (places[i + 1] - places[i]), 0.0) / 2.0
+            places[i] -= push
+            places[i + 1] += push
+    result = np.empty_like(places)
+    result[order] = places
+    return result

@@ -1,0 +1,146 @@
+"""One HTML page and its small parts; every text that comes from outside is escaped here.
+
+A page is one file in one style (`base.css`), light or dark as the reader's system is, which needs
+neither a server nor a network. It is complete without scripts.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+_UNIT = re.compile(r"(?<=\d) (?=(?:mm|ms|s|N|%)\b|%)")
+
+
+def page(
+    title: str,
+    body: str,
+    *,
+    lead: str = "",
+    scripts: Sequence[str] = (),
+    data: Mapping[str, object] | None = None,
+    files_beside: bool = False,
+) -> str:
+    """The whole page.
+
+    Args:
+        title: Plain text.
+        body: HTML, such as of `section`.
+        lead: HTML below the title.
+        scripts: File names of this package, such as ``charts.js``.
+        data: What the scripts read, JSON-like, by the id of its element.
+        files_beside: Whether the page shows pictures that are files in its folder.
+    """
+    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+    policy += " 'self' file:" if files_beside else ""
+    policy += "; script-src 'unsafe-inline'" if scripts else ""
+    parts = [_json_script(name, value) for name, value in (data or {}).items()]
+    parts += [f"<script>{resource(name)}</script>" for name in scripts]
+    return Template(resource("page.template")).substitute(
+        title=escape(title),
+        policy=policy,
+        style=resource("base.css"),
+        lead=lead,
+        body=body,
+        scripts="\n".join(parts),
+    )
+
+
+def resource(name: str) -> str:
+    """The text of a file of this package."""
+    return files("model.pages").joinpath(name).read_text(encoding="utf-8")
+
+
+def _json_script(name: str, value: Any) -> str:
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>'
+
+
+def section(name: str, title: str, *parts: str) -> str:
+    """A section with a heading; ``name`` is its id."""
+    return f'<section id="{name}"><h2>{escape(title)}</h2>{"".join(parts)}</section>'
+
+
+def contents(sections: Iterable[tuple[str, str]]) -> str:
+    """Links to sections by id and title."""
+    links = "".join(f'<li><a href="#{name}">{escape(text)}</a></li>' for name, text in sections)
+    return f'<nav aria-label="Sections"><ul>{links}</ul></nav>'
+
+
+def paragraph(text: str, kind: str = "") -> str:
+    """A quiet line of explanation; ``kind`` is one more CSS class."""
+    return (
+        f'<p class="quiet {kind}">{escape(text)}</p>'
+        if kind
+        else (f'<p class="quiet">{escape(text)}</p>')
+    )
+
+
+def bullets(texts: Iterable[str]) -> str:
+    """A list of plain texts."""
+    return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>"
+
+
+def tile(name: str, value: str, note: str, kind: str = "") -> str:
+    """A key figure: name, number with unit, and a note below; ``headline`` is a large one."""
+    number, _, unit = value.rpartition(" ") if " " in value else (value, "", "")
+    opening = f'<div class="{kind}">' if kind else "<div>"
+    return (
+        f"{opening}<dt>{escape(name)}</dt><dd>{escape(number)} <small>{escape(unit)}</small>"
+        f'<span class="note">{prose(note)}</span></dd></div>'
+    )
+
+
+def tiles(parts: Iterable[str]) -> str:
+    """Key figures beside each other."""
+    return f'<dl class="tiles">{"".join(parts)}</dl>'
+
+
+def table(rows: Iterable[tuple[str, str]]) -> str:
+    """A table of names and values."""
+    body = "".join(
+        f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in rows
+    )
+    return f'<div class="scroll"><table>{body}</table></div>'
+
+
+def list_table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """A table with a head line; it scrolls within itself where the window is narrow.
+
+    Args:
+        head: Title of each column.
+        rows: Cells; a line break in one stays.
+        kind: CSS class, such as ``numbers`` for columns of numbers.
+    """
+    top = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
+    return (
+        f'<div class="scroll" tabindex="0"><table class="events {kind}">'
+        f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
+
+
+def _cell(text: str) -> str:
+    joined = text.replace(" ± ", "\u00a0±\u00a0")
+    return "<td>" + escape(joined).replace("\n", "<br>") + "</td>"
+
+
+def picture(name: str, alternative: str) -> str:
+    """A picture that is a file beside the page, on white as its colours need, and a link to it."""
+    file = escape(name)
+    return f'<a href="{file}"><img class="paper" src="{file}" alt="{escape(alternative)}"></a>'
+
+
+def known(value: float | None, digits: int, unit: str) -> str:
+    """A number with its unit, or a dash for one that is not known."""
+    return "–" if value is None else f"{value:.{digits}f} {unit}".rstrip()
+
+
+def prose(text: str) -> str:
+    """An escaped sentence whose numbers keep their units on the same line."""
+    return _UNIT.sub("\u00a0", escape(text))

@@ -1,0 +1,299 @@
+"use strict";
+/* The scene of scene.py: drag to turn, buttons, two fingers or Ctrl and wheel to zoom, a slider for the time. */
+(() => {
+  const data = JSON.parse(document.getElementById("scene-data").textContent);
+  const canvas = document.getElementById("scene-canvas");
+  const context = canvas.getContext("2d");
+  const slider = document.getElementById("scene-time");
+  const play = document.getElementById("scene-play");
+  const speed = document.getElementById("scene-speed");
+  const readout = document.getElementById("scene-readout");
+  const boxes = [...document.querySelectorAll("[data-layer]")];
+  document.documentElement.classList.add("scripted");
+
+  const first = { azimuth: data.view.azimuth, elevation: data.view.elevation, zoom: 1 };
+  const eye = { ...first };
+  const placed = data.moments.filter((_, k) => k % Math.max(1, Math.floor(data.moments.length / 20)) === 0);
+  const reach = [0, 1, 2].map((k) => Math.max(...data.platform.vertices.map((v) => Math.abs(v[k]))));
+  const seenPoints = [ // all that must be in the picture
+    ...data.surfaces.flatMap((surface) => surface.vertices),
+    ...data.strokes.filter((s) => s.layer !== "tree").flatMap((s) => s.segments.flatMap((b) => [b.slice(0, 3), b.slice(3)])),
+    ...data.labels.map((label) => label.at),
+    ...placed.flatMap(({ p }) => [-1, 1].map((sign) => p.map((v, k) => v + sign * reach[k]))),
+  ];
+  const bounds = [0, 1, 2].map((k) => [Math.min(...seenPoints.map((v) => v[k])), Math.max(...seenPoints.map((v) => v[k]))]);
+  const centre = bounds.map(([low, high]) => (low + high) / 2);
+  const size = Math.hypot(...bounds.map(([low, high]) => high - low));
+  const distance = 2.2 * size;
+  for (const stroke of data.strokes) if (!stroke.dash.length) stroke.segments = stroke.segments.flatMap((b) => pieces(b, size / 30));
+  const CABLE_PIECES = 10; // so that a cable can pass behind one obstacle and in front of another
+  const MARGIN = 24; // px, for texts beside points
+  let now = 0;
+  let playing = false;
+  let before = 0;
+  let clock = 0;
+  let waiting = false;
+  let colours = {};
+
+  function pieces(segment, longest) {
+    const start = segment.slice(0, 3), end = segment.slice(3);
+    const count = Math.max(1, Math.ceil(Math.hypot(...end.map((v, c) => v - start[c])) / longest));
+    const at = (i) => end.map((v, c) => start[c] + ((v - start[c]) * i) / count);
+    return Array.from({ length: count }, (_, i) => [...at(i), ...at(i + 1)]);
+  }
+
+  function readColours() {
+    const style = getComputedStyle(document.documentElement);
+    for (const role of ["ink", "muted", "surface", "limit", "obstacle", "platform", "cable", "tree", "raw", "frame", "encoder", "tag"])
+      colours[role] = style.getPropertyValue("--" + role).trim();
+  }
+
+  function shade(hex, light) {
+    const value = parseInt(hex.slice(1), 16);
+    const mix = (channel) => Math.round(light < 1 ? channel * light : 255 - (255 - channel) * (2 - light));
+    return `rgb(${mix(value >> 16)},${mix((value >> 8) & 255)},${mix(value & 255)})`;
+  }
+
+  function shown(layer) {
+    return boxes.every((box) => box.dataset.layer !== layer || box.checked);
+  }
+
+  // Turned, and as seen from the eye, in mm on the plane through the centre; y is up.
+  function seer(eye) {
+    const a = (eye.azimuth * Math.PI) / 180, e = (eye.elevation * Math.PI) / 180;
+    const ca = Math.cos(a), sa = Math.sin(a), ce = Math.cos(e), se = Math.sin(e);
+    return (p) => {
+      const x = p[0] - centre[0], y = p[1] - centre[1], z = p[2] - centre[2];
+      const depth = distance - (ce * ca * x + ce * sa * y + se * z);
+      const k = distance / Math.max(depth, 0.05 * distance);
+      return [k * (-sa * x + ca * y), k * (-se * ca * x - se * sa * y + ce * z), depth];
+    };
+  }
+
+  // Everything fits at every angle and size of the window; zooming in goes beyond that.
+  function projector() {
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const see = seer(eye), seen = seenPoints.map(see);
+    const [[left, right], [low, high]] = [0, 1].map((k) => [Math.min(...seen.map((p) => p[k])), Math.max(...seen.map((p) => p[k]))]);
+    const scale = eye.zoom * Math.min((width - 2 * MARGIN) / (right - left), (height - 2 * MARGIN) / (high - low));
+    return (p) => {
+      const [x, y, depth] = see(p);
+      return [width / 2 + scale * (x - (left + right) / 2), height / 2 - scale * (y - (low + high) / 2), depth];
+    };
+  }
+
+  function draw() {
+    waiting = false;
+    const ratio = window.devicePixelRatio || 1;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio);
+      canvas.height = Math.round(height * ratio);
+    }
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    context.lineCap = context.lineJoin = "round";
+    const project = projector(), items = collect(project);
+    items.sort((one, other) => other.depth - one.depth);
+    for (const item of items) paint(item);
+    texts(project);
+  }
+
+  function paint(item) {
+    context.globalAlpha = item.alpha;
+    context.setLineDash(item.dash || []);
+    context.beginPath();
+    context.moveTo(item.points[0][0], item.points[0][1]);
+    for (const p of item.points.slice(1)) context.lineTo(p[0], p[1]);
+    if (item.fill) {
+      context.closePath();
+      context.fillStyle = item.fill;
+      context.fill();
+    } else {
+      context.strokeStyle = item.stroke;
+      context.lineWidth = item.width;
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+  }
+
+  function collect(project) {
+    const items = [];
+    const segment = (a, b, stroke, width, alpha = 1, dash = null) =>
+      items.push({ points: [a, b], depth: (a[2] + b[2]) / 2, stroke, width, alpha, dash });
+    const surface = (solid) => {
+      const seen = solid.vertices.map(project), colour = colours[solid.role];
+      for (const face of solid.faces) {
+        const points = face.map((k) => seen[k]);
+        const depth = points.reduce((sum, p) => sum + p[2], 0) / points.length;
+        items.push({ points, depth, alpha: solid.opacity, fill: shade(colour, light(face.map((k) => solid.vertices[k]))) });
+      }
+      for (const [a, b] of solid.edges) segment(seen[a], seen[b], colour, 1.2);
+    };
+    for (const solid of data.surfaces) if (shown(solid.layer)) surface(solid);
+    for (const stroke of data.strokes.filter((one) => shown(one.layer)))
+      for (const b of stroke.segments) {
+        segment(project(b.slice(0, 3)), project(b.slice(3)), colours[stroke.role], stroke.width, stroke.opacity, stroke.dash);
+        // A little nearer than it is, thin lines most: on the same track they cover the wide ones.
+        if (stroke.ahead) items[items.length - 1].depth -= 0.002 * size * (9 - stroke.width);
+        if (stroke.layer === "floor") items[items.length - 1].depth += size;
+      }
+    if (shown("robot") && data.moments.length) robot(project, segment, surface);
+    return items;
+  }
+
+  function light(corners) {
+    const [a, b, c] = corners;
+    const u = b.map((v, k) => v - a[k]), w = c.map((v, k) => v - a[k]);
+    const n = [u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0]];
+    const length = Math.hypot(...n) || 1;
+    return 0.82 + 0.34 * Math.abs(n[2] / length) + 0.12 * Math.abs(n[0] / length);
+  }
+
+  function cables() { // from outlet or pulley to anchor
+    const { r, p, exits } = data.moments[now];
+    const place = (v) => [0, 1, 2].map((k) => p[k] + r[3 * k] * v[0] + r[3 * k + 1] * v[1] + r[3 * k + 2] * v[2]);
+    return { place, ends: data.anchors.map((anchor, i) => [exits[i], place(anchor)]) };
+  }
+
+  function robot(project, segment, surface) {
+    const { place, ends } = cables();
+    for (const [start, end] of ends) {
+      let last = project(start);
+      for (let k = 1; k <= CABLE_PIECES; k++) {
+        const next = project(start.map((v, c) => v + ((end[c] - v) * k) / CABLE_PIECES));
+        segment(last, next, colours.cable, 1.4);
+        last = next;
+      }
+    }
+    surface({ ...data.platform, vertices: data.platform.vertices.map(place) });
+  }
+
+  function texts(project) {
+    for (const { layer, text, at, mark } of data.labels) if (shown(layer)) write(text, project(at), mark);
+    for (const solid of data.surfaces.filter((one) => one.name && shown(one.layer))) {
+      const top = Math.max(...solid.vertices.map((v) => v[2]));
+      const upper = solid.vertices.filter((v) => v[2] > top - 0.01);
+      write(solid.name, project([0, 1, 2].map((k) => upper.reduce((sum, v) => sum + v[k], 0) / upper.length)));
+    }
+    if (shown("numbers") && shown("robot") && data.moments.length)
+      cables().ends.forEach(([start, end], i) => write(String(i + 1), project(start.map((v, c) => v + 0.25 * (end[c] - v)))));
+  }
+
+  function write(text, [x, y], mark = "") {
+    context.font = "600 12px system-ui, sans-serif";
+    context.textAlign = mark ? "left" : "center";
+    context.lineWidth = 3;
+    if (mark) {
+      context.beginPath();
+      context.arc(x, y, 5, 0, 2 * Math.PI);
+      Object.assign(context, { fillStyle: mark === "ring" ? colours.surface : colours.ink, strokeStyle: colours.ink, lineWidth: 2 });
+      context.fill();
+      context.stroke();
+    }
+    const [left, base] = mark ? [x + 9, y - 7] : [x, y + 4];
+    Object.assign(context, { strokeStyle: colours.surface, fillStyle: colours.ink, lineWidth: 3 });
+    context.strokeText(text, left, base); // readable on lines and faces
+    context.fillText(text, left, base);
+  }
+
+  function redraw() {
+    if (!waiting) {
+      waiting = true;
+      requestAnimationFrame(draw);
+    }
+  }
+
+  function show(index) {
+    now = Math.min(Math.max(index, 0), data.moments.length - 1);
+    const moment = data.moments[now];
+    slider.value = String(now);
+    slider.setAttribute("aria-valuetext", `${moment.t.toFixed(1)} seconds`);
+    readout.textContent = `${moment.t.toFixed(1)} s · ${moment.p.map((v) => v.toFixed(0)).join(", ")} mm${moment.text ? " · " + moment.text : ""}`;
+    redraw();
+  }
+
+  function tick(time) {
+    if (!playing) return;
+    clock += ((time - before) / 1000) * Number(speed.value);
+    before = time;
+    const last = data.moments.length - 1;
+    let index = now;
+    while (index < last && data.moments[index + 1].t <= clock) index++;
+    show(index);
+    if (index >= last) return setPlaying(false);
+    requestAnimationFrame(tick);
+  }
+
+  function setPlaying(on) {
+    playing = on;
+    play.textContent = on ? "Pause" : "Play";
+    if (!on) return;
+    if (now >= data.moments.length - 1) show(0);
+    clock = data.moments[now].t;
+    before = performance.now();
+    requestAnimationFrame(tick);
+  }
+
+  function zoom(factor) {
+    eye.zoom = Math.min(Math.max(eye.zoom * factor, 0.4), 8);
+    redraw();
+  }
+
+  function turn(azimuth, elevation) {
+    eye.azimuth += azimuth;
+    eye.elevation = Math.min(Math.max(eye.elevation + elevation, -89), 89);
+    redraw();
+  }
+
+  const down = new Map(); // pointer → where it is
+  canvas.addEventListener("pointerdown", (event) => {
+    down.set(event.pointerId, [event.clientX, event.clientY]);
+    canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const last = down.get(event.pointerId), next = [event.clientX, event.clientY];
+    if (!last) return;
+    const other = [...down].filter(([id]) => id !== event.pointerId).map(([, at]) => at)[0];
+    const apart = (at) => Math.hypot(at[0] - other[0], at[1] - other[1]) || 1;
+    if (other) zoom(apart(next) / apart(last));
+    else turn((last[0] - next[0]) * 0.4, (next[1] - last[1]) * 0.4);
+    down.set(event.pointerId, next);
+  });
+  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => down.delete(event.pointerId));
+  canvas.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey && !event.metaKey) return; // the page scrolls
+    event.preventDefault();
+    zoom(Math.exp(-event.deltaY * 0.002));
+  }, { passive: false });
+  const keys = {
+    ArrowLeft: () => turn(-5, 0), ArrowRight: () => turn(5, 0), ArrowUp: () => turn(0, 5), ArrowDown: () => turn(0, -5),
+    "+": () => zoom(1.15), "-": () => zoom(1 / 1.15), " ": () => setPlaying(!playing),
+  };
+  canvas.addEventListener("keydown", (event) => {
+    if (!keys[event.key]) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
+  document.getElementById("scene-in").addEventListener("click", () => zoom(1.25));
+  document.getElementById("scene-out").addEventListener("click", () => zoom(0.8));
+  document.getElementById("scene-reset").addEventListener("click", () => {
+    Object.assign(eye, first);
+    redraw();
+  });
+  play.addEventListener("click", () => setPlaying(!playing));
+  slider.addEventListener("input", () => {
+    setPlaying(false);
+    show(Number(slider.value));
+  });
+  for (const box of boxes) box.addEventListener("change", redraw);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    readColours();
+    redraw();
+  });
+  new ResizeObserver(redraw).observe(canvas);
+  readColours();
+  if (data.moments.length) show(now);
+  else play.disabled = slider.disabled = true;
+  redraw();
+})();

@@ -1,0 +1,204 @@
+"""Plans: written with a hash over their content, and refused when it does not match."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from model.display import html_table
+from model.errors import BadInput, InvalidFile
+from model.files.documents import check_version, document_hash, problems_of, write_atomic
+from model.files.plan_file import PlanDocument, QualityDocument
+from model.files.reading import read_json
+from model.pose import Pose
+from model.rig import NOT_IN_PLAN_HASH, Rig, rig_from_document
+from model.scene import Scene, scene_from_document
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ANEW = "make the plan anew with `cdpr plan`"
+STOP_TOLERANCE = 1e-6
+"""How far a marked waypoint may be from its stop, [m] and [rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """A path whose file is whole: its hashes match its content.
+
+    Attributes:
+        document: The file it was made from.
+        rig: The rig it was made for.
+        scene: The scene it was made for.
+        waypoints: ``world_from_platform`` at the corners, start, stops and goal included.
+        stops: Which of the waypoints are at the scene's stops.
+        raw_path: The path before post-processing.
+    """
+
+    document: PlanDocument
+    rig: Rig
+    scene: Scene
+    waypoints: tuple[Pose, ...]
+    stops: tuple[int, ...]
+    raw_path: tuple[Pose, ...]
+
+    @property
+    def length(self) -> float:
+        """Length of the path of the platform's origin, [m]."""
+        return self.document.quality.length_mm / 1000.0
+
+    @property
+    def quality(self) -> QualityDocument:
+        """What the planner found: length, clearances, tensions, cost; units in the names."""
+        return self.document.quality
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the plan file, whole or not at all; returns it.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        save_plan(self.document, Path(path))
+        return Path(path)
+
+    def plot(self) -> Figure:
+        """A figure of the path among its obstacles, with the robot at the start."""
+        from model.figures import plan_figure  # loads matplotlib
+
+        return plan_figure(self)
+
+    def __repr__(self) -> str:
+        """Rig, scene and size."""
+        return (
+            f"<Plan for {self.rig.name} in {self.scene.name}: {len(self.waypoints)} waypoints,"
+            f" {self.length * 1e3:.1f} mm>"
+        )
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        quality = self.quality
+        near = quality.obstacle_clearance
+        clearance = f"{near.distance_mm:.2f} mm, {near.first} to {near.second}" if near else "–"
+        rows = [
+            ("rig, scene", f"{self.rig.name}, {self.scene.name}"),
+            ("planner", self.document.planner.name),
+            ("length", f"{quality.length_mm:.1f} mm, {len(self.waypoints)} waypoints"),
+            ("clearance", clearance),
+            ("tension", f"{quality.min_tension_n:.1f} to {quality.max_tension_n:.1f} N"),
+            ("planning time", f"{self.document.statistics.planning_time_s:.2f} s"),
+        ]
+        return html_table("Plan", rows)
+
+
+def plan_from_document(document: PlanDocument) -> Plan:
+    """The plan that a document describes."""
+    return Plan(
+        document=document,
+        rig=rig_from_document(document.rig),
+        scene=scene_from_document(document.scene),
+        waypoints=tuple(w.pose() for w in document.waypoints),
+        stops=tuple(mark.waypoint for mark in document.stops),
+        raw_path=tuple(w.pose() for w in document.raw_path),
+    )
+
+
+def sealed(fields: dict[str, Any]) -> PlanDocument:
+    """A plan document with its hash, from all of its other fields."""
+    unsealed = PlanDocument(hash="", **fields)
+    return unsealed.model_copy(update={"hash": _digest(unsealed)})
+
+
+def save_plan(document: PlanDocument, path: Path) -> None:
+    """Writes a plan file whole or not at all.
+
+    Raises:
+        BadInput: The folder cannot be written to.
+    """
+    write_atomic(path, json.dumps(document.model_dump(mode="json"), indent=1) + "\n")
+
+
+def load_plan(path: str | Path) -> Plan:
+    """Reads a plan file.
+
+    Raises:
+        BadInput: It cannot be read, is no JSON, holds NaN, or its hash does not match.
+        InvalidFile: With every key that does not fit.
+    """
+    path = Path(path)
+    data = _json_object(path)
+    if data.get("kind") != "cdpr-plan":
+        raise BadInput("this is not a plan file", where=str(path), next_step=ANEW)
+    check_version(data, PlanDocument, path, {}, ANEW)
+    try:
+        document = PlanDocument.model_validate(data)
+    except ValidationError as error:
+        raise InvalidFile(str(path), problems_of(error, PlanDocument, {}), ANEW) from None
+    _check_hash("hash", document.hash, _digest(document), path)
+    plan = plan_from_document(document)
+    _check_hash("rig_hash", document.rig_hash, plan.rig.plan_hash, path)
+    _check_hash("scene_hash", document.scene_hash, plan.scene.hash, path)
+    _check_stops(plan, path)
+    return plan
+
+
+def _check_stops(plan: Plan, path: Path) -> None:
+    """The marked waypoints are the scene's stops, in its order."""
+    marks, stops = plan.document.stops, plan.scene.stops
+    places = [mark.waypoint for mark in marks]
+    if [mark.name for mark in marks] != [stop.name for stop in stops]:
+        what = f"marks the stops {[m.name for m in marks]}, its scene has {[s.name for s in stops]}"
+    elif places != sorted(set(places)) or not all(0 < p < len(plan.waypoints) for p in places):
+        what = f"marks the waypoints {places} of {len(plan.waypoints)} as stops, which is no order"
+    else:
+        away = [plan.waypoints[p].distance_to(s.pose) for p, s in zip(places, stops, strict=True)]
+        turned = [plan.waypoints[p].angle_to(s.pose) for p, s in zip(places, stops, strict=True)]
+        if max([*away, *turned], default=0.0) <= STOP_TOLERANCE:
+            return
+        what = f"passes a stop {max(away) * 1000.0:.4g} mm off"
+    why = "the file was not made by `cdpr plan`"
+    raise BadInput(f"the plan {what}", where=str(path), why=why, next_step=ANEW)
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    data = read_json(path, ANEW)
+    if not isinstance(data, dict):
+        raise BadInput("this is not a plan file", where=str(path), next_step=ANEW)
+    return data
+
+
+def _digest(document: PlanDocument) -> str:
+    return document_hash(document, {"hash"})
+
+
+def _check_hash(key: str, stated: str, actual: str, path: Path) -> None:
+    if stated != actual:
+        raise BadInput(
+            f"the plan's {key} does not match its content",
+            where=str(path),
+            why="the file was edited or damaged, or written by a program with other defaults",
+            next_step=f"{ANEW}; a plan cannot be edited by hand",
+        )
+
+
+def require_same_rig(plan: Plan, rig: Rig, plan_path: Path | str) -> None:
+    """Rejects a plan that was made for another rig, and names what differs.
+
+    Raises:
+        BadInput: The rig's plan hash is not the plan's.
+    """
+    if plan.rig.plan_hash == rig.plan_hash:
+        return
+    ours = rig.document.model_dump(mode="json")
+    theirs = plan.rig.document.model_dump(mode="json")
+    differing = [k for k in ours if k not in NOT_IN_PLAN_HASH and ours[k] != theirs[k]]
+    raise BadInput(
+        f"the plan was made for the rig {plan.rig.name!r}, not for {rig.name!r} as it is now",
+        where=str(plan_path),
+        why=f"these parts of the rig file differ: {', '.join(differing)}",
+        next_step="plan again for this rig with `cdpr plan`; or, if the plan was made with"
+        " --calibration, pass the same --calibration here",
+    )

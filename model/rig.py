@@ -1,0 +1,427 @@
+"""The rig as the program uses it: checked, read-only, in SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from model.display import html_table
+from model.errors import BadInput
+from model.files.documents import document_hash, key_path, load_yaml, millimetres
+from model.files.rig_file import (
+    CameraDocument,
+    MotionDocument,
+    RigDocument,
+    TagDocument,
+    WinchDocument,
+)
+from model.pose import Array, Pose, read_only
+from model.posed_rig import PosedRig, posed_rig
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from model.scene import Load, Scene
+
+#: Parts of a rig file that a plan's proof does not rest on; they may change under a plan.
+NOT_IN_PLAN_HASH = (
+    *("description", "bus", "drives", "tags", "cameras", "motion", "winches"),
+    "simulation",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Winch:
+    """A winch: how cable length becomes drive counts.
+
+    Attributes:
+        node_id: Node of its drive on the bus.
+        counts_per_metre: Signed counts for one metre of cable paid out.
+        home_counts: Drive position with the platform at home.
+        absolute: The drive knows its position after its power was gone.
+        drum_to_outlet: Cable between drum and outlet, [m].
+        max_speed: Cable speed limit, [m/s].
+        torque_constant: Cable tension at rated torque, [N].
+        counts_per_turn: Counts of one turn of the motor shaft.
+        rated_torque: Of the motor at `torque_constant`, [N·m].
+        brake: It has one that closes by itself when its drive has no torque.
+    """
+
+    node_id: int
+    counts_per_metre: float
+    home_counts: int
+    absolute: bool
+    drum_to_outlet: float
+    max_speed: float
+    torque_constant: float
+    counts_per_turn: int
+    rated_torque: float
+    brake: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Limits of motion along a path, SI."""
+
+    speed: float
+    acceleration: float
+    jerk: float
+    blend_tolerance: float
+    following_error: float
+    start_tolerance: float
+    stuck_travel: float
+    stuck_speed: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tag:
+    """A fiducial tag in the frame of what carries it (x right, y up, z out of the print).
+
+    Attributes:
+        id: Number in its family.
+        size: Side of the black square, [m].
+        pose: ``platform_from_tag`` or ``world_from_tag``.
+    """
+
+    id: int
+    size: float
+    pose: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A calibrated camera.
+
+    Attributes:
+        name: Name in the rig file.
+        width: Picture width, [px].
+        height: Picture height, [px].
+        matrix: Camera matrix, shape (3, 3), [px].
+        distortion: OpenCV coefficients, shape (k,).
+        world_from_camera: Pose; x right, y down, z along the view.
+        rate: Pictures a second, [Hz].
+    """
+
+    name: str
+    width: int
+    height: int
+    matrix: Array
+    distortion: Array
+    world_from_camera: Pose
+    rate: float
+
+
+class CalibrationResult(Protocol):
+    """What `Rig.with_calibration` takes: a result of `calibration`."""
+
+    @property
+    def order(self) -> int:
+        """Results of lower order are applied first: those of higher order rest on them."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """What was calibrated, such as ``camera``."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Which of its kind, such as the camera's name."""
+        ...
+
+    @property
+    def date(self) -> str:
+        """When, ISO 8601."""
+        ...
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this result in place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A checked cable robot with m cables.
+
+    Attributes:
+        document: The file it was made from.
+        outlets: Cable outlet points, world frame, shape (m, 3), [m].
+        anchors: Cable anchor points, platform frame, shape (m, 3), [m].
+        pulley_radius: [m]; 0 for point exits.
+        feed_directions: Travel of the cable entering each pulley, world frame, shape (m, 3).
+        half_size: Half extents of the platform box, shape (3,), [m].
+    """
+
+    document: RigDocument
+    outlets: Array
+    anchors: Array
+    pulley_radius: float
+    feed_directions: Array
+    half_size: Array
+    mass: float
+    centre_of_mass: Array
+    home: Pose
+    workspace_lower: Array
+    workspace_upper: Array
+    cable_radius: float
+    cable_stiffness: float
+    min_tension: float
+    max_tension: float
+    winches: tuple[Winch, ...]
+    motion: Motion
+    tag_family: str
+    tag_detector: str
+    platform_tags: tuple[Tag, ...]
+    frame_tags: tuple[Tag, ...]
+    cameras: tuple[Camera, ...]
+
+    @property
+    def name(self) -> str:
+        """Name in the rig file."""
+        return self.document.name
+
+    @property
+    def cable_count(self) -> int:
+        """Number of cables m."""
+        return len(self.outlets)
+
+    @cached_property
+    def drive_names(self) -> dict[int, str]:
+        """What drives are called, by node id, in the order of the cables: ``cable 1 (drive 11)``.
+
+        Cables and winches are counted from 1 in the order of the file; a drive's number is its
+        node id.
+        """
+        nodes = [winch.node_id for winch in self.winches]
+        return {node: f"cable {k} (drive {node})" for k, node in enumerate(nodes, start=1)}
+
+    def tensions_by(self, torques: ArrayLike) -> Array:
+        """Cable tensions at rest, shape (..., m), [N], from torques [per mille of rated torque]."""
+        tensions: Array = np.asarray(torques, dtype=np.float64) / 1000.0 * self._rated_tensions
+        return tensions
+
+    def torques_by(self, tensions: ArrayLike) -> Array:
+        """The inverse of `tensions_by`: torques, shape (..., m), [per mille of rated torque]."""
+        torques: Array = np.asarray(tensions, dtype=np.float64) * 1000.0 / self._rated_tensions
+        return torques
+
+    @cached_property
+    def _rated_tensions(self) -> Array:
+        return np.array([winch.torque_constant for winch in self.winches])
+
+    @cached_property
+    def plan_hash(self) -> str:
+        """Hash of the parts of the rig that a plan's proof rests on."""
+        return document_hash(self.document, NOT_IN_PLAN_HASH)
+
+    @cached_property
+    def hash(self) -> str:
+        """Hash of the whole rig file's content."""
+        return document_hash(self.document)
+
+    @cached_property
+    def platform_corners(self) -> Array:
+        """Corners of the platform box, platform frame, shape (8, 3), [m]."""
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+        return read_only(signs * self.half_size)
+
+    def at(self, pose: Pose, load: Load | None = None) -> PosedRig:
+        """Cable lengths, structure matrix, tensions and margins at ``world_from_platform``.
+
+        Args:
+            pose: ``world_from_platform``.
+            load: Payload and external wrenches, as ``scene.load``; none when left out.
+
+        Raises:
+            NoCable: A cable cannot run at this pose.
+        """
+        return posed_rig(self, pose, load)
+
+    def camera(self, name: str | None = None) -> Camera:
+        """The camera of a name; the first when no name is given.
+
+        Raises:
+            BadInput: The rig has none of this name, or none at all.
+        """
+        names = [camera.name for camera in self.cameras]
+        if not names:
+            raise BadInput(
+                "the rig file has no camera", where=self.name, next_step="add a `cameras` section"
+            )
+        if name is None:
+            return self.cameras[0]
+        if name not in names:
+            raise BadInput(
+                f"no camera {name!r}", where=self.name, next_step=f"name one of: {', '.join(names)}"
+            )
+        return self.cameras[names.index(name)]
+
+    def with_bus(self, interface: str | None = None, channel: str | None = None) -> Rig:
+        """The same rig on another CAN bus, in memory only; the plan of a rig fits it on any bus.
+
+        Args:
+            interface: As python-can names it: ``virtual``, ``udp_multicast``, ``socketcan`` …; that
+                of the rig file when left out.
+            channel: Such as ``can0``; that of the rig file when left out.
+        """
+        named = {"interface": interface, "channel": channel}
+        given = {key: value for key, value in named.items() if value is not None}
+        bus = self.document.bus.model_copy(update=given)
+        return rig_from_document(self.document.model_copy(update={"bus": bus}))
+
+    def with_calibration(self, *results: CalibrationResult) -> Rig:
+        """The rig with calibration results in place of its file's numbers, in memory only.
+
+        Args:
+            results: From the functions that calibrate or from `calibration.load_result`; their
+                order does not matter.
+
+        Raises:
+            BadInput: A result is not about this rig, or two are of the same thing.
+        """
+        seen: dict[tuple[str, str], str] = {}
+        for result in results:
+            what = (result.kind, result.name)
+            if what in seen:
+                raise BadInput(
+                    f"two results of kind {result.kind} for {result.name!r}:"
+                    f" {seen[what]} and {result.date}",
+                    where="--calibration",
+                    next_step="pass the one that holds",
+                )
+            seen[what] = result.date
+        document = self.document
+        for result in sorted(results, key=lambda result: result.order):
+            document = result.corrected(document)
+        return rig_from_document(document)
+
+    def plot(self, pose: Pose | None = None, scene: Scene | None = None) -> Figure:
+        """A figure of the rig at a pose (home when left out), among a scene's obstacles."""
+        from model.figures import rig_figure  # loads matplotlib
+
+        return rig_figure(self, pose or self.home, scene)
+
+    def __repr__(self) -> str:
+        """Name, size and bus."""
+        bus = self.document.bus
+        where = f"{bus.interface} {bus.channel}".rstrip()
+        return f"<Rig {self.name}: {self.cable_count} cables, bus {where}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        bus, size = self.document.bus, self.half_size * 2e3
+        cameras = ", ".join(camera.name for camera in self.cameras)
+        rows = [
+            ("cables", f"{self.cable_count}, {self.min_tension:g} to {self.max_tension:g} N"),
+            ("platform", f"{size[0]:g} × {size[1]:g} × {size[2]:g} mm, {self.mass:g} kg"),
+            ("bus", f"{bus.interface} {bus.channel}, {bus.cycle_ms:g} ms cycle"),
+            ("cameras", cameras or "none"),
+        ]
+        return html_table(f"Rig {self.name}", rows)
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Reads a rig file.
+
+    Raises:
+        BadInput: The file cannot be read.
+        InvalidFile: With every problem and its place.
+    """
+    return rig_from_document(load_yaml(Path(path), RigDocument))
+
+
+def rig_from_document(document: RigDocument) -> Rig:
+    """The rig that a document describes.
+
+    Raises:
+        BadInput: Parts of the document do not agree.
+    """
+    findings = [f"{key_path(parts)}: {what}" for parts, what in document.findings()]
+    if findings:
+        raise BadInput("; ".join(findings), where=f"rig {document.name}")
+    pulleys, tags = document.pulleys, document.tags
+    count = len(document.outlets_mm)
+    feed = pulleys.feed_directions if pulleys else [[0.0, 0.0, 1.0]] * count
+    return Rig(
+        document=document,
+        outlets=_array(document.outlets_mm),
+        anchors=_array(document.anchors_mm),
+        pulley_radius=pulleys.radius_mm / 1000.0 if pulleys else 0.0,
+        feed_directions=read_only(np.asarray(feed) / np.linalg.norm(feed, axis=1)[:, None]),
+        half_size=read_only(millimetres(document.platform.size_mm) / 2.0),
+        mass=document.platform.mass_kg,
+        centre_of_mass=read_only(millimetres(document.platform.centre_of_mass_mm)),
+        home=document.platform.home.pose(),
+        workspace_lower=read_only(millimetres(document.workspace.lower_mm)),
+        workspace_upper=read_only(millimetres(document.workspace.upper_mm)),
+        cable_radius=document.cables.radius_mm / 1000.0,
+        cable_stiffness=document.cables.stiffness_n,
+        min_tension=document.cables.min_tension_n,
+        max_tension=document.cables.max_tension_n,
+        winches=tuple(_winch(w) for w in document.winches),
+        motion=_motion(document.motion),
+        tag_family=tags.family if tags else "",
+        tag_detector=tags.detector if tags else "",
+        platform_tags=tuple(_tag(t) for t in tags.platform) if tags else (),
+        frame_tags=tuple(_tag(t) for t in tags.frame) if tags else (),
+        cameras=tuple(_camera(c) for c in document.cameras),
+    )
+
+
+def _array(points_mm: list[list[float]]) -> Array:
+    return read_only(np.asarray(points_mm) / 1000.0)
+
+
+def _winch(document: WinchDocument) -> Winch:
+    counts_per_rev = document.counts_per_rev * document.gear_ratio * document.direction
+    drum_radius = document.drum_mm_per_rev / 1000.0 / (2.0 * np.pi)
+    return Winch(
+        node_id=document.node_id,
+        counts_per_metre=counts_per_rev / (document.drum_mm_per_rev / 1000.0),
+        home_counts=document.home_counts,
+        absolute=document.encoder == "absolute",
+        drum_to_outlet=document.drum_to_outlet_mm / 1000.0,
+        max_speed=document.max_speed_mm_s / 1000.0,
+        torque_constant=document.torque_constant_n,
+        counts_per_turn=document.counts_per_rev,
+        rated_torque=document.torque_constant_n * drum_radius / document.gear_ratio,
+        brake=document.brake,
+    )
+
+
+def _motion(document: MotionDocument) -> Motion:
+    return Motion(
+        speed=document.speed_mm_s / 1000.0,
+        acceleration=document.acceleration_mm_s2 / 1000.0,
+        jerk=document.jerk_mm_s3 / 1000.0,
+        blend_tolerance=document.blend_tolerance_mm / 1000.0,
+        following_error=document.following_error_mm / 1000.0,
+        start_tolerance=document.start_tolerance_mm / 1000.0,
+        stuck_travel=document.stuck_travel_mm / 1000.0,
+        stuck_speed=document.stuck_speed_mm_s / 1000.0,
+    )
+
+
+def _tag(document: TagDocument) -> Tag:
+    return Tag(id=document.id, size=document.size_mm / 1000.0, pose=document.pose())
+
+
+def _camera(document: CameraDocument) -> Camera:
+    matrix = [
+        [document.fx_px, 0.0, document.cx_px],
+        [0.0, document.fy_px, document.cy_px],
+        [0.0, 0.0, 1.0],
+    ]
+    return Camera(
+        name=document.name,
+        width=document.width_px,
+        height=document.height_px,
+        matrix=read_only(matrix),
+        distortion=read_only(document.distortion),
+        world_from_camera=document.world_from_camera.pose(),
+        rate=document.rate_hz,
+    )

@@ -1,0 +1,314 @@
+"""The scene as the program uses it: checked, read-only, in SI units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from model.display import html_table
+from model.errors import BadInput
+from model.files.documents import (
+    Document,
+    PoseDocument,
+    document_hash,
+    key_path,
+    load_yaml,
+    millimetres,
+)
+from model.files.scene_file import (
+    BoxDocument,
+    HullDocument,
+    LoadDocument,
+    MeshDocument,
+    ObstacleDocument,
+    Payload,
+    RotationLimitsDocument,
+    RoundDocument,
+    SceneDocument,
+    SphereDocument,
+    StopDocument,
+    payloads,
+)
+from model.geometry.shapes import (
+    Box,
+    Capsule,
+    Cylinder,
+    Obstacle,
+    Shape,
+    Sphere,
+    TriangleMesh,
+    convex_hull,
+    encloses_convex,
+    read_only_indices,
+)
+from model.pose import Array, Pose, read_only
+from model.rotation_limits import RotationLimits
+
+if TYPE_CHECKING:
+    from model.rig import Rig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Load:
+    """What the cables carry beside the platform's own weight.
+
+    Attributes:
+        payload_mass: [kg].
+        payload_centre: In the platform frame, shape (3,), [m].
+        force: Half widths of the external-force box, world axes, shape (3,), [N].
+        moment: Half widths of the external-moment box, world axes, shape (3,), [N·m].
+    """
+
+    payload_mass: float
+    payload_centre: Array
+    force: Array
+    moment: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stop:
+    """A pose that is met exactly on the way; the platform comes to rest there.
+
+    Attributes:
+        name: No other stop has it.
+        kind: ``pass``, or ``pick`` and ``place``, at which the load changes.
+        pose: ``world_from_platform``.
+        dwell: How long the platform stands still, [s].
+    """
+
+    name: str
+    kind: str
+    pose: Pose
+    dwell: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A checked scene.
+
+    Attributes:
+        document: The file it was made from.
+        obstacles: In the order of the file.
+        obstacle_clearance: Smallest allowed distance of cables and platform to obstacles, [m].
+        self_clearance: Smallest allowed distance between cables and of cables to platform, [m].
+        start: ``world_from_platform`` at the start.
+        goal: ``world_from_platform`` at the goal.
+        load: What the cables carry from the start on.
+        stops: Where the way leads through, in their order; `model.scene` tells the loads between.
+        rotation_limits: How far the platform may be tilted and turned; None where the scene does
+            not say, and the platform then keeps its orientation.
+    """
+
+    document: SceneDocument
+    obstacles: tuple[Obstacle, ...]
+    obstacle_clearance: float
+    self_clearance: float
+    start: Pose
+    goal: Pose
+    load: Load
+    stops: tuple[Stop, ...]
+    rotation_limits: RotationLimits | None
+
+    @property
+    def name(self) -> str:
+        """Name in the scene file."""
+        return self.document.name
+
+    @cached_property
+    def hash(self) -> str:
+        """Hash of the scene's content."""
+        return document_hash(self.document)
+
+    def changed(
+        self,
+        *,
+        start: Pose | None = None,
+        goal: Pose | None = None,
+        clearance: float | None = None,
+        stops: Sequence[StopDocument] | None = None,
+        payload: Payload | None = None,
+    ) -> Scene:
+        """The same scene with another start, goal, obstacle clearance [m], stops or payload.
+
+        Raises:
+            BadInput: A number is not finite, the clearance is negative, or stops do not fit the
+                payload.
+        """
+        document = self.document
+        for name, pose in (("start", start), ("goal", goal)):
+            if pose is not None and not np.all(np.isfinite(pose.matrix())):
+                raise BadInput(f"the {name} holds a value that is not a finite number")
+        if clearance is not None and not 0.0 <= clearance < np.inf:
+            raise BadInput(f"the clearance must be 0 mm or more (it is {clearance * 1000.0:g} mm)")
+        update: dict[str, object] = {}
+        if start is not None:
+            update["start"] = PoseDocument.of(start)
+        if goal is not None:
+            update["goal"] = PoseDocument.of(goal)
+        if clearance is not None:
+            value = {"obstacle_mm": round(clearance * 1000.0, 9)}
+            update["clearance"] = document.clearance.model_copy(update=value)
+        if stops is not None:
+            update["stops"] = list(stops)
+        if payload is not None:
+            update["load"] = document.load.carrying(payload)
+        return scene_from_document(document.model_copy(update=update))
+
+    def __repr__(self) -> str:
+        """Name and size."""
+        stops = f", {len(self.stops)} stops" if self.stops else ""
+        return f"<Scene {self.name}: {len(self.obstacles)} obstacles{stops}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        rows = [
+            ("obstacles", ", ".join(o.name for o in self.obstacles) or "none"),
+            ("start", _in_words(self.start)),
+            *(("stop " + stop.name, _in_words(stop.pose)) for stop in self.stops),
+            ("goal", _in_words(self.goal)),
+            ("clearance", f"{self.obstacle_clearance * 1e3:g} mm to obstacles"),
+        ]
+        return html_table(f"Scene {self.name}", rows)
+
+
+def _in_words(pose: Pose) -> str:
+    return f"{np.round(pose.position * 1e3, 1).tolist()} mm"
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Reads a scene file.
+
+    Raises:
+        BadInput: The file cannot be read.
+        InvalidFile: With every problem and its place.
+    """
+    return scene_from_document(load_yaml(Path(path), SceneDocument))
+
+
+def scene_from_document(document: SceneDocument) -> Scene:
+    """The scene that a document describes.
+
+    Raises:
+        BadInput: Parts of the document do not agree.
+    """
+    findings = [f"{key_path(parts)}: {what}" for parts, what in document.findings()]
+    if findings:
+        raise BadInput("; ".join(findings), where=f"scene {document.name}")
+    return Scene(
+        document=document,
+        obstacles=tuple(_obstacle(o) for o in document.obstacles),
+        obstacle_clearance=document.clearance.obstacle_mm / 1000.0,
+        self_clearance=document.clearance.self_mm / 1000.0,
+        start=document.start.pose(),
+        goal=document.goal.pose(),
+        load=load_from_document(document.load),
+        stops=tuple(Stop(s.name, s.kind, s.pose(), s.dwell_s) for s in document.stops),
+        rotation_limits=_rotation_limits(document.rotation_limits),
+    )
+
+
+def nothing_in_the_way(rig: Rig) -> Scene:
+    """Nothing but the rig, at home."""
+    home = PoseDocument.of(rig.home)
+    return scene_from_document(
+        SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
+    )
+
+
+def load_from_document(document: LoadDocument) -> Load:
+    """The load that a document describes."""
+    return Load(
+        payload_mass=document.payload_kg,
+        payload_centre=read_only(millimetres(document.payload_centre_mm)),
+        force=read_only(document.force_n),
+        moment=read_only(document.moment_nm),
+    )
+
+
+def _rotation_limits(document: RotationLimitsDocument | None) -> RotationLimits | None:
+    if document is None:
+        return None
+    return RotationLimits(math.radians(document.tilt_deg), math.radians(document.turn_deg))
+
+
+def _obstacle(document: ObstacleDocument) -> Obstacle:
+    pose = PoseDocument(
+        position_mm=document.position_mm, rotation_wxyz=document.rotation_wxyz
+    ).pose()
+    (key, given), *_ = document.shapes().items()
+    try:
+        shape = _shape(key, given)
+    except ValueError as error:
+        raise BadInput(str(error), where=f"obstacle {document.name!r}") from None
+    return Obstacle(document.name, shape, pose)
+
+
+def _shape(key: str, document: Document) -> Shape:
+    match document:
+        case BoxDocument(size_mm=size):
+            return Box(read_only(millimetres(size) / 2.0))
+        case SphereDocument(radius_mm=radius):
+            return Sphere(radius / 1000.0)
+        case RoundDocument(radius_mm=radius, length_mm=length):
+            kind = Cylinder if key == "cylinder" else Capsule
+            return kind(radius / 1000.0, length / 1000.0)
+        case HullDocument(points_mm=points):
+            return convex_hull(np.asarray(points) / 1000.0)
+        case MeshDocument(points_mm=points, triangles=triangles):
+            vertices = read_only(np.asarray(points) / 1000.0)
+            numbers = read_only_indices(triangles)
+            if encloses_convex(vertices, numbers):
+                return convex_hull(vertices[np.unique(numbers)])
+            return TriangleMesh(vertices, numbers)
+        case _:
+            raise ValueError(f"unknown shape {key!r}")
+
+
+# A scene with stops as legs, each of which is a scene from one stop to the next.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leg:
+    """A part of the way, run with one load.
+
+    Attributes:
+        scene: The whole scene but for its ends and its load, which are the leg's, without stops.
+        begin: What it begins at, for people: ``start`` or ``stop 'shelf'``.
+        end: What it ends at, likewise; ``goal`` for the last.
+    """
+
+    scene: Scene
+    begin: str
+    end: str
+
+
+def legs_of(scene: Scene) -> tuple[Leg, ...]:
+    """The legs of a scene in their order: one more than it has stops."""
+    document = scene.document
+    ends: list[tuple[str, PoseDocument]] = [
+        ("start", document.start),
+        *((f"stop {stop.name!r}", stop) for stop in document.stops),
+        ("goal", document.goal),
+    ]
+    legs = []
+    carried = payloads(document.load.payload(), document.stops)
+    for (begin, end), payload in zip(pairwise(ends), carried, strict=True):
+        load = document.load.carrying(payload)
+        changes = {"start": begin[1].bare(), "goal": end[1].bare(), "load": load, "stops": []}
+        part = replace(
+            scene,
+            document=document.model_copy(update=changes),
+            start=begin[1].pose(),
+            goal=end[1].pose(),
+            load=load_from_document(load),
+            stops=(),
+        )
+        legs.append(Leg(part, begin[0], end[0]))
+    return tuple(legs)

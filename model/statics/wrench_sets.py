@@ -1,0 +1,333 @@
+"""Size of the set of wrenches that the cables can give.
+
+The set ``{J t : t_min <= t <= t_max}`` is a zonotope: the sum of one segment a cable. Its volume
+is exactly the sum of |det| over every choice of as many segments as there are dimensions, and
+does not depend on t_min but only on t_max - t_min.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.errors import BadInput
+
+# What the functions of this package accept, checked at their border.
+
+
+FORCE_ROWS = 3
+WRENCH_SIZE = 6
+POSES_IN_A_BLOCK = 128
+"""Batches are worked through in blocks, so that a block stays in the processor's cache."""
+
+
+def checked_structure_matrix(structure_matrix: ArrayLike) -> NDArray[np.float64]:
+    """Return the structure matrix as floats, shape (..., 6, m).
+
+    Raises:
+        BadInput: The shape is another one, or a value is not finite.
+    """
+    matrix = np.asarray(structure_matrix, dtype=np.float64)
+    if matrix.ndim < 2 or matrix.shape[-2] != WRENCH_SIZE or matrix.shape[-1] == 0:
+        raise BadInput(f"the structure matrix has shape {matrix.shape}, not (..., 6, m)")
+    if not np.isfinite(matrix).all():
+        raise BadInput("the structure matrix holds a value that is not a finite number")
+    return matrix
+
+
+def checked_wrench(wrench: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return a wrench as floats, shape (..., 6).
+
+    Raises:
+        BadInput: The shape is another one, or a value is not finite.
+    """
+    checked = np.asarray(wrench, dtype=np.float64)
+    if checked.ndim < 1 or checked.shape[-1] != WRENCH_SIZE:
+        raise BadInput(f"the {name} has shape {checked.shape}, not (..., 6)")
+    if not np.isfinite(checked).all():
+        raise BadInput(f"the {name} holds a value that is not a finite number")
+    return checked
+
+
+def checked_per_cable(values: ArrayLike, cable_count: int, name: str) -> NDArray[np.float64]:
+    """Return one finite value a cable, shape (..., m); a single number serves every cable.
+
+    Raises:
+        BadInput: There are values for another number of cables, or one is not finite.
+    """
+    checked = np.asarray(values, dtype=np.float64)
+    if checked.ndim == 0:
+        checked = np.full(cable_count, checked)
+    if checked.shape[-1] != cable_count:
+        raise BadInput(
+            f"{name} has {checked.shape[-1]} values for {cable_count} cables",
+            next_step=f"give {cable_count} values, one a cable",
+        )
+    if not np.isfinite(checked).all():
+        raise BadInput(f"{name} holds a value that is not a finite number")
+    return checked
+
+
+def checked_limits(
+    t_min: ArrayLike, t_max: ArrayLike, cable_count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the smallest and largest tension of each cable, shape (..., m) each, [N].
+
+    Raises:
+        BadInput: As for `checked_per_cable`, or a smallest tension is above the largest.
+    """
+    low = checked_per_cable(t_min, cable_count, "t_min")
+    high = checked_per_cable(t_max, cable_count, "t_max")
+    if (low > high).any():
+        raise BadInput("t_min is above t_max for at least one cable")
+    return low, high
+
+
+def checked_length(characteristic_length: float) -> float:
+    """Return the characteristic length [m].
+
+    Raises:
+        BadInput: It is not a positive finite number.
+    """
+    if not 0.0 < characteristic_length < np.inf:
+        raise BadInput(f"the characteristic length is {characteristic_length} m, not above 0")
+    return characteristic_length
+
+
+def with_scaled_moments(
+    structure_matrix: NDArray[np.float64], characteristic_length: float
+) -> NDArray[np.float64]:
+    """Return the matrix, shape (..., 6, m), with its moment rows divided by the length [m]."""
+    scaled = structure_matrix.copy()
+    scaled[..., FORCE_ROWS:, :] /= checked_length(characteristic_length)
+    return scaled
+
+
+def blocks(count: int) -> Iterator[slice]:
+    """Yield slices that cover a batch of ``count`` poses block by block."""
+    for start in range(0, count, POSES_IN_A_BLOCK):
+        yield slice(start, start + POSES_IN_A_BLOCK)
+
+
+def force_volume(structure_matrix: ArrayLike, tension_ranges: ArrayLike) -> NDArray[np.float64]:
+    """Return the volume of the set of forces, whatever moment comes with them.
+
+    Args:
+        structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
+        tension_ranges: t_max - t_min, shape (m,) or (..., m), or one number, [N].
+
+    Returns:
+        Volume, shape (...), [N³].
+
+    Raises:
+        BadInput: A shape is wrong, a value is not finite, or a range is negative.
+
+    Source: Xu & Park, Eqs. 5-8 and Fig. 2b.
+    """
+    matrix = checked_structure_matrix(structure_matrix)
+    return zonotope_volume(_generators(matrix, tension_ranges)[..., :FORCE_ROWS, :])
+
+
+def wrench_volume(
+    structure_matrix: ArrayLike, tension_ranges: ArrayLike, characteristic_length: float
+) -> NDArray[np.float64]:
+    """Return the volume of the set of wrenches, moments divided by the characteristic length.
+
+    Args:
+        structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
+        tension_ranges: t_max - t_min, shape (m,) or (..., m), or one number, [N].
+        characteristic_length: [m].
+
+    Returns:
+        Volume, shape (...), [N⁶]; zero (to round-off) where the matrix has no full rank.
+
+    Raises:
+        BadInput: A shape is wrong, a value is not finite, a range is negative, or the length is
+            not positive.
+    """
+    matrix = checked_structure_matrix(structure_matrix)
+    scaled = with_scaled_moments(matrix, characteristic_length)
+    return zonotope_volume(_generators(scaled, tension_ranges))
+
+
+def zonotope_volume(generators: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the volume of the sum of segments in n dimensions.
+
+    Args:
+        generators: shape (..., n, m), one segment a column.
+
+    Returns:
+        Σ |det| over all n-subsets of the columns, shape (...).
+
+    Source: Shephard, "Combinatorial properties of associated zonotopes", 1974.
+    """
+    dimension, count = generators.shape[-2:]
+    batch = generators.shape[:-2]
+    volumes = np.zeros(int(np.prod(batch)))
+    if count >= dimension:
+        flat = generators.reshape(-1, dimension, count)
+        chosen = subsets(count, dimension)
+        for block in blocks(len(flat)):
+            columns = np.swapaxes(flat[block][:, :, chosen], 1, 2)
+            volumes[block] = np.abs(_determinants(columns)).sum(axis=-1)
+    return volumes.reshape(batch)
+
+
+@cache
+def subsets(count: int, size: int) -> NDArray[np.intp]:
+    """Return every ``size``-subset of ``range(count)``, one a row, in a read-only array."""
+    chosen = np.array(list(combinations(range(count), size)), dtype=np.intp).reshape(-1, size)
+    chosen.flags.writeable = False
+    return chosen
+
+
+def _determinants(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    if matrices.shape[-1] != 3:
+        return np.asarray(np.linalg.det(matrices), dtype=np.float64)
+    # The planner asks for thousands of these, and LAPACK is eight times slower at this size.
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrices, (-2, -1), (0, 1))
+    return np.asarray(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g))
+
+
+def _generators(
+    structure_matrix: NDArray[np.float64], tension_ranges: ArrayLike
+) -> NDArray[np.float64]:
+    ranges = checked_per_cable(tension_ranges, structure_matrix.shape[-1], "tension_ranges")
+    if (ranges < 0.0).any():
+        raise BadInput("a tension range is negative: t_max is below t_min")
+    return structure_matrix * ranges[..., np.newaxis, :]
+
+
+# The set of available wrenches as the space between pairs of parallel hyperplanes.
+#
+# Every facet of the zonotope ``{J t : t_min <= t <= t_max}`` is spanned by n - 1 columns of J, so
+# its normal c is orthogonal to them: ``y = Jᵀc`` is zero on these columns. Such a y lies in the row
+# space of J, that is, orthogonal to the null space; supported on m - n + 1 cables only, it is the
+# generalised cross product of their null-space rows. For m - n = 2 this takes 3-vectors where the
+# columns themselves would take 5×5 minors, and it is the same set of normals.
+
+
+RANK_TOLERANCE = 1e-10
+"""σ_min / σ_max at and below which the cables do not act in every direction."""
+DEPENDENT_COLUMNS = 1e-12
+"""Length of a cross product of null-space rows (each at most 1) that is round-off, no normal."""
+
+
+@dataclass(frozen=True, slots=True)
+class WrenchFacets:
+    """Pairs of parallel facet planes: the set is ``lower <= normals @ wrench <= upper``.
+
+    The wrench is that of the cables (``J t``), with its moments divided by the length.
+
+    Attributes:
+        normals: shape (..., k, 6), unit vectors; zero where dependent columns span no facet.
+        cable_gains: ``normals @ J``, shape (..., k, m): wrench along the normal by unit tension.
+        lower: shape (..., k), [N].
+        upper: shape (..., k), [N].
+        full_rank: shape (...); where it is false the set is flat and the planes say nothing.
+    """
+
+    normals: NDArray[np.float64]
+    cable_gains: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    full_rank: NDArray[np.bool_]
+
+
+def wrench_facets(
+    structure_matrix: ArrayLike,
+    t_min: ArrayLike,
+    t_max: ArrayLike,
+    characteristic_length: float,
+) -> WrenchFacets:
+    """Return the facet planes of the set of available wrenches.
+
+    Args:
+        structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
+        t_min: Smallest tensions, shape (m,) or (..., m), or one number, [N].
+        t_max: Largest tensions, likewise.
+        characteristic_length: [m], divides the moments.
+
+    Raises:
+        BadInput: A shape is wrong, a value is not finite, or limits are crossed.
+
+    Source: Bouchard, Gosselin & Moore, "On the ability of a cable-driven robot to generate a
+        prescribed set of wrenches", 2010 (hyperplane shifting).
+    """
+    matrix = checked_structure_matrix(structure_matrix)
+    low, high = checked_limits(t_min, t_max, matrix.shape[-1])
+    scaled = with_scaled_moments(matrix, characteristic_length)
+    normals, usable, full_rank = _normals(scaled)
+    gains = normals @ scaled
+    middle = (gains @ ((low + high) / 2.0)[..., np.newaxis])[..., 0]
+    reach = (np.abs(gains) @ ((high - low) / 2.0)[..., np.newaxis])[..., 0]
+    reach[~usable] = np.inf
+    return WrenchFacets(normals, gains, middle - reach, middle + reach, full_rank)
+
+
+def _normals(
+    scaled: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the unit normals, which of them are facets' normals, and where the rank is full."""
+    cable_count = scaled.shape[-1]
+    freedom = cable_count - WRENCH_SIZE
+    if freedom < 0:
+        batch = scaled.shape[:-2]
+        none = np.zeros((*batch, 0), dtype=np.bool_)
+        return np.zeros((*batch, 0, WRENCH_SIZE)), none, np.zeros(batch, dtype=np.bool_)
+    left, singular_values, right = np.linalg.svd(scaled)
+    largest, smallest = singular_values[..., 0], singular_values[..., -1]
+    full_rank = smallest > RANK_TOLERANCE * largest
+    inverse = 1.0 / np.where(full_rank[..., np.newaxis], singular_values, 1.0)
+    row_space, null_space = right[..., :WRENCH_SIZE, :], right[..., WRENCH_SIZE:, :]
+    gains = facet_gains(null_space)
+    normals = gains @ np.swapaxes(row_space, -1, -2) * inverse[..., np.newaxis, :]
+    normals = normals @ np.swapaxes(left, -1, -2)
+    usable = np.einsum("...i,...i", gains, gains) > DEPENDENT_COLUMNS**2
+    usable &= full_rank[..., np.newaxis]
+    lengths = np.sqrt(np.einsum("...i,...i", normals, normals))
+    scale = np.divide(1.0, lengths, out=np.zeros_like(lengths), where=usable)
+    return normals * scale[..., np.newaxis], usable, full_rank
+
+
+def facet_gains(null_space: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``Jᵀc`` of every facet normal c; its length fades where columns become dependent.
+
+    Args:
+        null_space: Orthonormal rows that span the null space of J, shape (..., d, m).
+
+    Returns:
+        shape (..., k, m), in the order of ``subsets(m, d + 1)``, whose cables have the gains.
+    """
+    freedom, cable_count = null_space.shape[-2:]
+    chosen = subsets(cable_count, freedom + 1)
+    products = generalised_cross(np.moveaxis(null_space[..., chosen], -3, -2))
+    gains = np.zeros((*null_space.shape[:-2], len(chosen), cable_count))
+    gains[..., np.arange(len(chosen))[:, np.newaxis], chosen] = products
+    return gains
+
+
+def generalised_cross(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vector orthogonal to d vectors of d + 1 components.
+
+    Args:
+        rows: shape (..., d, d + 1), one vector a row.
+
+    Returns:
+        shape (..., d + 1); its length is the volume that the vectors span.
+    """
+    count = rows.shape[-2]
+    if count == 0:
+        return np.ones((*rows.shape[:-2], 1))
+    if count == 1:
+        return np.stack([rows[..., 0, 1], -rows[..., 0, 0]], axis=-1)
+    if count == 2:
+        return np.asarray(np.cross(rows[..., 0, :], rows[..., 1, :]))
+    minors = [np.linalg.det(np.delete(rows, skipped, axis=-1)) for skipped in range(count + 1)]
+    signs = (-1.0) ** np.arange(count + 1)
+    return np.asarray(np.stack(minors, axis=-1) * signs)

@@ -1,0 +1,167 @@
+"""The first path: two trees, one from each end, joined by edges of any length.
+
+An exact test of a whole edge costs about as much as one of a point, so edges have no step: a sample
+is joined to the nearest node of one tree by one edge, and where that is allowed to the nearest of
+the other. A sample that both reach is the path.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.anytime.problem import PathProblem, edge_allowed
+from planner.anytime.random import State, uniform
+from planner.collision.edges import row_of
+from planner.kernels.jit import leaf
+from planner.kernels.primitives import Vector
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+NODES = 2048
+"""Room for nodes in each tree; a full tree takes no more and is still joined to."""
+MOST_ON_PATH = 128
+"""Room for the vertices of a path."""
+_FROM_INSIDE = 0.25
+"""Part of the samples that are uniform in the workspace box."""
+
+
+@leaf
+def connect(
+    problem: PathProblem,
+    ends: Array,
+    state: State,
+    trees: Array,
+    parents: Integers,
+    counts: Integers,
+    samples: int,
+    path: Array,
+) -> int:
+    """Grows both trees until they meet; called again with the same trees it goes on.
+
+    Args:
+        problem: Where.
+        ends: Start and goal, shape (2, 3), [m].
+        state: Of the random numbers; stepped.
+        trees: Nodes, shape (2, NODES, 3), written.
+        parents: Shape (2, NODES), written.
+        counts: Nodes in both trees, edge tests and samples so far, shape (4,); zeros at first.
+        samples: How many to draw at most.
+        path: From start to goal, shape (MOST_ON_PATH, 3), written.
+
+    Returns:
+        The number of vertices of the path; 0 where none was found yet.
+    """
+    if counts[0] == 0:
+        _put(trees[0], 0, row_of(ends[0]))
+        _put(trees[1], 0, row_of(ends[1]))
+        parents[0, 0], parents[1, 0] = -1, -1
+        counts[0], counts[1], counts[2] = 1, 1, counts[2] + 1
+        if edge_allowed(problem, row_of(ends[0]), row_of(ends[1])):
+            _put(path, 0, row_of(ends[0]))
+            _put(path, 1, row_of(ends[1]))
+            return 2
+    for _ in range(samples):
+        counts[3] += 1
+        wanted = _sample(problem, state)
+        tree = counts[3] & 1
+        near = _extended(problem, trees, parents, counts, tree, wanted)
+        if near < 0:
+            continue
+        far = _nearest(trees, 1 - tree, counts[1 - tree], wanted)
+        counts[2] += 1
+        if edge_allowed(problem, row_of(trees[1 - tree, far]), wanted):
+            first, second = (near, far) if tree == 0 else (far, near)
+            return _joined(trees, parents, first, wanted, second, path)
+    return 0
+
+
+@leaf
+def _sample(problem: PathProblem, state: State) -> Vector:
+    """A point of the workspace, most often on its walls, edges or in its corners.
+
+    Obstacles leave more room there: drawn from a box twice as wide and put back on the walls,
+    samples see the ends 2 to 5 times as often in the paper's scenes.
+    """
+    wide = 1.0 if uniform(state) < _FROM_INSIDE else 2.0
+    limits = problem.world.limits
+    return (
+        _drawn(state, wide, limits[0, 0], limits[1, 0]),
+        _drawn(state, wide, limits[0, 1], limits[1, 1]),
+        _drawn(state, wide, limits[0, 2], limits[1, 2]),
+    )
+
+
+@leaf
+def _drawn(state: State, wide: float, low: float, high: float) -> float:
+    share = 0.5 + wide * (uniform(state) - 0.5)
+    return low + min(max(share, 0.0), 1.0) * (high - low)
+
+
+@leaf
+def _extended(
+    problem: PathProblem,
+    trees: Array,
+    parents: Integers,
+    counts: Integers,
+    tree: int,
+    wanted: Vector,
+) -> int:
+    """Grows one tree toward a point: the node from which all the way was allowed, or -1."""
+    nearest = _nearest(trees, tree, counts[tree], wanted)
+    at = row_of(trees[tree, nearest])
+    counts[2] += 1
+    if not edge_allowed(problem, at, wanted):
+        return -1
+    if counts[tree] < NODES:
+        new = counts[tree]
+        _put(trees[tree], new, wanted)
+        parents[tree, new] = nearest
+        counts[tree] = new + 1
+    return nearest
+
+
+@leaf
+def _nearest(trees: Array, tree: int, count: int, wanted: Vector) -> int:
+    best, least = 0, np.inf
+    for i in range(count):
+        x, y, z = (
+            trees[tree, i, 0] - wanted[0],
+            trees[tree, i, 1] - wanted[1],
+            trees[tree, i, 2] - wanted[2],
+        )
+        squared = x * x + y * y + z * z
+        if squared < least:
+            best, least = i, squared
+    return best
+
+
+@leaf
+def _joined(
+    trees: Array, parents: Integers, first: int, between: Vector, second: int, path: Array
+) -> int:
+    """Writes the way from the first root over a point to the second; 0 where it has no room."""
+    length, node = 0, first
+    while node >= 0:
+        length, node = length + 1, parents[0, node]
+    other, node = 0, second
+    while node >= 0:
+        other, node = other + 1, parents[1, node]
+    if length + other + 1 > len(path):
+        return 0
+    node = first
+    for i in range(length - 1, -1, -1):
+        _put(path, i, row_of(trees[0, node]))
+        node = parents[0, node]
+    _put(path, length, between)
+    node = second
+    for i in range(length + 1, length + 1 + other):
+        _put(path, i, row_of(trees[1, node]))
+        node = parents[1, node]
+    return length + 1 + other
+
+
+@leaf
+def _put(points: Array, place: int, point: Vector) -> None:
+    points[place, 0], points[place, 1], points[place, 2] = point

@@ -1,0 +1,339 @@
+"""A first path where the room is narrow: parts of a roadmap that begin in the gaps themselves.
+
+Samples of the whole workspace miss a gap that is a thousandth of it. Under translation, though,
+every obstacle keeps a body behind planes (`planner.collision.separating_planes`), so a point that
+is too near to something is drawn before one of its planes, then before one of what is too near
+there, until it is free: it then lies at the side of a gap, if there is one nearby. From there
+straight ways along the planes it touches lead out at both mouths. Each such way is a part of its
+own, joined to those next to it by straight edges, until start and goal are of one part.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.anytime.problem import PathProblem, edge_allowed
+from planner.anytime.random import State, below, direction, uniform
+from planner.collision.edges import row_of
+from planner.kernels.jit import leaf
+from planner.kernels.primitives import Vector, along, cross, dot, minus, norm
+from planner.kernels.scene_arrays import World
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+PLACES = 1024
+"""Room for nodes; a full roadmap is begun anew."""
+_IN_GAPS, _NEAR_NODES = 0.6, 0.3
+"""Shares of the samples: drawn into gaps, and near a node; the rest is from all the workspace."""
+_DRAWN, _OTHER_PLANE = 24, 0.3
+"""How often a point is drawn before a plane, and how often not before that which is nearest."""
+_ROOM = 1e-7
+"""By which it is drawn farther, [m]: more than round-off, less than any gap worth finding."""
+_NEIGHBOURS = 6
+"""Nodes of other parts that a new node is joined to, beside those of start and goal."""
+_BISECTIONS = 12
+_NEAREST, _FARTHEST = 5e-5, 0.2
+"""Of samples near a node, [m]."""
+_START, _GOAL = 0, 1
+
+
+@leaf
+def through_passages(
+    problem: PathProblem,
+    ends: Array,
+    state: State,
+    places: Array,
+    above: Integers,
+    parts: Integers,
+    made: Integers,
+    samples: int,
+    path: Array,
+) -> int:
+    """Adds samples to a roadmap until it joins start and goal; called again it goes on.
+
+    Args:
+        problem: Where.
+        ends: Start and goal, shape (2, 3), [m].
+        state: Of the random numbers; stepped.
+        places: Nodes, the first two start and goal, shape (PLACES, 3), written.
+        above: Of each node the next toward the root of its part, -1 for that, shape (PLACES,).
+        parts: Of each node the part that it belongs to, shape (PLACES,), written.
+        made: Nodes and edge tests so far, shape (2,); zeros at first.
+        samples: How many to draw at most.
+        path: From start to goal, shape (k, 3), written.
+
+    Returns:
+        The number of vertices of the path; 0 where none was found yet.
+    """
+    for _ in range(samples):
+        if made[0] == 0 or made[0] + 3 > len(places):
+            _begin(ends, places, above, parts, made)
+        new = made[0]
+        choice = uniform(state)
+        if choice < _IN_GAPS:
+            at, touched, other = _in_gap(problem.world, state)
+            if not _allowed(problem, made, at, at):
+                continue
+            _add(places, above, parts, made, at, -1)
+            _add_ways(problem, state, places, above, parts, made, new, touched, other)
+        elif choice < _IN_GAPS + _NEAR_NODES:
+            node = below(state, made[0])
+            size = _NEAREST * math.exp(uniform(state) * math.log(_FARTHEST / _NEAREST))
+            _add_way(problem, places, above, parts, made, node, direction(state), size)
+        else:
+            at = _anywhere(problem.world, state)
+            if not _allowed(problem, made, at, at):
+                continue
+            _add(places, above, parts, made, at, -1)
+        for node in range(new, made[0]):
+            _join(problem, places, above, parts, made, node)
+        if parts[_START] == parts[_GOAL]:
+            count = _path(places, above, path)
+            made[0] = 0
+            if count > 0:
+                return count
+    return 0
+
+
+@leaf
+def _begin(ends: Array, places: Array, above: Integers, parts: Integers, made: Integers) -> None:
+    made[0] = 0
+    _add(places, above, parts, made, row_of(ends[0]), -1)
+    _add(places, above, parts, made, row_of(ends[1]), -1)
+
+
+@leaf
+def _allowed(problem: PathProblem, made: Integers, start: Vector, end: Vector) -> bool:
+    made[1] += 1
+    return edge_allowed(problem, start, end)
+
+
+@leaf
+def _add(
+    places: Array, above: Integers, parts: Integers, made: Integers, at: Vector, parent: int
+) -> None:
+    """Adds a node below another, or as a part of its own."""
+    new = made[0]
+    places[new, 0], places[new, 1], places[new, 2] = at
+    above[new] = parent
+    parts[new] = parts[parent] if parent >= 0 else new
+    made[0] = new + 1
+
+
+@leaf
+def _anywhere(world: World, state: State) -> Vector:
+    low, high = world.limits[0], world.limits[1]
+    return (
+        low[0] + uniform(state) * (high[0] - low[0]),
+        low[1] + uniform(state) * (high[1] - low[1]),
+        low[2] + uniform(state) * (high[2] - low[2]),
+    )
+
+
+@leaf
+def _in_gap(world: World, state: State) -> tuple[Vector, int, int]:
+    """A point drawn out of what it is too near to, and the last two planes it was drawn before.
+
+    Planes are those of `World.planes`, -1 for none. The point may still be too near to something.
+    """
+    at, touched, other = _anywhere(world, state), -1, -1
+    for _ in range(_DRAWN):
+        plane, room = _worst(world, state, at)
+        if plane < 0:
+            break
+        if plane != touched:
+            touched, other = plane, touched
+        normal = (world.planes[plane, 0], world.planes[plane, 1], world.planes[plane, 2])
+        at = along(at, normal, room - _ROOM)
+    low, high = world.limits[0], world.limits[1]
+    at = (
+        min(max(at[0], low[0]), high[0]),
+        min(max(at[1], low[1]), high[1]),
+        min(max(at[2], low[2]), high[2]),
+    )
+    return at, touched, other
+
+
+@leaf
+def _worst(world: World, state: State, at: Vector) -> tuple[int, float]:
+    """A plane of the pair that is proved least at a position, and the room before it, [m].
+
+    -1 where all pairs are proved.
+    """
+    worst, least, found = -1, 0.0, -1
+    for pair in range(len(world.pairs)):
+        first, last = world.pairs[pair, 2], world.pairs[pair, 3]
+        best, nearest = -math.inf, -1
+        for k in range(first, last):
+            room = _room(world, k, at)
+            if room > best:
+                best, nearest = room, k
+                if room >= least:
+                    break
+        if nearest >= 0 and best < least:
+            worst, least, found = nearest, best, pair
+    if worst >= 0 and uniform(state) < _OTHER_PLANE:
+        first, last = world.pairs[found, 2], world.pairs[found, 3]
+        worst = first + below(state, last - first)
+        least = _room(world, worst, at)
+    return worst, least
+
+
+@leaf
+def _room(world: World, k: int, at: Vector) -> float:
+    normal = (world.planes[k, 0], world.planes[k, 1], world.planes[k, 2])
+    return world.planes[k, 3] - dot(normal, at)  # type: ignore[no-any-return]
+
+
+@leaf
+def _add_ways(
+    problem: PathProblem,
+    state: State,
+    places: Array,
+    above: Integers,
+    parts: Integers,
+    made: Integers,
+    node: int,
+    touched: int,
+    other: int,
+) -> None:
+    """Adds the ends of the straight way through a node along the planes that it touches."""
+    if touched < 0:
+        return
+    planes = problem.world.planes
+    normal = row_of(planes[touched, :3])
+    second = direction(state)
+    if other >= 0 and uniform(state) < 0.7:
+        second = row_of(planes[other, :3])
+    way = cross(normal, second)
+    size = norm(way)
+    if size < 1e-6:
+        way = cross(normal, direction(state))
+        size = norm(way)
+    if size < 1e-6:
+        return
+    reach = norm(minus(row_of(problem.world.limits[1]), row_of(problem.world.limits[0])))
+    for sign in (-1.0, 1.0):
+        one = (sign * way[0] / size, sign * way[1] / size, sign * way[2] / size)
+        _add_way(problem, places, above, parts, made, node, one, reach)
+
+
+@leaf
+def _add_way(
+    problem: PathProblem,
+    places: Array,
+    above: Integers,
+    parts: Integers,
+    made: Integers,
+    node: int,
+    way: Vector,
+    reach: float,
+) -> None:
+    """Adds the farthest point allowed from a node along a unit vector, at most ``reach`` away."""
+    start = row_of(places[node])
+    reach = min(reach, _to_the_wall(problem.world, start, way))
+    low, high, share = 0.0, 1.0, 1.0
+    for _ in range(_BISECTIONS):
+        if _allowed(problem, made, start, along(start, way, share * reach)):
+            low = share
+        else:
+            high = share
+        if low == 1.0:
+            break
+        share = (low + high) / 2.0
+    if low * reach > _NEAREST:
+        _add(places, above, parts, made, along(start, way, low * reach), node)
+
+
+@leaf
+def _to_the_wall(world: World, start: Vector, way: Vector) -> float:
+    """How far it is from a point along a unit vector to the wall of the workspace, [m]."""
+    least = math.inf
+    for axis in range(3):
+        if way[axis] > 0.0:
+            least = min(least, (world.limits[1, axis] - start[axis]) / way[axis])
+        elif way[axis] < 0.0:
+            least = min(least, (world.limits[0, axis] - start[axis]) / way[axis])
+    return max(least, 0.0)
+
+
+@leaf
+def _join(
+    problem: PathProblem, places: Array, above: Integers, parts: Integers, made: Integers, node: int
+) -> None:
+    """Joins a node to the parts of start and goal, and to the nearest nodes of others."""
+    for end in (_START, _GOAL):
+        _try_to_join(problem, places, above, parts, made, node, parts[end], -1.0)
+    farther = -1.0
+    for _ in range(_NEIGHBOURS):
+        farther = _try_to_join(problem, places, above, parts, made, node, -1, farther)
+        if farther == math.inf:
+            break
+
+
+@leaf
+def _try_to_join(
+    problem: PathProblem,
+    places: Array,
+    above: Integers,
+    parts: Integers,
+    made: Integers,
+    node: int,
+    part: int,
+    farther: float,
+) -> float:
+    """Tries an edge to the node of a part (-1: any other) next beyond a squared distance.
+
+    Returns its squared distance; infinite without such a node.
+    """
+    own, best, least = parts[node], -1, math.inf
+    if own == part:
+        return math.inf
+    x, y, z = places[node, 0], places[node, 1], places[node, 2]
+    for i in range(made[0]):
+        if parts[i] == own or (part >= 0 and parts[i] != part):
+            continue
+        squared = (places[i, 0] - x) ** 2 + (places[i, 1] - y) ** 2 + (places[i, 2] - z) ** 2
+        if farther < squared < least:
+            best, least = i, squared
+    if best >= 0 and _allowed(problem, made, row_of(places[best]), row_of(places[node])):
+        _merge(above, parts, made, best, node)
+    return least
+
+
+@leaf
+def _merge(above: Integers, parts: Integers, made: Integers, one: int, two: int) -> None:
+    """Hangs all of the part of the second node below the first."""
+    _make_root(above, two)
+    above[two] = one
+    old, kept = parts[two], parts[one]
+    for i in range(made[0]):
+        if parts[i] == old:
+            parts[i] = kept
+
+
+@leaf
+def _make_root(above: Integers, node: int) -> None:
+    """Turns the way from a node to its root about."""
+    before, at = -1, node
+    while at >= 0:
+        after = above[at]
+        above[at] = before
+        before, at = at, after
+
+
+@leaf
+def _path(places: Array, above: Integers, path: Array) -> int:
+    """Writes the way from start to goal, which are of one part; 0 where it has no room."""
+    _make_root(above, _GOAL)
+    count, node = 0, _START
+    while node >= 0:
+        if count == len(path):
+            return 0
+        path[count, 0], path[count, 1], path[count, 2] = row_of(places[node])
+        count, node = count + 1, above[node]
+    return count

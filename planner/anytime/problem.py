@@ -1,0 +1,186 @@
+"""What a compiled search is given: where edges are allowed, and what they cost."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.collision.edges import edge_clearance, in_workspace, obstacles_free
+from planner.collision.self_collision import is_open, self_edge_free
+from planner.collision.self_collision_regions import Robot
+from planner.kernels.jit import inlined, kernel, leaf
+from planner.kernels.primitives import Vector, along, minus, norm
+from planner.kernels.scene_arrays import World
+from planner.wrench.capacity import LoadArrays
+from planner.wrench.translation import Holding, edge_held
+
+# Trilinear interpolation on a regular lattice, compiled; `planner.space` is its definition.
+
+
+@leaf
+def interpolated(grid: Array, values: Array, point: Vector) -> float:
+    """The value at a point; outside the lattice that of the nearest point on its border.
+
+    Args:
+        grid: Lower corner and spacing, shape (2, 3), [m].
+        values: At the lattice's points, shape (i, j, k), each at least 2.
+        point: World frame, [m].
+    """
+    x, i = _cell(point[0], grid[0, 0], grid[1, 0], values.shape[0])
+    y, j = _cell(point[1], grid[0, 1], grid[1, 1], values.shape[1])
+    z, k = _cell(point[2], grid[0, 2], grid[1, 2], values.shape[2])
+    low = values[i, j, k] * (1.0 - z) + values[i, j, k + 1] * z
+    high = values[i, j + 1, k] * (1.0 - z) + values[i, j + 1, k + 1] * z
+    front = low * (1.0 - y) + high * y
+    low = values[i + 1, j, k] * (1.0 - z) + values[i + 1, j, k + 1] * z
+    high = values[i + 1, j + 1, k] * (1.0 - z) + values[i + 1, j + 1, k + 1] * z
+    return front * (1.0 - x) + (low * (1.0 - y) + high * y) * x  # type: ignore[no-any-return]
+
+
+@leaf
+def _cell(value: float, lower: float, spacing: float, count: int) -> tuple[float, int]:
+    """Place within a cell, 0 … 1, and the number of the cell, along one axis."""
+    scaled = (value - lower) / spacing
+    scaled = min(max(scaled, 0.0), count - 1.0)
+    cell = min(int(scaled), count - 2)
+    return scaled - cell, cell
+
+
+Array = NDArray[np.float64]
+
+LENGTH, KINEMATIC, CLEARANCE, CAPACITY, VERTEX, UNIT, LEAST_MARGIN = 0, 1, 2, 3, 4, 5, 6
+"""Places in `PathProblem.terms`."""
+
+NO_MARGIN = -math.inf
+"""As the least margin: interpolated ones are not looked at."""
+ASK_PROOF = math.inf
+"""As the least margin: wrenches are proved to be held on every edge, which takes long."""
+
+_SAMPLING = 0.010
+"""Between samples of what is known on the grid, [m]: less than half of its spacing."""
+_CLEARANCE_SAMPLING = 0.020
+"""Between positions at which the clearance of cables over pulleys is looked at, [m]."""
+
+
+class PathProblem(NamedTuple):
+    """One question to the planner.
+
+    Attributes:
+        world: Obstacles and workspace, with the clearance that edges must keep.
+        robot: The self clearance that edges must keep.
+        load: The wrenches that must be held on edges.
+        holding: Where in the workspace they are proved to be.
+        grid: Lower corner of the lattice and its spacing, shape (2, 3), [m].
+        kinematic: The cost c = γ_d + γ_f at the lattice's points, shape (i, j, k).
+        margins: Capacity margins there, shape (i, j, k), [N].
+        terms: Weights of length, ∫c ds, smallest clearance and smallest margin in the cost that
+            is made small (the last two count against it); what a vertex more must save at least;
+            what a metre of a usual path costs; and the least margin of interpolated samples of
+            an edge, or `NO_MARGIN`, or `ASK_PROOF`, shape (7,).
+    """
+
+    world: World
+    robot: Robot
+    load: LoadArrays
+    holding: Holding
+    grid: Array
+    kinematic: Array
+    margins: Array
+    terms: Array
+
+
+@inlined
+def edge_allowed(problem: PathProblem, start: Vector, end: Vector) -> bool:
+    """Whether an edge keeps everything asked for: workspace, clearances, wrench feasibility."""
+    world, robot = problem.world, problem.robot
+    if not (in_workspace(world, start) and in_workspace(world, end)):
+        return False
+    if not obstacles_free(world, start, end):
+        return False
+    if is_open(world, robot, start, end) and not _keeps_off(problem, start, end):
+        return False
+    least = problem.terms[LEAST_MARGIN]
+    if least == NO_MARGIN:
+        return True
+    margin = lowest_margin(problem.grid, problem.margins, start, end)
+    if least < ASK_PROOF or margin < 0.0:  # far from held: not worth the time of a proof
+        return bool(margin >= least)
+    return _is_held(problem, start, end)
+
+
+@kernel
+def _keeps_off(problem: PathProblem, start: Vector, end: Vector) -> bool:
+    return self_edge_free(problem.world, problem.robot, np.array(start), np.array(end))
+
+
+@kernel
+def _is_held(problem: PathProblem, start: Vector, end: Vector) -> bool:
+    before, after = np.array(start), np.array(end)
+    return edge_held(problem.world, problem.load, problem.holding, before, after)
+
+
+@leaf
+def lowest_margin(grid: Array, margins: Array, start: Vector, end: Vector) -> float:
+    """The smallest interpolated capacity margin at samples of an edge, [N]."""
+    way = minus(end, start)
+    steps = math.ceil(norm(way) / _SAMPLING) + 1
+    least = math.inf
+    for i in range(steps + 1):
+        at = along(start, way, i / steps)
+        least = min(least, interpolated(grid, margins, at))
+    return least
+
+
+@leaf
+def edge_cost(problem: PathProblem, start: Vector, end: Vector) -> float:
+    """What an edge adds to the sums in the cost: weighted length and integral of c, [m]."""
+    way = minus(end, start)
+    length = norm(way)
+    cost = problem.terms[LENGTH] * length
+    weight = problem.terms[KINEMATIC]
+    if weight == 0.0:
+        return float(cost)
+    steps = math.ceil(length / _SAMPLING) + 1
+    total = 0.0
+    for i in range(steps):  # middles of equal parts
+        at = along(start, way, (i + 0.5) / steps)
+        total += interpolated(problem.grid, problem.kinematic, at)
+    return float(cost + weight * total * length / steps)
+
+
+@leaf
+def edge_lows(problem: PathProblem, start: Vector, end: Vector) -> tuple[float, float]:
+    """Smallest clearance [m] and margin [N] of an edge; infinite where they have no weight."""
+    clearance, margin = math.inf, math.inf
+    if problem.terms[CLEARANCE] > 0.0:
+        clearance = _clearance(problem.world, start, end)
+    if problem.terms[CAPACITY] > 0.0:
+        margin = lowest_margin(problem.grid, problem.margins, start, end)
+    return clearance, margin
+
+
+@kernel
+def _clearance(world: World, start: Vector, end: Vector) -> float:
+    """Smallest clearance of an edge, [m]: exact, with pulleys at samples, for the cost alone."""
+    if world.pulley == 0.0:
+        return float(edge_clearance(world, np.array(start), np.array(end))[0])
+    way, least = minus(end, start), math.inf
+    steps = math.ceil(norm(way) / _CLEARANCE_SAMPLING) + 1
+    for i in range(steps + 1):
+        at = np.array(along(start, way, i / steps))
+        least = min(least, edge_clearance(world, at, at)[0])
+    return least
+
+
+@leaf
+def gained(problem: PathProblem, clearance: float, margin: float) -> float:
+    """What smallest clearance and margin of a whole path take off its cost."""
+    gain = 0.0
+    if problem.terms[CLEARANCE] > 0.0 and clearance < math.inf:
+        gain += problem.terms[CLEARANCE] * clearance
+    if problem.terms[CAPACITY] > 0.0 and margin < math.inf:
+        gain += problem.terms[CAPACITY] * margin
+    return gain

@@ -1,0 +1,84 @@
+"""The state of a search, and how one begins."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.anytime.connect import NODES
+from planner.anytime.local_search import MOST_VERTICES
+from planner.anytime.passages import PLACES
+from planner.anytime.random import State, seeded
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+KEPT = 6
+"""Paths that are kept and polished."""
+BEST = KEPT
+"""The place of the best path so far, which is not worked on."""
+
+
+class AnytimeSearch(NamedTuple):
+    """The state of a search; kernels change it in place.
+
+    Attributes:
+        ends: Start and goal, shape (2, 3), [m].
+        points: Vertices of the paths kept and of the best, shape (KEPT + 1, MOST_VERTICES, 3), [m].
+        edges: See `planner.anytime.local_search.Polyline`, shape (KEPT + 1, MOST_VERTICES, 3).
+        counts: Vertices (0: no path) and edge tests of each path, shape (KEPT + 1, 2).
+        costs: Of each path; infinite for none, shape (KEPT + 1,).
+        polished: Rounds spent on each path, shape (KEPT,).
+        trees: See `planner.anytime.connect.connect`, shape (2, NODES, 3), [m].
+        parents: Likewise, shape (2, NODES).
+        grown: Likewise (`counts`), shape (4,).
+        places: See `planner.anytime.passages.through_passages`, shape (PLACES, 3), [m].
+        above: Likewise, shape (PLACES,).
+        parts: Likewise, shape (PLACES,).
+        made: Likewise, shape (2,).
+        totals: Rounds; nodes of finished trees and edge tests in them; first paths sought;
+            vertices of the very first path; the round at which all began anew, shape (6,).
+        first: That path, shape (MOST_VERTICES, 3), [m].
+        state: Of the random numbers.
+    """
+
+    ends: Array
+    points: Array
+    edges: Array
+    counts: Integers
+    costs: Array
+    polished: Integers
+    trees: Array
+    parents: Integers
+    grown: Integers
+    places: Array
+    above: Integers
+    parts: Integers
+    made: Integers
+    totals: Integers
+    first: Array
+    state: State
+
+
+def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:
+    """A search that has not begun; start and goal shape (3,), [m]."""
+    return AnytimeSearch(
+        ends=np.stack([start, goal]),
+        points=np.zeros((KEPT + 1, MOST_VERTICES, 3)),
+        edges=np.zeros((KEPT + 1, MOST_VERTICES, 3)),
+        counts=np.zeros((KEPT + 1, 2), dtype=np.int64),
+        costs=np.full(KEPT + 1, np.inf),
+        polished=np.zeros(KEPT, dtype=np.int64),
+        trees=np.zeros((2, NODES, 3)),
+        parents=np.zeros((2, NODES), dtype=np.int64),
+        grown=np.zeros(4, dtype=np.int64),
+        places=np.zeros((PLACES, 3)),
+        above=np.zeros(PLACES, dtype=np.int64),
+        parts=np.zeros(PLACES, dtype=np.int64),
+        made=np.zeros(2, dtype=np.int64),
+        totals=np.zeros(6, dtype=np.int64),
+        first=np.zeros((MOST_VERTICES, 3)),
+        state=seeded(seed),
+    )

@@ -1,0 +1,185 @@
+"""What a path costs: its length, or the line integral of the kinematic cost.
+
+The kinematic cost of a pose is c = γ_d + γ_f: the condition number of the structure matrix and the
+inverse volume of the force set, each scaled to 0..1 between its extremes over the workspace
+(paper, Eqs. 4, 5, 8 and section 3.2; see docs/paper.md for the corrections).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from model import kinematics
+from model.kinematics import cables_to, structure_matrix_of
+from model.pose import Array, Pose, interpolate
+from model.rig import Rig
+from model.scene import Scene
+from model.statics import dexterity, wrench_sets
+from model.statics.dexterity import condition_number, rms_anchor_radius
+from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.gravity import weight_wrench
+from model.statics.wrench_sets import force_volume
+from planner import space
+from planner.array_cache import stored
+from planner.space import Lattice, corners_and_weights
+
+_SAMPLING = 0.010
+_MODULES = (kinematics, dexterity, wrench_sets, space)
+"""What the indices on the lattice follow from, beside this module."""
+
+
+@cache
+def _version() -> str:
+    """A hash of the code that computes the lattice, so that a change forgets what it computed."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for module in _MODULES:
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()
+
+
+class Cost(Protocol):
+    """A cost of straight edges between coordinates."""
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Cost of the straight edge from ``start`` to ``end``, shape (n,) each."""
+        ...
+
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Costs of straight edges from many points, shape (k, n), to one; shape (k,)."""
+        ...
+
+
+class LengthCost:
+    """The length of an edge, [m]."""
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Length of the edge, [m]."""
+        return float(np.linalg.norm(end - start))
+
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Lengths of the edges, shape (k,), [m]."""
+        lengths: Array = np.linalg.norm(end - starts, axis=1)
+        return lengths
+
+
+class KinematicCost:
+    """The line integral of c = γ_d + γ_f, [m], for the platform at one orientation.
+
+    The extremes for the scaling, and the values that the search interpolates between, are those on
+    a lattice over the workspace box. They depend on rig and orientation alone and are kept in the
+    user's cache: the ready rigs take 80 to 200 ms to compute them, and below 1 ms to read them.
+
+    Attributes:
+        lattice: Points over the workspace box.
+        values: The cost c at them, shape (lattice.count,).
+    """
+
+    def __init__(self, rig: Rig, rotation: Array) -> None:
+        """Computes the lattice for ``rotation``, ``world_from_platform``, shape (3, 3)."""
+        self.rig = rig
+        self._rotation = rotation
+        self.lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
+        key = [rig.plan_hash, rotation.tolist(), _version()]
+        condition, inverse = stored("cost", key, (2, self.lattice.count), self._on_lattice)
+        self.extremes = [(float(v.min()), float(v.max())) for v in (condition, inverse)]
+        self.values = self._scaled(condition, inverse)
+
+    def at(self, positions: Array) -> Array:
+        """The cost c of poses, exact; positions shape (k, 3), [m]; shape (k,)."""
+        return self._scaled(*self._indices(positions, self._rotation))
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Line integral of c along the edge, [m]."""
+        return float(self.edges(start[None, :], end)[0])
+
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Line integrals of c, shape (k,), [m]: trapezoids between samples at most 10 mm apart."""
+        if not len(starts):
+            return np.zeros(0)
+        lengths = np.linalg.norm(end - starts, axis=1)
+        count = max(2, int(np.ceil(float(lengths.max()) / _SAMPLING)) + 1)
+        shares = np.linspace(0.0, 1.0, count)[:, None, None]
+        points = (starts + shares * (end - starts)).reshape(-1, starts.shape[1])
+        corners, weights = corners_and_weights(self.lattice, points)
+        values = np.einsum("kc,kc->k", self.values[corners], weights).reshape(count, -1)
+        inner = values.sum(axis=0) - (values[0] + values[-1]) / 2.0
+        integrals: Array = lengths * inner / (count - 1)
+        return integrals
+
+    def mean_along(self, waypoints: Array) -> float:
+        """Mean of c over the length of a path, exact at samples; waypoints shape (k, 3), [m]."""
+        return self.mean_along_poses([Pose(point, self._rotation) for point in waypoints])
+
+    def mean_along_poses(self, poses: Sequence[Pose]) -> float:
+        """Mean of c over the length of a path on which the platform may turn, exact at samples.
+
+        The scaling stays that of the one orientation.
+        """
+        total, length = 0.0, 0.0
+        for start, end in pairwise(poses):
+            part = start.distance_to(end)
+            count = max(2, int(np.ceil(part / _SAMPLING)) + 1)
+            samples = [interpolate(start, end, s) for s in np.linspace(0.0, 1.0, count).tolist()]
+            values = self._at_poses(samples)
+            total += part * float(np.mean((values[1:] + values[:-1]) / 2.0))
+            length += part
+        return total / length if length > 0.0 else float(self._at_poses(poses[:1])[0])
+
+    def _at_poses(self, poses: Sequence[Pose]) -> Array:
+        """The cost c of poses, each with its own orientation; shape (k,)."""
+        rotations = np.array([pose.rotation for pose in poses])
+        return self._scaled(*self._indices(np.array([p.position for p in poses]), rotations))
+
+    def _on_lattice(self) -> Array:
+        """Both indices at the lattice's points, shape (2, lattice.count)."""
+        points = self.lattice.points(np.arange(self.lattice.count))
+        return np.stack(self._indices(points, self._rotation))
+
+    def _indices(self, positions: Array, rotations: Array) -> tuple[Array, Array]:
+        """Condition number and inverse volume of the force set, shape (k,) each."""
+        rig = self.rig
+        anchors = rig.anchors @ np.swapaxes(rotations, -1, -2) + positions[:, None, :]
+        matrices = structure_matrix_of(cables_to(rig, anchors), positions)
+        condition = condition_number(matrices, rms_anchor_radius(rig.anchors))
+        return condition, 1.0 / force_volume(matrices, rig.max_tension - rig.min_tension)
+
+    def _scaled(self, condition: Array, inverse: Array) -> Array:
+        scaled = [
+            (v - low) / (high - low) if high > low else np.zeros_like(v)
+            for v, (low, high) in zip((condition, inverse), self.extremes, strict=True)
+        ]
+        total: Array = scaled[0] + scaled[1]
+        return total
+
+
+# Wrench feasibility: weight, payload and the box of disturbances within the tensions.
+
+
+def external_wrenches(rig: Rig, scene: Scene, rotation: Array) -> WrenchBox:
+    """The wrenches that must be held at an orientation, shape (3, 3): weight and disturbances."""
+    load = scene.load
+    weight = weight_wrench(rig, Pose(rig.home.position, rotation), load)
+    return WrenchBox(weight, np.concatenate([load.force, load.moment]))
+
+
+def capacity_margins(rig: Rig, scene: Scene, positions: Array, rotation: Array) -> Array:
+    """Capacity margins at one orientation, positions shape (k, 3), [m]; shape (k,), [N].
+
+    Moments are divided by the root mean square radius of the anchors.
+    """
+    anchors = rig.anchors @ rotation.T + positions[:, None, :]
+    matrices = structure_matrix_of(cables_to(rig, anchors), positions)
+    return capacity_margin(
+        matrices,
+        rig.min_tension,
+        rig.max_tension,
+        external_wrenches(rig, scene, rotation),
+        rms_anchor_radius(rig.anchors),
+    )

@@ -1,0 +1,409 @@
+"""Vectors of three floats as tuples: compiled code keeps them in registers."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner.kernels.jit import kernel, leaf
+
+Vector = tuple[float, float, float]
+
+
+@kernel
+def dot(a: Vector, b: Vector) -> float:
+    """The scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def minus(a: Vector, b: Vector) -> Vector:
+    """The difference a - b."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@kernel
+def plus(a: Vector, b: Vector) -> Vector:
+    """The sum a + b."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@kernel
+def along(start: Vector, direction: Vector, share: float) -> Vector:
+    """The point ``start + share * direction``."""
+    return (
+        start[0] + share * direction[0],
+        start[1] + share * direction[1],
+        start[2] + share * direction[2],
+    )
+
+
+@kernel
+def cross(a: Vector, b: Vector) -> Vector:
+    """The vector product."""
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@kernel
+def norm(a: Vector) -> float:
+    """The length."""
+    return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+@leaf
+def row(array: NDArray[np.float64], index: int) -> Vector:
+    """A row of an array, shape (k, 3)."""
+    return (array[index, 0], array[index, 1], array[index, 2])
+
+
+@leaf
+def turned(matrix: NDArray[np.float64], a: Vector) -> Vector:
+    """The product of a matrix, shape (3, 3), and a vector."""
+    return (
+        matrix[0, 0] * a[0] + matrix[0, 1] * a[1] + matrix[0, 2] * a[2],
+        matrix[1, 0] * a[0] + matrix[1, 1] * a[1] + matrix[1, 2] * a[2],
+        matrix[2, 0] * a[0] + matrix[2, 1] * a[1] + matrix[2, 2] * a[2],
+    )
+
+
+# The distance of a segment to a box about the origin, in closed form.
+#
+# Along the segment half the squared distance is convex, and its slope is piecewise linear with
+# bends where the segment crosses the planes of the faces. The bends are used to shut in the zero of
+# the slope, between two of which it is then found by one division.
+
+
+@kernel
+def segment_box_squared(start: Vector, end: Vector, half: Vector) -> float:
+    """Squared distance of a segment to the box |x| ≤ half, [m²]; 0 where they touch."""
+    between = segment_box_between(start, end, half)
+    return dot(between, between)
+
+
+@kernel
+def segment_box_between(start: Vector, end: Vector, half: Vector) -> Vector:
+    """From the nearest point of the box |x| ≤ half to that of a segment, [m]; 0 where they touch.
+
+    A plane across it parts the two.
+    """
+    way = minus(end, start)
+    low_slope = _slope(start, way, half, 0.0)
+    if low_slope >= 0.0:
+        return _excess(start, half)
+    high_slope = _slope(start, way, half, 1.0)
+    if high_slope <= 0.0:
+        return _excess(end, half)
+    low, high = 0.0, 1.0
+    for axis in range(3):
+        if way[axis] != 0.0:
+            for face in (-half[axis], half[axis]):
+                bend = (face - start[axis]) / way[axis]
+                if low < bend < high:
+                    slope = _slope(start, way, half, bend)
+                    if slope < 0.0:
+                        low, low_slope = bend, slope
+                    else:
+                        high, high_slope = bend, slope
+    share = low - low_slope * (high - low) / (high_slope - low_slope)
+    return _excess(along(start, way, share), half)
+
+
+@kernel
+def _slope(start: Vector, way: Vector, half: Vector, share: float) -> float:
+    return dot(way, _excess(along(start, way, share), half))
+
+
+@kernel
+def _excess(point: Vector, half: Vector) -> Vector:
+    """The vector from the nearest point of the box."""
+    return (
+        point[0] - min(max(point[0], -half[0]), half[0]),
+        point[1] - min(max(point[1], -half[1]), half[1]),
+        point[2] - min(max(point[2], -half[2]), half[2]),
+    )
+
+
+def segment_box_definition(
+    start: NDArray[np.float64], end: NDArray[np.float64], half: NDArray[np.float64]
+) -> float:
+    """The same distance, [m], by trying each of the 27 regions about the box.
+
+    Args:
+        start: Box frame, shape (3,), [m].
+        end: Likewise.
+        half: Half extents of the box, shape (3,), [m].
+    """
+    way = end - start
+    shares = [0.0, 1.0]
+    for region in np.ndindex(3, 3, 3):
+        side = np.array(region) - 1
+        slope = np.where(side != 0, way, 0.0)
+        offset = np.where(side != 0, start - side * half, 0.0)
+        if slope @ slope > 0.0:
+            shares.append(float(np.clip(-(offset @ slope) / (slope @ slope), 0.0, 1.0)))
+    points = start + np.array(shares)[:, None] * way
+    return float(np.min(np.linalg.norm(points - np.clip(points, -half, half), axis=1)))
+
+
+# The distance of two segments, in closed form; its definition is `model.geometry.segments`.
+
+
+@kernel
+def segment_pair_squared(p: Vector, q: Vector, r: Vector, s: Vector) -> float:
+    """Squared distance of the segments p q and r s, [m²]."""
+    between = segment_pair_between(p, q, r, s)
+    return dot(between, between)
+
+
+@kernel
+def segment_pair_between(p: Vector, q: Vector, r: Vector, s: Vector) -> Vector:
+    """From the nearest point of the segment p q to that of the segment r s, [m].
+
+    The nearest points are an end of one and the point of the other nearest to it, or they are
+    inside both; all cases are tried, so that parallel segments need no tolerance.
+    """
+    first, second, gap = minus(q, p), minus(s, r), minus(p, r)
+    best = _to_segment(p, r, s)
+    best = _shorter(best, _to_segment(q, r, s))
+    best = _shorter(best, _back(_to_segment(r, p, q)))
+    best = _shorter(best, _back(_to_segment(s, p, q)))
+    aa, bb, ab = dot(first, first), dot(second, second), dot(first, second)
+    determinant = aa * bb - ab * ab
+    if determinant > 0.0:
+        share = (ab * dot(second, gap) - bb * dot(first, gap)) / determinant
+        if 0.0 < share < 1.0:
+            best = _shorter(best, _to_segment(along(p, first, share), r, s))
+    return best
+
+
+@kernel
+def _to_segment(point: Vector, start: Vector, end: Vector) -> Vector:
+    """From a point to the nearest point of a segment."""
+    way, offset = minus(end, start), minus(point, start)
+    length = dot(way, way)
+    share = min(max(dot(way, offset) / length, 0.0), 1.0) if length > 0.0 else 0.0
+    return minus((share * way[0], share * way[1], share * way[2]), offset)
+
+
+@kernel
+def _shorter(a: Vector, b: Vector) -> Vector:
+    return a if dot(a, a) <= dot(b, b) else b
+
+
+@kernel
+def _back(a: Vector) -> Vector:
+    return (-a[0], -a[1], -a[2])
+
+
+# The distance of a triangle to a point, in closed form; exact for triangles without area too.
+
+
+@kernel
+def triangle_point_squared(a: Vector, b: Vector, c: Vector, point: Vector) -> float:
+    """Squared distance of the triangle a, b, c to a point, [m²]."""
+    edges = min(
+        segment_point_squared(a, b, point),
+        segment_point_squared(b, c, point),
+        segment_point_squared(c, a, point),
+    )
+    return min(edges, face_point_squared(a, b, c, point))
+
+
+@kernel
+def segment_point_squared(start: Vector, end: Vector, point: Vector) -> float:
+    """Squared distance of a segment to a point, [m²]."""
+    way, offset = minus(end, start), minus(point, start)
+    length = dot(way, way)
+    share = min(max(dot(way, offset) / length, 0.0), 1.0) if length > 0.0 else 0.0
+    away = minus(offset, (share * way[0], share * way[1], share * way[2]))
+    return dot(away, away)
+
+
+@kernel
+def face_point_squared(a: Vector, b: Vector, c: Vector, point: Vector) -> float:
+    """Squared distance of a point to its foot on the triangle's face, [m²]; else infinity.
+
+    The foot is a point of the triangle whatever round-off does to the shares, so that the value
+    is never below the true distance.
+    """
+    side, other, offset = minus(b, a), minus(c, a), minus(point, a)
+    aa, ab, bb = dot(side, side), dot(side, other), dot(other, other)
+    determinant = aa * bb - ab * ab
+    if determinant <= 0.0:
+        return np.inf
+    ao, bo = dot(side, offset), dot(other, offset)
+    first = (bb * ao - ab * bo) / determinant
+    second = (aa * bo - ab * ao) / determinant
+    if first < 0.0 or second < 0.0 or first + second > 1.0:
+        return np.inf
+    away = minus(point, along(along(a, side, first), other, second))
+    return dot(away, away)
+
+
+def triangle_point_definition(corners: NDArray[np.float64], point: NDArray[np.float64]) -> float:
+    """The same distance, [m]: the least over face, edges and corners, each where it applies.
+
+    Args:
+        corners: Shape (3, 3), [m].
+        point: Shape (3,), [m].
+    """
+    found = [float(np.min(np.linalg.norm(corners - point, axis=1)))]
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        way = end - start
+        if way @ way > 0.0:
+            share = np.clip((point - start) @ way / (way @ way), 0.0, 1.0)
+            found.append(float(np.linalg.norm(start + share * way - point)))
+    sides = (corners[1:] - corners[0]).T
+    shares = np.linalg.lstsq(sides, point - corners[0], rcond=None)[0]
+    if np.all(shares >= 0.0) and shares.sum() <= 1.0:
+        found.append(float(np.linalg.norm(corners[0] + sides @ shares - point)))
+    return min(found)
+
+
+# The distance of a triangle to a box about the origin, in closed form.
+#
+# The nearest points are either on an edge of the triangle (three segments against the box), or the
+# triangle's is in its inside; then the box lies wholly on one side of the triangle's plane and its
+# nearest point is the corner nearest to that plane, or the plane cuts the box and, since no edge of
+# the triangle touches it, the cut lies wholly inside the triangle. In either case one point of the
+# box decides: the one where the diagonal that leaves the plane fastest comes nearest to the plane.
+
+
+@kernel
+def triangle_box_squared(a: Vector, b: Vector, c: Vector, half: Vector) -> float:
+    """Squared distance of the triangle a, b, c to the box |x| ≤ half, [m²]; 0 where they touch."""
+    edges = min(
+        segment_box_squared(a, b, half),
+        segment_box_squared(b, c, half),
+        segment_box_squared(c, a, half),
+    )
+    return min(edges, _face_box_squared(a, b, c, half))
+
+
+@kernel
+def triangle_box_apart(a: Vector, b: Vector, c: Vector, half: Vector, needed: float) -> bool:
+    """Whether triangle and box are at least ``needed`` apart, [m].
+
+    The side of c and a comes first: where a search asks for a way to somewhere, it is the cable at
+    its end, which most often is the one in the way.
+    """
+    squared = needed * needed
+    return (
+        segment_box_squared(c, a, half) >= squared
+        and segment_box_squared(b, c, half) >= squared
+        and segment_box_squared(a, b, half) >= squared
+        and _face_box_squared(a, b, c, half) >= squared
+    )
+
+
+@kernel
+def _face_box_squared(a: Vector, b: Vector, c: Vector, half: Vector) -> float:
+    """Squared distance of the triangle's inside to the box, where it is the least; else more."""
+    normal = cross(minus(b, a), minus(c, a))
+    reach = abs(normal[0]) * half[0] + abs(normal[1]) * half[1] + abs(normal[2]) * half[2]
+    if reach == 0.0:
+        return np.inf
+    share = min(max(dot(normal, a) / reach, -1.0), 1.0)
+    corner = (
+        share * half[0] if normal[0] >= 0.0 else -share * half[0],
+        share * half[1] if normal[1] >= 0.0 else -share * half[1],
+        share * half[2] if normal[2] >= 0.0 else -share * half[2],
+    )
+    return face_point_squared(a, b, c, corner)
+
+
+def triangle_box_definition(corners: NDArray[np.float64], half: NDArray[np.float64]) -> float:
+    """The same distance, [m], by trying every pair of features.
+
+    Args:
+        corners: Box frame, shape (3, 3), [m].
+        half: Half extents of the box, shape (3,), [m].
+    """
+    sides = list(zip(corners, np.roll(corners, -1, axis=0), strict=True))
+    found = [segment_box_definition(start, end, half) for start, end in sides]
+    vertices = np.array(list(product((-1.0, 1.0), repeat=3))) * half
+    found += [triangle_point_definition(corners, vertex) for vertex in vertices]
+    if any(_crosses(corners, *edge) for edge in _box_edges(vertices)):
+        return 0.0
+    return min(found)
+
+
+def _box_edges(
+    vertices: NDArray[np.float64],
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    signs = np.sign(vertices)
+    return [
+        (vertices[i], vertices[j])
+        for i in range(8)
+        for j in range(i)
+        if np.count_nonzero(signs[i] != signs[j]) == 1
+    ]
+
+
+def _crosses(
+    corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
+) -> bool:
+    """Whether a segment passes through a triangle that is not in one plane with it."""
+    matrix = np.column_stack([start - end, corners[1] - corners[0], corners[2] - corners[0]])
+    if abs(np.linalg.det(matrix)) < 1e-300:
+        return False
+    share, first, second = np.linalg.solve(matrix, start - corners[0])
+    return bool(0.0 <= share <= 1.0 and first >= 0.0 and second >= 0.0 and first + second <= 1.0)
+
+
+# The distance of a triangle to a segment, in closed form.
+
+
+@kernel
+def triangle_segment_squared(a: Vector, b: Vector, c: Vector, start: Vector, end: Vector) -> float:
+    """Squared distance of the triangle a, b, c to a segment, [m²]; 0 where they cross.
+
+    The nearest points lie on an edge and the segment, or on the face and an end, or are one.
+    """
+    normal = cross(minus(b, a), minus(c, a))
+    first, last = dot(normal, minus(start, a)), dot(normal, minus(end, a))
+    if first != last and min(first, last) <= 0.0 <= max(first, last):
+        crossing = along(start, minus(end, start), first / (first - last))
+        if face_point_squared(a, b, c, crossing) < np.inf:
+            return 0.0
+    return min(
+        min(
+            segment_pair_squared(a, b, start, end),
+            segment_pair_squared(b, c, start, end),
+            segment_pair_squared(c, a, start, end),
+        ),
+        min(face_point_squared(a, b, c, start), face_point_squared(a, b, c, end)),
+    )
+
+
+def triangle_segment_definition(
+    corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
+) -> float:
+    """The same distance, [m]: the least of a convex function of the place on the segment.
+
+    Args:
+        corners: Of the triangle, shape (3, 3), [m].
+        start: Of the segment, shape (3,), [m].
+        end: Likewise.
+    """
+    golden = (np.sqrt(5.0) - 1.0) / 2.0
+    low, high = 0.0, 1.0
+    for _ in range(120):
+        left, right = high - golden * (high - low), low + golden * (high - low)
+        at_left, at_right = (
+            triangle_point_definition(corners, start + s * (end - start)) for s in (left, right)
+        )
+        if at_left < at_right:
+            high = right
+        else:
+            low = left
+    middle = start + (low + high) / 2.0 * (end - start)
+    ends = (triangle_point_definition(corners, p) for p in (start, middle, end))
+    return min(ends)

@@ -1,0 +1,96 @@
+"""Work on all cores or on a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+
+class Count:
+    """Adds up what is done for a progress bar."""
+
+    def __init__(self, advance: Callable[[float], None]) -> None:
+        """Reports sums to ``advance``."""
+        self._advance = advance
+        self._done = 0
+
+    def more(self, done: int) -> None:
+        """Counts what is newly done."""
+        self._done += done
+        self._advance(self._done)
+
+
+@contextmanager
+def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
+    """What does the work: a Dask cluster, processes of this computer, or nobody else.
+
+    Args:
+        workers: Number of processes; with 1 there is no pool.
+        dask: Address of a scheduler, instead of processes.
+
+    Raises:
+        BadInput: Dask is not installed, or no scheduler answers.
+    """
+    if dask is not None:
+        with _dask_client(dask) as client:
+            yield client.get_executor()
+        return
+    if workers == 1:
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin_worker)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    """Ctrl-C is for the process that was started; a worker ends when that does, however it ends."""
+    import signal
+    from threading import Thread
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    from multiprocessing import parent_process
+    from multiprocessing.connection import wait
+
+    parent = parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+def _dask_client(address: str) -> Any:
+    from importlib import import_module
+
+    from model.errors import BadInput
+
+    try:
+        client = import_module("distributed").Client
+    except ImportError as error:
+        raise BadInput(
+            "Dask is not installed",
+            next_step="pip install 'cdpr[dask]' (in a source checkout as docs/workspace.md says),"
+            " or leave --dask out",
+        ) from error
+    try:
+        return client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise BadInput(
+            "no Dask scheduler answers there",
+            where=address,
+            why=str(error) or type(error).__name__,
+            next_step="start one (dask scheduler), or leave --dask out",
+        ) from error

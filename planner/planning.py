@@ -1,0 +1,431 @@
+"""From a goal to a sealed plan: search, post-processing, check, figures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import BadInput, Fault, NoSolution
+from model.files.documents import PoseDocument
+from model.files.plan_file import PlanDocument
+from model.files.scene_file import StopDocument
+from model.plan import Plan, plan_from_document, sealed
+from model.pose import Array, Pose
+from model.progress import SILENT, Listener
+from model.rig import Rig
+from model.scene import Leg, Scene, legs_of
+from planner.check import check_path
+from planner.check_report import CheckReport, PlanRejected
+from planner.costs import KinematicCost
+from planner.endpoints import require_room_for_the_way, require_usable_ends
+from planner.kernels.jit import planner_compilation
+from planner.path import Progress, Route
+from planner.rrt.variants import AlgorithmVariant
+from planner.settings import AnytimeSettings, OptimalSettings, PlannerSettings, TurningSettings
+from planner.space import PoseSpace, Space, TranslationSpace
+
+if TYPE_CHECKING:
+    from planner.anytime.path import OptimalRoute
+    from planner.anytime_6d.path import TurningRoute
+
+
+# The whole way through a scene: its legs planned one after the other, and joined.
+
+
+Settings = PlannerSettings | OptimalSettings | TurningSettings
+"""Of any planner."""
+_LONG = 1000.0
+"""Milliseconds or rounds from which the progress of a search is reported."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MultiSegmentPath:
+    """A route through all stops.
+
+    Attributes:
+        route: From start to goal; its tree has a root for each leg.
+        stops: Which points of the route's path are at stops.
+        rounds: Of each leg, which find it again; none of the paper's planners.
+        search_time: Of the legs together, [s]; None for the paper's planners.
+    """
+
+    route: Route
+    stops: tuple[int, ...]
+    rounds: tuple[int, ...]
+    search_time: float | None
+
+
+def plan_segments(
+    rig: Rig,
+    legs: Sequence[Leg],
+    settings: Sequence[Settings],
+    kinematic: KinematicCost,
+    progress: Progress | None,
+    clock: Callable[[], float],
+) -> MultiSegmentPath:
+    """Plans every leg with its own load.
+
+    Args:
+        rig: The robot.
+        legs: In their order.
+        settings: Which planner, and its settings, for each leg.
+        kinematic: The cost of poses at the legs' orientation.
+        progress: Told how the search of each leg goes on.
+        clock: Seconds.
+
+    Raises:
+        NoSolution: A leg has no path, or its search ended at its limit; it is named.
+    """
+    routes: list[Route] = []
+    found: list[OptimalRoute | TurningRoute] = []
+    for leg, own in zip(legs, settings, strict=True):
+        try:
+            # Each planner is imported when it is asked for: its kernels take a while to load.
+            if isinstance(own, OptimalSettings):
+                from planner.anytime.path import optimal_route
+
+                found.append(optimal_route(rig, leg.scene, own, kinematic, progress, clock))
+                routes.append(found[-1].route)
+            elif isinstance(own, TurningSettings):
+                from planner.anytime_6d.path import turning_route
+
+                found.append(turning_route(rig, leg.scene, own, kinematic, progress, clock))
+                routes.append(found[-1].route)
+            else:
+                from planner.rrt.path import paper_route
+
+                routes.append(paper_route(rig, leg.scene, own, kinematic, progress))
+        except NoSolution as error:
+            if len(legs) > 1:
+                error.what = f"from {leg.begin} to {leg.end}: {error.what}"
+            raise
+    return MultiSegmentPath(
+        *_joined(routes),
+        rounds=tuple(f.rounds for f in found),
+        search_time=sum(max(0.0, f.search_time) for f in found) if found else None,
+    )
+
+
+def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> Sequence[Settings]:
+    """The settings of each leg: all alike, but for rounds that are given for each.
+
+    Raises:
+        BadInput: Rounds are not one number for each leg, or are for a planner that has none; or a
+            longest path is asked for with stops.
+    """
+    if isinstance(settings, PlannerSettings):
+        if rounds:
+            raise BadInput("the paper's planners know no rounds", next_step="leave them out")
+        return [settings] * count
+    if count > 1 and settings.longest < np.inf:
+        raise BadInput(
+            "a longest path cannot be asked for in a scene with stops",
+            why="each leg is planned for itself, and none knows what the others need",
+            next_step="leave --longest-mm out, or plan from stop to stop",
+        )
+    if not rounds:
+        return [settings] * count
+    if len(rounds) != count:
+        raise BadInput(
+            f"rounds are given for {len(rounds)} legs; the scene's stops make {count} of the way",
+            next_step="give one number for all legs, or one for each",
+        )
+    return [replace(settings, rounds=own) for own in rounds]
+
+
+def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
+    """The routes end to end, and which points of the path are where two of them meet."""
+    lengths = [len(route.path) - 1 for route in routes]
+    before = [0, *accumulate(len(route.nodes) for route in routes[:-1])]
+    joined = Route(
+        path=_end_to_end([route.path for route in routes]),
+        raw=_end_to_end([route.raw for route in routes]),
+        nodes=np.concatenate([route.nodes for route in routes]),
+        parents=np.concatenate(
+            [_later(route.parents, n) for route, n in zip(routes, before, strict=True)]
+        ),
+        iterations=sum(route.iterations for route in routes),
+        edge_checks=sum(route.edge_checks for route in routes),
+    )
+    return joined, tuple(accumulate(lengths[:-1]))
+
+
+def _later(parents: NDArray[np.int64], before: int) -> NDArray[np.int64]:
+    """Parents of nodes that come after others."""
+    return np.where(parents < 0, -1, parents + before)
+
+
+def _end_to_end(paths: Sequence[Array]) -> Array:
+    """Paths whose ends meet as one; each point where two meet stands once."""
+    return np.concatenate([paths[0], *(path[1:] for path in paths[1:])])
+
+
+def make_plan(
+    rig: Rig,
+    scene: Scene,
+    settings: Settings | None = None,
+    progress: Progress | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+    *,
+    rounds: Sequence[int] = (),
+    done: Sequence[StopDocument] = (),
+) -> PlanDocument:
+    """Plans a path from the scene's start through its stops to its goal.
+
+    The same rig, scene and settings give the same path on every machine of the same libraries. The
+    clock is read for the statistics alone; except that settings without a number of rounds
+    go on until a budget is spent: the plan then tells the rounds, which give its path again.
+
+    Args:
+        rig: The robot.
+        scene: Obstacles, clearances, load, start, stops and goal.
+        settings: Which planner, and its settings; the planner we recommend when left out. A budget
+            is that of each leg between stops.
+        progress: Told how the search goes on.
+        clock: Seconds, for the planning time and the budget.
+        rounds: Of each leg, in place of those in the settings.
+        done: Stops that a run before visited; the plan only remembers them.
+
+    Returns:
+        The plan, sealed with its hash, which has passed `planner.check.check_path`.
+
+    Raises:
+        BadInput: Start, goal or a stop cannot be used, or settings do not fit the legs.
+        NoSolution: There is no path, or the search ended at its limit.
+        Fault: The finished path failed its check; that is a fault of this program.
+    """
+    began = clock()
+    settings = settings or OptimalSettings()
+    turns = isinstance(settings, TurningSettings)
+    require_usable_ends(rig, scene, free_rotation=turns)
+    if isinstance(settings, AnytimeSettings) and not scene.stops:
+        require_room_for_the_way(scene, settings.longest)
+    space: Space = PoseSpace(rig) if turns else TranslationSpace(rig, scene.start.rotation)
+    kinematic = KinematicCost(rig, scene.start.rotation)
+    legs = legs_of(scene)
+    of_legs = settings_of_legs(settings, rounds, len(legs))
+    way = plan_segments(rig, legs, of_legs, kinematic, progress, clock)
+    route = way.route
+    poses = [space.pose(point) for point in route.path]
+    report = check_path(rig, scene, poses, way.stops)
+    if not report.passed:
+        raise Fault(
+            "the planned path failed its own check: "
+            + "; ".join(v.sentence() for v in report.violations),
+            where=f"plan for {rig.name} in {scene.name}",
+            next_step="report it with the rig, the scene and the seed; no plan was written",
+        )
+    return sealed(
+        {
+            "rig_hash": rig.plan_hash,
+            "scene_hash": scene.hash,
+            "rig": rig.document,
+            "scene": scene.document,
+            "planner": _planner(of_legs[0], way),
+            "waypoints": [PoseDocument.of(pose) for pose in poses],
+            "stops": [
+                {"name": stop.name, "waypoint": waypoint}
+                for stop, waypoint in zip(scene.stops, way.stops, strict=True)
+            ],
+            "done": list(done),
+            "raw_path": [PoseDocument.of(space.pose(point)) for point in route.raw],
+            "tree": _tree(space, route),
+            "statistics": {
+                "nodes": len(route.nodes),
+                "iterations": route.iterations,
+                "edge_checks": route.edge_checks,
+                "planning_time_s": max(0.0, clock() - began),
+                "search_time_s": way.search_time,
+            },
+            "quality": _quality(report, route.raw, kinematic.mean_along_poses(poses)),
+        }
+    )
+
+
+def plan_path(
+    rig: Rig,
+    scene: Scene,
+    settings: Settings | None = None,
+    listener: Listener = SILENT,
+    *,
+    rounds: Sequence[int] = (),
+    done: Sequence[StopDocument] = (),
+) -> PlanDocument:
+    """As `make_plan`, reporting how far it is, and when the planner must be compiled first.
+
+    After compiling, a short search is made and thrown away, so that no figure of the plan counts
+    the compiler.
+    """
+    settings = settings or OptimalSettings()
+    make = partial(make_plan, rig, scene, settings, rounds=rounds, done=done)
+    with planner_compilation(_work(settings), listener) as compiled:
+        if not compiled:
+            with suppress(NoSolution):
+                make_plan(rig, scene, _short(settings))
+            return make()
+        if isinstance(settings, PlannerSettings):
+            with listener.progress("planning", settings.max_iterations) as advance:
+                return make(progress=lambda done, _most, _distance: advance(done))
+        unit, scale = ("ms", 1e3) if settings.rounds is None else ("rounds", 1.0)
+        total = scale * (settings.rounds or settings.budget)
+        if total < _LONG:
+            with listener.waiting("planning"):
+                return make()
+        with listener.progress(f"planning, {unit}", total) as advance:
+            return make(progress=lambda done, _most, _cost: advance(scale * done))
+
+
+def _short(settings: Settings) -> Settings:
+    """The settings of a search that only compiles what a longer one needs."""
+    if isinstance(settings, PlannerSettings):
+        return replace(settings, max_iterations=min(settings.max_iterations, 200))
+    return replace(settings, rounds=1)
+
+
+def _work(settings: Settings) -> Literal["paper", "turning", "optimal"]:
+    if isinstance(settings, PlannerSettings):
+        return "paper"
+    return "turning" if isinstance(settings, TurningSettings) else "optimal"
+
+
+def plan_from_waypoints(
+    rig: Rig,
+    scene: Scene,
+    waypoints: Sequence[Pose],
+    *,
+    stops: Sequence[int] = (),
+    author: str = "",
+) -> Plan:
+    """A plan from the waypoints of another planner, proved like one of ours.
+
+    Args:
+        rig: The robot.
+        scene: Obstacles, clearances, load, start, stops and goal.
+        waypoints: ``world_from_platform``, from the scene's start to its goal; between two the
+            platform moves straight, and its orientation changes evenly.
+        stops: Which of the waypoints are at the scene's stops, one for each.
+        author: The planner, in its user's words; kept in the plan file.
+
+    Returns:
+        The plan, which has passed `planner.check.check_path`.
+
+    Raises:
+        BadInput: There are fewer than two waypoints, or not one in order for each stop.
+        PlanRejected: With every violation, what by how much and where.
+    """
+    if len(waypoints) < 2:
+        raise BadInput(
+            f"a path needs two waypoints, not {len(waypoints)}",
+            where=f"plan for {rig.name} in {scene.name}",
+            next_step="begin with scene.start and end with scene.goal",
+        )
+    report = check_path(rig, scene, waypoints, stops)
+    if not report.passed:
+        raise PlanRejected(
+            report,
+            where=f"waypoints for {rig.name} in {scene.name}",
+            next_step="change the waypoints; nothing has moved",
+        )
+    positions = np.array([pose.position for pose in waypoints])
+    kinematic = KinematicCost(rig, scene.start.rotation)
+    poses = [PoseDocument.of(pose) for pose in waypoints]
+    marks = zip(scene.stops, stops, strict=True)
+    return plan_from_document(
+        sealed(
+            {
+                "rig_hash": rig.plan_hash,
+                "scene_hash": scene.hash,
+                "rig": rig.document,
+                "scene": scene.document,
+                "planner": {"name": "waypoints", "author": author},
+                "waypoints": poses,
+                "stops": [{"name": stop.name, "waypoint": index} for stop, index in marks],
+                "raw_path": poses,
+                "tree": {
+                    "positions_mm": (positions * 1000.0).round(3).tolist(),
+                    "parents": list(range(-1, len(poses) - 1)),
+                },
+                "statistics": {
+                    "nodes": len(poses),
+                    "iterations": 0,
+                    "edge_checks": 0,
+                    "planning_time_s": 0.0,
+                },
+                "quality": _quality(report, positions, kinematic.mean_along_poses(waypoints)),
+            }
+        )
+    )
+
+
+def _planner(settings: Settings, way: MultiSegmentPath) -> dict[str, Any]:
+    if isinstance(settings, AnytimeSettings):
+        return _improving_planner(settings, way)
+    return {
+        "name": settings.sampler,
+        "cost": settings.cost,
+        "mode": settings.mode,
+        "seed": settings.seed,
+        "step_mm": settings.step * 1000.0,
+        "neighbour_radius_mm": settings.neighbour_radius * 1000.0,
+        "goal_radius_mm": settings.goal_radius * 1000.0,
+        "max_iterations": settings.max_iterations,
+        "readings": _readings(settings.readings),
+    }
+
+
+def _improving_planner(settings: AnytimeSettings, way: MultiSegmentPath) -> dict[str, Any]:
+    weights, longest = settings.weights, settings.longest
+    return {
+        "name": "turning" if isinstance(settings, TurningSettings) else "optimal",
+        "weights": {
+            "length": weights.length,
+            "kinematic": weights.kinematic,
+            "clearance": weights.clearance,
+            "capacity": weights.capacity,
+        },
+        "seed": settings.seed,
+        "rounds": list(way.rounds),
+        "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
+        "longest_mm": longest * 1000.0 if longest < float("inf") else None,
+    }
+
+
+def _readings(readings: AlgorithmVariant) -> dict[str, Any]:
+    return {
+        "failure_rate": readings.failure_rate,
+        "focus": readings.focus,
+        "cone_draw": readings.cone_draw,
+        "steer": readings.steer,
+        "spacing_mm": readings.spacing * 1000.0,
+        "goal_sight": readings.goal_sight,
+    }
+
+
+def _tree(space: Space, route: Route) -> dict[str, Any]:
+    positions = [space.pose(point).position for point in route.nodes]
+    return {
+        "positions_mm": [[round(float(x) * 1000.0, 3) for x in p] for p in positions],
+        "parents": [int(parent) for parent in route.parents],
+    }
+
+
+def _quality(report: CheckReport, raw: Array, mean_cost: float) -> dict[str, Any]:
+    closest = report.obstacle_clearance
+    steps = np.linalg.norm(np.diff(raw[:, :3], axis=0), axis=1)
+    return {
+        "length_mm": report.length * 1000.0,
+        "raw_length_mm": float(steps.sum()) * 1000.0,
+        "obstacle_clearance": closest.as_dict() if closest else None,
+        "self_clearance": report.self_clearance.as_dict(),
+        "mean_kinematic_cost": mean_cost,
+        "min_tension_n": report.min_tension,
+        "max_tension_n": report.max_tension,
+    }

@@ -1,0 +1,264 @@
+"""Algorithm 1 compiled: the tree grows from the start until the goal is a node of it, or on.
+
+As the paper stops it at the first path and never rewires children, or as RRT* does and goes on.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from planner.edge_checks import FREE, REASONS
+from planner.kernels.jit import kernel
+from planner.rrt.cost_field import CostField, edge_cost
+from planner.rrt.edge_checks import EdgeLimits, problem
+from planner.rrt.sampling import (
+    Tallies,
+    backward,
+    failure_rate,
+    focus_node,
+    forward,
+    goal_bias,
+    near_way,
+    tell,
+)
+from planner.rrt.tree import Tree, add, move, nearest, squared_distance, way_to, within
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+ITERATIONS, LAST, CHECKS, REACHED, REFUSALS = range(5)
+NOT_REACHED = -1
+KEPT_REFUSALS = 1024
+
+_GAIN = 1e-12
+"""What a rewired edge must gain at least, so that round-off rewires nothing."""
+
+
+class Task(NamedTuple):
+    """What is searched for; points have shape (n,)."""
+
+    start: Array
+    goal: Array
+    lower: Array
+    upper: Array
+    limits: EdgeLimits
+    field: CostField
+
+
+class Rules(NamedTuple):
+    """How it is searched, as numbers; see `PlannerSettings` and `AlgorithmVariant`."""
+
+    adaptive: bool
+    rate: int
+    focus: int
+    by_volume: bool
+    full_step: bool
+    spacing: float
+    sight: bool
+    rewire: bool
+    step: float
+    neighbour_radius: float
+    goal_radius: float
+    improving: int
+
+
+class Search(NamedTuple):
+    """A search that goes on.
+
+    Attributes:
+        tree: All nodes.
+        tallies: How expansions went.
+        counts: By name: iterations, the last one to be, edges checked, the goal's node or -1, edges
+            refused; shape (5,).
+        reasons: Edges refused by reason (`planner.rrt.edge_checks`), shape (5,).
+        refused: The latest of them, both ends, shape (KEPT_REFUSALS, 2, n).
+        closest: Smallest distance of a node to the goal, shape (1,).
+        found: Scratch space for neighbours, shape (capacity,).
+    """
+
+    tree: Tree
+    tallies: Tallies
+    counts: Integers
+    reasons: Integers
+    refused: Array
+    closest: Array
+    found: Integers
+
+
+def new_search(tree: Tree, tallies: Tallies, goal: Array, most: int) -> Search:
+    """A search that has not begun, of at most ``most`` iterations."""
+    counts = np.array([0, most, 0, NOT_REACHED, 0], dtype=np.int64)
+    return Search(
+        tree=tree,
+        tallies=tallies,
+        counts=counts,
+        reasons=np.zeros(len(REASONS), dtype=np.int64),
+        refused=np.empty((KEPT_REFUSALS, 2, len(goal))),
+        closest=np.array([float(np.linalg.norm(tree.points[0] - goal))]),
+        found=np.empty(len(tree.points), dtype=np.int64),
+    )
+
+
+@kernel
+def try_straight(search: Search, task: Task) -> None:
+    """Joins the goal to the root if the straight line is free."""
+    if _free(search, task.limits, task.start, task.goal):
+        cost = edge_cost(task.field, task.start, task.goal)
+        search.counts[REACHED] = add(search.tree, task.goal, 0, cost)
+        search.counts[LAST] = 0
+        search.closest[0] = 0.0
+
+
+@kernel
+def go_on(search: Search, task: Task, rules: Rules, random: Generator, iterations: int) -> None:
+    """Does so many iterations more, fewer where the search ends before."""
+    counts, tree = search.counts, search.tree
+    wanted = np.empty(len(task.goal))
+    for _ in range(iterations):
+        if counts[ITERATIONS] >= counts[LAST]:
+            return
+        counts[ITERATIONS] += 1
+        if counts[REACHED] == NOT_REACHED:
+            draw(search, task, rules, random, wanted)
+        else:
+            nodes = way_to(tree, counts[REACHED])
+            way = np.empty((len(nodes), len(wanted)))
+            for k in range(len(nodes)):
+                way[k] = tree.points[nodes[k]]
+            spread = rules.neighbour_radius
+            wanted = near_way(random, tree, way, spread, task.lower, task.upper)
+        node = _grow(search, task, rules, wanted)
+        if node >= 0:
+            away = math.sqrt(squared_distance(tree.points, node, task.goal))
+            search.closest[0] = min(search.closest[0], away)
+            if away <= rules.goal_radius or rules.sight:
+                _join_goal(search, task, rules, node)
+
+
+@kernel
+def draw(search: Search, task: Task, rules: Rules, random: Generator, wanted: Array) -> None:
+    """Writes the point to grow to: Algorithm 2, or the goal bias."""
+    if not rules.adaptive:
+        goal_bias(random, task.goal, task.lower, task.upper, wanted)
+        return
+    focus = search.tree.points[focus_node(search.tallies)]
+    if random.random() > failure_rate(search.tallies, rules.rate):
+        forward(
+            random,
+            task.start,
+            task.goal,
+            focus,
+            task.lower,
+            task.upper,
+            rules.by_volume,
+            wanted,
+        )
+    else:
+        backward(random, search.tree, focus, task.lower, task.upper, wanted)
+
+
+@kernel
+def _grow(search: Search, task: Task, rules: Rules, wanted: Array) -> int:
+    """One expansion (lines 5 to 18); the new node, or -1 when it failed."""
+    tree = search.tree
+    near = nearest(tree, wanted)
+    length = math.sqrt(squared_distance(tree.points, near, wanted))
+    if length < 1e-9:  # drawn on a node: no direction to grow in
+        tell(search.tallies, near, False, rules.focus)
+        return -1
+    step = rules.step if rules.full_step else min(rules.step, length)
+    new = tree.points[near] + (wanted - tree.points[near]) * (step / length)
+    if _crowded(tree, new, rules.spacing) or not _free(search, task.limits, tree.points[near], new):
+        tell(search.tallies, near, False, rules.focus)
+        return -1
+    tell(search.tallies, near, True, rules.focus)
+    count = within(tree, new, rules.neighbour_radius, search.found)
+    costs = np.empty(count)
+    for k in range(count):
+        costs[k] = edge_cost(task.field, tree.points[search.found[k]], new)
+    parent, cost = _best_parent(search, task, near, new, costs)
+    node = add(tree, new, parent, cost)
+    if rules.rewire:
+        _rewire(search, task.limits, node, costs)
+    return node
+
+
+@kernel
+def _crowded(tree: Tree, new: Array, spacing: float) -> bool:
+    """Whether a candidate is nearer to a node than the spacing."""
+    if spacing == 0.0:
+        return False
+    return math.sqrt(squared_distance(tree.points, nearest(tree, new), new)) < spacing
+
+
+@kernel
+def _best_parent(
+    search: Search, task: Task, near: int, new: Array, costs: Array
+) -> tuple[int, float]:
+    """Lines 10 to 17: the neighbour with the least cost to come whose edge is free."""
+    tree, found = search.tree, search.found
+    bound = tree.costs[near] + edge_cost(task.field, tree.points[near], new)
+    totals = np.empty(len(costs))
+    for k in range(len(costs)):
+        totals[k] = tree.costs[found[k]] + costs[k]
+    for _ in range(len(costs)):
+        k = int(np.argmin(totals))
+        if totals[k] >= bound:
+            break
+        if _free(search, task.limits, tree.points[found[k]], new):
+            return found[k], totals[k]
+        totals[k] = np.inf
+    return near, bound
+
+
+@kernel
+def _rewire(search: Search, limits: EdgeLimits, node: int, costs: Array) -> None:
+    """RRT*: neighbours that are cheaper through the new node become its children."""
+    tree = search.tree
+    for k in range(len(costs)):
+        neighbour = search.found[k]
+        through = tree.costs[node] + costs[k]
+        if through < tree.costs[neighbour] - _GAIN and _free(
+            search, limits, tree.points[node], tree.points[neighbour]
+        ):
+            move(tree, neighbour, node, through)
+
+
+@kernel
+def _join_goal(search: Search, task: Task, rules: Rules, node: int) -> None:
+    """Adds the exact goal behind a node, or gives it a better parent, where the edge is free."""
+    tree, counts = search.tree, search.counts
+    reached = counts[REACHED]
+    total = tree.costs[node] + edge_cost(task.field, tree.points[node], task.goal)
+    if reached != NOT_REACHED and total >= tree.costs[reached]:
+        return
+    if not _free(search, task.limits, tree.points[node], task.goal):
+        return
+    if reached != NOT_REACHED:
+        move(tree, reached, node, total)
+        return
+    counts[REACHED] = add(tree, task.goal, node, total)
+    search.closest[0] = 0.0
+    on = rules.improving if rules.rewire else 0
+    counts[LAST] = min(counts[ITERATIONS] + on, counts[LAST])
+
+
+@kernel
+def _free(search: Search, limits: EdgeLimits, start: Array, end: Array) -> bool:
+    """Whether an edge is allowed; counts it, and keeps it where it is refused."""
+    counts = search.counts
+    counts[CHECKS] += 1
+    reason = problem(limits, start, end)
+    if reason == FREE:
+        return True
+    search.reasons[reason] += 1
+    slot = counts[REFUSALS] % KEPT_REFUSALS
+    search.refused[slot, 0] = start
+    search.refused[slot, 1] = end
+    counts[REFUSALS] += 1
+    return False

@@ -1,0 +1,213 @@
+"""Maps over a grid, part by part, on as many processes as there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.pose import Array
+from model.progress import SILENT, Listener
+from model.rig import Rig
+from planner.kernels.jit import planner_compilation
+from planner.parallel import Count, worker_pool
+from planner.workspace.grid import Grid, frame_box, slice_through
+from planner.workspace.grid import volume as grid_of_volume
+from planner.workspace.maps import OBSTACLE_CLEARANCE, Extremes, Question, Values, costs, values_at
+
+POINTS_IN_A_PART = 4096
+VERDICTS = (
+    "allowed",
+    "no wrench closure",
+    "not wrench feasible",
+    "self clearance too small",
+    "obstacle clearance too small",
+)
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Maps:
+    """Values of quantities over a grid.
+
+    Attributes:
+        question: For what they are.
+        grid: Where.
+        values: Shape of the grid each, SI, by name: the quantities that were asked for, and
+            the costs (`planner.workspace.maps.costs`).
+    """
+
+    question: Question
+    grid: Grid
+    values: Values
+
+    def __repr__(self) -> str:
+        """Where it is, its points, and the names of its values."""
+        return f"<Maps {self.grid.name}: {self.grid.count} points of {', '.join(self.values)}>"
+
+    @property
+    def closed(self) -> NDArray[np.bool_]:
+        """Where the cables can balance any wrench."""
+        return np.asarray(self.values["closure_margin"] > 0.0)
+
+    @property
+    def feasible(self) -> NDArray[np.bool_]:
+        """Where the tension limits suffice for weight, payload and disturbances."""
+        return np.asarray(self.values["capacity_margin"] >= 0.0)
+
+    @property
+    def collision_free(self) -> NDArray[np.bool_]:
+        """Where the scene's clearances are kept; without a scene, where nothing touches."""
+        scene = self.question.scene
+        own, to_obstacles = 0.0, 0.0
+        if scene is not None:
+            own, to_obstacles = scene.self_clearance, scene.obstacle_clearance
+        free = self.values["self_clearance"] >= own
+        if OBSTACLE_CLEARANCE in self.values:
+            free &= self.values[OBSTACLE_CLEARANCE] >= to_obstacles
+        return np.asarray(free)
+
+    @property
+    def verdict(self) -> NDArray[np.int64]:
+        """What forbids a pose first, by its place in `VERDICTS`; 0 where nothing does."""
+        scene = self.question.scene
+        own = scene.self_clearance if scene else 0.0
+        tests = [self.closed, self.feasible, self.values["self_clearance"] >= own]
+        if OBSTACLE_CLEARANCE in self.values:
+            tests.append(self.collision_free)
+        return np.asarray(np.select([~test for test in tests], range(1, len(tests) + 1), 0))
+
+
+def compute(
+    question: Question,
+    extremes: Extremes,
+    grid: Grid,
+    *,
+    pool: Executor | None = None,
+    progress: Progress = lambda _: None,
+) -> Maps:
+    """Computes maps.
+
+    Args:
+        question: Of what.
+        extremes: For the costs.
+        grid: Where.
+        pool: Does the work, in other processes or on other machines; this process without one.
+            The values do not depend on it.
+        progress: Told how many points are newly done.
+    """
+    bounds = [(k, min(k + POINTS_IN_A_PART, grid.count)) for k in _starts(grid)]
+    values = {name: np.empty(grid.count) for name in question.quantities}
+    for (first, last), part in _parts(question, grid, bounds, pool):
+        for name, found in part.items():
+            values[name][first:last] = found
+        progress(last - first)
+    shaped = {name: array.reshape(grid.shape) for name, array in values.items()}
+    return Maps(question, grid, shaped | costs(shaped, extremes))
+
+
+def _starts(grid: Grid) -> range:
+    return range(0, grid.count, POINTS_IN_A_PART)
+
+
+def _parts(
+    question: Question, grid: Grid, bounds: list[tuple[int, int]], pool: Executor | None
+) -> Iterator[tuple[tuple[int, int], Values]]:
+    if pool is None or len(bounds) == 1:
+        for part in bounds:
+            yield part, values_at(question, grid.points(*part))
+        return
+    tasks = {pool.submit(_part, question, grid, *part): part for part in bounds}
+    try:
+        for done in as_completed(tasks):
+            yield tasks[done], done.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+
+
+def _part(question: Question, grid: Grid, first: int, last: int) -> Values:
+    return values_at(question, grid.points(first, last))
+
+
+# Maps of a whole workspace.
+
+CELLS_OF_A_SLICE = 50
+CELLS_OF_THE_FRAME = 40
+POINTS_FOR_ONE_PROCESS = 20000
+"""Fewer are done before other processes have started."""
+
+
+def workspace_grids(
+    rig: Rig,
+    slices: Sequence[tuple[int, float]] = (),
+    *,
+    volume: bool | None = None,
+    step: float | None = None,
+    lower: Array | None = None,
+    upper: Array | None = None,
+) -> list[Grid]:
+    """The slices, and with the volume the frame around it and the region itself.
+
+    Args:
+        rig: The robot.
+        slices: Axis (0 to 2) and position [m] of planes; the level one through home when left out.
+        volume: Whether the whole box is mapped too; left out, if there are no slices.
+        step: Distance of points, [m]; a fiftieth of the longest side when left out.
+        lower: Corner of the region, shape (3,), [m]; that of the rig's workspace when left out.
+        upper: The opposite corner.
+
+    Raises:
+        BadInput: A plane is outside the region, or there are too many points.
+    """
+    lower = rig.workspace_lower if lower is None else lower
+    upper = rig.workspace_upper if upper is None else upper
+    step = float(np.max(upper - lower)) / CELLS_OF_A_SLICE if step is None else step
+    wanted = list(slices)
+    if not wanted:
+        wanted = [(2, float(np.clip(rig.home.position[2], lower[2], upper[2])))]
+    grids = [slice_through(axis, value, lower, upper, step) for axis, value in wanted]
+    if volume or (volume is None and not slices):
+        around = frame_box(rig)
+        coarse = float(np.max(around[1] - around[0])) / CELLS_OF_THE_FRAME
+        grids.append(grid_of_volume("frame", *around, coarse))
+        grids.append(grid_of_volume("workspace", lower, upper, step))
+    return grids
+
+
+def map_workspace(
+    question: Question,
+    grids: Sequence[Grid],
+    *,
+    workers: int | None = None,
+    dask: str | None = None,
+    listener: Listener = SILENT,
+) -> list[Maps]:
+    """Maps of what a rig can do where; `planner.workspace.files.write_maps` writes them.
+
+    Args:
+        question: Of what.
+        grids: Where, see `workspace_grids`.
+        workers: Processes; one a core when left out.
+        dask: Address of a Dask cluster that does the work instead.
+        listener: Receives how far it is.
+
+    Raises:
+        BadInput: Dask is not installed, or no scheduler answers.
+    """
+    with planner_compilation("maps", listener):
+        extremes = Extremes.over_workspace(question)
+        # Compiles what is needed once, before several processes would do so.
+        values_at(question, question.rig.home.position[None, :])
+    total = sum(grid.count for grid in grids)
+    cores = 1 if total <= POINTS_FOR_ONE_PROCESS else os.cpu_count() or 1
+    with (
+        worker_pool(workers or cores, dask) as pool,
+        listener.progress("mapping", total) as advance,
+    ):
+        done = Count(advance)
+        return [compute(question, extremes, grid, pool=pool, progress=done.more) for grid in grids]

@@ -1,0 +1,102 @@
+"""Pictures, tables and page of maps, as files in a folder."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from planner.workspace.compute import Maps
+from planner.workspace.report import Chapter, arrays_of, csv_of, page, shown_in, summary_of
+from planner.workspace.slices import SETTINGS, cost_figure, slice_figure, title_of
+from planner.workspace.volumes import level_figure, space_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Draw = Callable[[], "Figure"]
+PAGE = "index.html"
+SUMMARY = "summary.json"
+_LEVELS_OF = (
+    "capacity_margin",
+    "dexterity_cost",
+    "wrench_cost",
+    "self_clearance",
+    "obstacle_clearance",
+)
+
+
+def write_maps(folder: Path, made: list[Maps], title: str, lead: str) -> dict[str, Any]:
+    """Writes everything and returns the summary, by name of grid.
+
+    Args:
+        folder: An existing folder.
+        made: Of slices; of a volume named ``frame`` for the picture of the whole space; of other
+            volumes.
+        title: Of the page.
+        lead: First sentence of the page.
+    """
+    chapters = [_chapter(folder, maps) for maps in made]
+    (folder / PAGE).write_text(page(title, lead, chapters), encoding="utf-8")
+    summary = {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    return summary
+
+
+def _chapter(folder: Path, maps: Maps) -> Chapter:
+    name = maps.grid.name
+    tables = [f"{name}.npz"]
+    packed = io.BytesIO()
+    np.savez_compressed(packed, allow_pickle=False, **arrays_of(maps))
+    (folder / tables[0]).write_bytes(packed.getvalue())
+    if maps.grid.normal is not None:
+        tables.append(f"{name}.csv")
+        (folder / tables[1]).write_text(csv_of(maps), encoding="utf-8")
+    title, text, figures = _content(maps)
+    pictures = [_picture(folder, file, draw) for file, draw in figures]
+    alternative = f"{title}: colour maps; the numbers are in the table below and in the files"
+    return Chapter(
+        title, text, tuple((p, alternative) for p in pictures), tuple(tables), summary_of(maps)
+    )
+
+
+def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
+    """Heading, sentence and pictures of a grid."""
+    name = maps.grid.name
+    if maps.grid.normal is not None:
+        figures: list[tuple[str, Draw]] = [
+            (name, partial(slice_figure, maps)),
+            (f"{name}_costs", partial(cost_figure, maps)),
+        ]
+        text = (
+            "Red lines: where a limit is reached. Colours leave out the most extreme hundredth"
+            " at each end. The two surfaces are the paper's Fig. 7."
+        )
+        return f"Slice {title_of(maps.grid)}", text, figures
+    if name == "frame":
+        text = (
+            "The paper's Fig. 6: where the cables can balance any wrench, and where the tension"
+            " limits suffice; red: frame of the outlets, grey: workspace box."
+        )
+        return "The whole frame", text, [(name, partial(space_figure, maps))]
+    chosen = [quantity for quantity in shown_in(maps) if quantity.name in _LEVELS_OF]
+    levels: list[tuple[str, Draw]] = [
+        (f"{name}_{quantity.name}", partial(level_figure, maps, quantity)) for quantity in chosen
+    ]
+    return "The workspace, level by level", "Red lines: where a limit is reached.", levels
+
+
+def _picture(folder: Path, name: str, draw: Draw) -> str:
+    """Draws once and writes it for screens and for print; returns the name of the first."""
+    import matplotlib
+
+    with matplotlib.rc_context(SETTINGS):
+        figure = draw()
+        figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None, "Creator": None})
+    return f"{name}.png"

@@ -1,0 +1,195 @@
+"""Pictures of a slice: every quantity as colours, and the two costs as surfaces (paper, Fig. 7)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.pose import Array
+from planner.workspace.compute import VERDICTS, Maps
+from planner.workspace.grid import AXES, Grid
+from planner.workspace.report import SHOWN, Shown, limit_of, shown_in
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# One look for all pictures of maps.
+
+
+CLOSED = "#3f9b6b"
+FEASIBLE = "#2f7fb5"
+FREE = "#c98500"
+FRAME = "#c0392b"
+LIMIT = "#d0004f"
+VERDICT_COLOURS = ("#dcefe3", "#2b2f36", "#2f7fb5", "#e08a3c", "#c1465a")
+"""In the order of `planner.workspace.compute.VERDICTS`."""
+MUTED = "#5c6675"
+DOTS_PER_INCH = 150
+
+SETTINGS: dict[Any, Any] = {  # matplotlib types the keys as a union of every setting's name
+    "svg.fonttype": "none",
+    "svg.hashsalt": "cdpr",
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": MUTED,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "legend.frameon": False,
+    "figure.dpi": DOTS_PER_INCH,
+    "savefig.dpi": DOTS_PER_INCH,
+}
+
+
+def new_figure(
+    width: float, height: float, layout: Literal["constrained"] | None = "constrained"
+) -> Figure:
+    """An empty figure, [in], outside of any window system."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout=layout)
+
+
+_COLUMNS = 3
+_BELOW_LABELS = 0.42
+"""Where the legend begins, [in] below the axes."""
+_COSTS = ("dexterity_cost", "wrench_cost")
+_LEAST_SPREAD = 1e-12
+
+
+def slice_figure(maps: Maps) -> Figure:
+    """Every quantity over a slice, with the line beyond which a limit is broken."""
+    panels = [quantity for quantity in shown_in(maps) if quantity.name != "condition_number"]
+    rows = -(-(1 + len(panels)) // _COLUMNS)
+    figure = new_figure(11.0, rows * (2.7 * height_to_width(maps.grid) + 0.8) + 0.4)
+    figure.suptitle(title_of(maps.grid), x=0.01, ha="left", weight="bold")
+    cells = np.asarray(figure.subplots(rows, _COLUMNS)).ravel()
+    _verdict_map(cells[0], maps)
+    for axes, quantity in zip(cells[1:], panels, strict=False):
+        coloured = colour_map(axes, maps, quantity, *colour_range([maps], quantity))
+        figure.colorbar(coloured, ax=axes, shrink=0.86)
+        axes.set_title(quantity.label)
+    for axes in cells[1 + len(panels) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _verdict_map(axes: Axes, maps: Maps) -> None:
+    """Draws where the platform may be, and what forbids it elsewhere."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+    from matplotlib.transforms import ScaledTranslation
+
+    values = _flat(maps.verdict, maps.grid)
+    x, y = _coordinates(maps.grid)
+    axes.pcolormesh(
+        x, y, values, cmap=ListedColormap(VERDICT_COLOURS), vmin=-0.5,
+        vmax=len(VERDICTS) - 0.5, shading="nearest", rasterized=True,
+    )  # fmt: skip
+    present = sorted(set(values.ravel().tolist()))
+    patches = [Patch(color=VERDICT_COLOURS[k], label=VERDICTS[k]) for k in present]
+    below = axes.transAxes + ScaledTranslation(0.0, -_BELOW_LABELS, axes.figure.dpi_scale_trans)
+    axes.legend(
+        handles=patches, loc="upper left", bbox_to_anchor=(0.0, 0.0), bbox_transform=below,
+        borderaxespad=0.0, fontsize=8.0,
+    )  # fmt: skip
+    axes.set_title("where the platform may be")
+    _label(axes, maps.grid)
+
+
+def cost_figure(maps: Maps) -> Figure:
+    """Dexterity cost (a) and wrench cost (b) over a slice as surfaces, as in the paper's Fig. 7."""
+    figure = new_figure(11.0, 4.6)
+    across, up = sides_of(maps.grid)
+    grid = np.meshgrid(*_coordinates(maps.grid))
+    for place, (letter, name) in enumerate(zip("ab", _COSTS, strict=True)):
+        quantity = next(q for q in SHOWN if q.name == name)
+        axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
+        values = values_on_slice(maps, quantity)
+        low, high = colour_range([maps], quantity)
+        surface = axes.plot_surface(
+            *grid, values, cmap=quantity.colours, vmin=low, vmax=high, linewidth=0.15,
+            edgecolor="#00000030", rcount=60, ccount=60,
+        )  # fmt: skip
+        axes.set_title(f"{letter}  {quantity.title}, {title_of(maps.grid)}")
+        axes.set_xlabel(f"{AXES[across]} [mm]")
+        axes.set_ylabel(f"{AXES[up]} [mm]")
+        axes.view_init(elev=32.0, azim=-125.0)
+        figure.colorbar(surface, ax=axes, shrink=0.6, pad=0.09)
+    return figure
+
+
+def colour_map(axes: Axes, maps: Maps, quantity: Shown, low: float, high: float) -> Any:
+    """Draws one quantity over a slice; returns what a colour bar is made from."""
+    x, y = _coordinates(maps.grid)
+    values = values_on_slice(maps, quantity)
+    coloured = axes.pcolormesh(
+        x, y, values, cmap=quantity.colours, vmin=low, vmax=high, shading="nearest", rasterized=True
+    )
+    limit = limit_of(maps, quantity)
+    if limit is not None and np.nanmin(values) < limit < np.nanmax(values):
+        bounded = np.nan_to_num(np.clip(values, 2.0 * min(low, limit) - high, high))
+        axes.contour(x, y, bounded, levels=[limit], colors=LIMIT, linewidths=1.4)
+    _label(axes, maps.grid)
+    return coloured
+
+
+def _label(axes: Axes, grid: Grid) -> None:
+    across, up = sides_of(grid)
+    axes.set_aspect("equal")
+    axes.set_xlabel(f"{AXES[across]} [mm]")
+    axes.set_ylabel(f"{AXES[up]} [mm]")
+
+
+def colour_range(slices: list[Maps], quantity: Shown) -> tuple[float, float]:
+    """Values at the ends of the colours: all but the most extreme hundredth at each end."""
+    values = np.concatenate([(m.values[quantity.name] * quantity.scale).ravel() for m in slices])
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return 0.0, 1.0
+    low, high = (float(v) for v in np.percentile(finite, [1.0, 99.0]))
+    return low, max(high, low + _LEAST_SPREAD * max(1.0, abs(low)))
+
+
+def values_on_slice(maps: Maps, quantity: Shown) -> Array:
+    """Values as a picture has them: rows upward, columns to the right, in the unit shown."""
+    flat: Array = _flat(maps.values[quantity.name], maps.grid) * quantity.scale
+    return flat
+
+
+def _flat(values: NDArray[Any], grid: Grid) -> NDArray[Any]:
+    return np.squeeze(values, axis=_normal(grid)).T
+
+
+def _coordinates(grid: Grid) -> tuple[Array, Array]:
+    """To the right and upward, [mm]."""
+    across, up = sides_of(grid)
+    return grid.axes[across] * 1e3, grid.axes[up] * 1e3
+
+
+def sides_of(grid: Grid) -> tuple[int, int]:
+    """Numbers of the axes that go to the right and upward in a picture of a slice."""
+    across, up = (axis for axis in range(3) if axis != _normal(grid))
+    return across, up
+
+
+def height_to_width(grid: Grid) -> float:
+    """Shape of a picture of a slice, within what still can be read."""
+    x, y = _coordinates(grid)
+    return float(np.clip(np.ptp(y) / np.ptp(x), 0.35, 2.0))
+
+
+def title_of(grid: Grid) -> str:
+    """Where the slice is."""
+    normal = _normal(grid)
+    return f"{AXES[normal]} = {round(float(grid.axes[normal][0]) * 1e3, 1):g} mm"
+
+
+def _normal(grid: Grid) -> int:
+    return 2 if grid.normal is None else grid.normal

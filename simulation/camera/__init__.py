@@ -1,0 +1,1 @@
+"""A synthetic camera: renders what a camera would see of the simulated rig."""

@@ -1,0 +1,256 @@
+"""The synthetic camera: pictures of the rig with an exactly known pose.
+
+Tags, platform and obstacles are met by the undistorted ray of every sample, 2 × 2 samples a pixel.
+What stands still is drawn once; a picture redraws the platform's surroundings and the cables.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import BadInput
+from model.kinematics import cables_at
+from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.rig import Camera, Rig
+from model.scene import Scene
+from simulation.camera.cables import draw_cables
+from simulation.camera.rendering import (
+    ROOM,
+    SAMPLES,
+    Canvas,
+    CanvasRegion,
+    Image8,
+    Image32,
+    draw_background,
+    draw_quad,
+    draw_tag,
+    pixels_of,
+    region_of,
+    sample_rays,
+    shade,
+)
+from simulation.ground_truth import Optics
+
+if TYPE_CHECKING:
+    from simulation.camera.rendering import Image8
+
+
+# How a simulated platform moves while a picture is exposed, and pictures one after the other.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlatformMotion:
+    """A steady motion of the platform.
+
+    Attributes:
+        velocity: Of its origin, world frame, shape (3,), [m/s].
+        turning: Along the world's axes, shape (3,), [rad/s].
+    """
+
+    velocity: Array
+    turning: Array
+
+    @classmethod
+    def between(cls, before: Pose, after: Pose, seconds: float) -> PlatformMotion:
+        """The motion from one pose to another in a time that is not 0."""
+        turn = rotation_vector_from_matrix(after.rotation @ before.rotation.T)
+        return cls((after.position - before.position) / seconds, turn / seconds)
+
+    def moved(self, pose: Pose, seconds: float) -> Pose:
+        """The pose so much later, or earlier."""
+        turn = matrix_from_rotation_vector(self.turning * seconds)
+        return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)
+
+
+class Film:
+    """Pictures of one camera, each smeared by the platform's motion since the one before.
+
+    The first is sharp. Between pictures the platform is taken to have moved steadily.
+    """
+
+    def __init__(self, camera: SyntheticCamera) -> None:
+        """Takes the camera; nothing is rendered yet."""
+        self._camera = camera
+        self._before: tuple[float, Pose] | None = None
+
+    def picture(self, time: float, pose: Pose, frame: int) -> Image8:
+        """The next picture.
+
+        Args:
+            time: At the middle of its exposure, [s].
+            pose: Of the platform there, ``world_from_platform``.
+            frame: Number of the picture; it picks the noise.
+
+        Returns:
+            Grey picture, shape (height, width).
+        """
+        motion = None
+        if self._before is not None and time > self._before[0]:
+            motion = PlatformMotion.between(self._before[1], pose, time - self._before[0])
+        self._before = time, pose
+        return self._camera.render(pose, frame, motion)
+
+
+#: Brightness of the platform's faces in full light.
+PLATFORM = 168.0
+#: A platform that is nearer to the lens is not drawn, or not smeared, [m].
+NEAREST = 0.02
+#: A smear is drawn as so many poses that neighbours are this far apart, [px], but no more than:
+SMEAR_STEP, MOST_POSES = 0.5, 64
+#: A shorter smear is not to be seen, [px].
+LEAST_SMEAR = 0.02
+#: Slack of the precomputed noise, in which each picture takes another place, [px].
+NOISE_SLACK = 96
+
+
+class SyntheticCamera:
+    """Takes pictures of a simulated rig.
+
+    Args:
+        rig: Its platform, tags and cables.
+        scene: Its obstacles.
+        camera: One of the rig's cameras, or another.
+        seed: Of the noise: the same seed, pose and frame give the same picture.
+        optics: Imperfections of lens and sensor.
+
+    Raises:
+        BadInput: The rig has no tags.
+    """
+
+    def __init__(
+        self, rig: Rig, scene: Scene, camera: Camera, seed: int = 0, optics: Optics | None = None
+    ) -> None:
+        if not rig.tag_family:
+            raise BadInput(
+                "the rig has no tags, a camera can measure nothing",
+                where=f"rig {rig.name}",
+                next_step="add a `tags` section to the rig file",
+            )
+        self.rig, self.camera, self.seed = rig, camera, seed
+        self.optics = optics or Optics()
+        self._camera_from_world = camera.world_from_camera.inverse()
+        self._background = Canvas.blank(camera, sample_rays(camera), ROOM)
+        draw_background(self._background, rig, scene, self._camera_from_world)
+        self._light = _vignette(camera, self.optics.vignetting) * np.float32(self.optics.light)
+        self._still = self._exposed(self._background, self._light)
+        self._depth = self._background.depth[1::SAMPLES, 1::SAMPLES].copy()
+        self._noise = _noise(camera, self.optics.noise, seed)
+
+    def render(self, pose: Pose, frame: int = 0, motion: PlatformMotion | None = None) -> Image8:
+        """The picture with the platform at ``pose`` (``world_from_platform``).
+
+        Args:
+            pose: Exact truth of the picture, in the middle of its exposure.
+            frame: Number of the picture; it picks the noise.
+            motion: Of the platform meanwhile; left out, it stands still.
+
+        Returns:
+            Grey picture, shape (height, width).
+        """
+        poses = self._while_exposed(pose, motion)
+        if len(poses) == 1:
+            return self._with_noise(self._at(pose), frame)
+        light = np.zeros(self._still.shape, np.float32)
+        for one in poses:
+            light += self._at(one)
+        # Rounded up as often as the mean lies near: the mean of two is a tie half the time, and a
+        # rule for ties would make edges brighter or darker.
+        chance = np.random.default_rng([self.seed, frame, 0x5EA2]).random(light.shape, np.float32)
+        mean = np.floor(light / len(poses) + chance)
+        return self._with_noise(np.asarray(np.minimum(mean, 255.0), dtype=np.uint8), frame)
+
+    def _while_exposed(self, pose: Pose, motion: PlatformMotion | None) -> list[Pose]:
+        """Poses in the middles of equal parts of the exposure, so many that the smear is even."""
+        time = self.optics.exposure
+        if motion is None or time <= 0.0:
+            return [pose]
+        ends = (motion.moved(pose, share * time) for share in (-0.5, 0.5))
+        seen = [self._camera_from_world.apply(p.apply(self.rig.platform_corners)) for p in ends]
+        if min(float(corners[:, 2].min()) for corners in seen) < NEAREST:
+            return [pose]
+        first, last = (pixels_of(self.camera, corners) for corners in seen)
+        smear = float(np.linalg.norm(last - first, axis=1).max())
+        count = 1 if smear < LEAST_SMEAR else min(MOST_POSES, 1 + math.ceil(smear / SMEAR_STEP))
+        return [motion.moved(pose, ((k + 0.5) / count - 0.5) * time) for k in range(count)]
+
+    def _at(self, pose: Pose) -> Image8:
+        """The picture of a platform that stands still, without noise."""
+        picture, depth = self._still.copy(), self._depth
+        region = self._platform_region(pose)
+        if not region.empty:
+            canvas = self._background.part(region).copy()
+            self._draw_platform(canvas, pose)
+            rows, columns = region.slices()
+            picture[rows, columns] = self._exposed(canvas, self._light[rows, columns])
+            depth = depth.copy()
+            depth[rows, columns] = canvas.depth[1::SAMPLES, 1::SAMPLES]
+        if self.optics.cables:
+            cables, radius = cables_at(self.rig, pose), self.rig.cable_radius
+            draw_cables(picture, depth, self.camera, cables, self._camera_from_world, radius)
+        return picture
+
+    def _platform_region(self, pose: Pose) -> CanvasRegion:
+        corners = self._camera_from_world.apply(pose.apply(self.rig.platform_corners))
+        if np.all(corners[:, 2] < NEAREST):
+            return CanvasRegion(0, 0, 0, 0)
+        return region_of(self.camera, corners, margin=8)
+
+    def _draw_platform(self, canvas: Canvas, pose: Pose) -> None:
+        for face, half_size in _faces(self.rig):
+            world_from_face = pose.compose(face)
+            light = np.float32(PLATFORM * shade(world_from_face.rotation[:, 2]))
+            texture = np.full((32, 32), light, dtype=np.float32)
+            texture[[0, -1]] *= np.float32(0.8)
+            texture[:, [0, -1]] *= np.float32(0.8)
+            draw_quad(canvas, self._camera_from_world.compose(world_from_face), half_size, texture)
+        for tag in self.rig.platform_tags:
+            draw_tag(canvas, self.rig.tag_family, tag, self._camera_from_world, pose)
+
+    def _exposed(self, canvas: Canvas, light: Image32) -> Image8:
+        pixels = canvas.pixels()
+        if self.optics.blur > 0:
+            pixels = np.asarray(cv2.GaussianBlur(pixels, (0, 0), self.optics.blur), np.float32)
+        return np.asarray(np.clip(pixels * light + 0.5, 0, 255), dtype=np.uint8)
+
+    def _with_noise(self, picture: Image8, frame: int) -> Image8:
+        if self.optics.noise <= 0:
+            return picture
+        down, right = np.random.default_rng([self.seed, frame]).integers(0, NOISE_SLACK, 2)
+        height, width = picture.shape
+        noise = np.ascontiguousarray(self._noise[down : down + height, right : right + width])
+        return np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def _faces(rig: Rig) -> list[tuple[Pose, tuple[float, float]]]:
+    """``platform_from_face`` (z outward) and half width and height of the box's faces, [m]."""
+    faces = []
+    for axis in range(3):
+        across, up = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (1.0, -1.0):
+            rotation = np.zeros((3, 3))
+            rotation[across, 0], rotation[up, 1], rotation[axis, 2] = sign, 1.0, sign
+            centre = rotation[:, 2] * rig.half_size[axis]
+            half = (float(rig.half_size[across]), float(rig.half_size[up]))
+            faces.append((Pose(centre, rotation), half))
+    return faces
+
+
+def _vignette(camera: Camera, loss: float) -> Image32:
+    """Share of light that reaches each pixel."""
+    x = (np.arange(camera.width) - (camera.width - 1) / 2.0) / (camera.width / 2.0)
+    y = (np.arange(camera.height) - (camera.height - 1) / 2.0) / (camera.width / 2.0)
+    radius = x[None, :] ** 2 + y[:, None] ** 2
+    return np.asarray(1.0 - loss * radius / radius.max(), dtype=np.float32)
+
+
+def _noise(camera: Camera, deviation: float, seed: int) -> NDArray[np.int16]:
+    """Noise somewhat larger than a picture."""
+    shape = (camera.height + NOISE_SLACK, camera.width + NOISE_SLACK)
+    values = np.random.default_rng([seed, 0xCA3E]).standard_normal(shape, dtype=np.float32)
+    return np.round(values * np.float32(deviation)).astype(np.int16)

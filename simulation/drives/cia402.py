@@ -1,0 +1,432 @@
+"""A simulated CiA 402 drive on a CANopen bus; it knows the standards, not the master.
+
+It is built from an EDS file and does what CiA 301 and CiA 402 allow, to the letter; what they
+leave to the maker is a `DriveBehaviour`. Set-points are taken and replies sent at SYNC; a reply
+shows what was so at that SYNC, before the new set-point acts. Time goes on only by `advance`. The
+drive has a brake that is closed whenever there is no torque, so that its drum stays where it is.
+
+Source: CiA 301 (4.2), CiA 402-2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.cia402.pdo import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    RPDO1_BASE,
+    SDO_REPLY_BASE,
+    NmtCommand,
+    NmtState,
+    make_emergency,
+    make_heartbeat,
+)
+from drivers.cia402.state_machine import FAULTED, DriveState
+from simulation.drives.behaviour import STRICT, DriveBehaviour
+from simulation.drives.eds_file import Eds, Key, profile_path, read_eds
+from simulation.drives.motion import (
+    ACCELERATION_UNIT,
+    POSITION_UNIT,
+    VELOCITY_UNIT,
+    Motor,
+    counts_in,
+)
+from simulation.drives.object_dictionary import NO_DUPLICATE_CONSUMER, OUT_OF_RANGE, DriveObjects
+from simulation.drives.pdo import (
+    ACTING,
+    CONTROL_WORD,
+    MODE,
+    RPDO,
+    RPDO_MAP,
+    TARGET,
+    TOLERANCE,
+    TPDO,
+    TPDO_MAP,
+    Deadlines,
+    ProcessData,
+    ReceivePdo,
+)
+from simulation.drives.power import MODE_FOLLOWS, NO_WINDOW, WARNING_CHANGES, PowerStage
+from simulation.drives.sdo import SdoServer
+
+Frame = bytes | bytearray
+Send = Callable[[int, Frame], None]
+
+OPERATIONAL, BOOT_UP = NmtState.OPERATIONAL, NmtState.BOOT_UP
+
+LIFE_GUARD = 0x8130
+PDO_LENGTH = 0x8210
+SET_POINT_OVERDUE = 0x8250
+SYNC_OVERDUE = 0x8700
+
+STATUS_WORD, MODE_DISPLAY, POSITION, TORQUE = (0x6041, 0), (0x6061, 0), (0x6064, 0), (0x6077, 0)
+ERROR_REGISTER, ERROR_CODE = (0x1001, 0), (0x603F, 0)
+
+_SYNC, _BOOT = "sync", "boot"
+
+_FLICKERING = 0xFF90
+
+_REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
+"""Of 1001h by the first digit of an error code: current, voltage, temperature, communication,
+the maker's; each beside bit 0, generic error."""
+
+
+class SimulatedDrive(PowerStage):
+    """One drive and its motor.
+
+    Attributes:
+        node: CANopen node id.
+        behaviour: What it does where the standards leave a choice.
+        objects: Its object dictionary.
+        motor: What it moves.
+        nmt: NMT state.
+        torque: Actual torque, set by the plant, [per mille of rated torque].
+        silent: It hears and says nothing, as with its bus cable pulled (set from outside).
+    """
+
+    def __init__(
+        self,
+        node: int,
+        position: float,
+        top_speed: float,
+        send: Send,
+        *,
+        eds: Eds | None = None,
+        behaviour: DriveBehaviour = STRICT,
+        counts_per_turn: float = 4096.0,
+    ) -> None:
+        """Switches a drive on: it announces itself and waits in PRE-OPERATIONAL.
+
+        Args:
+            node: CANopen node id.
+            position: Of the motor, [counts].
+            top_speed: Of the motor, [counts/s].
+            send: Puts a frame (identifier, data) on the bus.
+            eds: Its objects; left out, those of the profile ``cia402``.
+            behaviour: What it does where the standards leave a choice.
+            counts_per_turn: Of the motor shaft, for a drive that counts speed in revolutions.
+        """
+        motor = Motor(position, position, top_speed, stick=behaviour.stick)
+        super().__init__(motor, behaviour, counts_per_turn, seed=node)
+        self.node = node
+        self._bus_send = send
+        self._eds = eds or read_eds(profile_path("cia402"))
+        self.silent = False
+        self.power_on()
+
+    def power_on(self) -> None:
+        """Starts, or starts again: everything set up is lost, the motor stays where it is."""
+        self.objects = DriveObjects(self._eds, self.node, self.behaviour)
+        for (index, sub), read in (
+            (STATUS_WORD, self._status_shown),
+            (MODE_DISPLAY, lambda: self._mode),
+            (POSITION, self._position_shown),
+            (TORQUE, self._torque_shown),
+        ):
+            self.objects.measured(index, sub, read)
+        self._pdos = ProcessData(self.objects)
+        self.objects.judge, self.objects.changed = self._judge, self._on_changed
+        self._switch_on()
+        self._deadlines = Deadlines()
+        self._read_settings()
+        self._boot()
+
+    def _boot(self) -> None:
+        """After switching on, or a reset of the communication."""
+        self.nmt = NmtState.BOOT_UP
+        self._server = SdoServer(self.objects, self.behaviour, self._answer)
+        self._deadlines = Deadlines()
+        self._watched = self._heartbeat_consumers()
+        self._waiting: dict[int, tuple[ReceivePdo, tuple[int, ...]]] = {}
+        self._errors: dict[object, int] = {}
+        self._own_heartbeat_due = self._now
+        if self.behaviour.boot_delay:
+            self._deadlines.expect(_BOOT, self._now + self.behaviour.boot_delay)
+        else:
+            self._booted()
+
+    def _booted(self) -> None:
+        self.nmt = NmtState.PRE_OPERATIONAL
+        if self.state is DriveState.NOT_READY:
+            self.state = DriveState.SWITCH_ON_DISABLED
+        self._send(HEARTBEAT_BASE + self.node, make_heartbeat(NmtState.BOOT_UP))
+
+    def until_answer(self, with_mode: bool = False) -> float:
+        """Time until something that was asked for is there, [s]; infinity where nothing will be.
+
+        Args:
+            with_mode: The mode, which comes late, is asked for, too.
+        """
+        if self.nmt is BOOT_UP or (with_mode and MODE_FOLLOWS in self._deadlines):
+            due = min(self._deadlines.earliest, self._server.next_due)
+        else:
+            due = self._server.next_due
+        return max(0.0, due - self._now)
+
+    @property
+    def pdo_ids(self) -> list[int]:
+        """Identifiers of the RPDOs that it takes."""
+        return list(self._pdos.received)
+
+    def advance(self, elapsed: float) -> None:
+        """Lets time pass, [s]: the motor moves, time-outs run, what is late goes out."""
+        if elapsed <= 0.0:
+            return
+        now = self._now = self._now + elapsed
+        self._move(elapsed)
+        if self._window != NO_WINDOW:
+            self._check_following(elapsed)
+        if now > self._deadlines.earliest:
+            self._on_deadlines()
+        if self._heartbeat_period and now >= self._own_heartbeat_due - TOLERANCE:
+            self._own_heartbeat_due = now + self._heartbeat_period
+            if self.nmt is not NmtState.BOOT_UP:
+                self._send(HEARTBEAT_BASE + self.node, make_heartbeat(self.nmt))
+        if now >= self._server.next_due - TOLERANCE:
+            self._server.deliver(now)
+
+    def on_sync(self) -> None:
+        """SYNC: reply with what is, then act on the set-points that were waiting."""
+        if self.silent or self.nmt is not OPERATIONAL:
+            return
+        if self._sync_timeout:
+            self._deadlines.expect(_SYNC, self._now + self._sync_timeout)
+            if self._errors:
+                self._recovered(_SYNC)
+        if self.behaviour.flicker:
+            self._flicker = self._random.getrandbits(16) & _FLICKERING
+        for pdo in self._pdos.sent:
+            if pdo.is_due():
+                self._send(pdo.can_id, pdo.form.pack(*[read() for read in pdo.readers]))
+        if self._waiting:
+            waiting, self._waiting = self._waiting, {}
+            for received, values in waiting.values():
+                self._take(received, values)
+
+    def on_set_point(self, data: Frame) -> None:
+        """RPDO1 with its usual identifier."""
+        self.on_pdo(RPDO1_BASE + self.node, data)
+
+    def on_pdo(self, can_id: int, data: Frame) -> None:
+        """An RPDO: parsed by the current mapping, kept until the next SYNC if it is synchronous."""
+        if self.silent or self.nmt is not OPERATIONAL:
+            return
+        pdo = self._pdos.received.get(can_id)
+        if pdo is None:
+            return
+        if len(data) != pdo.form.size:
+            self._comes_amiss((PDO_LENGTH, pdo.number), PDO_LENGTH)
+            return
+        if pdo.deadline:
+            self._deadlines.expect(pdo.number, self._now + pdo.deadline)
+        if self._errors:
+            self._recovered((PDO_LENGTH, pdo.number))
+            self._recovered(pdo.number)
+        values = pdo.form.unpack(data)
+        if pdo.synchronous:
+            self._waiting[pdo.number] = pdo, values
+        else:
+            self._take(pdo, values)
+
+    def on_sdo(self, data: Frame) -> None:
+        """An SDO request."""
+        if self.silent or len(data) != 8 or self.nmt in (NmtState.STOPPED, NmtState.BOOT_UP):
+            return
+        self._server.on_request(bytes(data), self._now)
+
+    def on_nmt(self, command: int, node: int) -> None:
+        """An NMT command."""
+        if self.silent or node not in (0, self.node) or self.nmt is NmtState.BOOT_UP:
+            return
+        if command == NmtCommand.START:
+            self.nmt = NmtState.OPERATIONAL
+        elif command == NmtCommand.PRE_OPERATIONAL:
+            self._leave_operational(NmtState.PRE_OPERATIONAL)
+        elif command == NmtCommand.STOP:
+            self._leave_operational(NmtState.STOPPED)
+            self._connection_lost(LIFE_GUARD)
+        elif command == NmtCommand.RESET_NODE:
+            self.power_on()
+        elif command == NmtCommand.RESET_COMMUNICATION:
+            self._connection_lost(LIFE_GUARD)
+            self.objects.restore_communication()
+            self._pdos.rebuild()
+            self._read_settings()
+            self._boot()
+
+    def on_heartbeat(self, node: int, data: Frame) -> None:
+        """The heartbeat of another node; watched from the first one on."""
+        if node not in self._watched or self.silent or self.nmt is BOOT_UP:
+            return
+        if len(data) == 1:
+            self._deadlines.expect((LIFE_GUARD, node), self._now + self._watched[node])
+            if self._errors:
+                self._recovered((LIFE_GUARD, node))
+
+    def _judge(self, key: Key, value: int) -> int:
+        """Abort code of a write by SDO that the drive does not take now."""
+        index, sub = key
+        if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
+            pre_operational = self.nmt is NmtState.PRE_OPERATIONAL
+            may_map = pre_operational or self.behaviour.maps_when_operational
+            return self._pdos.refused(key, value, may_map=may_map)
+        if index == 0x1016 and self._is_consumed_already(sub, value):
+            return NO_DUPLICATE_CONSUMER
+        if key == MODE and not self._has_mode(value):
+            return OUT_OF_RANGE
+        if index in (POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT):
+            known = counts_in(value, self._counts_per_turn)
+            return 0 if known and (index != POSITION_UNIT or known == 1.0) else OUT_OF_RANGE
+        return 0
+
+    def _is_consumed_already(self, sub: int, value: int) -> bool:
+        node = value >> 16 & 0x7F
+        others = (self.objects[0x1016, s] for s in self.objects.subs(0x1016) if s not in (0, sub))
+        return bool(value & 0xFFFF) and any(e >> 16 & 0x7F == node and e & 0xFFFF for e in others)
+
+    def _on_changed(self, key: Key, value: int) -> None:
+        """An object has another value."""
+        index = key[0]
+        if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
+            if index in TPDO:
+                self._drop_remote_bit(key, value)
+            self._pdos.rebuild()
+            watched = {pdo.number for pdo in self._pdos.received.values() if pdo.deadline}
+            for what in self._deadlines.kept():
+                if isinstance(what, int) and what not in watched:
+                    self._deadlines.forget(what)
+        elif index == 0x1016:
+            self._watched = self._heartbeat_consumers()
+            for what in self._deadlines.kept():
+                if isinstance(what, tuple) and what[1] not in self._watched:
+                    self._deadlines.forget(what)
+                    self._errors.pop(what, None)
+        elif key in (STATUS_WORD, MODE_DISPLAY, POSITION, TORQUE):
+            self._pdos.rebuild()  # another reader
+        elif key in ACTING:
+            self._write(key, value)
+        else:
+            self._read_settings()
+
+    def _drop_remote_bit(self, key: Key, value: int) -> None:
+        """Bit 30 of a TPDO's COB-ID: it answers no remote request, and keeps no bit for it."""
+        if key[1] == 1:
+            self.objects.note(key, value & ~(1 << 30))
+
+    def _read_settings(self) -> None:
+        """What time-outs need, so that `advance` need not look objects up."""
+        self._read_motion_settings()
+        get = self.objects.get
+        self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
+        self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6
+        if not self._sync_timeout:
+            self._deadlines.forget(_SYNC)
+
+    def _heartbeat_consumers(self) -> dict[int, float]:
+        """Nodes and times [s] of the heartbeat consumer, 1016h."""
+        entries = (self.objects[0x1016, sub] for sub in self.objects.subs(0x1016) if sub)
+        room = self.objects.get((0x1016, 0), 0)
+        taken = [e for e, _ in zip(entries, range(room), strict=False)]
+        return {e >> 16 & 0x7F: (e & 0xFFFF) / 1000.0 for e in taken if e & 0xFFFF}
+
+    def _on_deadlines(self) -> None:
+        """Something has not come in time, or happens by itself at a time."""
+        for what in self._deadlines.passed(self._now):
+            if what == _BOOT:
+                self._booted()
+            elif what == MODE_FOLLOWS:
+                self._mode = self._wanted_mode
+            elif what == WARNING_CHANGES:
+                self._warn()
+            elif what == _SYNC:
+                self._comes_amiss(_SYNC, SYNC_OVERDUE)
+                self._connection_lost(SYNC_OVERDUE)
+            elif isinstance(what, int):
+                self._comes_amiss(what, SET_POINT_OVERDUE)
+                self._connection_lost(SET_POINT_OVERDUE)
+            else:
+                self._comes_amiss(what, LIFE_GUARD)
+                self._lose_heartbeat()
+
+    def _lose_heartbeat(self) -> None:
+        """A node that is watched by 1016h is silent: 6007h, and 1029h:01 for the NMT state."""
+        if self.behaviour.heartbeat_loss_is_fault:
+            self._fault_code = LIFE_GUARD
+            self._react_to_fault()
+        else:
+            self._connection_lost(LIFE_GUARD)
+        option = self.objects.get((0x1029, 1), 0)
+        if option == 2:
+            self._leave_operational(NmtState.STOPPED)
+        elif option == 0 and self.nmt is NmtState.OPERATIONAL:
+            self._leave_operational(NmtState.PRE_OPERATIONAL)
+
+    def _leave_operational(self, nmt: NmtState) -> None:
+        """Process data, and the watch over them, stop."""
+        self.nmt = nmt
+        self._waiting.clear()
+        for what in self._deadlines.kept():
+            if what == _SYNC or isinstance(what, int):
+                self._deadlines.forget(what)
+
+    def _connection_lost(self, code: int) -> None:
+        """Abort connection option code 6007h: 1 a fault, 2 disable voltage, 3 quick stop."""
+        option = self.objects.get((0x6007, 0), 1)
+        if option == 1:
+            self._fault_code = code
+            self._react_to_fault()
+        elif self.state in FAULTED:
+            return
+        elif option == 2:
+            self._power_off(DriveState.SWITCH_ON_DISABLED)
+        elif option == 3:
+            self._command_quick_stop()
+
+    def _comes_amiss(self, what: object, code: int) -> None:
+        """An error of the communication: reported once, until it is over."""
+        if what not in self._errors:
+            self._errors[what] = code
+            self._emergency(code)
+
+    def _recovered(self, what: object) -> None:
+        """It is over: EMCY 0000h, with what is left in the error register."""
+        if self._errors.pop(what, None) is not None:
+            self._emergency(0)
+
+    def _take(self, pdo: ReceivePdo, values: tuple[int, ...]) -> None:
+        """The data of an RPDO act; the control word last, so that a target is there before it."""
+        self.objects.keep(pdo.keys, values)
+        for at, key in pdo.acting:
+            self._write(key, values[at])
+
+    def _write(self, key: Key, value: int) -> None:
+        """An object that acts at once, by RPDO or SDO."""
+        if key == TARGET:
+            self._take_target(value)
+        elif key == CONTROL_WORD:
+            self._take_control_word(value)
+        else:
+            self._take_mode(value)
+
+    def _emergency(self, code: int) -> None:
+        """EMCY: an error has come (code), or one has gone (0)."""
+        active = [*self._errors.values(), self._fault_code, code]
+        register = 0
+        for one in active:
+            if one:
+                register |= 0x01 | _REGISTER_BITS.get(one >> 12, 0x20)
+        if 0x8600 <= code < 0x8800:
+            register |= 0x20  # device profile
+        self.objects.note(ERROR_CODE, code or self._fault_code)
+        self.objects.note(ERROR_REGISTER, register)
+        if self.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
+            self._send(EMCY_BASE + self.node, make_emergency(code, register))
+
+    def _answer(self, data: bytes) -> None:
+        if self.nmt is not NmtState.STOPPED:
+            self._send(SDO_REPLY_BASE + self.node, data)
+
+    def _send(self, can_id: int, data: Frame) -> None:
+        if not self.silent:
+            self._bus_send(can_id, data)

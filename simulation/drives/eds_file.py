@@ -1,0 +1,240 @@
+"""EDS files: which objects a drive has, who may read and write them, their ranges and defaults.
+
+Source: CiA 306. Makers' files deviate in small ways, which are read as they are meant: hexadecimal
+limits of signed types, `$NODEID` before or after the sum, other encodings than ASCII.
+"""
+
+from __future__ import annotations
+
+import configparser
+import re
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from model.errors import BadInput
+from model.files.reading import MEGABYTE, read_bytes
+from model.rig import Rig
+
+Key = tuple[int, int]
+
+EDS_FOLDER = Path(__file__).parent / "eds"
+EDS_LIMIT = 4 * MEGABYTE
+"""Of a file, [bytes]; makers' files have a tenth of it."""
+
+_SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
+_RECORD, _ARRAY = 0x8, 0x9
+_REALS = {0x08: "<f", 0x11: "<d"}
+_SIGNED = {0x02: 1, 0x03: 2, 0x04: 4, 0x10: 3, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8}
+_UNSIGNED = {0x01: 1, 0x05: 1, 0x06: 2, 0x07: 4, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
+_UNSIGNED |= {0x08: 4, 0x11: 8}  # reals travel as their bits
+_UNSIGNED_8 = 0x05
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectDescription:
+    """One object of a drive.
+
+    Attributes:
+        name: As the file says.
+        length: In bytes; 0 for a text or a domain, which may have any.
+        signed: The value is a signed integer.
+        readable: By SDO.
+        writable: By SDO.
+        to_rpdo: It can be mapped to an RPDO.
+        to_tpdo: It can be mapped to a TPDO.
+        default: After switching on; an integer, or the bytes of a text.
+        of_node: The node id is added to the default.
+        low: Smallest value, if the file names one.
+        high: Largest value, if the file names one.
+    """
+
+    name: str
+    length: int
+    signed: bool
+    readable: bool
+    writable: bool
+    to_rpdo: bool
+    to_tpdo: bool
+    default: int | bytes
+    of_node: bool
+    low: int | None
+    high: int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eds:
+    """The objects of one EDS file.
+
+    Attributes:
+        path: Of the file.
+        objects: By index and sub-index.
+        dummies: Data types that may fill gaps in an RPDO, by the file's ``DummyUsage``.
+    """
+
+    path: Path
+    objects: Mapping[Key, ObjectDescription]
+    dummies: frozenset[int]
+
+
+def profile_path(profile: str) -> Path:
+    """The EDS file of a drive profile.
+
+    Raises:
+        BadInput: There is none of that name.
+    """
+    path = EDS_FOLDER / f"{profile}.eds"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in EDS_FOLDER.glob("*.eds")))
+        raise BadInput(
+            f"the simulation has no EDS file for the drive profile {profile!r}",
+            where="drives.profile",
+            why=f"it has these: {known}",
+            next_step="choose one of them, or pass the maker's file with --eds",
+        )
+    return path
+
+
+def eds_of(rig: Rig, path: Path | None = None) -> Eds:
+    """The objects of a rig's simulated drives: a file's, or those of its drive profile.
+
+    Raises:
+        BadInput: There is no such file, or it cannot be used.
+    """
+    return read_eds(path or profile_path(getattr(rig.document.drives, "profile", "cia402")))
+
+
+@cache
+def read_eds(path: Path) -> Eds:
+    """Reads an EDS file.
+
+    Raises:
+        BadInput: The file cannot be read, has no objects, or a line in it has no meaning.
+    """
+    parser = configparser.ConfigParser(
+        interpolation=None, strict=False, delimiters=("=",), comment_prefixes=(";",)
+    )
+    try:
+        parser.read_string(_text(path))
+    except (OSError, configparser.Error) as error:
+        raise BadInput(
+            f"cannot be read as an EDS file: {error}",
+            where=str(path),
+            next_step="pass an electronic data sheet (.eds) of CiA 306",
+        ) from error
+    objects: dict[Key, ObjectDescription] = {}
+    for section in parser.sections():
+        matched = _SECTION.match(section)
+        if matched:
+            where = f"{path}: [{section}]"
+            index, sub = int(matched[1], 16), int(matched[2] or "0", 16)
+            objects |= _described(index, sub, parser[section], where)
+    if not any(index >= 0x6000 for index, _ in objects):
+        raise BadInput(
+            "has no object of a drive profile (6000h and above)",
+            where=str(path),
+            next_step="pass the EDS file of a CiA 402 drive",
+        )
+    used = parser["DummyUsage"] if parser.has_section("DummyUsage") else {}
+    dummies = {
+        int(name[5:], 16)
+        for name, value in used.items()
+        if value.strip() == "1" and re.fullmatch(r"dummy[0-9a-f]{4}", name, re.IGNORECASE)
+    }
+    return Eds(path, objects, frozenset(dummies))
+
+
+def _text(path: Path) -> str:
+    data = read_bytes(path, EDS_LIMIT)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def _described(
+    index: int, sub: int, section: Mapping[str, str], where: str
+) -> dict[Key, ObjectDescription]:
+    """What one section describes: a variable, or an array in its compact form."""
+    kind = _number(section.get("objecttype", ""), where)[0] or 0x7
+    compact = _number(section.get("compactsubobj", ""), where)[0] or 0
+    if not 0 <= compact <= 254:
+        raise BadInput(f"CompactSubObj {compact}: an object has 254 sub-objects", where=where)
+    if kind in (_RECORD, _ARRAY) and not compact:
+        return {}
+    one = _variable(section, where)
+    if not compact:
+        return {(index, sub): one}
+    count = ObjectDescription(
+        "Highest sub-index supported", 1, False, True, False, False, False, compact, False, None,
+        None,
+    )  # fmt: skip
+    return {(index, 0): count} | {(index, number): one for number in range(1, compact + 1)}
+
+
+def _variable(section: Mapping[str, str], where: str) -> ObjectDescription:
+    kind = _number(section.get("datatype", ""), where)[0] or _UNSIGNED_8
+    access = section.get("accesstype", "rw").strip().lower()
+    if access not in ("ro", "wo", "rw", "rwr", "rww", "const"):
+        raise BadInput(f"the access type {access!r} does not exist", where=where)
+    length, signed = _SIGNED.get(kind) or _UNSIGNED.get(kind, 0), kind in _SIGNED
+    default, of_node = _default(section.get("defaultvalue", ""), kind, length, where)
+    mappable = section.get("pdomapping", "0").strip() == "1"
+    readable, writable = access != "wo", access not in ("ro", "const")
+    limits = [
+        _limit(section.get(name, ""), length, signed, where) for name in ("lowlimit", "highlimit")
+    ]
+    return ObjectDescription(
+        section.get("parametername", ""),
+        length,
+        signed,
+        readable,
+        writable,
+        mappable and writable and access != "rwr",
+        mappable and readable and access != "rww",
+        _wrapped(default, length, signed) if isinstance(default, int) else default,
+        of_node,
+        *limits,
+    )
+
+
+def _default(text: str, kind: int, length: int, where: str) -> tuple[int | bytes, bool]:
+    if not length:
+        return text.strip().encode("latin-1", "replace"), False
+    if kind in _REALS and text.strip() and not text.strip().lower().startswith("0x"):
+        return int.from_bytes(struct.pack(_REALS[kind], float(text)), "little"), False
+    value, of_node = _number(text, where)
+    return value or 0, of_node
+
+
+def _limit(text: str, length: int, signed: bool, where: str) -> int | None:
+    if not length:
+        return None
+    try:
+        value = _number(text, where)[0]
+    except BadInput:
+        if "." in text:  # of a real
+            return None
+        raise
+    return None if value is None else _wrapped(value, length, signed)
+
+
+def _number(text: str, where: str) -> tuple[int | None, bool]:
+    """The value, None where there is none; and whether the node id is to be added."""
+    plain = text.strip().upper().replace(" ", "")
+    of_node = "$NODEID" in plain
+    plain = plain.replace("$NODEID", "").strip("+")
+    if not plain:
+        return (0 if of_node else None), of_node
+    try:
+        return int(plain, 16 if plain.startswith(("0X", "-0X")) else 10), of_node
+    except ValueError:
+        raise BadInput(f"{text.strip()!r} is not a number", where=where) from None
+
+
+def _wrapped(value: int, length: int, signed: bool) -> int:
+    """0xFF of a signed byte is −1."""
+    bits = 8 * length
+    return value - (1 << bits) if signed and value >= 1 << (bits - 1) else value

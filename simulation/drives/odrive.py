@@ -1,0 +1,236 @@
+"""A simulated ODrive; it knows CANSimple, not the master.
+
+It sends heartbeats, estimates and torques at its own periods. A set-point acts when it comes. When
+the axis is disarmed, by the master, its watchdog or an error, the torque goes and the brake closes.
+
+Source: ODrive documentation, "CAN Protocol" (firmware 0.6). Where it leaves something open: the
+watchdog runs while the axis is enabled; errors keep an axis from being enabled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from drivers.odrive.dbc import Layout, Layouts
+from drivers.odrive.messages import AxisError, AxisState, ControlMode, InputMode, can_id
+from simulation.drives.motion import Motor
+
+Frame = bytes | bytearray
+Send = Callable[[int, Frame], None]
+
+SUCCESS, DISARMED, NOT_CALIBRATED = 0, 3, 14
+"""Procedure results."""
+
+SUPPLY = 48.0
+"""[V]."""
+
+
+@dataclass(slots=True)
+class OdriveSettings:
+    """What a lab has written into a drive with odrivetool; as on the drive, it outlives power.
+
+    Attributes:
+        watchdog: Time without a set-point after which the axis is disarmed, [s]; None when off.
+        heartbeat: Period, [s].
+        estimates: Period, [s].
+        torques: Period, [s].
+        firmware: Major, minor, revision.
+        values: Other endpoints by number: four bytes as the bus has them.
+        stuck: Endpoints that do not keep what is written (tests set it).
+    """
+
+    watchdog: float | None
+    heartbeat: float
+    estimates: float
+    torques: float
+    firmware: tuple[int, int, int] = (0, 6, 11)
+    values: dict[int, int] = field(default_factory=dict)
+    stuck: set[int] = field(default_factory=set)
+
+
+class SimulatedOdrive:
+    """One ODrive and its motor.
+
+    Attributes:
+        node: Node id.
+        settings: Written with odrivetool.
+        motor: What it moves.
+        state: Axis state.
+        errors: Active errors of the axis.
+        calibrated: Without a calibration the axis cannot be enabled (set from outside).
+        torque: Actual torque, set by the rig, [N·m].
+        supply: Of the motors, [V] (set from outside).
+        silent: Messages that it does not send: ``heartbeat``, ``estimates``, ``torques`` (set from
+            outside).
+        deaf: It hears and says nothing, as with its bus cable pulled (set from outside).
+    """
+
+    def __init__(
+        self,
+        node: int,
+        settings: OdriveSettings,
+        layouts: Layouts,
+        counts_per_turn: int,
+        torque_constant: float,
+        position: float,
+        top_speed: float,
+        send: Send,
+    ) -> None:
+        """Switches a drive on: idle, its brake closed.
+
+        Args:
+            node: Node id.
+            settings: Written with odrivetool.
+            layouts: Of the messages.
+            counts_per_turn: The motor's position is in counts, the drive's in turns.
+            torque_constant: Of the motor, [N·m/A].
+            position: Of the motor, [counts].
+            top_speed: Of the motor, [counts/s].
+            send: Puts a frame (identifier, data) on the bus.
+        """
+        self.node, self.settings = node, settings
+        self._layouts, self._send_frame = layouts, send
+        self._per_turn, self._torque_constant = counts_per_turn, torque_constant
+        self.motor = Motor(position, position, top_speed)
+        self._top_speed = top_speed
+        self.calibrated, self.supply, self.torque = True, SUPPLY, 0.0
+        self.silent: set[str] = set()
+        self.deaf = False
+        self._due = {"heartbeat": 0.0, "estimates": 0.0, "torques": 0.0}
+        self._commands: dict[int, tuple[Layout, Callable[..., None]]] = {
+            layout.command: (layout, act)
+            for layout, act in (
+                (layouts.set_axis_state, self._set_axis_state),
+                (layouts.set_controller_mode, self._set_controller_mode),
+                (layouts.set_input_pos, self._set_input_pos),
+                (layouts.set_limits, self._set_limits),
+                (layouts.clear_errors, self._clear_errors),
+                (layouts.estop, self._estop),
+            )
+        }
+        self.power_on()
+
+    def power_on(self) -> None:
+        """Starts, or starts again: errors and limits are gone, the motor stays where it is."""
+        self.state, self.errors, self.result = AxisState.IDLE, 0, SUCCESS
+        self._mode: tuple[int, int] = (0, 0)
+        self._target = self.motor.position
+        self._unfed = 0.0
+        self._largest_torque = float("inf")
+        self.motor.top_speed = self._top_speed
+        self.motor.release()
+
+    @property
+    def torque_on(self) -> bool:
+        """The motor holds or moves the cable; otherwise the brake does."""
+        return self.state is AxisState.CLOSED_LOOP_CONTROL
+
+    def advance(self, elapsed: float) -> None:
+        """Lets time pass, [s]: the motor moves, the watchdog runs, messages are due."""
+        if elapsed <= 0.0:
+            return
+        if self.torque_on:
+            self.motor.follow(self._target, 0.0, elapsed, self._limited_direction())
+            self._unfed += elapsed
+            watchdog = self.settings.watchdog
+            if watchdog is not None and self._unfed > watchdog + 1e-9:
+                self.fail(AxisError.WATCHDOG_TIMER_EXPIRED)
+        for kind in self._due:
+            self._due[kind] -= elapsed
+            if self._due[kind] <= 1e-9:
+                self._due[kind] += getattr(self.settings, kind)
+                self._tell(kind)
+
+    def hear(self, command: int, data: Frame) -> None:
+        """A frame for this drive."""
+        if self.deaf:
+            return
+        if not data:
+            self._answer(command)
+        elif command == self._layouts.rxsdo.command:
+            self._on_sdo(bytes(data))
+        elif command in self._commands:
+            layout, act = self._commands[command]
+            values = layout.unpack(data)
+            if values is not None:
+                act(*values)
+
+    def fail(self, error: int) -> None:
+        """An error: the axis is disarmed, its brake closes."""
+        self.errors |= error
+        self._disarm(DISARMED)
+
+    def _disarm(self, result: int) -> None:
+        self.state, self.result = AxisState.IDLE, result
+        self.motor.release()
+
+    def _limited_direction(self) -> int:
+        """At its current limit the motor cannot pull further the way it is pulling."""
+        if abs(self.torque) < self._largest_torque:
+            return 0
+        return 1 if self.torque > 0 else -1
+
+    def _set_axis_state(self, wanted: int) -> None:
+        self._unfed = 0.0
+        if wanted == AxisState.IDLE:
+            self._disarm(SUCCESS)
+        elif wanted == AxisState.CLOSED_LOOP_CONTROL and not self.torque_on:
+            position_control = self._mode == (ControlMode.POSITION, InputMode.PASSTHROUGH)
+            if self.errors or not self.calibrated or not position_control:
+                self.result = DISARMED if self.errors else NOT_CALIBRATED
+                return
+            self.motor.release()
+            self.state, self.result = AxisState.CLOSED_LOOP_CONTROL, SUCCESS
+
+    def _set_controller_mode(self, control: int, entry: int) -> None:
+        self._mode = (control, entry)
+
+    def _set_input_pos(self, turns: float, _speed: float, _torque: float) -> None:
+        self._unfed = 0.0
+        self._target = turns * self._per_turn
+
+    def _set_limits(self, speed: float, current: float) -> None:
+        self.motor.top_speed = min(self._top_speed, speed * self._per_turn)
+        self._largest_torque = current * self._torque_constant
+
+    def _clear_errors(self, _identify: int) -> None:
+        self.errors = 0
+
+    def _estop(self) -> None:
+        self.fail(AxisError.ESTOP_REQUESTED)
+
+    def _answer(self, command: int) -> None:
+        """A question: a message without data."""
+        if command == self._layouts.estop.command:  # the only command that has none
+            self._estop()
+        elif command == self._layouts.get_version.command:
+            self._send(self._layouts.get_version, 2, *self.settings.firmware)
+        elif command == self._layouts.get_bus_voltage_current.command:
+            self._send(self._layouts.get_bus_voltage_current, self.supply, 0.0)
+
+    def _on_sdo(self, data: bytes) -> None:
+        """Reads or writes an endpoint; a write is confirmed as from firmware 0.6.11 on."""
+        opcode, endpoint, raw = (
+            int(v) for v in self._layouts.rxsdo.unpack(data.ljust(8, b"\0")) or (0, 0, 0)
+        )
+        if opcode and endpoint not in self.settings.stuck:
+            self.settings.values[endpoint] = raw
+        self._send(self._layouts.txsdo, endpoint, self.settings.values.get(endpoint, 0))
+
+    def _tell(self, kind: str) -> None:
+        if kind in self.silent:
+            return
+        if kind == "heartbeat":
+            self._send(self._layouts.heartbeat, self.errors, self.state, self.result)
+        elif kind == "estimates":
+            turns = self.motor.position / self._per_turn
+            self._send(
+                self._layouts.get_encoder_estimates, turns, self.motor.speed / self._per_turn
+            )
+        else:
+            self._send(self._layouts.get_torques, self.torque, self.torque)
+
+    def _send(self, layout: Layout, *values: float) -> None:
+        if not self.deaf:
+            self._send_frame(can_id(self.node, layout.command), layout.pack(*values))

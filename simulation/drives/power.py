@@ -1,0 +1,315 @@
+"""The drive function of a simulated CiA 402 drive: state machine, modes, motor and faults.
+
+It knows no bus: commands come as control words, and what it has to say as EMCY codes. Commands act
+by their level; only the reset of a fault needs a rising edge.
+
+Source: CiA 402-2.
+"""
+
+from __future__ import annotations
+
+import random
+from abc import ABC, abstractmethod
+
+from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState
+from simulation.drives.behaviour import DriveBehaviour
+from simulation.drives.motion import ACCELERATION_UNIT, Motor, counts_in
+from simulation.drives.object_dictionary import DriveObjects
+from simulation.drives.pdo import Deadlines
+
+SLIP_SHARE = 0.005
+"""A motor that is loaded with twice the torque that it can hold slips at this share of its top
+speed, and comes back at no more."""
+
+WARNING_LASTS = 0.5
+"""A warning comes and goes after this time, [s]."""
+
+CYCLIC_POSITION = 8
+FOLLOWING_ERROR = 0x8611
+NO_WINDOW = 0xFFFFFFFF
+"""6065h for no watch over the following error."""
+
+MODE_FOLLOWS, WARNING_CHANGES = "mode", "warning"
+
+_STATUS_CODES = {
+    DriveState.NOT_READY: 0x0000,
+    DriveState.SWITCH_ON_DISABLED: 0x0040,
+    DriveState.READY_TO_SWITCH_ON: 0x0021,
+    DriveState.SWITCHED_ON: 0x0023,
+    DriveState.OPERATION_ENABLED: 0x0027,
+    DriveState.QUICK_STOP_ACTIVE: 0x0007,
+    DriveState.FAULT_REACTION_ACTIVE: 0x000F,
+    DriveState.FAULT: 0x0008,
+}
+_VOLTAGE_AND_REMOTE = 0x0210
+_WARNING_BIT = 0x0080
+_FOLLOWS_COMMAND = 0x1000
+_FOLLOWING_ERROR_BIT = 0x2000
+
+
+class PowerStage(ABC):
+    """State machine and motor of one drive.
+
+    Attributes:
+        behaviour: What it does where the standards leave a choice.
+        objects: Its object dictionary.
+        motor: What it moves.
+        torque: Actual torque, set by the plant, [per mille of rated torque].
+    """
+
+    objects: DriveObjects
+    _deadlines: Deadlines
+
+    def __init__(
+        self, motor: Motor, behaviour: DriveBehaviour, counts_per_turn: float, seed: int
+    ) -> None:
+        """Takes the motor; `_switch_on` has to follow.
+
+        Args:
+            motor: What it moves.
+            behaviour: What it does where the standards leave a choice.
+            counts_per_turn: Of the motor shaft.
+            seed: Of all noise.
+        """
+        self.motor, self.behaviour = motor, behaviour
+        self._counts_per_turn = counts_per_turn
+        self._random = random.Random(seed)
+        self._now = 0.0
+
+    @abstractmethod
+    def _emergency(self, code: int) -> None:
+        """Reports an error, or with 0 that one is over."""
+
+    def _switch_on(self) -> None:
+        """The state after switching on; the motor stays where it is."""
+        self.state, self.torque = DriveState.NOT_READY, 0.0
+        self.motor.release()
+        self._control_word = 0
+        self._mode: int = self.objects.get((0x6060, 0), 0)
+        self._wanted_mode = self._mode
+        self._target = self.motor.position
+        self._time_to_target = self._error_time = 0.0
+        self._at_limit = self._warned = False
+        self._fault_code = self._flicker = 0
+
+    def _read_motion_settings(self) -> None:
+        """What `_move` needs, so that it need not look objects up."""
+        get = self.objects.get
+        unit = get((ACCELERATION_UNIT, 0), 0)
+        acceleration = counts_in(unit, self._counts_per_turn) or 1.0
+        self._deceleration = max(1e-3, get((0x6085, 0), 1_000_000) * acceleration)
+        self._max_torque = get((0x6072, 0), 0xFFFF)
+        self._window = get((0x6065, 0), NO_WINDOW)
+        self._window_time = get((0x6066, 0), 0) / 1000.0
+        self._limits = get((0x607D, 1), -(2**31)), get((0x607D, 2), 2**31 - 1)
+        self._interpolation = get((0x60C2, 1), 1) * 10.0 ** get((0x60C2, 2), -3)
+        self._stop_option = get((0x605A, 0), 2)
+
+    @property
+    def state(self) -> DriveState:
+        """CiA 402 state."""
+        return self._state
+
+    @state.setter
+    def state(self, state: DriveState) -> None:
+        self._state = state
+        self._torque_on = state in TORQUE_ON
+        self._enabled = state is DriveState.OPERATION_ENABLED
+        self._status = _STATUS_CODES[state] | _VOLTAGE_AND_REMOTE
+
+    @property
+    def status_word(self) -> int:
+        """6041h as it is now."""
+        return self._status_shown()
+
+    def _status_shown(self) -> int:
+        word = self._status
+        if self._enabled and self._mode == CYCLIC_POSITION:
+            word |= _FOLLOWS_COMMAND
+        if self._error_time > 0.0:
+            word |= _FOLLOWING_ERROR_BIT
+        if self._warned:
+            word |= _WARNING_BIT
+        return word ^ self._flicker
+
+    @property
+    def torque_on(self) -> bool:
+        """The motor holds or moves the cable; otherwise the brake does."""
+        return self._torque_on
+
+    def fail(self, code: int) -> None:
+        """A fault inside the drive: fault reaction, then FAULT."""
+        if self.state in FAULTED:
+            return
+        self._fault_code = code
+        self._emergency(code)
+        self._react_to_fault()
+
+    def _react_to_fault(self) -> None:
+        """605Eh: 0 takes the torque off at once, the others brake before."""
+        if self.state in FAULTED:
+            return
+        if self.torque_on and self.objects.get((0x605E, 0), 2) != 0:
+            self.state = DriveState.FAULT_REACTION_ACTIVE
+        else:
+            self._power_off(DriveState.FAULT)
+
+    def _has_mode(self, mode: int) -> bool:
+        """By 6502h: bit 0 is mode 1; mode 0 is none."""
+        modes = self.objects.get((0x6502, 0), 0xFFFFFFFF)
+        return mode <= 0 or (mode <= 32 and bool(modes >> (mode - 1) & 1))
+
+    def _position_shown(self) -> int:
+        position = self.motor.position
+        if self.behaviour.position_noise:
+            position += self._random.gauss(0.0, self.behaviour.position_noise)
+        return (round(position) + 0x80000000 & 0xFFFFFFFF) - 0x80000000  # a counter of 32 bits
+
+    def _torque_shown(self) -> int:
+        torque = self.torque
+        if self.behaviour.torque_noise:
+            torque += self._random.gauss(0.0, self.behaviour.torque_noise)
+        return max(-0x8000, min(0x7FFF, round(torque)))
+
+    def _move(self, elapsed: float) -> None:
+        load = self._limited_direction()
+        if self._enabled:
+            self.motor.follow(self._target, self._time_to_target, elapsed, load)
+            left = self._time_to_target - elapsed
+            self._time_to_target = left if left > 0.0 else 0.0
+        elif self._state is DriveState.QUICK_STOP_ACTIVE:
+            self.motor.ramp_down(self._deceleration, elapsed, load)
+            if self._stop_option < 5 and self.motor.speed == 0.0:
+                self._power_off(DriveState.SWITCH_ON_DISABLED)  # transition 12
+        elif self.state is DriveState.FAULT_REACTION_ACTIVE:
+            self.motor.ramp_down(self._deceleration, elapsed, load)
+            if self.motor.speed == 0.0:
+                self._power_off(DriveState.FAULT)
+        if load and self._torque_on:
+            room = 1.0 - abs(self.torque) / max(1, self._max_torque)
+            speed = SLIP_SHARE * self.motor.top_speed * max(-1.0, min(1.0, room))
+            self.motor.yield_to(load, speed * elapsed)
+
+    def _limited_direction(self) -> int:
+        """At its torque limit the motor cannot pull further the way it is pulling.
+
+        A load above it turns the motor back; it is at its limit until it is where it is to be.
+        """
+        limited = abs(self.torque) >= self._max_torque
+        if not (limited or self._at_limit):
+            return 0
+        pull = 1 if self.torque > 0 else -1
+        self._at_limit = limited or self.motor.following_error * pull > 0.0
+        return pull if self._at_limit else 0
+
+    def _check_following(self, elapsed: float) -> None:
+        """Following error above 6065h for longer than 6066h."""
+        motor = self.motor
+        if self._torque_on and abs(motor.demand - motor.position) > self._window:
+            self._error_time += elapsed
+            if self._error_time > self._window_time:
+                self.fail(FOLLOWING_ERROR)
+        else:
+            self._error_time = 0.0
+
+    def _take_mode(self, mode: int) -> None:
+        """6060h: at once, late, or only while the drive is enabled, as its behaviour says."""
+        if not self._has_mode(mode):
+            return
+        self._wanted_mode = mode
+        if self.behaviour.mode_when_enabled and self.state is not DriveState.OPERATION_ENABLED:
+            return
+        self._change_mode()
+
+    def _change_mode(self) -> None:
+        if self.behaviour.mode_delay:
+            self._deadlines.expect(MODE_FOLLOWS, self._now + self.behaviour.mode_delay)
+        else:
+            self._mode = self._wanted_mode
+
+    def _take_target(self, target: int) -> None:
+        """A target outside the software limits (607Dh) is not approached further than they are."""
+        if self._mode != CYCLIC_POSITION:
+            return
+        low, high = self._limits
+        self._target = float(low if target < low else high if target > high else target)
+        self._time_to_target = self._interpolation
+
+    def _take_control_word(self, word: int) -> None:
+        """Commands act by their level, whatever the word was before; only a reset needs an edge."""
+        rising = word & 0x80 and not self._control_word & 0x80
+        self._control_word = word
+        if self._enabled and word & 0x8F == 0x0F:
+            return
+        if self.state in FAULTED:
+            if rising and self.state is DriveState.FAULT:
+                self.state = DriveState.SWITCH_ON_DISABLED
+                self._fault_code = 0
+                self._emergency(0)
+            return
+        if rising or self.state is DriveState.NOT_READY:
+            return
+        if word & 0x02 == 0:
+            if self.state is not DriveState.SWITCH_ON_DISABLED:
+                self._power_off(DriveState.SWITCH_ON_DISABLED)
+        elif word & 0x04 == 0:
+            self._command_quick_stop()
+        elif word & 0x01 == 0:
+            self._command_shutdown()
+        elif word & 0x08 == 0:
+            self._command_switch_on()
+        else:
+            self._command_enable()
+
+    def _command_quick_stop(self) -> None:
+        """Transitions 7, 10 and 11."""
+        if self.state is DriveState.OPERATION_ENABLED:
+            self._quick_stop()
+        elif self.state is not DriveState.QUICK_STOP_ACTIVE:
+            self._power_off(DriveState.SWITCH_ON_DISABLED)
+
+    def _command_shutdown(self) -> None:
+        """Transitions 2, 6 and 8."""
+        if self.state is not DriveState.QUICK_STOP_ACTIVE:
+            self._power_off(DriveState.READY_TO_SWITCH_ON)
+
+    def _command_switch_on(self) -> None:
+        """Transitions 3 and 5."""
+        if self.state in (DriveState.READY_TO_SWITCH_ON, DriveState.OPERATION_ENABLED):
+            self._power_off(DriveState.SWITCHED_ON)
+
+    def _command_enable(self) -> None:
+        """Transitions 4 and 16, and 3 followed by 4 at once; 16 only where 605Ah lets it hold."""
+        stopped = self.state is DriveState.QUICK_STOP_ACTIVE
+        if (stopped and self._stop_option >= 5) or self.state in (
+            DriveState.READY_TO_SWITCH_ON,
+            DriveState.SWITCHED_ON,
+        ):
+            self.state = DriveState.OPERATION_ENABLED
+            if self._mode != self._wanted_mode and MODE_FOLLOWS not in self._deadlines:
+                self._change_mode()
+            if self._mode != CYCLIC_POSITION:
+                self._target = self.motor.demand
+            if self.behaviour.warning and WARNING_CHANGES not in self._deadlines:
+                self._deadlines.expect(WARNING_CHANGES, self._now + WARNING_LASTS)
+
+    def _warn(self) -> None:
+        """A warning comes, or goes; the drive does what it did before."""
+        enabled, was = self.state is DriveState.OPERATION_ENABLED, self._warned
+        self._warned = enabled and not was
+        if self._warned != was:
+            self._emergency(self.behaviour.warning if self._warned else 0)
+        if enabled:
+            self._deadlines.expect(WARNING_CHANGES, self._now + WARNING_LASTS)
+
+    def _quick_stop(self) -> None:
+        """605Ah: 5 to 8 hold after the ramp, 1 to 4 take the torque off then, 0 at once."""
+        self.state = DriveState.QUICK_STOP_ACTIVE
+        if self._stop_option == 0:
+            self._power_off(DriveState.SWITCH_ON_DISABLED)
+
+    def _power_off(self, state: DriveState) -> None:
+        """Brake closed, torque off."""
+        self.state, self.torque = state, 0.0
+        self.motor.release()
+        self._error_time = 0.0

@@ -1,0 +1,183 @@
+"""The rig that is simulated, which need not be the one that its file describes.
+
+Only this package looks into the rig file's ``simulation`` section.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.errors import BadInput
+from model.files.documents import PoseDocument
+from model.files.simulation_file import (
+    SimulatedCameraDocument,
+    SimulatedWinchesDocument,
+    SimulationDocument,
+)
+from model.pose import Array, read_only
+from model.rig import Camera, Rig, rig_from_document
+from simulation.drives.motion import Motor
+from simulation.plant import Plant
+
+# What the synthetic camera's lens and sensor do to a picture.
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """What lens, sensor and lamp do to brightness, and whether cables are in the way.
+
+    Attributes:
+        noise: Standard deviation, [grey levels of 255].
+        vignetting: Light lost in the corners of the picture, share of 1.
+        blur: Standard deviation of the lens's and focus's blur, [px].
+        exposure: Time for which the platform's motion is smeared, [s]; 0 for sharp pictures.
+        light: Share of full light; less leaves less contrast, more overexposes.
+        cables: Cables hide what is behind them.
+    """
+
+    noise: float = 1.5
+    vignetting: float = 0.25
+    blur: float = 0.0
+    exposure: float = 0.0
+    light: float = 1.0
+    cables: bool = True
+
+
+def simulation_of(rig: Rig) -> SimulationDocument:
+    """The imperfections of a rig; a perfect one has none."""
+    return rig.document.simulation or SimulationDocument()
+
+
+def rig_as_built(rig: Rig) -> Rig:
+    """The rig with its true geometry: outlets, anchors, drums, pulleys, counts at home.
+
+    Raises:
+        BadInput: There is no such rig.
+    """
+    truth = simulation_of(rig).as_built
+    if truth is None:
+        return rig
+    document = rig.document
+    winches = [
+        winch.model_copy(update={"drum_mm_per_rev": drum, "home_counts": round(home)})
+        for winch, drum, home in zip(
+            document.winches, truth.drums_mm_per_rev, truth.home_counts, strict=True
+        )
+    ]
+    changes = {
+        "outlets_mm": truth.outlets_mm,
+        "anchors_mm": truth.anchors_mm,
+        "winches": winches,
+    }
+    if document.pulleys is not None:
+        radius = {"radius_mm": truth.pulley_radius_mm}
+        changes["pulleys"] = document.pulleys.model_copy(update=radius)
+    return rig_from_document(document.model_copy(update=changes))
+
+
+def stiffness_as_built(rig: Rig) -> Array | None:
+    """Axial stiffness of each cable, shape (m,), [N]; None where the rig file tells it."""
+    truth = simulation_of(rig).as_built
+    if truth is None or truth.stiffness_n is None:
+        return None
+    return read_only(truth.stiffness_n)
+
+
+def winches_as_built(rig: Rig) -> SimulatedWinchesDocument:
+    """Backlash, steps and noise of the simulated winches."""
+    return simulation_of(rig).winches
+
+
+def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
+    """The camera that truly takes the pictures, and what its lens and sensor do to them.
+
+    Raises:
+        BadInput: The true lens has a number of distortion coefficients that OpenCV does not know.
+    """
+    found = [c for c in simulation_of(rig).cameras if c.name == camera.name]
+    if not found:
+        return camera, Optics()
+    truth = found[0]
+    optics = Optics(
+        noise=truth.noise,
+        vignetting=truth.vignetting,
+        blur=truth.blur_px,
+        exposure=truth.exposure_ms / 1e3,
+        light=truth.light,
+        cables=truth.cables,
+    )
+    return _moved(_with_lens(camera, truth), truth.world_from_camera), optics
+
+
+def _with_lens(camera: Camera, truth: SimulatedCameraDocument) -> Camera:
+    lens = truth.lens
+    if lens is None:
+        return camera
+    if len(lens.distortion) not in (0, 4, 5, 8, 12, 14):
+        raise BadInput(
+            f"needs 0, 4, 5, 8, 12 or 14 coefficients, it has {len(lens.distortion)}",
+            where=f"simulation.cameras: {truth.name}: lens.distortion",
+        )
+    matrix = [[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
+    distortion = read_only(np.array(lens.distortion))
+    return replace(camera, matrix=read_only(matrix), distortion=distortion)
+
+
+def _moved(camera: Camera, place: PoseDocument | None) -> Camera:
+    return camera if place is None else replace(camera, world_from_camera=place.pose())
+
+
+# How a rig stands after its power was gone: drives count from anywhere, cables hang slack.
+
+
+#: Counters start this far from where they were, at most, [turns of the motor].
+MOST_TURNS = 100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PowerLoss:
+    """What became of the drums and of their counters.
+
+    Attributes:
+        miscounted: What each drive counts too much from now on, shape (m,), [counts].
+        slack: What each drum has paid out meanwhile, shape (m,), [m].
+        on_a_stand: The platform was caught by a stand; otherwise it hangs on what is taut.
+    """
+
+    miscounted: Array
+    slack: Array
+    on_a_stand: bool
+
+    @classmethod
+    def drawn(cls, rig: Rig, seed: int, most_slack: float, *, on_a_stand: bool) -> PowerLoss:
+        """A random one.
+
+        Args:
+            rig: The robot.
+            seed: Of the random numbers.
+            most_slack: The longest slack of a cable, [m].
+            on_a_stand: Whether a stand keeps the platform where it is.
+        """
+        random = np.random.default_rng(seed)
+        per_turn = np.array([w.counts_per_rev for w in rig.document.winches], dtype=np.float64)
+        turns = random.uniform(-MOST_TURNS, MOST_TURNS, rig.cable_count)
+        slack = random.uniform(0.0, most_slack, rig.cable_count)
+        return cls(read_only(np.rint(turns * per_turn)), read_only(slack), on_a_stand)
+
+    def happen_to(self, rig: Rig, plant: Plant, motors: Iterable[Motor]) -> None:
+        """Turns the drums and sets their counters; the platform goes where that leaves it.
+
+        Raises:
+            Fault: The platform has no equilibrium there.
+        """
+        if self.on_a_stand:
+            plant.put_on_a_stand()
+        plant.miscounted = self.miscounted
+        for winch, motor, more, slack in zip(
+            rig.winches, motors, self.miscounted, self.slack, strict=True
+        ):
+            motor.position += float(more) + round(slack * winch.counts_per_metre)
+            motor.demand = motor.position

@@ -1,0 +1,55 @@
+"""Images, calibrations and workspace maps by one call each, with paths as texts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cdpr
+from drivers import ImageFolder
+
+ROOT = Path(__file__).parents[2]
+SESSION = ROOT / "examples" / "rig_session"
+
+
+@pytest.fixture(scope="module")
+def rig() -> cdpr.Rig:
+    return cdpr.load_rig(ROOT / "configs/gachon_8_6_rehearsal.yaml")
+
+
+def test_a_folder_of_images_is_tracked_and_logged(rig: cdpr.Rig, tmp_path: Path) -> None:
+    result = cdpr.track(rig, str(SESSION / "pictures"), pictures=1)
+    assert repr(result) == "<TrackResult 1 poses in 1 images>"
+    result.save(str(tmp_path / "poses.csv"))
+    assert len((tmp_path / "poses.csv").read_text().splitlines()) == 2
+
+
+def test_a_source_of_images_is_opened_by_what_it_is(rig: cdpr.Rig) -> None:
+    images = cdpr.open_camera(rig, SESSION / "pictures", "front")
+    assert isinstance(images, ImageFolder)
+    assert next(iter(images)).name == "place_01.jpg"
+    with pytest.raises(cdpr.BadInput):
+        cdpr.open_camera(rig, str(SESSION / "no-such-folder"))
+
+
+def test_a_calibrated_rig_is_used_in_memory_and_kept_in_a_file(
+    rig: cdpr.Rig, tmp_path: Path
+) -> None:
+    outcome = cdpr.calibrate_rig(rig, [str(SESSION / "places.csv")], output=str(tmp_path))
+    better = rig.with_calibration(outcome)
+    assert np.abs(better.outlets - rig.outlets).max() > 1e-5
+    again = rig.with_calibration(cdpr.load_calibration(str(outcome.files[0])))
+    np.testing.assert_allclose(again.outlets, better.outlets, atol=1e-9)
+    assert repr(outcome).startswith("<Calibration rig rig, ")
+    with pytest.raises(cdpr.BadInput, match="two results"):
+        rig.with_calibration(outcome, outcome)
+
+
+def test_a_slice_of_the_workspace_is_mapped(rig: cdpr.Rig) -> None:
+    (maps,) = cdpr.workspace_map(rig, slices=[("z", 0.445)], step=0.1, workers=1)
+    assert maps.values["capacity_margin"].shape == maps.grid.shape
+    middle = tuple(n // 2 for n in maps.grid.shape)
+    assert maps.feasible[middle]
+    assert "capacity_margin" in repr(maps)

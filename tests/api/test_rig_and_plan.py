@@ -1,0 +1,128 @@
+"""Rigs, scenes and plans as objects of a script or a notebook."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import cdpr
+from model.kinematics import cable_lengths
+from model.statics.gravity import weight_wrench
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(scope="module")
+def rig() -> cdpr.Rig:
+    return cdpr.load_rig(str(CONFIGS / "gachon_8_6.yaml"))
+
+
+@pytest.fixture(scope="module")
+def scene() -> cdpr.Scene:
+    return cdpr.load_scene(CONFIGS / "environment_1.yaml")
+
+
+@pytest.fixture(scope="module")
+def plan(rig: cdpr.Rig, scene: cdpr.Scene) -> cdpr.Plan:
+    return cdpr.plan(rig, scene, rounds=12, seed=3)
+
+
+def test_a_rig_at_a_pose_balances_its_weight(rig: cdpr.Rig) -> None:
+    posed = rig.at(rig.home)
+    np.testing.assert_array_equal(posed.lengths, cable_lengths(rig, rig.home))
+    residual = posed.structure_matrix @ posed.tensions + weight_wrench(rig, rig.home)
+    assert np.abs(residual).max() < 1e-6
+    assert posed.is_wrench_feasible
+    assert 0.0 < posed.dexterity < 1.0
+    assert not posed.tensions.flags.writeable
+
+
+def test_a_pose_that_cannot_be_held_says_so_and_has_no_tensions(rig: cdpr.Rig) -> None:
+    above = cdpr.Pose.level(rig.outlets.max(axis=0) + 0.2)
+    posed = rig.at(above)
+    assert not posed.is_wrench_feasible
+    assert np.isnan(posed.tensions).all()
+    assert "not feasible" in repr(posed)
+
+
+def test_another_bus_changes_nothing_that_a_plan_rests_on(rig: cdpr.Rig) -> None:
+    other = rig.with_bus("socketcan", "can0")
+    bus = other.document.bus
+    assert (bus.interface, bus.channel) == ("socketcan", "can0")
+    assert other.plan_hash == rig.plan_hash
+    assert rig.document.bus.interface == "virtual"
+
+
+def test_a_camera_is_found_by_its_name_or_refused_with_the_names_that_exist(rig: cdpr.Rig) -> None:
+    assert rig.camera().name == rig.camera("front").name == "front"
+    with pytest.raises(cdpr.BadInput, match="name one of: front"):
+        rig.camera("rear")
+
+
+def test_the_same_rounds_and_seed_give_the_same_path(
+    rig: cdpr.Rig, scene: cdpr.Scene, plan: cdpr.Plan
+) -> None:
+    again = cdpr.plan(rig, scene, rounds=[12], seed=3)
+    assert again.document.waypoints == plan.document.waypoints
+
+
+def test_arguments_that_contradict_each_other_are_refused(rig: cdpr.Rig, scene: cdpr.Scene) -> None:
+    with pytest.raises(cdpr.BadInput):
+        cdpr.plan(rig, scene, budget=0.1, rounds=5)
+    with pytest.raises(cdpr.BadInput):
+        cdpr.plan(rig, scene, cost="length", weights={"length": 1.0})
+    with pytest.raises(cdpr.BadInput, match="objective"):
+        cdpr.plan(rig, scene, cost="beauty")  # type: ignore[arg-type]
+
+
+def test_a_saved_plan_is_loaded_and_proved_again(
+    rig: cdpr.Rig, plan: cdpr.Plan, tmp_path: Path
+) -> None:
+    again = cdpr.load_plan(str(plan.save(tmp_path / "plan.json")))
+    report = cdpr.check(again, rig)
+    assert report.passed
+    assert report.proved_obstacle_clearance >= again.scene.obstacle_clearance
+    assert report.length == pytest.approx(plan.length)
+
+
+def test_a_plan_is_not_checked_for_another_rig(plan: cdpr.Plan) -> None:
+    with pytest.raises(cdpr.BadInput, match="was made for the rig"):
+        cdpr.check(plan, cdpr.load_rig(CONFIGS / "open_frame_8_6.yaml"))
+
+
+def test_more_clearance_than_the_scene_asks_is_kept(rig: cdpr.Rig, scene: cdpr.Scene) -> None:
+    plan = cdpr.plan(rig, scene, rounds=12, clearance=0.015)
+    assert cdpr.check(plan).proved_obstacle_clearance >= 0.015
+
+
+def test_objects_show_themselves_briefly_and_in_a_notebook(
+    rig: cdpr.Rig, scene: cdpr.Scene, plan: cdpr.Plan
+) -> None:
+    for shown in (rig, scene, plan, cdpr.check(plan), rig.at(rig.home)):
+        assert len(repr(shown)) < 300
+        assert repr(shown).startswith("<")
+    for shown in (rig, scene, plan, cdpr.check(plan)):
+        assert shown._repr_html_().count("<tr>") >= 3
+
+
+def test_names_from_files_are_escaped_in_a_notebook(scene: cdpr.Scene) -> None:
+    odd = replace(scene, document=scene.document.model_copy(update={"name": "<script>"}))
+    assert "<script>" not in odd._repr_html_()
+    assert "&lt;script&gt;" in odd._repr_html_()
+
+
+def test_figures_show_cables_obstacles_and_path(
+    rig: cdpr.Rig, scene: cdpr.Scene, plan: cdpr.Plan
+) -> None:
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    alone, among, path = rig.plot(), rig.plot(rig.home, scene), plan.plot()
+    lines = [len(figure.axes[0].lines) for figure in (alone, among, path)]
+    assert lines[0] >= rig.cable_count
+    assert lines[0] < lines[1] < lines[2]
+    plt.close("all")

@@ -1,0 +1,170 @@
+"""What no verb can use is refused before anything is opened: overwriting, odd paths and numbers."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cdpr.cli.arguments import check_arguments
+from model.errors import BadInput
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import call, nothing_written, one_message
+
+SCENE = CONFIGS / "environment_1.yaml"
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    folder = tmp_path / "src"
+    folder.mkdir()
+    (folder / "a.png").write_bytes(b"a picture")
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["same", "symbolic link", "hard link", "in a folder", "missing"])
+def test_an_output_that_is_an_input_is_refused_even_with_force(
+    tmp_path: Path, pictures: Path, kind: str
+) -> None:
+    source, output = pictures / "a.png", tmp_path / "out"
+    match kind:
+        case "same":
+            output = source
+        case "symbolic link":
+            output.symlink_to(source)
+        case "hard link":
+            output.hardlink_to(source)
+        case "in a folder":
+            source, output = pictures, pictures / "a.png"
+        case "missing":
+            source, output = tmp_path / "no", tmp_path / "src" / ".." / "no"
+    with pytest.raises(BadInput, match="would overwrite"):
+        check_arguments({"source": [str(source), source], "output": output, "force": True})
+
+
+def test_a_source_of_a_named_camera_is_an_input_too(pictures: Path) -> None:
+    with pytest.raises(BadInput, match="--overlay would overwrite"):
+        check_arguments({"source": [f"front={pictures}"], "overlay": pictures})
+
+
+def test_two_outputs_of_one_name_are_refused_before_they_exist(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    outputs = {"output": tmp_path / "a", "mcap": tmp_path / "sub" / ".." / "a"}
+    with pytest.raises(BadInput, match="--output and --mcap name the same"):
+        check_arguments(outputs)
+
+
+def test_an_output_beside_its_input_is_fine(tmp_path: Path, pictures: Path) -> None:
+    check_arguments({"source": [str(pictures)], "output": pictures / "poses.csv"})
+    check_arguments({"rig": RIG, "output": tmp_path / "plan.json", "seed": 2**60, "x": (1.0, 2)})
+
+
+def test_results_may_go_into_the_folder_that_is_read(pictures: Path) -> None:
+    check_arguments({"folder": pictures, "output": pictures})
+
+
+def test_a_camera_s_own_log_is_an_output_too(tmp_path: Path) -> None:
+    data = yaml.safe_load(RIG.read_text())
+    data["cameras"].append({**data["cameras"][0], "name": "side"})
+    rig, log, own = tmp_path / "rig.yaml", tmp_path / "p.csv", tmp_path / "p-front.csv"
+    rig.write_text(yaml.safe_dump(data))
+    sources = f"front={RIG}", f"side={SCENE}"
+    with nothing_written(tmp_path):
+        answer = call("track", rig, *sources, "-o", log, "--mcap", own)
+    one_message(answer, 2, "--mcap", "the log of front")
+
+
+def test_a_device_is_never_replaced_by_a_file() -> None:
+    with pytest.raises(BadInput, match="no plain file"):
+        check_arguments({"output": Path("/dev/null"), "force": True})
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"dwell_s": float("inf")},
+        {"columns": 10**30},
+        {"tip_mm": (0.0, 1e308, 0.0)},
+        {"seed": 2**64},
+        {"workers": 10_000},
+        {"size_px": (1280, 99_999)},
+        {"name": "x" * 300},
+        {"rig": Path("x" * 300)},
+        {"source": ["x" * 300]},
+    ],
+)
+def test_a_number_or_name_past_any_machine_is_refused(given: dict[str, object]) -> None:
+    with pytest.raises(BadInput) as caught:
+        check_arguments(given)
+    assert len(str(caught.value)) < 500
+
+
+def test_track_never_draws_into_its_source_pictures(tmp_path: Path) -> None:
+    source = tmp_path / "src"
+    shutil.copytree(CONFIGS.parent / "examples/rig_session/pictures", source)
+    rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
+    with nothing_written(tmp_path):
+        log = tmp_path / "p.csv"
+        answer = call("track", rig, source, "-o", log, "--overlay", source, "--force")
+    one_message(answer, 2, "--overlay", str(source))
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "loop", "pipe", "x" * 300])
+def test_a_rig_file_that_is_none_ends_in_one_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    Path("loop").symlink_to("loop")
+    answer = call("plan", name, SCENE, "-o", "plan.json")
+    one_message(answer, 2)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--columns", "1" + "0" * 30, "--rows", "5", "--square-mm", "20"),
+        ("--columns", "8", "--rows", "5", "--square-mm", "inf"),
+    ],
+)
+def test_a_board_past_any_machine_is_refused(tmp_path: Path, options: tuple[str, ...]) -> None:
+    answer = call("calibrate", "print", tmp_path / "board.pdf", *options)
+    one_message(answer, 2)
+    assert not (tmp_path / "board.pdf").exists()
+
+
+def _program(*arguments: str | Path, **how: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from cdpr.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(  # type: ignore[call-overload, no-any-return]
+        command, stderr=subprocess.PIPE, text=True, check=False, timeout=60, **how
+    )
+
+
+def test_a_full_disk_behind_standard_output_is_told() -> None:
+    with open("/dev/full", "w") as full:
+        done = _program("--version", stdout=full)
+    assert done.returncode == 1
+    assert "could not write all its output" in done.stderr
+    assert "defect" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+def test_a_terminal_of_ascii_only_shows_what_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Streams as a terminal of the C locale has them."""
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors="strict")
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", out)
+    monkeypatch.setattr(sys, "argv", ["cdpr", "check", "é→.json"])
+    from cdpr.cli import main
+
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    out.flush()
+    assert b"\\xe9\\u2192.json: no such file" in out.buffer.getvalue()  # type: ignore[attr-defined]

@@ -1,0 +1,62 @@
+"""`cdpr examples` lists and copies what comes with the program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.cli.plans import CONFIGS
+from tests.cli.program import call, nothing_written, one_message
+
+SESSION = CONFIGS.parent / "examples" / "rig_session"
+
+
+def test_every_ready_file_and_session_is_listed_with_what_it_is() -> None:
+    answer = call("examples")
+    assert answer.code == 0
+    listed = {line.split()[1]: line.split() for line in answer.out.splitlines()[:-1]}
+    assert set(listed) == {*(path.stem for path in CONFIGS.glob("*.yaml")), SESSION.name}
+    assert listed["gachon_8_6"][0] == "rig"
+    assert listed["environment_1"][0] == "scene"
+    assert listed["rig_session"][0] == "session"
+    assert all(len(words) > 4 for words in listed.values())
+
+
+def test_copies_are_the_files_themselves(tmp_path: Path) -> None:
+    folder = tmp_path / "my" / "robot"
+    assert call("examples", "gachon_8_6", "environment_1.yaml", "-o", folder).code == 0
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "environment_1.yaml",
+        "gachon_8_6.yaml",
+    ]
+    for path in folder.iterdir():
+        assert path.read_bytes() == (CONFIGS / path.name).read_bytes()
+
+
+def test_all_of_them_are_copied_as_a_clone_has_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call("examples", "--all").code == 0
+    copied = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert {f"configs/{path.name}" for path in CONFIGS.glob("*.yaml")} < copied
+    assert "examples/rig_session/places.csv" in copied
+    assert "examples/rig_session/pictures/place_01.jpg" in copied
+
+
+def test_a_copy_replaces_nothing_unless_asked(tmp_path: Path) -> None:
+    mine = tmp_path / "gachon_8_6.yaml"
+    mine.write_text("mine")
+    with nothing_written(tmp_path):
+        answer = call("examples", "environment_1", "gachon_8_6", "-o", tmp_path)
+    one_message(answer, 2, "exists already", "1 of the 2 copies", "--force")
+    assert call("examples", "gachon_8_6", "-o", tmp_path, "--force").code == 0
+    assert mine.read_bytes() == (CONFIGS / mine.name).read_bytes()
+
+
+def test_a_name_that_is_unknown_lists_those_there_are(tmp_path: Path) -> None:
+    answer = call("examples", "gachon", "-o", tmp_path)
+    one_message(answer, 2, "there is no example 'gachon'", "gachon_8_6, ")
+    one_message(call("examples", "--all", "turn"), 2, "--all copies every example")
+    one_message(call("examples", "-o", tmp_path), 2, "-o needs something to copy")

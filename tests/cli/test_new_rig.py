@@ -1,0 +1,124 @@
+"""`cdpr new` writes a rig file that the other verbs accept, or nothing and says why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from model.files.new_rig import CSV_COLUMNS
+from model.rig import load_rig
+from tests.cli.plans import CONFIGS
+from tests.cli.program import call, nothing_written, one_message
+
+PAPER = load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+def cables_csv(folder: Path, rows: int = 8) -> Path:
+    """Outlets and anchors of the paper's rig."""
+    document = PAPER.document
+    ends = zip(document.outlets_mm[:rows], document.anchors_mm[:rows], strict=True)
+    lines = [",".join(CSV_COLUMNS), *(",".join(map(str, [*o, *a])) for o, a in ends)]
+    path = folder / "cables.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_enter_for_every_question_makes_a_rig_that_can_be_planned_and_looked_at(
+    tmp_path: Path,
+) -> None:
+    rig = tmp_path / "my rig.yaml"
+    answer = call("new", rig, answers="\n" * 50)
+    assert answer.code == 0, answer
+    assert "next: read it, then cdpr doctor" in answer.out
+    assert load_rig(rig).cable_count == 8
+    assert load_rig(rig).name == "my rig"
+    assert call("doctor", rig).code == 0
+    scene = CONFIGS / "environment_1.yaml"
+    planned = call("plan", rig, scene, "-o", tmp_path / "plan.json")
+    assert planned.code == 0, planned
+
+
+def test_each_question_shows_its_default_and_its_unit(tmp_path: Path) -> None:
+    answer = call("new", tmp_path / "rig.yaml", answers="\n" * 50)
+    assert "platform size X Y Z [130 130 130] mm: " in answer.err
+    assert "mass of the platform [0.4] kg: " in answer.err
+    assert "largest tension of a cable [100] N: " in answer.err
+
+
+@pytest.mark.parametrize(
+    ("question", "bad", "reason"),
+    [
+        (1, "130 130", "three numbers X Y Z are needed, 2 were given"),
+        (1, "130 130 -1", "greater than 0"),
+        (2, "heavy", "'heavy' is not a number"),
+        (2, "nan", "finite number"),
+        (3, "5", "not a whole number from 6 to 64"),
+        (21, "0 0 500", "would be outside"),
+        (26, "4", "more than the least tension, 5 N"),
+        (30, "sometimes", "not one of absolute, incremental"),
+    ],
+)
+def test_a_bad_answer_is_asked_again_with_the_reason(
+    tmp_path: Path, question: int, bad: str, reason: str
+) -> None:
+    rig = tmp_path / "rig.yaml"
+    answer = call("new", rig, answers="\n" * question + f"{bad}\n" + "\n" * 50)
+    assert answer.code == 0, answer
+    assert answer.err.count("; once more") == 1
+    assert reason in answer.err
+    load_rig(rig)
+
+
+def test_answers_are_in_the_file(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    answer = call("new", rig, answers="beam\n200 100, 50\n1.5\n" + "\n" * 50)
+    assert answer.code == 0, answer
+    document = load_rig(rig).document
+    assert document.name == "beam"
+    assert document.platform.size_mm == [200.0, 100.0, 50.0]
+    assert document.platform.mass_kg == 1.5
+
+
+def test_the_end_of_the_answers_writes_nothing(tmp_path: Path) -> None:
+    with nothing_written(tmp_path):
+        answer = call("new", tmp_path / "rig.yaml", answers="\n\n\n8\n1 2")
+    one_message(answer, 2, "the answers ended at the question about 'outlet of cable 1", "--from")
+
+
+def test_coordinates_from_a_table_ask_nothing(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    options = ("--mass-kg", "0.7", "--platform-mm", "130", "130", "130", "--drum-radius-mm", "50")
+    answer = call("new", rig, "--from", cables_csv(tmp_path), *options)
+    assert answer.code == 0, answer
+    assert answer.err == ""
+    document = load_rig(rig).document
+    assert document.outlets_mm == PAPER.document.outlets_mm
+    assert document.anchors_mm == PAPER.document.anchors_mm
+    assert document.platform.mass_kg == 0.7
+    assert document.winches[7].drum_mm_per_rev == pytest.approx(314.159265)
+
+
+def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    table = cables_csv(tmp_path)
+    with nothing_written(tmp_path):
+        low = call("new", tmp_path / "rig.yaml", "--from", table, "--max-tension-n", "3")
+    one_message(low, 2, "--max-tension-n", "more than the least tension, 5 N")
+    table.write_text(table.read_text().replace("864.7443", "high"))
+    high = call("new", tmp_path / "rig.yaml", "--from", table)
+    one_message(high, 2, f"{table}:2", "'high' is not a number")
+    table.write_text("outlet_x_mm\n1\n")
+    one_message(
+        call("new", tmp_path / "rig.yaml", "--from", table), 2, "column outlet_y_mm is missing"
+    )
+    few = call("new", tmp_path / "rig.yaml", "--from", cables_csv(tmp_path, 5))
+    one_message(few, 2, "5 cables", "from 6")
+
+
+def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("mine")
+    one_message(call("new", rig, answers="\n" * 50), 2, "exists already", "--force")
+    assert rig.read_text() == "mine"
+    assert call("new", rig, "--force", answers="\n" * 50).code == 0
+    load_rig(rig)

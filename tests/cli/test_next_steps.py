@@ -1,0 +1,189 @@
+"""What the program tells a user to do next can be done: each printed command is run here."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calibration.results import write_result
+from cdpr.cli.facts import show_summary
+from cdpr.cli.output import progress_bar
+from cdpr.cli.status import _next_step
+from executor.recording.verdict import page_text
+from executor.remote.client import request_run as told
+from model.errors import Fault
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.planning import plan_path
+from planner.settings import OptimalSettings, PlannerSettings
+from tests.calibration.results import camera_result_of
+from tests.cli.plans import CONFIGS, RIG
+from tests.cli.program import call, one_message
+
+SCENE = CONFIGS / "environment_1.yaml"
+
+
+def commands_in(line: str) -> list[list[str]]:
+    """The words of each `cdpr …` of a sentence, without `cdpr`."""
+    parts = [part.split(", then ")[0] for part in line.split("cdpr ")[1:]]
+    return [shlex.split(part.rstrip(" ,")) for part in parts]
+
+
+def test_after_a_plan_with_a_calibration_its_next_step_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my rig").mkdir()
+    monkeypatch.chdir(tmp_path / "my rig")
+    result = write_result(tmp_path / "my rig", camera_result_of())
+    plan = tmp_path / "my rig" / "plan.json"
+    goal = ("--goal-mm", "170", "180", "300")
+    answer = call("plan", RIG, SCENE, "-o", plan, "--calibration", result, *goal)
+    assert answer.code == 0, answer
+    (line,) = (line for line in answer.out.splitlines() if line.split()[:1] == ["next"])
+    check, run = commands_in(line)
+    assert call(*check).code == 0
+    done = call(*run, "--fast", "--no-camera")
+    assert done.code == 0, done
+    assert (tmp_path / "my rig" / "RUNDIR" / "report.html").is_file()
+
+
+def test_a_plan_that_was_made_for_calibrated_numbers_is_refused_with_that_as_a_reason(
+    short_plan: Path, tmp_path: Path
+) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG.read_text().replace("mass_kg:", "mass_kg: 0.5 # "))
+    answer = call("run", short_plan, "--rig", rig, "-o", tmp_path / "run", "--fast")
+    one_message(answer, 2, "was made for the rig", "pass the same --calibration")
+
+
+@pytest.mark.parametrize(
+    ("state", "interface", "says"),
+    [
+        ("latched", "socketcan", "cdpr reset RIG"),
+        ("latched", "virtual", "run again into a new folder"),
+        ("finished", "socketcan", "see in the report"),
+    ],
+)
+def test_a_run_that_failed_has_a_next_step_and_its_faults_explained(
+    capsys: pytest.CaptureFixture[str], state: str, interface: str, says: str
+) -> None:
+    summary = {
+        "verdict": "FAILED",
+        "sentence": "The run ended with a fault before the goal.",
+        "reasons": [],
+        "final_state": state,
+        "interface": interface,
+        "events": [{"code": "moving"}, {"code": "drive_silent"}],
+    }
+    show_summary(summary, Path("run"), as_json=False)
+    lines = capsys.readouterr().out.splitlines()
+    assert says in lines[-1]
+    assert lines[-1].startswith("  next: ")
+    (explained,) = (commands_in(line)[0] for line in lines if "more about it" in line)
+    assert call(*explained).out.strip() == page_text("drive_silent").strip()
+
+
+@pytest.mark.parametrize("verdict", ["PASSED", "STOPPED"])
+def test_a_run_that_went_well_points_to_no_fault(
+    capsys: pytest.CaptureFixture[str], verdict: str
+) -> None:
+    """A reply that was lost and did not matter is no reason to read about it."""
+    events = [{"code": "pass"}, {"code": "reply_lost"}]
+    summary = {"verdict": verdict, "sentence": "", "reasons": [], "events": events}
+    show_summary(summary, Path("run"), as_json=False)
+    assert "more about it" not in capsys.readouterr().out
+
+
+STANDING: dict[str, Any] = {
+    "run": None,
+    "latched": None,
+    "being_set_up": False,
+    "reference": {"counts": True},
+}
+
+
+def test_status_says_what_has_to_be_done_before_a_run() -> None:
+    rig = Path("my rig.yaml")
+    assert _next_step(rig, STANDING) == ""
+    lost = {**STANDING, "reference": {"counts": False}}
+    assert _next_step(rig, lost).startswith("cdpr home 'my rig.yaml'")
+    both = _next_step(rig, {**lost, "latched": "cable 3 is slack"})
+    assert both.index("cdpr reset 'my rig.yaml'") < both.index("cdpr home 'my rig.yaml'")
+    assert _next_step(rig, {**lost, "run": 17}) == ""
+
+
+def test_monitor_calls_itself_by_its_name() -> None:
+    with pytest.raises(Fault, match="no run of yours") as caught:
+        told("status", None, verb="monitor")
+    assert caught.value.where == "cdpr monitor"
+    assert "cdpr status" not in str(caught.value)
+    answer = call("monitor", "--once")
+    assert answer.code == 1
+    assert "cdpr monitor: no run of yours" in answer.err
+
+
+def test_a_jig_has_no_uncertainty_of_nothing() -> None:
+    homed = call("home", RIG, "--at-home", "--fast")
+    assert homed.code == 0, homed
+    assert "0.000" not in homed.out
+    assert "that of the jig, which was not measured" in homed.out
+
+
+def test_no_coordinate_is_a_negative_zero(short: Path, tmp_path: Path) -> None:
+    answer = call("run", short, "--rig", RIG, "-o", tmp_path / "run", "--fast", "--no-camera")
+    assert answer.code == 0, answer
+    assert "-0.0" not in answer.out
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    """A plan that begins a hair below zero."""
+    scene = load_scene(SCENE)
+    path = tmp_path / "plan.json"
+    start = [-0.00001, 0.0, float(scene.start.position[2]) * 1000.0]
+    goal = [30.0, -0.00002, start[2]]
+    options = ("--start-mm", *map(str, start), "--goal-mm", *map(str, goal))
+    answer = call("plan", RIG, SCENE, "-o", path, *options)
+    assert answer.code == 0, answer
+    return path
+
+
+@pytest.mark.parametrize("settings", [OptimalSettings(rounds=40), PlannerSettings(seed=3)])
+def test_compiling_is_no_part_of_planning(
+    monkeypatch: pytest.MonkeyPatch, settings: OptimalSettings | PlannerSettings
+) -> None:
+    """The first plan with new machine code is a short one that is thrown away."""
+    made: list[Any] = []
+
+    @contextmanager
+    def not_compiled(*_: object) -> Iterator[bool]:
+        yield False
+
+    def make(_rig: object, _scene: object, wanted: Any, **_options: object) -> Any:
+        made.append(wanted)
+        return len(made)
+
+    monkeypatch.setattr("planner.planning.planner_compilation", not_compiled)
+    monkeypatch.setattr("planner.planning.make_plan", make)
+    document: Any = plan_path(load_rig(RIG), load_scene(SCENE), settings)
+    assert document == 2
+    first, second = made
+    assert second == settings
+    assert first != settings
+
+
+def test_the_bar_says_what_the_run_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    told_of: list[dict[str, Any]] = []
+    monkeypatch.setattr(
+        "cdpr.cli.output.Progress.update", lambda *_, **options: told_of.append(options)
+    )
+    with progress_bar("preparing, row", 10.0, shown=False) as advance:
+        advance(3.0, "", "holding, row")
+        advance(4.0)
+    assert told_of[0]["description"] == "holding, row"
+    assert told_of[1]["description"] is None

@@ -1,0 +1,303 @@
+"""Drive profiles: makers' drives are set up with theirs, refused with reasons without."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import pytest
+
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402 import configure
+from drivers.cia402 import inspection as examine
+from drivers.cia402.configure import configure_drives
+from drivers.cia402.inspection import Examined, examine_drives
+from drivers.cia402.object_dictionary import settings_for
+from drivers.cia402.profile import load_profile, profile_names
+from drivers.cia402.sdo import SetupNetwork
+from drivers.factory import make_drive_group
+from drivers.stopping_distance import lost_master, require_stopping_room
+from model.errors import BadInput, CdprError, InvalidFile, Refused
+from model.files.rig_file import RigDocument
+from model.rig import Rig, rig_from_document
+from model.winches import WinchMap
+from tests.drivers.sdo_server import ScriptedBus, ScriptedDrive, downloads, eds_of
+
+MAKERS = ("akd", "elmo-gold", "epos4", "nanotec-c5-e")
+
+
+def with_profile(rig: Rig, profile: str) -> Rig:
+    document = rig.document.model_dump()
+    document["drives"]["profile"] = profile
+    return rig_from_document(RigDocument.model_validate(document))
+
+
+def eight_of(profile: str) -> ScriptedBus:
+    return ScriptedBus(ScriptedDrive(node, eds_of(profile)) for node in range(1, 9))
+
+
+@pytest.fixture(autouse=True)
+def _simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The set-up waits in the time of the scripted bus."""
+
+    class Timed(SetupNetwork):
+        def __init__(self, bus: can.BusABC, *arguments: object, timeout: float) -> None:
+            super().__init__(bus, *arguments, timeout=timeout, clock=bus.clock)  # type: ignore[arg-type,attr-defined]
+
+    monkeypatch.setattr(configure, "SetupNetwork", Timed)
+    monkeypatch.setattr(examine, "SetupNetwork", Timed)
+
+
+def set_up(rig: Rig, bus: ScriptedBus) -> tuple[str, ...]:
+    ignored: Callable[[tuple[int, ...]], None] = lambda _nodes: None  # noqa: E731
+    return configure_drives(
+        rig,
+        bus,
+        None,
+        max_tension=None,
+        to_reset=False,
+        on_restarted=ignored,  # type: ignore[arg-type]
+    )
+
+
+def examined(rig: Rig, bus: ScriptedBus) -> Examined:
+    return examine_drives(rig, bus, None)  # type: ignore[arg-type]
+
+
+def test_the_profiles_are_those_of_the_documentation() -> None:
+    assert profile_names() == ("akd", "cia402", "elmo-gold", "epos4", "nanotec-c5-e")
+
+
+@pytest.mark.parametrize("name", ["cia402", *MAKERS])
+def test_drives_of_a_profile_are_set_up_with_it(rig: Rig, name: str) -> None:
+    theirs, bus = with_profile(rig, name), eight_of(name)
+    remarks = set_up(theirs, bus)
+    assert all("drive" in remark for remark in remarks)
+    for drive, node in enumerate(range(1, 9)):
+        values = bus.drives[node].values
+        for setting in settings_for(theirs, drive, WinchMap(theirs)):
+            if (
+                setting.transient
+                or setting.per_mille_of
+                or (setting.index, setting.sub) == (0x1800, 3)
+            ):
+                continue
+            held = values[setting.index, setting.sub]
+            assert not (held ^ setting.value) & (setting.mask or 0xFFFFFFFF), setting
+        assert values.get((0x1800, 3), 0) == 0
+
+
+@pytest.mark.parametrize("name", ["akd", "epos4", "nanotec-c5-e"])
+def test_with_another_profile_everything_wrong_is_told_at_once(rig: Rig, name: str) -> None:
+    bus = eight_of("cia402" if name == "akd" else name)
+    if name == "akd":
+        for drive in bus.drives.values():
+            drive.aborts |= {(0x1006, 0): 0x06020000, (0x6072, 0): 0x06020000}
+    elif name == "nanotec-c5-e":
+        for drive in bus.drives.values():
+            drive.aborts[0x6072, 0] = 0x06090030
+            drive.aborts[0x6007, 0] = 0x06010002
+    with pytest.raises(Refused) as caught:
+        set_up(rig, bus)
+    told = caught.value.what
+    wanted = {"akd": ("1006h", "6072h"), "epos4": ("1006h", "6072h")}
+    for index in wanted.get(name, ("6072h", "6007h")):
+        assert index in told
+    assert "drive 1, 2, 3, 4, 5, 6, 7, 8" in told
+    assert "cdpr doctor RIG --drives" in caught.value.next_step
+    starts = [m for m in bus.sent if m.arbitration_id == 0 and m.data[0] == 0x01]
+    assert not starts, "no drive is started"
+
+
+def test_epos4_gets_its_limits_in_its_own_units(rig: Rig) -> None:
+    """rpm/s of the motor shaft; milliamperes of the nominal current."""
+    bus, winch = eight_of("epos4"), rig.winches[0]
+    set_up(with_profile(rig, "epos4"), bus)
+    values = bus.drives[1].values
+    cycle = rig.document.bus.cycle_ms / 1000.0
+    rpm = winch.max_speed * abs(winch.counts_per_metre) / winch.counts_per_turn * 60.0
+    assert values[0x6085, 0] == math.ceil(rpm / cycle)
+    assert values[0x3001, 2] == 6000  # 1200 per mille of 5 A
+    assert values[0x6066, 0] == 0
+    assert (values[0x60C2, 1], values[0x60C2, 2]) == (10, -3)
+    assert values[0x1016, 1] == 127 << 16 | 100
+
+
+def test_a_cycle_that_the_drives_cannot_take_is_refused(rig: Rig) -> None:
+    document = with_profile(rig, "nanotec-c5-e").document.model_dump()
+    document["bus"]["cycle_ms"] = 4.5
+    with pytest.raises(BadInput, match="interpolate"):
+        set_up(rig_from_document(RigDocument.model_validate(document)), eight_of("nanotec-c5-e"))
+
+
+def test_another_unit_of_position_is_refused_before_anything_is_written(rig: Rig) -> None:
+    bus = eight_of("nanotec-c5-e")
+    bus.drives[4].values[0x60A8, 0] = 0xFF410000  # as it leaves the maker: tenths of a degree
+    with pytest.raises(Refused, match="FF410000h"):
+        set_up(with_profile(rig, "nanotec-c5-e"), bus)
+    assert not downloads(bus)
+
+
+def test_drives_without_csp_are_refused_with_the_reason(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x6502, 0] = 0x65  # all but the cyclic modes
+    with pytest.raises(Refused, match="CSP"):
+        set_up(rig, bus)
+    assert not downloads(bus)
+
+
+@pytest.mark.parametrize("late", [0, 1, 9])
+def test_a_mode_that_shows_late_is_waited_for(rig: Rig, late: int) -> None:
+    bus = eight_of("cia402")
+    bus.drives[6].mode_late = late
+    set_up(rig, bus)
+
+
+def test_a_mode_that_never_shows_is_refused(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    bus.drives[6].mode_late = 1000
+    with pytest.raises(Refused) as caught:
+        set_up(rig, bus)
+    assert "drive 6, object 6061h" in caught.value.where
+
+
+OPTIONAL = [(0x1007, 0), (0x1029, 1), (0x605C, 0), (0x605E, 0)]
+
+
+@pytest.mark.parametrize(
+    "code", [0x06020000, 0x06090011, 0x06010000, 0x06010002, 0x08000000, 0x06090030, 0x06040047]
+)
+def test_an_optional_object_that_is_refused_is_a_remark(rig: Rig, code: int) -> None:
+    bus = eight_of("cia402")
+    for node, key in enumerate(OPTIONAL, start=1):
+        bus.drives[node].aborts[key] = code
+    remarks = set_up(rig, bus)
+    for node, (index, sub) in enumerate(OPTIONAL, start=1):
+        (remark,) = (each for each in remarks if each.startswith(f"drive {node}: "))
+        assert f"{index:04X}h:{sub:02X}" in remark
+        assert (f"{code:08X}h" in remark) == (code not in (0x06020000, 0x06090011))
+    assert len(remarks) == len(OPTIONAL)
+
+
+def test_a_slow_drive_is_set_up_all_the_same(rig: Rig) -> None:
+    """Answers after 0.7 s were blamed on other objects."""
+    bus = eight_of("cia402")
+    bus.times = lambda node, _key: (0.7,) if node == 3 else (0.001,)
+    assert set_up(rig, bus) == ()
+
+
+def test_doctor_tells_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -> None:
+    bus = eight_of("epos4")
+    bus.drives[7].values[0x6502, 0] = 0x65
+    found = examined(rig, bus)
+    assert not found.good
+    wrong = {row.object[:8]: row for row in found.rows if row.verdict == "wrong"}
+    assert set(wrong) == {"1006h:00", "6072h:00", "6502h:00"}
+    assert wrong["1006h:00"].found == {"absent": list(range(1, 9))}
+    assert wrong["1006h:00"].change.endswith("epos4")
+    assert (
+        wrong["6502h:00"].found_text(found.nodes) == "drive 1, 2, 3, 4, 5, 6, 8: 3A5h; drive 7: 65h"
+    )
+    assert not downloads(bus)
+    assert not [m for m in bus.sent if m.arbitration_id < 0x600], "no NMT, no SYNC, no heartbeat"
+
+
+@pytest.mark.parametrize("name", ["cia402", *MAKERS])
+def test_doctor_finds_nothing_wrong_with_the_right_profile(rig: Rig, name: str) -> None:
+    found = examined(with_profile(rig, name), eight_of(name))
+    assert found.good, [(row.object, row.found) for row in found.rows if row.verdict == "wrong"]
+
+
+def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    del bus.drives[2]
+    found = examined(rig, bus)
+    assert (found.silent, len(found.nodes), found.good) == ((2,), 7, False)
+
+
+@pytest.mark.parametrize(("name", "millimetres"), [("cia402", 0.7), ("epos4", 2.1)])
+def test_without_sync_monitoring_the_platform_goes_further(
+    rig: Rig, name: str, millimetres: float
+) -> None:
+    """Heartbeat 100 ms, SYNC 30 ms, both with a ramp of one cycle, at 20 mm/s."""
+    theirs = with_profile(rig, name)
+    distance = lost_master(theirs).distance
+    assert distance == pytest.approx(millimetres / 1000.0)
+    require_stopping_room(theirs, distance)
+    require_stopping_room(theirs, math.inf)
+    with pytest.raises(Refused, match="without the master"):
+        require_stopping_room(theirs, 0.99 * distance)
+
+
+def test_impatient_drives_are_said_to_stop_sooner(rig: Rig, tmp_path: Path) -> None:
+    """What the loop and the clearance go by."""
+    path = tmp_path / "impatient.yaml"
+    path.write_text("name: Ours\nsources: [our bench]\nsync_timeout_periods: 1.5\n")
+    theirs = with_profile(rig, str(path))
+    settings = BusSettings("virtual", "impatient")
+    with open_bus(settings) as bus:
+        capabilities = [
+            make_drive_group(each, bus).capabilities
+            for each in (theirs, rig, with_profile(rig, "epos4"))
+        ]
+    assert [each.sync_timeout for each in capabilities] == [1.5, 3.0, 3.0]
+    assert [each.master_timeout for each in capabilities] == [0.1] * 3
+    assert lost_master(theirs).notice == pytest.approx(0.015)
+
+
+@pytest.mark.parametrize("periods", ["1.0", "11"])
+def test_a_sync_time_out_that_no_cycle_can_keep_is_refused(tmp_path: Path, periods: str) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(f"name: Ours\nsources: [our bench]\nsync_timeout_periods: {periods}\n")
+    with pytest.raises(InvalidFile, match="sync_timeout_periods"):
+        load_profile(str(path))
+
+
+def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
+    with pytest.raises(BadInput) as caught:
+        settings_for(with_profile(rig, "epos5"), 0, WinchMap(rig))
+    assert "epos4" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('absent: ["6073h:00"]', "6072h:00"),
+        ("abscent: []", "absent"),
+        ('absent: ["605Ah:00"]', "no run is safe"),
+        ('absent: ["1006h:00"]', "heartbeat"),
+        ('absent: ["6072h:00"]', "torque_limit"),
+        ('warnings: ["31"]', "3180h"),
+        ('ranges: {"60C3h:02": {low: 0, high: 1}}', "60C2h:02"),
+    ],
+)
+def test_a_wrong_profile_file_says_what_where_and_what_there_is(
+    tmp_path: Path, line: str, told: str
+) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(f"name: Ours\nsources: [our bench]\n{line}\n")
+    with pytest.raises(InvalidFile) as caught:
+        load_profile(str(path))
+    text = str(caught.value)
+    assert told in text
+    assert "lab.yaml:3" in text or ":3:" in text
+
+
+def test_a_profile_of_the_lab_is_used(tmp_path: Path, rig: Rig) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text('name: Ours\nsources: [our bench]\nabsent: ["1400h:05"]\nwarnings: ["33xxh"]\n')
+    assert load_profile(str(path)).is_warning(0x33F0)
+    assert not load_profile(str(path)).is_warning(0x3210)
+    written = {
+        (s.index, s.sub) for s in settings_for(with_profile(rig, str(path)), 0, WinchMap(rig))
+    }
+    assert (0x1400, 5) not in written
+
+
+def test_every_profile_names_its_sources() -> None:
+    for name in profile_names():
+        assert load_profile(name).sources, name
+    assert issubclass(InvalidFile, CdprError)

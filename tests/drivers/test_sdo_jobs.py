@@ -1,0 +1,113 @@
+"""SDO requests beside the cycle: golden bytes, one at a time, no answer that was not asked."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.cia402.sdo_jobs import MONITORING_OFF, ModeCheck, SdoJobs, SdoRequest
+
+NODE = 5
+NEVER = 1_000_000
+"""Turns after which a request is sent again."""
+READ, WRITE = SdoRequest(0x6041, 0), SdoRequest(0x1006, 0, bytes(4))
+
+
+def test_requests_are_those_of_cia_301() -> None:
+    jobs = SdoJobs({NODE: (*MONITORING_OFF, READ)}, NEVER)
+    sent = []
+    for answer in ("60 16 10 01", "60 00 14 05", "60 06 10 00", "4b 41 60 00 37 02"):
+        sent += jobs.next_requests(9)
+        jobs.take(NODE, bytes.fromhex(answer).ljust(8, b"\0"))
+    assert sent == [
+        (0x605, bytes.fromhex("23 16 10 01 00 00 00 00")),
+        (0x605, bytes.fromhex("2b 00 14 05 00 00 00 00")),
+        (0x605, bytes.fromhex("23 06 10 00 00 00 00 00")),
+        (0x605, bytes.fromhex("40 41 60 00 00 00 00 00")),
+    ]
+    assert jobs.unfinished() == set()
+    assert jobs.values == {(NODE, READ): 0x237}
+
+
+def test_a_drive_is_asked_one_thing_at_a_time_and_all_at_once() -> None:
+    jobs = SdoJobs({1: (READ, WRITE), 2: (READ,)}, NEVER)
+    assert [can_id for can_id, _ in jobs.next_requests(1)] == [0x601]
+    assert [can_id for can_id, _ in jobs.next_requests(5)] == [0x602]
+    assert jobs.next_requests(5) == []
+    assert jobs.is_asking
+
+
+def test_a_refusal_is_kept_with_its_code_and_the_next_follows() -> None:
+    jobs = SdoJobs({NODE: (WRITE, READ)}, NEVER)
+    jobs.next_requests(1)
+    jobs.take(NODE, bytes.fromhex("80 06 10 00 00 00 02 06"))
+    assert jobs.failed == {(NODE, WRITE): 0x06020000}
+    assert [data[0] for _, data in jobs.next_requests(1)] == [0x40]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "60 06 10 01 00 00 00 00",  # another sub-index
+        "60 07 10 00 00 00 00 00",  # another object
+        "4b 06 10 00 00 00 00 00",  # an upload's answer to a download
+        "60 06 10 00",  # too short
+        "",
+    ],
+)
+def test_an_answer_to_another_question_counts_for_nothing(answer: str) -> None:
+    jobs = SdoJobs({NODE: (WRITE,)}, NEVER)
+    jobs.next_requests(1)
+    jobs.take(NODE, bytes.fromhex(answer))
+    assert jobs.is_asking
+    assert jobs.failed == {}
+    assert jobs.values == {}
+
+
+@given(st.binary(max_size=8), st.integers(0, 127))
+def test_whatever_comes_nothing_breaks_and_nothing_is_taken_that_was_not_asked(
+    data: bytes, node: int
+) -> None:
+    jobs = SdoJobs({NODE: (READ,)}, NEVER)
+    jobs.take(node, data)
+    assert jobs.unfinished() == {NODE}
+    jobs.next_requests(1)
+    jobs.take(node, data)
+    if jobs.unfinished() == set():
+        assert node == NODE
+        assert data[1:4] == b"\x41\x60\x00"
+
+
+def test_a_request_without_an_answer_is_sent_again_and_only_then() -> None:
+    jobs = SdoJobs({NODE: (READ,), 6: (READ,)}, 3)
+    asked = [[can_id - 0x600 for can_id, _ in jobs.next_requests(9)] for _ in range(2)]
+    jobs.take(6, bytes.fromhex("4b 41 60 00 37 02 00 00"))
+    asked += [[can_id - 0x600 for can_id, _ in jobs.next_requests(9)] for _ in range(5)]
+    assert asked == [[5, 6], [], [], [5], [], [], [5]]
+
+
+def mode(value: int) -> bytes:
+    return bytes((0x4F, 0x61, 0x60, 0, value, 0, 0, 0))
+
+
+def test_enabled_drives_are_asked_until_all_show_the_mode() -> None:
+    check = ModeCheck((1, 2), 20, NEVER)
+    assert [can_id for can_id, _ in check.next_requests(9)] == [0x601, 0x602]
+    check.take(1, mode(8))
+    check.take(2, mode(0))
+    assert check.wrong() == {2: 0}
+    assert [can_id for can_id, _ in check.next_requests(9)] == [0x602]
+    check.take(2, mode(8))
+    assert check.wrong() == {}
+    assert not check.is_overdue
+
+
+def test_a_drive_that_never_says_its_mode_is_named_when_time_is_over() -> None:
+    check = ModeCheck((1, 2), 3, NEVER)
+    for _ in range(3):
+        assert not check.is_overdue
+        check.next_requests(1)
+        check.take(1, mode(8))
+    assert check.is_overdue
+    assert check.wrong() == {2: None}

@@ -1,0 +1,153 @@
+"""The record of a run on disk while it goes on: it never lacks more than the last second."""
+
+from __future__ import annotations
+
+import resource
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from executor.recording.recorder import BEHIND, RecordWriter
+from executor.recording.run_folder import RunEvent, RunFolder
+from model.errors import CdprError, Fault
+
+CYCLE = 0.01
+
+
+class Log:
+    """Cycles that are their own numbers; a stand-in for `RunLog`."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __len__(self) -> int:
+        return self.count
+
+    def table(self, first: int, end: int) -> Any:
+        return Rows(first, end)
+
+
+class Rows:
+    def __init__(self, first: int, end: int) -> None:
+        self.numbers = range(first, end)
+
+    def csv_header(self) -> str:
+        return "cycle\n"
+
+    def csv_rows(self, first: int) -> str:
+        assert first == self.numbers.start
+        return "".join(f"{number}\n" for number in self.numbers)
+
+
+def recorded(folder: RunFolder) -> list[int]:
+    path = folder.path / "cycles.csv"
+    return [int(line) for line in path.read_text().split("\n")[1:-1]] if path.is_file() else []
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+@pytest.mark.parametrize("cycle", [0.001, 0.01, 0.3, 2.0])
+def test_after_every_cycle_the_file_lacks_less_than_a_second(
+    folder: RunFolder, cycle: float
+) -> None:
+    log: Any = Log()
+    writer = RecordWriter(folder, log, own_thread=False)
+    for number in range(60 if cycle > 0.1 else 1500):
+        log.count += 1
+        writer.take_cycles(5.0 + number * cycle)
+        rows = recorded(folder) if number % 97 == 0 or cycle > 0.1 else [number]
+        assert (number - rows[-1]) * cycle < 1.0
+    writer.close()
+    assert recorded(folder) == list(range(log.count))
+
+
+def test_a_thread_writes_all_in_order_and_ends_with_the_block(folder: RunFolder) -> None:
+    log: Any = Log()
+    events = [RunEvent(k * CYCLE, "speed", f"Nr. {k} – über") for k in range(0, 300, 50)]
+    with RecordWriter(folder, log, own_thread=True) as writer:
+        for number in range(300):
+            log.count += 1
+            if number % 50 == 0:
+                writer.take_event(events[number // 50])
+            writer.take_cycles(number * CYCLE)
+    assert recorded(folder) == list(range(300))
+    assert folder.events() == events
+
+
+def test_a_disk_that_hangs_holds_nothing_up_and_is_a_fault_when_it_is_far_behind(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on, log = threading.Event(), Log()
+    append = RunFolder.append_cycles
+
+    def hangs(self: RunFolder, lines: str, *, fsync: bool) -> None:
+        goes_on.wait()
+        append(self, lines, fsync=fsync)
+
+    monkeypatch.setattr(RunFolder, "append_cycles", hangs)
+    at = 0.0
+    with RecordWriter(folder, log, own_thread=True) as writer:  # type: ignore[arg-type]
+        try:
+            for _ in range(round(BEHIND / CYCLE)):
+                log.count, at = log.count + 1, at + CYCLE
+                writer.take_cycles(at)
+            log.count += 100
+            with pytest.raises(Fault, match=r"6\.\d s behind the run"):
+                writer.take_cycles(at + 1.0)
+            with pytest.raises(Fault, match="behind the run"):
+                writer.take_event(RunEvent(at, "stop", "stop requested"))
+        finally:
+            goes_on.set()
+
+
+def full_at(size: int, folder: RunFolder) -> RecordWriter:
+    """A writer whose files cannot grow beyond a size: a part of what is written last still fits."""
+    log: Any = Log()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with RecordWriter(folder, log, own_thread=True) as writer:
+            for number in range(450):
+                log.count += 1
+                writer.take_cycles(number * CYCLE)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    return writer
+
+
+def test_a_full_disk_is_a_fault_and_leaves_whole_lines(folder: RunFolder) -> None:
+    writer = full_at(1003, folder)
+    with pytest.raises(CdprError, match="cannot be written to"):
+        writer.take_event(RunEvent(4.5, "stop", "stop requested"))
+    rows = recorded(folder)
+    assert rows == list(range(len(rows)))
+    assert 100 < rows[-1] < 400
+
+
+def test_a_folder_that_is_gone_is_a_fault(folder: RunFolder) -> None:
+    log: Any = Log()
+    writer = RecordWriter(folder, log, own_thread=False)
+    folder.discard()
+    log.count = 1
+    with pytest.raises(Fault, match="cannot be written to"):
+        writer.take_cycles(0.0)
+
+
+def test_what_is_not_a_fault_of_the_disk_is_one_of_the_record(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_memory(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(Rows, "csv_rows", no_memory)
+    log: Any = Log()
+    with RecordWriter(folder, log, own_thread=True) as writer:
+        log.count = 1
+        writer.take_cycles(0.0)
+    with pytest.raises(Fault, match="MemoryError"):
+        writer.take_event(RunEvent(0.0, "stop", "stop requested"))

@@ -1,0 +1,62 @@
+"""Several drives with one cause are one message, and the verdict does not contradict it."""
+
+from __future__ import annotations
+
+from executor.recording.summary import summarize
+from executor.safety.monitor import Alarm, Monitor, Observation, StopReaction, WatchLimits
+from executor.state_machine import shared_causes
+from tests.executor import fake_run
+
+NAMES = [f"cable {k} (drive {k + 10})" for k in range(1, 9)]
+
+
+def silent(*drives: int, cycles: int = 2) -> tuple[Alarm, ...]:
+    """What the watch finds when these drives do not answer for so many cycles."""
+    watch = Monitor.fresh(WatchLimits(1e-3, 2.0, 50.0, 0.5), NAMES)
+    found: tuple[Alarm, ...] = ()
+    missing = [drive in drives for drive in range(1, 9)]
+    for _ in range(cycles):
+        watch, found = watch.look(Observation(True, [0.0] * 8, [9.0] * 8, missing, [], 0.0))
+    return found
+
+
+def test_all_drives_that_fall_silent_at_once_are_one_cause() -> None:
+    (finding,) = shared_causes(silent(*range(1, 9)), NAMES)
+    assert finding.text == "all 8 drives did not answer for 2 cycles: bus or supply"
+    assert (finding.code, finding.reaction, finding.drive) == (
+        "drive_silent",
+        StopReaction.QUICK_STOP,
+        0,
+    )
+    (note,) = shared_causes(silent(*range(1, 9), cycles=1), NAMES)
+    assert note.text == "all 8 drives did not answer for 1 cycle: bus or supply"
+
+
+def test_some_drives_are_named_and_one_keeps_its_own_text() -> None:
+    (finding,) = shared_causes(silent(2, 5), NAMES)
+    assert finding.text == ("cable 2 (drive 12), cable 5 (drive 15) did not answer for 2 cycles")
+    assert shared_causes(silent(3), NAMES) == silent(3)
+
+
+def test_other_findings_keep_their_order_and_their_texts() -> None:
+    late = Alarm(StopReaction.PATH_STOP, "late", "a cycle began 2.0 cycles late")
+    slack = [Alarm(StopReaction.PATH_STOP, "slack", f"cable {k} carries 1.0 N", k) for k in (1, 2)]
+    both = shared_causes([slack[0], *silent(1, 2), slack[1], late], NAMES)
+    assert [finding.code for finding in both] == ["slack", "drive_silent", "slack", "late"]
+    assert shared_causes([*slack, late], NAMES) == (*slack, late)
+
+
+def test_a_run_that_was_stopped_for_silent_drives_did_not_lose_few_replies() -> None:
+    from dataclasses import replace
+
+    from executor.recording.run_folder import RunEvent
+
+    run = fake_run.make(rate_hz=1.0, every=100, camera=False)
+    cycles = replace(run.cycles, missing=run.cycles.missing + 1)
+    event = RunEvent(1.0, "drive_silent", "all 8 drives did not answer for 2 cycles")
+    for codes, passed in (((), True), ((event,), False)):
+        context = replace(run.context, simulated=False, events=codes, final_state="latched")
+        checks = summarize(context, cycles, run.poses, run.clearance)["checks"]
+        (check,) = (check for check in checks if check["name"] == "lost_replies")
+        assert check["passed"] is passed, check
+        assert ("never so many" in check["text"]) is passed

@@ -1,0 +1,166 @@
+"""Files of a shared state folder: a link is not followed, a FIFO or a huge file hangs nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+import pytest
+
+from drivers.can_bus import BusSettings
+from executor.interlock import locks as state_folder
+from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.locks import LARGEST_FILE, SetUpLock, read_state_file, state_file
+from executor.interlock.reference import ReferenceFile
+from model.errors import Refused
+from tests.cli.plans import RIG
+from tests.cli.program import call
+
+CHANNEL = "239.74.163.61"
+BUS = BusSettings("udp_multicast", CHANNEL)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(state_folder, "SHARED", tmp_path / "absent")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))  # the real-time process has it, too
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    made = tmp_path / "cdpr"
+    made.mkdir()
+    return made
+
+
+@pytest.fixture(autouse=True)
+def nothing_hangs() -> Iterator[None]:
+    """A program that waits for a FIFO fails its test instead."""
+
+    def hung(_number: int, _frame: FrameType | None) -> None:
+        pytest.fail("it waits for the file")
+
+    before = signal.signal(signal.SIGALRM, hung)
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def link(path: Path) -> None:
+    path.symlink_to(path.parent / "elsewhere")
+
+
+def link_to_a_file(path: Path) -> None:
+    (path.parent / "elsewhere").write_text("{}")
+    link(path)
+
+
+def bound(path: Path) -> None:
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(os.path.relpath(path))
+    listener.close()
+
+
+STRANGE: dict[str, Callable[[Path], object]] = {
+    "a symbolic link": link,
+    "a symbolic link,": link_to_a_file,
+    "a FIFO": os.mkfifo,
+    "a folder": Path.mkdir,
+    "a socket": bound,
+}
+
+
+@pytest.fixture(params=STRANGE)
+def strange(request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A kind of file, put in the place of every file of the bus."""
+    monkeypatch.chdir(folder)
+    for path in (_latched(), _latched().with_suffix(".lock"), _set_up(), _reference()):
+        (path.parent / "elsewhere").unlink(missing_ok=True)
+        STRANGE[request.param](path)
+    return str(request.param).rstrip(",")
+
+
+def _latched() -> Path:
+    return state_file("latched", BUS)
+
+
+def _set_up() -> Path:
+    return state_file("set-up", BUS).with_suffix(".lock")
+
+
+def _reference() -> Path:
+    return state_file("reference", BUS)
+
+
+def test_a_set_up_lock_of_another_kind_is_refused_by_name(strange: str) -> None:
+    for use in (SetUpLock(BUS).held, SetUpLock(BUS).tried):
+        with pytest.raises(Refused, match=strange) as caught, use():
+            pytest.fail("it was locked")
+        assert caught.value.where == str(_set_up())
+
+
+def test_a_lock_of_the_latch_of_another_kind_is_refused_by_name(strange: str) -> None:
+    _latched().rmdir() if strange == "a folder" else _latched().unlink()
+    with pytest.raises(Refused, match=strange) as caught:
+        FaultLatch(BUS).held_by_another()
+    assert caught.value.where == str(_latched().with_suffix(".lock"))
+    with pytest.raises(Refused, match=strange):
+        FaultLatch(BUS).engage("rig", _latched().parent)
+    assert not _latched().exists()
+
+
+def test_a_latch_file_of_another_kind_counts_as_engaged(strange: str) -> None:
+    latched = FaultLatch(BUS).read()
+    assert latched is not None
+    assert strange in latched.cause
+    assert str(_latched()) in latched.cause
+
+
+def test_a_reference_of_another_kind_cannot_be_read(strange: str) -> None:
+    with pytest.raises(Refused, match=strange) as caught:
+        ReferenceFile(BUS).read()
+    assert caught.value.where == str(_reference())
+
+
+def test_no_file_is_made_where_a_link_points(folder: Path) -> None:
+    link(_set_up())
+    link(_latched().with_suffix(".lock"))
+    with pytest.raises(Refused), SetUpLock(BUS).held():
+        pytest.fail("it was locked")
+    with pytest.raises(Refused):
+        FaultLatch(BUS).engage("rig", folder)
+    assert not (folder / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("verb", [("status",), ("reset", "--yes")])
+@pytest.mark.parametrize("file", [_set_up, lambda: _latched().with_suffix(".lock")])
+def test_status_and_reset_name_a_fifo_and_end(
+    verb: tuple[str, ...], file: Callable[[], Path]
+) -> None:
+    os.mkfifo(file())
+    answer = call(verb[0], RIG, "--interface", "udp_multicast", "--channel", CHANNEL, *verb[1:])
+    assert answer.code == Refused.exit_code, answer
+    assert f"{file()}: it is a FIFO" in answer.err
+
+
+@pytest.mark.parametrize(("size", "readable"), [(LARGEST_FILE, True), (LARGEST_FILE + 1, False)])
+def test_a_file_too_large_is_not_read(size: int, readable: bool) -> None:
+    _latched().write_bytes(b"[" * size)
+    if readable:
+        assert len(read_state_file(_latched())) == size
+    else:
+        with pytest.raises(Refused, match="more than 65536 bytes"):
+            read_state_file(_latched())
+    latched = FaultLatch(BUS).read()
+    assert latched is not None
+    assert "cannot be read" in latched.cause
+
+
+def test_files_left_open_do_not_pile_up(strange: str) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        with pytest.raises(Refused):
+            read_state_file(_latched())
+    assert len(os.listdir("/proc/self/fd")) == before

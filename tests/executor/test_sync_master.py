@@ -1,0 +1,226 @@
+"""The one sender of SYNC: when 0Fh may go out, what is waited for, and how it leaves the drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.drive_group import GroupCommand
+from executor.control.sync_master import GIVEN_UP_AFTER, UNWATCHED_WITHIN, SyncMaster, late_fault
+from executor.safety.sync_age import USUAL_TIMEOUT
+from model.errors import Fault, HardwareMissing
+from model.rig import load_rig
+from tests.cli.plans import RIG
+
+THE_RIG = load_rig(RIG)
+CYCLE = THE_RIG.document.bus.cycle_ms / 1000.0
+TARGETS = list(range(8))
+
+
+class Clock:
+    """Each cycle takes its time; a cycle may begin late."""
+
+    def __init__(self) -> None:
+        self.now, self.late, self.cycles = 5.0, 0.0, 0
+
+    @property
+    def time(self) -> float:
+        return self.now
+
+    def next_cycle(self) -> float:
+        self.cycles += 1
+        self.now += CYCLE * (1.0 + self.late)
+        return self.late
+
+    def time_left(self) -> float:
+        return 0.004
+
+
+class Group:
+    """Drives that are asked, and answer as they are told to here."""
+
+    def __init__(self, sync_timeout: float | None = 3.0, monitored_for: float = 0) -> None:
+        self.capabilities = SimpleNamespace(sync_timeout=sync_timeout, master_timeout=0.101)
+        self.targets = np.array(TARGETS)
+        self.sent: list[tuple[tuple[int, ...], bool]] = []
+        self.told: list[object] = []
+        self.missing = [False] * 8
+        self.paced: list[float] = []
+        self.monitored_for, self.asked = monitored_for, []
+        self.left = 0.0
+
+    def send_cycle(self, targets: Sequence[int], may_enable: Callable[[], bool]) -> None:
+        self.sent.append((tuple(targets), may_enable()))
+
+    def receive(self, left: float) -> Any:
+        self.left = left
+        return SimpleNamespace(missing=np.array(self.missing), number=len(self.sent))
+
+    def read_positions(self, pace: Callable[[], float]) -> str:
+        self.paced = [pace(), pace()]
+        return "read"
+
+    def look(self, pace: Callable[[], float]) -> str:
+        self.paced = [pace()]
+        return "looked"
+
+    def quick_stop_now(self) -> None:
+        self.told.append("stop")
+
+    def command(self, command: GroupCommand) -> None:
+        self.told.append(command)
+
+    def is_monitored(self, *, silent_too: bool) -> bool:
+        self.asked.append(silent_too)
+        return len(self.asked) <= self.monitored_for
+
+
+def made(**group: Any) -> tuple[SyncMaster, Any, Clock]:
+    clock, drives = Clock(), Group(**group)
+    return SyncMaster(THE_RIG, drives, clock), drives, clock  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("given", "kept"), [(3.0, 3.0), (1.5, 1.5), (None, USUAL_TIMEOUT)])
+def test_the_rule_is_that_of_the_drives(given: float | None, kept: float) -> None:
+    assert made(sync_timeout=given)[0].rule.timeout == kept
+
+
+def test_a_cycle_is_sent_and_its_replies_are_the_status() -> None:
+    master, group, _ = made()
+    assert (master.status, master.overdue) == (None, 0.0)
+    assert master.begin() == 0.0
+    status = master.exchange([3] * 8)
+    assert master.status is status
+    assert group.sent == [((3,) * 8, True)]
+    assert group.left == 0.004
+
+
+@pytest.mark.parametrize(
+    ("late", "may"), [(0.0, True), (1.49, True), (1.51, False), (2.0, False), (9.0, False)]
+)
+def test_drives_are_not_enabled_when_the_last_sync_is_too_old(late: float, may: bool) -> None:
+    master, group, clock = made()
+    assert master.age == 0.0
+    master.begin()
+    master.exchange(TARGETS)
+    assert (group.sent[-1][1], master.overdue) == (True, 0.0)
+    clock.late = late
+    assert master.begin() == late
+    assert master.age == pytest.approx(1.0 + late)
+    master.exchange(TARGETS)
+    assert group.sent[-1][1] is may
+    assert master.overdue == (0.0 if may else pytest.approx(1.0 + late))
+    clock.late = 0.0
+    master.begin()
+    master.exchange(TARGETS)
+    assert (group.sent[-1][1], master.overdue) == (True, 0.0), "that SYNC was the last one"
+
+
+def test_a_stop_counts_as_a_sync() -> None:
+    master, group, clock = made()
+    master.begin()
+    master.exchange(TARGETS)
+    clock.now += 7.0 * CYCLE
+    master.stop_now()
+    assert group.told == ["stop"]
+    assert master.age == 0.0
+
+
+def test_positions_are_read_in_cycles_that_count() -> None:
+    master, group, clock = made()
+    assert master.read_positions() == "read"
+    assert master.status == "read"
+    assert (clock.cycles, group.paced) == (2, [0.004, 0.004])
+    clock.now += CYCLE
+    assert master.age == pytest.approx(1.0)
+
+
+def test_the_cycle_goes_on_until_the_word_is_heard() -> None:
+    master, group, clock = made()
+    words: list[int | None] = [None, None, None, 0]
+    assert master.keep_until(lambda: words.pop(0)) == 0
+    assert clock.cycles == 3
+    assert group.sent == [(tuple(TARGETS), True)] * 3
+
+
+def test_a_drive_that_falls_silent_before_the_word_is_named() -> None:
+    master, group, _ = made()
+    group.missing[4] = True
+    with pytest.raises(HardwareMissing, match=r"cable 5 \(drive 5\) fell silent before") as caught:
+        master.keep_until(lambda: None)
+    assert len(group.sent) == 2
+    assert caught.value.where == "arming"
+    assert "nothing was enabled" in caught.value.next_step
+
+
+def test_it_leaves_as_soon_as_no_drive_watches_it() -> None:
+    master, group, clock = made(monitored_for=3)
+    cycles: list[None] = []
+    assert master.leave(lambda: cycles.append(None) is None) == "looked"
+    assert group.told == [GroupCommand.END_MONITORING]
+    assert len(cycles) == 3
+    assert group.asked == [True] * 5
+    assert clock.cycles == 1, "the look alone: no time-out of a drive is waited for"
+    assert master.status == "looked"
+    assert master.age == 0.0
+
+
+def test_a_monitoring_that_stays_on_is_waited_for_in_silence() -> None:
+    """A silent drive is waited for a while only; then the drives' own time-out must be over."""
+    master, group, clock = made(monitored_for=10_000)
+    cycles: list[None] = []
+    master.leave(lambda: cycles.append(None) is None)
+    assert len(cycles) == round(UNWATCHED_WITHIN / CYCLE) == 300
+    patient = round(GIVEN_UP_AFTER / CYCLE)
+    assert patient == 50
+    assert group.asked == [True] * patient + [False] * (300 - patient) + [True]
+    assert clock.cycles == 12 + 1
+    assert clock.now - 5.0 > group.capabilities.master_timeout + CYCLE
+
+
+def test_no_further_cycle_is_wanted_when_the_gate_denies_one() -> None:
+    master, group, _ = made(monitored_for=10_000)
+    wanted = [True, False]
+    master.leave(lambda: wanted.pop(0))
+    assert wanted == []
+    assert group.asked == [True] * 3
+
+
+def test_after_the_end_the_age_of_sync_is_forgotten() -> None:
+    """Reading without SYNC must not make a later first cycle a stop."""
+    master, group, clock = made()
+    master.begin()
+    master.exchange(TARGETS)
+    master.look()
+    assert group.paced == [0.004]
+    clock.now += 100.0 * CYCLE
+    assert master.age == 0.0
+
+
+def test_drives_that_were_never_enabled_are_left_where_they_are() -> None:
+    master, group, clock = made(monitored_for=2)
+    master.leave_unmoved()
+    assert group.sent == [(tuple(TARGETS), True)] * 2
+    assert clock.cycles == 3
+    assert master.status == "looked"
+
+
+def test_a_bus_that_fails_then_is_left_as_it_is() -> None:
+    master, group, _ = made(monitored_for=2)
+
+    def fails(*_frames: object) -> None:
+        raise Fault("bus-off")
+
+    group.send_cycle = fails
+    master.leave_unmoved()
+    assert master.status is None
+
+
+def test_lateness_counts_from_when_the_cycle_was_due() -> None:
+    error = late_fault(2.6)
+    assert error.what == "a cycle began 1.6 cycles late"
+    assert "cdpr reset" in error.next_step

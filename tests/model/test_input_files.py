@@ -1,0 +1,129 @@
+"""What can hurt is refused before it costs memory or time: devices, pipes, sizes, odd content."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from calibration.geometry.measurements import read_rig_data
+from executor.recording.csv import TableFile
+from model.errors import BadInput, InvalidFile
+from model.files.documents import load_yaml
+from model.files.reading import CsvFile, parse_json, read_bytes, read_text
+from model.files.scene_file import SceneDocument
+from model.rig import load_rig
+from model.scene import load_scene
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def test_a_device_is_refused_without_reading_it() -> None:
+    with pytest.raises(BadInput, match="no plain file"):
+        read_text(Path("/dev/zero"))
+
+
+def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BadInput, match="no plain file"):
+        read_text(tmp_path / "pipe")
+
+
+def test_a_file_beyond_the_limit_is_refused_by_its_stated_size(tmp_path: Path) -> None:
+    with (tmp_path / "large").open("wb") as stream:
+        stream.truncate(10**12)  # no block of it is on disk
+    with pytest.raises(BadInput, match=r"1000000\.0 MB"):
+        read_bytes(tmp_path / "large")
+
+
+@pytest.mark.parametrize("name", ["loop", "x" * 300, "a\0b"])
+def test_a_path_that_can_be_none_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(BadInput, match="cannot be read"):
+        read_text(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"a": 1, "a": 2}',
+        '{"a": 1e400}',
+        '{"a": NaN}',
+        '{"a": ' + "9" * 50 + "}",
+        "",
+    ],
+)
+def test_json_that_no_program_of_ours_writes_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"nested|twice|finite|no number|digits|Expecting"):
+        parse_json(text)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_a_csv_file_is_the_same_whatever_its_line_ends(tmp_path: Path, end: str) -> None:
+    (tmp_path / "a.csv").write_bytes(f"a,b{end}1,2{end}3,4{end}".encode())
+    assert CsvFile(tmp_path / "a.csv").rows == [["a", "b"], ["1", "2"], ["3", "4"]]
+
+
+def test_a_field_that_never_ends_is_told_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text('a,b\n1,"' + "x" * 200_000)
+    for reader in (CsvFile, TableFile, lambda path: read_rig_data(path, 8)):
+        with pytest.raises(BadInput, match="not valid CSV") as caught:
+            reader(tmp_path / "a.csv")
+        assert caught.value.where.endswith("a.csv:2")
+
+
+def test_a_whole_number_past_64_bits_in_a_table_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("n\n" + "9" * 30 + "\n")
+    with pytest.raises(BadInput, match="whole number"):
+        TableFile(tmp_path / "a.csv").ints("n")
+
+
+def changed(tmp_path: Path, name: str, old: str, new: str) -> Path:
+    text = (CONFIGS / name).read_text()
+    assert old in text
+    path = tmp_path / "changed.yaml"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("home_counts: 0", "home_counts: " + "9" * 399),
+        ("mass_kg: 0.4", "mass_kg: 1e308"),
+        ("mass_kg: 0.4", "mass_kg: 1e-300"),
+        ("max_tension_n: 100", "max_tension_n: 1e308"),
+        ("width_px: 1280", "width_px: 9000000000000000000"),
+        ("channel: cdpr", "channel: " + "x" * 300),
+    ],
+)
+def test_a_number_or_name_past_any_machine_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    text = (CONFIGS / "gachon_8_6.yaml").read_text()
+    if old not in text:
+        old, new = "direction: 1", f"direction: 1, {new}"
+    with pytest.raises(InvalidFile) as caught:
+        load_rig(changed(tmp_path, "gachon_8_6.yaml", old, new))
+    (problem,) = caught.value.problems
+    assert problem.key.endswith(new.split(": ")[-2].split()[-1])
+    assert problem.line > 0
+
+
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput) as caught:
+        load_scene(changed(tmp_path, "environment_1.yaml", "name: ", f"name: {'x' * 300} "))
+    assert "100 bytes" in str(caught.value)
+
+
+def test_a_hull_with_a_point_of_two_numbers_is_told_with_its_place(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "schema_version: 1\nname: hull\nstart: {position_mm: [0, 0, 0]}\n"
+        "goal: {position_mm: [0, 0, 9]}\nobstacles:\n  - name: hull\n    convex:\n"
+        "      points_mm: [[0, 0, 0], [1, 0], [0, 1, 0], [0, 0, 1]]\n"
+    )
+    with pytest.raises(BadInput) as caught:
+        load_yaml(scene, SceneDocument)
+    assert "points_mm[1]" in str(caught.value)
+    assert "needs 3 entries" in str(caught.value)

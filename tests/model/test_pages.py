@@ -1,0 +1,221 @@
+"""The one style of every page: self-contained, escaped, complete without scripts."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.pages.charts import Chart, ChartLine, Span, charts, ticks
+from model.pages.page import list_table, page, picture, resource, section, table, tile
+from model.pages.scene import (
+    Label,
+    Moment,
+    SceneFigure,
+    SceneSurface,
+    Stroke,
+    arrows,
+    grid_floor,
+    scene_data,
+    still,
+    viewer,
+)
+from model.pose import Array
+
+EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)> & \"'"
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, and whether all were closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "img", "br", "input"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def chart_of(y: Array, **more: object) -> Chart:
+    x = np.linspace(0.0, 10.0, len(y))
+    line = ChartLine(EVIL, x, y, "encoder", band=(y - 1.0, y + 1.0))
+    return Chart(
+        EVIL, EVIL, EVIL, "mm", (line,), (0.0, 10.0), spans=(Span(2.0, 3.0, EVIL),), **more
+    )  # type: ignore[arg-type]
+
+
+def scene_of(name: str) -> SceneFigure:
+    box = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (0.0, 1.0)])
+    solid = SceneSurface("obstacles", "obstacle", box, ((0, 1, 3, 2),), ((0, 1), (2, 3)), name=name)
+    platform = SceneSurface("robot", "platform", 0.1 * box, ((0, 1, 3, 2),), ((0, 1),))
+    path = Stroke.along("path", "ink", np.array([[0.0, 0.0, 0.5], [0.5, 0.0, 0.5]]), 4.0)
+    moments = tuple(
+        Moment(float(k), np.array([0.5 * k, 0.0, 0.5]), np.eye(3), box[:3], name) for k in range(2)
+    )
+    labels = (Label("path", name, np.zeros(3), "ring"),)
+    return SceneFigure(
+        (solid,), (grid_floor(box)[0], path), labels, 0.1 * box[:3], platform, moments
+    )
+
+
+def whole() -> str:
+    scene = scene_of(EVIL)
+    parts = [
+        section("one", EVIL, table([(EVIL, EVIL)]), list_table([EVIL], [[EVIL]])),
+        tile(EVIL, EVIL, EVIL),
+        picture("a.png", EVIL),
+        charts(chart_of(np.arange(5.0))),
+        viewer(scene, EVIL, [("path", EVIL, "ink", True)], EVIL),
+    ]
+    data = {"scene-data": scene_data(scene)}
+    return page(EVIL, "".join(parts), scripts=("charts.js", "viewer.js"), data=data)
+
+
+def test_a_page_fits_a_phone_and_asks_nothing_from_outside() -> None:
+    text = whole()
+    reader = Reader(text)
+    assert reader.open == []
+    (viewport,) = [m for m in reader.all("meta") if m.get("name") == "viewport"]
+    assert viewport["content"] == "width=device-width, initial-scale=1"
+    (policy,) = [m for m in reader.all("meta") if m.get("http-equiv")]
+    assert (policy["content"] or "").startswith("default-src 'none'")
+    assert "@import" not in text
+    # The one address is a name: of SVG's elements, in the script that makes them.
+    assert set(re.findall(r"https?://[^\s\"'<)]+", text)) == {"http://www.w3.org/2000/svg"}
+    assert not re.findall(r"url\(", text)
+
+
+def test_no_text_becomes_markup() -> None:
+    text = whole()
+    reader = Reader(text)
+    programs = [s for s in reader.all("script") if s.get("type") != "application/json"]
+    assert len(programs) == 2
+    assert len(reader.all("img")) == 1
+    assert not [a for _, a in reader.tags if "onerror" in a]
+    for found in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.S):
+        json.loads(found)
+
+
+def test_every_figure_says_what_it_shows() -> None:
+    for figure in Reader(whole()).tags:
+        if figure[0] in ("canvas", "svg") and figure[1].get("role") == "img":
+            assert figure[1]["aria-label"]
+
+
+def test_colours_are_defined_for_light_and_dark() -> None:
+    style = resource("base.css")
+    light, dark = (
+        set(re.findall(r"--([\w-]+):", part))
+        for part in style.split("@media screen and (prefers-color-scheme: dark)")
+    )
+    assert light == dark - {"of"}
+
+
+def test_scripts_are_small_and_need_no_library() -> None:
+    assert len(resource("charts.js").splitlines()) <= 150
+    for name in ("charts.js", "viewer.js"):
+        assert not re.findall(r"\b(fetch|import|XMLHttpRequest|eval|innerHTML)\b", resource(name))
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
+def test_ticks_are_few_and_within(low: float, span: float) -> None:
+    found = ticks(low, low + span)
+    assert 1 <= len(found) <= 8
+    assert all(low - 1e-6 * span <= value <= low + span * (1 + 1e-6) for value in found)
+
+
+def data_of(text: str) -> dict[str, object]:
+    found = re.search(r'<script type="application/json">(.*?)</script>', text, re.S)
+    assert found
+    data = json.loads(found[1])
+    assert isinstance(data, dict)
+    return data
+
+
+@pytest.mark.parametrize(
+    "y", [np.zeros(5), np.full(5, np.nan), np.array([1.0, np.nan, 2.0, 3.0, 3.0]), np.ones(1)]
+)
+def test_a_chart_of_any_values_is_drawn_with_gaps_and_no_nan(y: Array) -> None:
+    text = charts(chart_of(y))
+    assert "nan" not in text.lower().replace(EVIL, "")
+    (line,) = data_of(text)["lines"]  # type: ignore[misc]
+    assert [v is None for v in line["y"]] == np.isnan(y).tolist()
+
+
+def test_the_chart_and_the_data_of_its_script_agree() -> None:
+    text = charts(chart_of(np.array([2.0, 4.0, 8.0]), from_zero=True))
+    low, high = data_of(text)["y"]  # type: ignore[misc]
+    path = re.findall(r'<path d="([^"Z]*)" fill="none"', text.split('class="lines"')[1])[0]
+    drawn = [float(point.split()[1]) for point in path[1:].split("L")]
+    assert [high - v / 1000.0 * (high - low) for v in drawn] == pytest.approx([2, 4, 8], abs=1e-2)
+
+
+def test_a_line_that_does_not_count_leaves_the_range_alone() -> None:
+    far = ChartLine("limit", np.array([0.0, 10.0]), np.array([100.0, 100.0]), "limit", fits=False)
+    near = ChartLine("", np.array([0.0, 10.0]), np.array([1.0, 2.0]), "ink")
+    chart = Chart("t", "a", "q", "mm", (near, far), (0.0, 10.0))
+    assert data_of(charts(chart))["y"] == pytest.approx([0.94, 2.06])
+
+
+def test_the_still_scene_holds_all_its_points() -> None:
+    """Cropped at no side, with the platform at its first moment."""
+    text = still(scene_of("box"), "a box")
+    box = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', text)
+    assert box
+    width, height = map(float, box.groups())
+    points = np.array(re.findall(r"[ML]([-\d.]+) ([-\d.]+)", text), dtype=float)
+    assert points.min() >= 0.0
+    assert points[:, 0].max() <= width
+    assert points[:, 1].max() <= height
+    assert [f">{k}</text>" in text for k in (1, 2, 3)] == [True] * 3
+
+
+def test_the_floor_is_below_everything_with_round_lines() -> None:
+    points = np.array([[-0.61, 0.0, 0.2], [0.58, 0.9, 1.2]])
+    floor, step = grid_floor(points)
+    assert step == pytest.approx(0.1)
+    assert floor.segments[..., 2].max() == 0.0
+    ends = floor.segments.reshape(-1, 3)
+    assert np.all(ends[:, :2].min(axis=0) <= points[0, :2] + 1e-9)
+    assert np.all(ends[:, :2].max(axis=0) >= points[1, :2] - 1e-9)
+    sunk, _ = grid_floor(points - [0.0, 0.0, 1.0])
+    assert sunk.segments[..., 2].max() == pytest.approx(-0.8)
+
+
+def test_arrows_begin_and_end_where_they_are_told_and_vanish_without_length() -> None:
+    ends = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    found = arrows("a", "limit", np.zeros((2, 3)), ends).segments
+    assert len(found) == 5
+    np.testing.assert_allclose(found[0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(found[1:, 0], np.tile([1.0, 0.0, 0.0], (4, 1)))
+
+
+def test_on_paper_nothing_is_shown_that_only_a_screen_can_use() -> None:
+    style = resource("base.css")
+    assert style.count("{") == style.count("}")
+    screen, paper = style.split("@media print {")
+    hidden = [
+        selector.strip()
+        for selectors in re.findall(r"([^{}]+)\{ display: none; \}", paper)
+        for selector in selectors.split(",")
+    ]
+    assert {"nav", ".viewer", ".scripted .viewer"} <= set(hidden)
+    assert not {line for line in paper.splitlines() if len(line) > 40} & set(screen.splitlines())

@@ -1,0 +1,34 @@
+"""Benchmarks refuse what they cannot measure, before they keep the machine busy."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import realtime
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--rates", "500"), "500 Hz is outside 10 to 250 Hz"),
+        (("--rates", "100", "nan"), "nan Hz is outside"),
+        (("--rates", "0"), "0 Hz is outside"),
+        (("--seconds", "0"), "0 s leave no time"),
+        (("--seconds", "inf"), "inf s leave no time"),
+    ],
+)
+def test_a_rate_that_arming_refuses_is_refused_in_one_message(
+    options: tuple[str, ...],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def measured(*_asked: object) -> list[str]:
+        pytest.fail("it began to measure")
+
+    monkeypatch.setattr(realtime, "measured", measured)
+    assert realtime.main(options) == 2
+    told = capsys.readouterr()
+    assert said in told.err
+    assert "next:" in told.err
+    assert not told.out

@@ -1,0 +1,85 @@
+"""Every command that a message or a help text tells a user to run exists, with its options."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from cdpr.cli.app import build_app
+from executor.doctor import PACKAGES
+
+ROOT = Path(__file__).parents[2]
+COMMAND = re.compile(r"(?:^|`|sudo )cdpr ([a-z][^`;]*)")
+
+
+def texts(tree: ast.AST) -> Iterator[str]:
+    """String constants, f-strings with an X for every value."""
+    inside = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.JoinedStr)
+        for part in node.values
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(str(p.value) if isinstance(p, ast.Constant) else "X" for p in node.values)
+        elif (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in inside
+        ):
+            yield node.value
+
+
+def commands_in(text: str) -> Iterator[str]:
+    """What follows `cdpr` between backticks, or at the beginning of a line."""
+    for line in text.splitlines():
+        yield from (found.group(1).strip() for found in COMMAND.finditer(line.strip()))
+
+
+def all_commands() -> list[tuple[str, str]]:
+    found = set()
+    sources = [p for package in PACKAGES for p in (ROOT / package).rglob("*.py")]
+    pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    for path in sources:
+        for text in texts(ast.parse(path.read_text())):
+            found |= {(str(path.relative_to(ROOT)), c) for c in commands_in(text)}
+    for path in pages:
+        found |= {(str(path.relative_to(ROOT)), c) for c in commands_in(path.read_text())}
+    return sorted(found)
+
+
+COMMANDS = all_commands()
+APP: Any = typer.main.get_command(build_app())
+
+
+def problem(command: str) -> str:
+    """What of a command does not exist; nothing when all does."""
+    words, verb = command.split(), APP
+    while hasattr(verb, "commands"):  # a group of verbs
+        if not words or not re.fullmatch(r"[a-z]+", words[0]):
+            return "" if verb is not APP else f"no verb: {command}"
+        name = words.pop(0)
+        if name not in verb.commands:
+            return f"no verb {name!r}"
+        verb = verb.loaded(name)
+    known = {option for p in verb.params for option in (*p.opts, *p.secondary_opts)} | {"--help"}
+    wanted = {w.split("=")[0].rstrip(".,:)") for w in words if re.match(r"--?[a-z]", w)}
+    return f"no option {sorted(wanted - known)}" if wanted - known else ""
+
+
+def test_commands_are_found() -> None:
+    assert len(COMMANDS) > 100
+    assert problem("run plan.json --rig rig.yaml -o RUNDIR") == ""
+    assert problem("runn plan.json") == "no verb 'runn'"
+    assert problem("run plan.json --rigg rig.yaml") == "no option ['--rigg']"
+
+
+def test_a_command_in_a_message_or_a_page_exists() -> None:
+    wrong = [f"{where}: cdpr {command}: {problem(command)}" for where, command in COMMANDS]
+    assert [line for line in wrong if not line.endswith(": ")] == []

@@ -1,0 +1,240 @@
+"""A run whose program was killed: its cycles are on disk, and its report says what is known."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.can_bus import BusSettings
+from executor.evaluation import evaluate_cut_short
+from executor.interlock.fault_latch import FaultLatch
+from executor.recording.resume import run_end
+from executor.recording.run_course import RunCourse
+from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
+from executor.remote.client import ask_all
+from executor.remote.registry import find_runs
+from executor.trajectory.prepare import PreparedRun
+from model.errors import BadInput, Refused
+from tests.cli.plans import RIG
+from tests.cli.program import call, one_message
+from tests.executor import fake_run
+from tests.scenarios.test_real_time import moving_over_udp, real_time_process, wait_until_gone
+
+RUN = fake_run.make(rate_hz=1.0, every=100, camera=False)
+KEPT = ("plan.json", "rig.json", "cycles.csv", "events.jsonl")
+ENDED = (*(name for name in NEEDED if name not in KEPT),)
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """What is there when the program is killed while the platform moves."""
+    folder = fake_run.write(RUN, tmp_path_factory.mktemp("killed") / "run", pictures=False)
+    folder.append_event(RunEvent(99.0, "pass", "an der Säule vorbei – ¾"))
+    context = RUN.context
+    folder.write_course(RunCourse(context.started, "socketcan", False, False))
+    for name in (*ENDED, "run.mcap"):
+        (folder.path / name).unlink()
+    return folder
+
+
+def cut(killed: RunFolder, path: Path, **kept: int) -> RunFolder:
+    """A copy of which only so many bytes of some files are left."""
+    shutil.rmtree(path, ignore_errors=True)
+    shutil.copytree(killed.path, path)
+    for name, size in kept.items():
+        os.truncate(path / name.replace("_", "."), size)
+    return RunFolder(path)
+
+
+def test_cut_at_every_byte_the_whole_lines_are_read(killed: RunFolder, tmp_path: Path) -> None:
+    data = (killed.path / "cycles.csv").read_bytes()
+    few = data[: data.index(b"\n", data.index(b"\n", data.index(b"\n") + 1) + 1) + 1]
+    whole = killed.cycles()
+    folder = cut(killed, tmp_path / "cut")
+    for size in range(len(few) + 1):
+        (folder.path / "cycles.csv").write_bytes(few[:size])
+        cycles = folder.cycles_cut_short(8)
+        lines = few[:size].count(b"\n")
+        assert len(cycles) == max(0, lines - 1)
+        assert cycles.cable_count == 8
+        assert cycles.time.tolist() == whole.time[: len(cycles)].tolist()
+
+
+def test_events_cut_at_every_byte_are_read_up_to_the_cut(killed: RunFolder, tmp_path: Path) -> None:
+    folder = cut(killed, tmp_path / "cut")
+    data, events = (killed.path / "events.jsonl").read_bytes(), killed.events()
+    for size in range(len(data) + 1):
+        (folder.path / "events.jsonl").write_bytes(data[:size])
+        assert folder.events() == events[: data[:size].count(b"\n")]
+
+
+@given(st.data())
+@settings(max_examples=25)
+def test_wherever_the_files_were_cut_there_is_a_verdict(
+    killed: RunFolder, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    sizes = {
+        name.replace(".", "_"): data.draw(
+            st.integers(0, (killed.path / name).stat().st_size), label=name
+        )
+        for name in ("cycles.csv", "events.jsonl")
+    }
+    folder = cut(killed, tmp_path_factory.getbasetemp() / "cut", **sizes)
+    summary = evaluate_cut_short(folder).summary
+    assert (summary["verdict"], summary["final_state"]) == ("FAILED", "not_ended")
+    assert summary["sentence"] == "The run did not come to its end."
+    assert (summary["interface"], summary["simulated"]) == ("socketcan", False)
+
+
+@pytest.mark.parametrize("lines", [0, 2, 20])
+def test_the_report_of_a_killed_run_shows_what_there_is(
+    killed: RunFolder, tmp_path: Path, lines: int
+) -> None:
+    data = (killed.path / "cycles.csv").read_bytes()
+    size = len(b"".join(data.splitlines(keepends=True)[:lines])) + 17
+    folder = cut(killed, tmp_path / "run", cycles_csv=size)
+    answer = call("report", folder.path)
+    assert answer.code == 0, answer
+    assert "did not come to its end" in folder.report.read_text()
+    assert len(RunFolder.open(folder.path).cycles()) == max(0, lines - 1)
+    # Made once, it is a run folder as any other; but from where it ended nothing is planned.
+    assert call("report", folder.path).code == 0
+    with pytest.raises(Refused, match="did not come to its end"):
+        run_end(RunFolder.open(folder.path))
+
+
+def test_cycles_that_are_not_on_record_are_told_of_a_run_whose_end_is(
+    killed: RunFolder, tmp_path: Path
+) -> None:
+    """The disk was full: its end is in the room that was kept for it, its last cycles are not."""
+    folder = cut(killed, tmp_path / "run")
+    there = len(folder.cycles())
+    course = replace(folder.course(), final_state="finished", cause="", cycles=there + 7)
+    folder.write_end_of_course(course)
+    assert folder.course() == course
+    summary = evaluate_cut_short(folder).summary
+    assert (summary["verdict"], summary["final_state"]) == ("FAILED", "finished")
+    assert f"Of {there + 7} cycles the last 7 are not on record." in summary["reasons"]
+    folder.write_end_of_course(replace(course, cycles=there))
+    assert evaluate_cut_short(folder).summary["verdict"] == "PASSED"
+
+
+def test_the_end_of_a_run_has_room_on_a_full_disk(
+    killed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = cut(killed, tmp_path / "run")
+    size = (folder.path / "run.json").stat().st_size
+
+    def full(path: Path, _text: str) -> None:
+        raise BadInput("the file cannot be written", where=str(path))
+
+    monkeypatch.setattr("executor.recording.run_course.write_atomic", full)
+    course = replace(folder.course(), final_state="latched", cause="Säule ✗ " * 1000, cycles=5)
+    folder.write_end_of_course(course)
+    assert (folder.path / "run.json").stat().st_size == size
+    assert folder.course() == replace(course, cause=course.cause[:256])
+    (folder.path / "run.json").unlink()
+    with pytest.raises(BadInput, match="cannot be written"):
+        folder.write_end_of_course(course)
+
+
+def test_a_killed_run_without_a_cycle_file_has_a_report_too(
+    killed: RunFolder, tmp_path: Path
+) -> None:
+    folder = cut(killed, tmp_path / "run")
+    (folder.path / "cycles.csv").unlink()
+    assert call("report", folder.path).code == 0
+    assert "did not come to its end" in folder.report.read_text()
+
+
+def test_a_run_that_is_under_way_has_no_report_yet(killed: RunFolder, tmp_path: Path) -> None:
+    folder = cut(killed, tmp_path / "run")
+    with folder.held():
+        one_message(call("report", folder.path), 2, "still under way")
+    assert call("report", folder.path).code == 0
+
+
+def test_what_a_program_wrote_while_it_ran_is_what_it_writes_at_the_end(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "executor.recording.run_folder.RunFolder.write_cycles", lambda _self, _table: None
+    )
+    run = ("run", short_plan, "--rig", RIG, "--fast", "--no-camera", "-o")
+    assert call(*run, tmp_path / "appended").code == 0
+    monkeypatch.undo()
+    assert call(*run, tmp_path / "written").code == 0
+    appended = (tmp_path / "appended/cycles.csv").read_bytes()
+    assert appended == (tmp_path / "written/cycles.csv").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "path_mm", "whole"), [(31, 1.0, True), (32, 15.0, False)])
+def test_cycles_up_to_the_last_second_outlive_a_kill_of_the_program_or_of_all_of_it(
+    slow_run: PreparedRun,
+    slow_rig: Path,
+    short_plan: Path,
+    tmp_path: Path,
+    number: int,
+    path_mm: float,
+    whole: bool,
+) -> None:
+    run = tmp_path / "run"
+    with moving_over_udp(slow_run, slow_rig, short_plan, run, number) as (process, _):
+        child = real_time_process(process.pid)
+        elapsed = wait_until(lambda status: (status["path_mm"] or 0.0) > path_mm)
+        if whole:
+            with suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+        process.kill()
+        process.wait()
+        wait_until_gone(child)
+    ended = RunFolder(run).course().final_state  # a busy computer may have stopped it before
+    table = RunFolder(run).cycles_cut_short(8)
+    assert table.time[-1] > elapsed - 1.0
+    answer = call("report", run, "--json")
+    assert answer.code == 0, answer
+    summary = json.loads(answer.out)
+    assert summary["cycles"] == len(table)
+    assert summary["final_state"] == (ended or "not_ended")
+
+
+@pytest.mark.slow
+def test_a_folder_that_is_removed_while_drives_move_ends_in_a_latched_fault(
+    slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
+) -> None:
+    run, number = tmp_path / "run", 33
+    with moving_over_udp(slow_run, slow_rig, short_plan, run, number) as (process, _):
+        shutil.rmtree(run)
+        out, err = process.communicate()
+    assert process.returncode == 1, (out, err)
+    assert "\nFAILED " in out
+    assert "not every file of the run could be written" in err
+    channel = f"239.74.163.22:{20000 + (os.getpid() * 7 + number) % 20000}"
+    latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
+    assert latched is not None
+    assert "what records the run failed" in latched.cause
+
+
+def wait_until(enough: Callable[[dict[str, float]], bool]) -> float:
+    """Until the run says so, or ends; how long it had lasted when it was last heard, [s]."""
+    elapsed = 0.0
+    while True:
+        with find_runs() as runs:
+            answers = ask_all(runs, "status")
+        if not answers or answers[0].status is None:
+            return elapsed
+        elapsed = float(answers[0].status["elapsed_s"] or 0.0)
+        if enough(answers[0].status):
+            return elapsed
+        signal.sigtimedwait([], 0.01)

@@ -1,0 +1,90 @@
+"""A script runs a robot with one call, without the command line."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from executor import jogging, runner
+from executor.homing import home
+from executor.interlock.interlock import MotionInterlock
+from executor.recording.run_folder import RunEvent, RunFolder
+from model.errors import BadInput, StoppedByOperator
+from model.plan import Plan, load_plan
+from model.rig import Rig, load_rig
+from tests.cli.plans import RIG
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return load_rig(RIG)
+
+
+@pytest.fixture
+def plan(short_plan: Path) -> Plan:
+    return load_plan(short_plan)
+
+
+def test_a_run_gives_its_verdict_its_tables_and_its_events(
+    plan: Plan, rig: Rig, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    events: list[RunEvent] = []
+    result = runner.run(
+        plan, rig, folder=tmp_path / "run", cameras=(), realtime=False, on_event=events.append
+    )
+    assert (result.verdict, result.passed, result.exit_code) == ("PASSED", True, 0)
+    assert result.report == tmp_path / "run" / "report.html"
+    assert not result.missing
+    assert len(result.cycles["time_s"]) == result.summary["cycles"]
+    assert np.all(np.diff(result.cycles["time_s"]) > 0.0)
+    assert {len(column) for column in result.cycles.values()} == {result.summary["cycles"]}
+    assert len(result.poses["frame"]) == 0
+    assert events == RunFolder.open(tmp_path / "run").events()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_no_before_the_motion_leaves_nothing(plan: Plan, rig: Rig, tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def refuse(proposal: runner.MotionProposal) -> bool:
+        asked.append(proposal.question)
+        return False
+
+    with pytest.raises(StoppedByOperator, match="nothing was moved"):
+        runner.run(plan, rig, folder=tmp_path / "run", cameras=(), realtime=False, confirm=refuse)
+    assert asked == ["Move the platform now?"]
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_ctrl_c_in_a_script_ends_in_a_coordinated_stop_that_is_on_record(
+    plan: Plan, slow_rig: Path, tmp_path: Path, realtime: bool
+) -> None:
+    def press(event: RunEvent) -> None:
+        if event.code == "moving":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    rig = load_rig(slow_rig)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(
+            plan, rig, folder=tmp_path / "run", cameras=(), realtime=realtime, on_event=press
+        )
+    folder = RunFolder.open(tmp_path / "run")
+    assert folder.summary()["verdict"] == "STOPPED"
+    assert folder.report.is_file()
+    MotionInterlock(rig).require_free()
+
+
+def test_limits_of_the_verbs_are_those_of_the_library(rig: Rig) -> None:
+    with pytest.raises(BadInput, match="speed"):
+        home(rig, at_home=True, realtime=False, speed=0.011)
+    with pytest.raises(BadInput, match="reach"):
+        home(rig, at_home=True, realtime=False, reach=0.201)
+    with pytest.raises(BadInput, match="speed"):
+        jogging.jog(rig, None, by=np.array([0.0, 0.0, 0.01]), speed=0.021, realtime=False)
+    with pytest.raises(BadInput, match="no cable 0"):
+        jogging.jog_cable(rig, 0, 0.001, realtime=False)

@@ -1,0 +1,219 @@
+"""Release and reset: whatever happens on the way, no drive is left following set-points."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.state_machine import DriveState
+from drivers.drive_group import DriveGroup, DriveSnapshot, GroupState
+from drivers.factory import make_drive_group, read_drives
+from executor.control.preconditions import set_up_here
+from executor.control.standstill import FaultReset, Release, Standstill
+from executor.control.sync_master import SyncMaster
+from executor.operator_requests import OperatorRequests
+from executor.realtime.clock import SimulatedClock
+from executor.state_machine import CycleRecord, State
+from model.errors import CdprError, Refused, StoppedByOperator
+from model.rig import load_rig
+from simulation.drives.cia402 import SimulatedDrive
+from simulation.drives.cia402_rig import SimulatedCia402Rig
+from simulation.ground_truth import PowerLoss
+from tests.cli.plans import RIG
+
+_CHANNELS = itertools.count()
+FOLLOWING, HOLDING = DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE
+
+
+class Held:
+    """Drives that hold and count from anywhere."""
+
+    def __init__(self, rehearsal: SimulatedCia402Rig, group: DriveGroup) -> None:
+        self.drives, self.group = rehearsal.drives, group
+        self.clock = SimulatedClock(0.01)
+
+    def do(
+        self, kind: type[Standstill], each_cycle: Callable[[int], bool] = lambda _cycle: False
+    ) -> Standstill:
+        """Does it; ``each_cycle`` says whether the operator wants to stop."""
+        cycles = itertools.count()
+
+        def wishes() -> OperatorRequests:
+            return OperatorRequests(stop=each_cycle(next(cycles)))
+
+        rig, records = load_rig(RIG), list[CycleRecord]()
+        procedure = kind(rig, SyncMaster(rig, self.group, self.clock), wishes, records.append)
+        procedure.arm()
+        self.ended = procedure.run()
+        return procedure
+
+    @property
+    def states(self) -> set[DriveState]:
+        return {drive.state for drive in self.drives}
+
+
+@contextmanager
+def held(*, set_up_where_they_are: bool = True) -> Iterator[Held]:
+    rig, settings = load_rig(RIG), BusSettings("virtual", f"standstill-{next(_CHANNELS)}")
+    with open_bus(settings) as near, open_bus(settings) as far:
+        rehearsal = SimulatedCia402Rig(rig, far, rig.home)
+        loss = PowerLoss.drawn(rig, 3, 0.0, on_a_stand=True)
+        loss.happen_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+        for drive in rehearsal.drives:
+            drive.objects[0x605A, 0] = 6  # else it lets go at the end of its ramp
+            drive.state = HOLDING
+        if set_up_where_they_are:
+            seen: DriveSnapshot = read_drives(rig, near, rehearsal.pump)
+            rig = set_up_here(rig, seen)[0]
+        group = make_drive_group(rig, near, rehearsal.pump)
+        group.configure(to_reset=True)
+        yield Held(rehearsal, group)
+
+
+def error_of(procedure: Standstill) -> CdprError:
+    assert procedure.error is not None
+    return procedure.error
+
+
+def test_all_lose_their_torque_where_they_are() -> None:
+    with held() as bench:
+        stood = [drive.motor.position for drive in bench.drives]
+        bench.do(Release)
+        assert bench.ended is State.FINISHED
+        assert bench.group.state is GroupState.RELEASED
+        assert bench.states == {DriveState.READY_TO_SWITCH_ON}
+        assert [drive.motor.position for drive in bench.drives] == pytest.approx(stood, abs=1)
+
+
+@pytest.mark.parametrize("kind", [Release, FaultReset])
+def test_nobody_is_watched_any_more_when_the_program_leaves(kind: type[Standstill]) -> None:
+    with held() as bench:
+        bench.do(kind)
+        for drive in bench.drives:
+            assert drive.objects[0x1006, 0] == 0
+            assert drive.objects[0x1400, 5] == 0
+            assert drive.objects[0x1016, 1] == 0
+
+
+def test_drives_beyond_their_limits_are_not_enabled() -> None:
+    with held(set_up_where_they_are=False) as bench:
+        with pytest.raises(Refused, match="beyond its position limits"):
+            bench.do(Release)
+        assert bench.states == {HOLDING}
+
+
+@pytest.mark.parametrize("cycle", range(6))
+def test_a_stop_at_any_cycle_leaves_none_enabled(cycle: int) -> None:
+    with held() as bench:
+        error = error_of(bench.do(Release, lambda now: now == cycle))
+        assert isinstance(error, StoppedByOperator)
+        assert "a fault is latched" in error.what
+        assert bench.ended is State.LATCHED
+        assert FOLLOWING not in bench.states
+
+
+def test_an_exception_while_the_drives_are_enabled_stops_them() -> None:
+    def interrupt(_cycle: int) -> bool:
+        if FOLLOWING in bench.states:
+            raise KeyboardInterrupt
+        return False
+
+    with held() as bench:
+        with pytest.raises(KeyboardInterrupt):
+            bench.do(Release, interrupt)
+        assert bench.states == {HOLDING}
+
+
+def test_a_drive_that_falls_silent_stops_the_others() -> None:
+    def silence(_cycle: int) -> bool:
+        if FOLLOWING in bench.states:
+            bench.drives[4].silent = True
+        return False
+
+    with held() as bench:
+        error = error_of(bench.do(Release, silence))
+        assert "cable 5 (drive 5) fell silent" in error.what
+        assert FOLLOWING not in {drive.state for drive in bench.drives if not drive.silent}
+
+
+def test_a_drive_that_stopped_by_itself_is_not_enabled_again() -> None:
+    enabled: list[int] = []
+    after: list[DriveState] = []
+
+    def drop(cycle: int) -> bool:
+        if bench.drives[2].state is FOLLOWING:
+            enabled.append(cycle)
+        if len(enabled) == 2:  # the group has heard that it is enabled
+            bench.drives[2]._quick_stop()
+            enabled.append(cycle)
+        elif len(enabled) > 2:
+            after.append(bench.drives[2].state)
+        return False
+
+    with held() as bench:
+        error = error_of(bench.do(Release, drop))
+        assert "cable 3 (drive 3) stopped by itself" in error.what
+        assert FOLLOWING not in bench.states
+        assert set(after) <= {HOLDING}
+        assert bench.drives[2].state is HOLDING
+
+
+@pytest.mark.parametrize("lateness", [1.5, 2.0, 40.0])
+def test_a_late_cycle_while_the_drives_are_enabled_ends_the_release(lateness: float) -> None:
+    waits = SimulatedClock.next_cycle
+
+    def late(cycle: int) -> bool:
+        hit = FOLLOWING in bench.states
+        bench.clock.next_cycle = lambda: waits(bench.clock) + hit * lateness  # type: ignore[method-assign]
+        return False
+
+    with held() as bench:
+        error = error_of(bench.do(Release, late))
+        assert f"{lateness:.1f} cycles late" in error.what
+        assert bench.states == {HOLDING}
+
+
+def test_a_drive_in_fault_is_reset_where_no_other_holds() -> None:
+    with held() as bench:
+        for drive in bench.drives:
+            drive.state = DriveState.SWITCH_ON_DISABLED
+        bench.drives[3].state = DriveState.FAULT
+        bench.do(FaultReset)
+        assert bench.ended is State.FINISHED
+        assert DriveState.FAULT not in bench.states
+
+
+def test_a_drive_in_fault_stays_so_while_others_hold_the_platform() -> None:
+    with held() as bench:
+        bench.drives[3].state = DriveState.FAULT
+        error = error_of(bench.do(FaultReset))
+        assert isinstance(error, Refused)
+        assert "cannot be reset while other drives hold" in error.what
+        assert bench.drives[3].state is DriveState.FAULT
+
+
+@pytest.mark.parametrize("kind", [Release, FaultReset])
+def test_a_drive_that_does_not_stay_as_it_was_left_is_told(kind: type[Standstill]) -> None:
+    """As one that takes the end of SYNC and heartbeat as a fault, whatever it was told."""
+    with held() as bench:
+        bench.drives[5].objects.changed = _fails_unwatched(bench.drives[5])  # type: ignore[method-assign]
+        error = error_of(bench.do(kind))
+        assert "drives did not stay as they were left" in error.what
+        told = next(each for each in error.what.split(", ") if "cable 6 (drive 6)" in each)
+        assert told.endswith("to fault")
+        assert bench.ended is State.LATCHED
+
+
+def _fails_unwatched(drive: SimulatedDrive) -> Callable[[tuple[int, int], int], None]:
+    changed = drive.objects.changed
+
+    def fails(key: tuple[int, int], value: int) -> None:
+        changed(key, value)
+        if key == (0x1006, 0) and value == 0:
+            drive.state = DriveState.FAULT
+
+    return fails

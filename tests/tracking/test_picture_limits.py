@@ -1,0 +1,139 @@
+"""Pictures that hurt: absurd sizes are refused before decoding; outputs are whole or none."""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from typing import NoReturn
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.cameras.files import PictureOutput, read_picture
+from drivers.cameras.live import MOST_PIXELS, is_too_large, stated_size
+from model.errors import Fault
+
+IMAGE = np.full((48, 64, 3), 90, np.uint8)
+
+
+def png(width: int, height: int) -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        whole = kind + data
+        return struct.pack(">I", len(data)) + whole + struct.pack(">I", zlib.crc32(whole))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    rows = zlib.compress(b"\0" * 10_000_000)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", rows), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp"])
+@pytest.mark.parametrize("size", [(64, 48), (1, 1), (301, 7)])
+def test_the_stated_size_is_the_decoded_one(ending: str, size: tuple[int, int]) -> None:
+    done, data = cv2.imencode(ending, np.zeros((size[1], size[0]), np.uint8))
+    assert done
+    assert stated_size(data.tobytes()) == size
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp"])
+def test_a_header_cut_off_anywhere_has_a_size_or_none(ending: str) -> None:
+    data = cv2.imencode(ending, IMAGE)[1].tobytes()
+    for end in range(min(len(data), 700)):
+        assert stated_size(data[:end]) in (None, (64, 48))
+
+
+def test_a_picture_of_900_megapixels_is_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decoded(*_: object) -> NoReturn:
+        raise AssertionError("it was decoded")
+
+    (tmp_path / "a.png").write_bytes(png(30_000, 30_000))
+    monkeypatch.setattr(cv2, "imdecode", decoded)
+    assert is_too_large((tmp_path / "a.png").read_bytes())
+    assert read_picture(tmp_path / "a.png") is None
+
+
+def test_opencv_itself_refuses_it_in_formats_whose_header_is_not_read(tmp_path: Path) -> None:
+    """With a lower limit, to have a small picture beyond it; ours is set before OpenCV is there."""
+    assert os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] == str(MOST_PIXELS)
+    cv2.imwrite(str(tmp_path / "a.pgm"), IMAGE[:, :, 0])
+    reads = (
+        "import sys; from pathlib import Path; from drivers.cameras.files import read_picture;"
+        " print(read_picture(Path(sys.argv[1])) is None)"
+    )
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", reads, str(tmp_path / "a.pgm")],
+            env={**os.environ, "OPENCV_IO_MAX_IMAGE_PIXELS": str(limit)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+        for limit in (100, 10_000)
+    ]
+    assert answers == ["True", "False"]
+
+
+def test_a_pipe_or_device_among_pictures_is_none(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.png")
+    assert read_picture(tmp_path / "a.png") is None
+    assert read_picture(Path("/dev/zero")) is None
+
+
+def test_a_full_disk_leaves_no_empty_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> NoReturn:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with PictureOutput(tmp_path / "drawn", 10.0) as out:
+        out.write(IMAGE, "a.png")
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(Fault, match="cannot be written") as caught:
+            out.write(IMAGE, "b.png")
+    assert caught.value.why == "No space left on device"
+    assert [path.name for path in (tmp_path / "drawn").iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
+def test_a_video_has_its_name_once_it_is_whole(tmp_path: Path, name: str) -> None:
+    with PictureOutput(tmp_path / name, 10.0) as out:
+        for _ in range(3):
+            out.write(IMAGE, "")
+        assert not (tmp_path / name).exists()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_video_that_a_full_disk_cut_short_is_not_kept(tmp_path: Path) -> None:
+    """OpenCV does not say that a picture was not written; the video is counted afterwards."""
+    out = PictureOutput(tmp_path / "a.avi", 10.0)
+    for _ in range(3):
+        out.write(IMAGE, "")
+    out._count = 5
+    with pytest.raises(Fault, match="cannot be written") as caught:
+        out.__exit__(None, None, None)
+    assert "3 of 5" in caught.value.why
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_that_was_not_finished_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "a.avi").write_bytes(b"before")
+    out = PictureOutput(tmp_path / "a.avi", 10.0, force=True)
+    out.write(IMAGE, "")
+    out.__exit__(RuntimeError, RuntimeError(), None)
+    assert (tmp_path / "a.avi").read_bytes() == b"before"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_pictures_whose_names_differ_only_in_their_ending_are_both_kept(tmp_path: Path) -> None:
+    with PictureOutput(tmp_path / "drawn", 10.0) as out:
+        for name in ("a.jpg", "a.png", "a.jpg"):
+            out.write(IMAGE, name)
+    assert sorted(p.name for p in (tmp_path / "drawn").iterdir()) == ["a.png", "a.png.png"]

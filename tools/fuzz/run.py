@@ -1,0 +1,215 @@
+"""Feeds every reader mutated files and every verb odd command lines, and counts what goes wrong.
+
+    python tools/fuzz/run.py [--minutes 10] [--seed 1] [--workers 2] [--only READER] [--keep DIR]
+
+What goes wrong is a traceback, a call of more than 10 s of processor time or 30 s in all, more than
+2 GB of memory, a process that dies, or an unfinished output; the file or command line behind each
+is kept. The exit status is 0 when nothing went wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+from corpus import build  # noqa: E402
+from mutate import mutated  # noqa: E402
+from readers import (  # noqa: E402
+    Reader,
+    readers,
+)
+from verbs import VerbFuzzer  # noqa: E402
+
+CALL_S, SILENT_S = 10, 30
+MEMORY = 2 * 1024**3
+VERB_SHARE = 0.3
+
+
+class Hang(BaseException):
+    """A call took too long."""
+
+
+def main() -> int:
+    """Runs the workers, restarts those that die, and prints the counts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--only", default="", help="readers whose name begins so; no verbs")
+    parser.add_argument("--keep", type=Path, help="folder for what went wrong")
+    options = parser.parse_args()
+    keep = options.keep or Path(tempfile.mkdtemp(prefix="cdpr-fuzz-"))
+    keep.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="cdpr fuzz ") as place:
+        counts = _all(options, Path(place), keep)
+    return _report(counts, keep)
+
+
+def _all(options: argparse.Namespace, place: Path, keep: Path) -> Counter[str]:
+    corpus = build(place / "corpus")
+    context = get_context("fork")
+    end = time.monotonic() + 60.0 * options.minutes
+    running: dict[int, Any] = {}
+    starts = [0] * options.workers
+    while time.monotonic() < end + SILENT_S + CALL_S:
+        for number in range(options.workers):
+            worker = running.get(number)
+            beat = place / f"beat-{number}"
+            if worker is not None and worker.is_alive():
+                if time.time() - beat.stat().st_mtime > SILENT_S:
+                    worker.kill()  # a call that no signal ends: counted as a dead worker below
+                continue
+            if worker is not None and worker.exitcode == 0:
+                continue
+            if worker is not None:
+                _note(place, keep, number, worker.exitcode)
+                starts[number] += 1
+            if time.monotonic() < end:
+                beat.touch()
+                task = (options, corpus, place, keep, number, starts[number], end)
+                running[number] = context.Process(target=_work, args=task)
+                running[number].start()
+        if time.monotonic() > end and not any(w.is_alive() for w in running.values()):
+            break
+        time.sleep(0.5)
+    total: Counter[str] = Counter()
+    for file in place.glob("counts-*.json"):
+        total.update(json.loads(file.read_text()))
+    return total
+
+
+def _note(place: Path, keep: Path, number: int, code: int) -> None:
+    """Keeps what a worker that died was at."""
+    now = place / f"now-{number}"
+    shutil.copy(now, keep / f"died-{number}-{time.time_ns()}") if now.exists() else None
+    file = place / f"counts-died-{number}-{time.time_ns()}.json"
+    file.write_text(json.dumps({"died": 1}))
+    print(f"worker {number} died with {code}", file=sys.stderr)
+
+
+def _work(
+    options: argparse.Namespace,
+    corpus: dict[str, list[Path]],
+    place: Path,
+    keep: Path,
+    number: int,
+    start: int,
+    end: float,
+) -> None:
+    sys.stdout = sys.stderr = (keep / f"worker-{number}.log").open("a")
+    os.dup2(sys.stderr.fileno(), 2)  # what libraries print about damaged pictures
+    scratch = place / f"worker-{number}-{start}"
+    scratch.mkdir()
+    os.chdir(scratch)
+    for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+        os.environ[name] = str(scratch)
+    tempfile.tempdir = None
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGPROF, _too_long)
+    chance = random.Random(f"{options.seed} {number} {start}")
+    chosen = [r for r in readers(corpus, scratch) if r.name.startswith(options.only)]
+    verbs = None if options.only else VerbFuzzer(corpus, scratch)
+    counts: Counter[str] = Counter()
+    spent: Counter[str] = Counter({reader.name: 0 for reader in chosen})
+    by_name = {reader.name: reader for reader in chosen}
+    seeds = {reader.name: reader.seed.read_bytes() for reader in chosen}
+    beat, now = place / f"beat-{number}", place / f"now-{number}"
+    in_verbs = 0.0
+    while time.monotonic() < end:
+        os.utime(beat)
+        (place / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
+        began = time.monotonic()
+        if verbs is not None and in_verbs < VERB_SHARE * sum(spent.values()):
+            for found in verbs.one(chance, now):
+                counts[found] += 1
+                if found.startswith("verb "):
+                    shutil.copy(now, keep / f"verb-{options.seed}-{number}-{time.time_ns()}")
+            counts["verb calls"] += 1
+            in_verbs += time.monotonic() - began
+            continue
+        name = min(spent, key=spent.__getitem__)  # as much time for each reader
+        while time.monotonic() < began + 0.2:
+            data = mutated(seeds[name], chance)
+            problem = _read(by_name[name], data, scratch, now)
+            counts["reader calls"] += 1
+            counts[f"calls of {name}"] += 1
+            if problem:
+                counts[problem[0]] += 1
+                _keep(keep, name, data, problem)
+        spent[name] += time.monotonic() - began
+    (place / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
+
+
+def _read(reader: Reader, data: bytes, scratch: Path, now: Path) -> tuple[str, str] | None:
+    """One call: nothing, or what went wrong and how."""
+    from model.errors import CdprError
+
+    path = reader.place or scratch / f"file{reader.seed.suffix}"
+    path.write_bytes(data)
+    now.write_bytes(data)
+    signal.setitimer(signal.ITIMER_PROF, CALL_S)
+    try:
+        reader.read(path)
+    except CdprError:
+        return None
+    except Hang:
+        return "hangs", "".join(traceback.format_stack(limit=5))
+    except MemoryError:
+        return "out of memory", traceback.format_exc(limit=-8)
+    except Exception:
+        return "tracebacks", traceback.format_exc(limit=-8)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        if reader.place is not None:
+            shutil.copyfile(reader.seed, path)
+    return None
+
+
+def _keep(keep: Path, name: str, data: bytes, problem: tuple[str, str]) -> None:
+    """One file of each cause, with its trace."""
+    last = "\n".join(problem[1].strip().splitlines()[-4:])
+    mark = f"{name.replace('/', '_')}-{problem[0]}-{abs(hash(last[:200])) % 10**8:08d}"
+    if not (keep / f"{mark}.txt").exists() and len(list(keep.iterdir())) < 500:
+        (keep / f"{mark}.bin").write_bytes(data)
+        (keep / f"{mark}.txt").write_text(problem[1])
+
+
+def _too_long(*_: object) -> None:
+    raise Hang
+
+
+def _report(counts: Counter[str], keep: Path) -> int:
+    wrong = {
+        key: count
+        for key, count in counts.items()
+        if key in ("tracebacks", "hangs", "out of memory", "died") or key.startswith("verb ")
+        if key != "verb calls"
+    }
+    for key, count in sorted(counts.items()):
+        print(f"{count:9d}  {key}")
+    if wrong:
+        print(f"what went wrong is in {keep}")
+    print(f"{counts['reader calls']} reader calls, {counts['verb calls']} verb calls: ", end="")
+    print(", ".join(f"{count} {key}" for key, count in wrong.items()) or "nothing went wrong")
+    return 1 if wrong or not counts["reader calls"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

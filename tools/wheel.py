@@ -1,0 +1,130 @@
+"""Builds the wheel into dist/ and tries it in a clean environment outside the repository.
+
+    python tools/wheel.py               # needs no network
+    python tools/wheel.py --with-index  # installs the dependencies by pip instead of borrowing them
+
+The environment is a new one with the wheel in it. Its dependencies are those of the Python that
+runs this, made visible by a path file; the repository is not, so whatever the wheel lacks is
+missing. Kernels run as plain Python: compiling them in a new folder takes minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import tomllib
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PACKAGES = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+VERSION = PROJECT["project"]["version"]
+
+TRIED = (
+    "cdpr --version",
+    "cdpr examples",
+    "cdpr examples --all",
+    "cdpr examples rig_session -o copy",
+    "cdpr doctor configs/gachon_8_6.yaml",
+    "cdpr plan configs/gachon_8_6.yaml configs/environment_1.yaml -o plan.json --rounds 1",
+    "cdpr check plan.json",
+    "cdpr run plan.json -o runs/first --fast --no-camera",
+    "cdpr explain drive_silent",
+)
+
+
+class Failed(Exception):
+    """Something that a release must have is not so."""
+
+
+def build() -> Path:
+    """The wheel, in dist/."""
+    require_tag_of_this_version()
+    output = ROOT / "dist"
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(output)]
+    run(command, ROOT)
+    return output / f"cdpr-{VERSION}-py3-none-any.whl"
+
+
+def require_tag_of_this_version() -> None:
+    """A commit that has a tag of a version is that version."""
+    command = ["git", "tag", "--points-at", "HEAD", "--list", "v*"]
+    shown = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if wrong := [tag for tag in shown.stdout.split() if tag != f"v{VERSION}"]:
+        raise Failed(f"this commit has the tag {wrong[0]}, pyproject.toml has version {VERSION}")
+
+
+def install(wheel: Path, folder: Path, with_index: bool) -> Path:
+    """A clean environment with the wheel; its folder of programs."""
+    venv.create(folder, with_pip=True)
+    python = folder / "bin" / "python"
+    borrowed = [] if with_index else ["--no-deps", "--no-index"]
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    run([*pip, *borrowed, "-c", str(ROOT / "constraints.txt"), str(wheel)], folder)
+    if not with_index:
+        (site,) = folder.glob("lib/python*/site-packages")
+        (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return python.parent
+
+
+def try_out(programs: Path, folder: Path) -> None:
+    """Runs what a newcomer runs first, in an empty folder."""
+    where = f"import {', '.join(PACKAGES)}; print({', '.join(f'{p}.__file__' for p in PACKAGES)})"
+    found = run([str(programs / "python"), "-c", where], folder).split()
+    if outside := [path for path in found if not path.startswith(str(programs.parent))]:
+        raise Failed(f"not of the wheel: {outside[0]}")
+    for command in TRIED:
+        program, *words = command.split()
+        answer = run([str(programs / program), *words], folder)
+        if command == "cdpr --version" and answer.split() != ["cdpr", VERSION]:
+            raise Failed(f"cdpr --version says {answer.strip()!r}, not {VERSION}")
+        print(f"ok     {command}", flush=True)
+    if not re.search(r"PASSED", (folder / "runs/first/summary.json").read_text()):
+        raise Failed("the run did not pass")
+
+
+def run(command: list[str], folder: Path) -> str:
+    """What a command prints.
+
+    Raises:
+        Failed: Its exit code is not 0.
+    """
+    settings = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
+    settings["NUMBA_DISABLE_JIT"] = "1"
+    done = subprocess.run(
+        command, cwd=folder, env=settings, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise Failed(
+            f"{' '.join(command)}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
+        )
+    return done.stdout
+
+
+def main() -> int:
+    """Parses the command line."""
+    parser = argparse.ArgumentParser(description="build the wheel and try it")
+    parser.add_argument("--with-index", action="store_true", help="install dependencies by pip")
+    options = parser.parse_args()
+    try:
+        wheel = build()
+        print(f"built  {wheel.relative_to(ROOT)}, {wheel.stat().st_size / 1e6:.1f} MB", flush=True)
+        with tempfile.TemporaryDirectory(prefix="cdpr-wheel-") as base:
+            folder = Path(base).resolve() / "empty"
+            folder.mkdir()
+            programs = install(wheel, Path(base).resolve() / "venv", options.with_index)
+            try_out(programs, folder)
+    except Failed as error:
+        print(f"FAILED {error}")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Finds and decodes tags in an image."""

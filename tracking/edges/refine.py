@@ -1,0 +1,321 @@
+"""Tag corners to hundredths of a pixel: lines fitted to the four edges of the black square.
+
+A blurred step from ink to paper is fitted to the pixels beside each edge, freed of what its corners
+and the modules next to it add. Pixels tell their noise themselves, so each line comes with what it
+may be off. The lines are freed of lens distortion and meet at the corners.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.pose import Array, read_only
+from model.rig import Camera
+from tracking.camera_model import Image, ideal_from_pixels, pixels_from_ideal
+from tracking.edges.coarse import find_edges
+from tracking.edges.fit import fit_edges
+from tracking.edges.sampling import (
+    COLUMNS,
+    COVARIANCE,
+    HALF,
+    MIDDLE,
+    OFFSET,
+    OFFSET_VARIANCE,
+    SHARE,
+    SPREAD,
+    TILT,
+    TILT_VARIANCE,
+)
+
+# Straight lines of edges, and where they meet.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """Lines of edges in ideal pixels, four a tag."""
+
+    points: Array  # (e, 2) on the lines
+    directions: Array  # (e, 2) unit
+    offset_deviation: Array  # (e,) [px] at ``points``
+    tilt_deviation: Array  # (e,) [rad]
+    good: NDArray[np.bool_]  # (e,)
+
+
+def meet(lines: Lines, rough: Array) -> Array:
+    """Corners where neighbouring good lines meet, else the rough ones; shape (t, 4, 2)."""
+    points, directions = lines.points.reshape(-1, 4, 2), lines.directions.reshape(-1, 4, 2)
+    before_point, before = np.roll(points, 1, axis=1), np.roll(directions, 1, axis=1)
+    cross = directions[..., 0] * before[..., 1] - directions[..., 1] * before[..., 0]
+    good = lines.good.reshape(-1, 4)
+    good = good & np.roll(good, 1, axis=1) & (np.abs(cross) > 1e-3)
+    gap = before_point - points
+    share = gap[..., 0] * before[..., 1] - gap[..., 1] * before[..., 0]
+    share /= np.where(good, cross, 1.0)
+    return np.where(good[..., None], points + share[..., None] * directions, rough)
+
+
+# Edges of tags as curves in the picture, bent by the lens, and as lines in ideal pixels.
+
+
+#: An edge is used only if this share of it looks like one.
+LEAST_SHARE = 0.4
+#: Where the brightness of pixels tells so little that one pixel of its length places an edge no
+#: better than this, there is none, [px].
+MOST_SCATTER = 1.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeCurves:
+    """Where the edges of squares are looked for.
+
+    Attributes:
+        camera: In whose picture.
+        pixels: Corners, shape (t, 4, 2), [px], lens distortion included.
+        ideal: The same in ideal pixels.
+        lengths: Of the chords, shape (t, 4), [px].
+        along: Unit directions of the chords, shape (t, 4, 2).
+        bows: Shape (t, 4, 2): at a share f of its length a curve lies f (1 − f) (b₀ + f b₁) outside
+            of its chord, [px].
+    """
+
+    camera: Camera
+    pixels: Array
+    ideal: Array
+    lengths: Array
+    along: Array
+    bows: Array
+
+    @classmethod
+    def between(cls, camera: Camera, pixels: Array) -> EdgeCurves:
+        """The edges between corners, shape (t, 4, 2), [px]."""
+        ideal = ideal_from_pixels(camera, pixels)
+        chords = np.roll(pixels, -1, axis=1) - pixels
+        lengths = np.maximum(np.linalg.norm(chords, axis=2), 1e-6)
+        along = chords / lengths[..., None]
+        bows = np.zeros_like(pixels)
+        if camera.distortion.size:
+            bows = _bows(camera, pixels, ideal, lengths, along)
+        return cls(camera, pixels, ideal, lengths, along, bows)
+
+    @property
+    def outward(self) -> Array:
+        """Unit directions out of the squares, shape (t, 4, 2)."""
+        return _outward(self.along)
+
+    def module_widths(self, modules: int) -> Array:
+        """Width of a module across each edge, shape (t, 4), [px]."""
+        middle = (self.pixels + np.roll(self.pixels, -1, axis=1)) / 2.0
+        opposite = np.roll(middle, -2, axis=1) - middle
+        return np.asarray(np.abs(np.sum(opposite * self.outward, axis=2)) / modules)
+
+    def lines(self, found: Array, doubt: Array) -> Lines:
+        """Straight lines in ideal pixels.
+
+        Args:
+            found: What is known of each edge, shape (t, 4, `COLUMNS`).
+            doubt: What each edge may be off beside that, shape (t, 4), [px].
+        """
+        # Where offset and tilt err independently.
+        tilt_variance = np.maximum(found[..., TILT_VARIANCE], 1e-12)
+        centre = np.clip(-found[..., COVARIANCE] / tilt_variance, -1.0, 1.0)
+        variance = found[..., OFFSET_VARIANCE] + centre * found[..., COVARIANCE]
+        deviation = np.sqrt(np.maximum(variance, 0.0))
+        ends = np.stack([self._points(found, np.full_like(centre, q)) for q in (-1.0, 1.0)])
+        middle = self._points(found, centre)
+        points = ideal_from_pixels(self.camera, np.stack([*ends, middle, middle + self.outward]))
+        way = points[1] - points[0]
+        length = np.maximum(np.linalg.norm(way, axis=2), 1e-6)
+        ideal_pixel = np.linalg.norm(points[3] - points[2], axis=2)  # how long one pixel is there
+        good = (found[..., SHARE] >= LEAST_SHARE) & (
+            deviation * np.sqrt(2.0 * found[..., HALF]) < MOST_SCATTER
+        )
+        more = np.hypot(deviation, doubt) / np.maximum(deviation, 1e-9)
+        tilt = np.sqrt(tilt_variance) * ideal_pixel / (length / 2.0)
+        return Lines(
+            points=points[2].reshape(-1, 2),
+            directions=(way / length[..., None]).reshape(-1, 2),
+            offset_deviation=np.maximum(deviation * ideal_pixel * more, 1e-6).reshape(-1),
+            tilt_deviation=(tilt * more).reshape(-1),
+            good=good.reshape(-1),
+        )
+
+    def _points(self, found: Array, place: Array) -> Array:
+        """Points of the edges that were found, at q of `edge_kernels.columns`, [px]."""
+        way = found[..., MIDDLE] + place * found[..., HALF]
+        share = way / self.lengths
+        aside = share * (1.0 - share) * (self.bows[..., 0] + share * self.bows[..., 1])
+        aside += found[..., OFFSET] + place * found[..., TILT]
+        return np.asarray(
+            self.pixels + way[..., None] * self.along + aside[..., None] * self.outward
+        )
+
+
+def _outward(along: Array) -> Array:
+    return np.stack([along[..., 1], -along[..., 0]], axis=-1)  # corners run clockwise on the screen
+
+
+def _bows(camera: Camera, pixels: Array, ideal: Array, lengths: Array, along: Array) -> Array:
+    """Through the pictures of two points of each straight edge."""
+    share = np.array([1.0, 2.0])[:, None] / 3.0
+    way = np.roll(ideal, -1, axis=1) - ideal
+    inner = pixels_from_ideal(camera, ideal[:, :, None] + share * way[:, :, None])
+    gap = inner - pixels[:, :, None]
+    share = np.sum(gap * along[:, :, None], axis=3) / lengths[..., None]
+    aside = np.sum(gap * _outward(along)[:, :, None], axis=3) / (share * (1.0 - share))
+    slope = (aside[..., 1] - aside[..., 0]) / (share[..., 1] - share[..., 0])
+    return np.stack([aside[..., 0] - slope * share[..., 0], slope], axis=-1)
+
+
+#: What an edge may be off beside noise, so that none claims to be exact: pixels are no mixture of a
+#: bell and a box, nor is paper flat, [px].
+FLOOR = 0.0015
+#: The second row of modules inside an edge is not modelled: this many times the share of it that
+#: the blur brings to the first row's middle, in deviations of the blur.
+SECOND_ROW = 1.0
+#: Where the blur is wider than this share of a module, corners are fitted again as long as they
+#: move by more than `NEAR` and half of what an edge may be off: what the modules beside an edge add
+#: hangs on where they lie.
+CROWDED = 0.22
+#: Elsewhere they are fitted again only if they move by more than `FAR`, [px].
+NEAR, FAR = 0.03, 0.3
+#: At most so many fits.
+MOST_FITS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedTag:
+    """The square of one tag in ideal (undistorted) pixels.
+
+    For true corners c, flattened, ``whitening @ c - target`` holds eight independent errors of unit
+    variance: offset and tilt of the four edges in turn; both are nought for a hidden edge.
+
+    Attributes:
+        corners: In the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2), [px]; rough
+            where an edge is hidden.
+        whitening: Shape (8, 8), [1/px].
+        target: Shape (8,).
+        edges: Which edges were measured, shape (4,).
+    """
+
+    corners: Array
+    whitening: Array
+    target: Array
+    edges: NDArray[np.bool_]
+
+    @property
+    def whole(self) -> bool:
+        """Whether all four edges were measured."""
+        return bool(self.edges.all())
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the corners of a whole tag, flattened, shape (8, 8), [px²]."""
+        inverse = np.linalg.inv(self.whitening)
+        return np.asarray(inverse @ inverse.T)
+
+
+def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[RefinedTag | None]:
+    """Refines the corners of tags.
+
+    Args:
+        image: Grey picture, shape (h, w).
+        camera: Whose picture it is.
+        corners: Roughly (to about a module), in the order of
+            `tracking.detection.tags.CORNER_SIGNS`, shape (t, 4, 2), [px], lens distortion included.
+        modules: Modules along the side of the black square.
+
+    Returns:
+        One entry a tag: None where it leaves the picture or fewer than two edges are to be seen.
+    """
+    if not len(corners):
+        return []
+    pixels = np.ascontiguousarray(image)[:]
+    pixels.flags.writeable = False  # kernels are compiled for pictures that nobody writes to
+    rough = np.array(corners, dtype=np.float64)
+    inside = _inside(rough, image.shape)
+    curves = EdgeCurves.between(camera, np.where(inside, rough, _somewhere(image.shape)))
+    found = np.zeros((len(rough), 4, COLUMNS))
+    widths = curves.module_widths(modules)
+    find_edges(pixels, curves.pixels, curves.bows, widths, found)
+    final = meet(curves.lines(found, _doubt(found, widths)), curves.ideal)
+    again = inside.copy()
+    for _ in range(MOST_FITS):
+        better = pixels_from_ideal(camera, final)
+        inside &= _inside(better, image.shape)
+        again &= inside
+        curves = EdgeCurves.between(camera, np.where(again, better, curves.pixels))
+        widths, which = curves.module_widths(modules), np.flatnonzero(again)
+        fit = np.empty((len(which), 4, COLUMNS))
+        places = curves.pixels[which], curves.bows[which], widths[which]
+        fit_edges(pixels, *places, modules, found[which], fit)
+        found[which] = fit
+        lines = curves.lines(found, _doubt(found, widths))
+        final = meet(lines, curves.ideal)
+        again = inside & _unsettled(final - curves.ideal, found, widths, lines)[:, None, None]
+        if not again.any():
+            break
+    return [_refined(final, lines, t) if inside[t, 0, 0] else None for t in range(len(final))]
+
+
+def load_kernels() -> None:
+    """Loads the machine code of `refine`, or compiles it, so that no picture waits for it."""
+    grey = np.zeros((16, 16), dtype=np.uint8)
+    grey.flags.writeable = False
+    square, bows = _somewhere(grey.shape)[None], np.zeros((1, 4, 2))
+    widths, found = np.ones((1, 4)), np.zeros((1, 4, COLUMNS))
+    find_edges(grey, square, bows, widths, found)
+    fit_edges(grey, square, bows, widths, 8, found, np.zeros_like(found))
+
+
+def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which tags lie in the picture, shape (t, 1, 1)."""
+    limit = np.array([shape[1], shape[0]]) - 3.0
+    return np.asarray(
+        np.all((corners >= 2.0) & (corners <= limit), axis=(1, 2), keepdims=True), dtype=np.bool_
+    )
+
+
+def _somewhere(shape: tuple[int, ...]) -> Array:
+    """A square in the picture that stands in for unusable tags, so that arrays stay whole."""
+    return np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
+
+
+def _unsettled(moved: Array, found: Array, widths: Array, lines: Lines) -> NDArray[np.bool_]:
+    """Which tags' corners moved so far that they are fitted again, shape (t,)."""
+    blurred = np.where(found[..., SHARE] > 0.0, found[..., SPREAD] / widths, 0.0).max(axis=1)
+    unsure = lines.offset_deviation.reshape(-1, 4).max(axis=1)
+    limit = np.where(blurred > CROWDED, np.maximum(NEAR, 0.5 * unsure), FAR)
+    return np.asarray(np.abs(moved).max(axis=(1, 2)) > limit, dtype=np.bool_)
+
+
+def _doubt(found: Array, widths: Array) -> Array:
+    """What the edges may be off beside noise, shape (t, 4), [px]."""
+    spread = np.maximum(found[..., SPREAD], 1e-6)
+    away = np.clip(widths / spread, 1.0, 20.0)
+    tail = np.exp(-0.5 * away**2) / (np.sqrt(2.0 * np.pi) * away)  # of a bell, beyond a module
+    return np.asarray(np.hypot(FLOOR, SECOND_ROW * spread * tail))
+
+
+def _refined(corners: Array, lines: Lines, tag: int) -> RefinedTag | None:
+    """Corners of a tag with the whitening that its lines' deviations give."""
+    quad, edges = corners[tag], lines.good[4 * tag : 4 * tag + 4]
+    if edges.sum() < 2:
+        return None
+    whitening, target = np.zeros((8, 8)), np.zeros(8)
+    for edge in np.flatnonzero(edges).tolist():
+        index, other = 4 * tag + edge, (edge + 1) % 4
+        point, direction = lines.points[index], lines.directions[index]
+        normal = np.array([direction[1], -direction[0]])
+        length = float((quad[other] - quad[edge]) @ direction)
+        share = float((point - quad[edge]) @ direction) / length
+        offset, tilt = lines.offset_deviation[index], lines.tilt_deviation[index]
+        start, end = slice(2 * edge, 2 * edge + 2), slice(2 * other, 2 * other + 2)
+        whitening[2 * edge, start] = (1.0 - share) * normal / offset
+        whitening[2 * edge, end] = share * normal / offset
+        target[2 * edge] = normal @ point / offset
+        whitening[2 * edge + 1, start] = -normal / length / tilt
+        whitening[2 * edge + 1, end] = normal / length / tilt
+    return RefinedTag(read_only(quad), read_only(whitening), read_only(target), edges.copy())

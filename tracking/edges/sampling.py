@@ -1,0 +1,267 @@
+"""The pixels on both sides of an edge, and what the rest of the square does to each of them.
+
+Beside a blurred edge lie the square's two neighbouring edges, the modules within it, and what is
+beyond the white around it: all in reach of the blur when modules are small or the blur is wide.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from model.jit import compiled
+from model.pose import Array
+from tracking.camera_model import Image
+
+# A tag's square in the picture: its edges' frames, and where its modules lie beside an edge.
+
+
+@compiled
+def edge_frame(quad: Array, edge: int) -> tuple[float, float, float, float, float]:
+    """Start (x, y), unit direction (x, y) and length of an edge; outward is (y, -x) of it."""
+    x, y = quad[edge, 0], quad[edge, 1]
+    after = (edge + 1) % 4
+    dx, dy = quad[after, 0] - x, quad[after, 1] - y
+    length = max(math.hypot(dx, dy), 1e-6)
+    return x, y, dx / length, dy / length, length
+
+
+@compiled
+def bow(shape: Array, share: float) -> float:
+    """How far the curve of an edge lies outside of its chord, at a share of its length, [px]."""
+    return float(share * (1.0 - share) * (shape[0] + share * shape[1]))
+
+
+@compiled
+def plane_of(quad: Array, edge: int, plane: Array) -> None:
+    """Writes the map of places in the square to pixels, shape (8,).
+
+    Places are (a, b) with a from 0 to 1 along the edge, b from 0 at the edge to 1 at the opposite.
+    """
+    x0, y0 = quad[edge, 0], quad[edge, 1]
+    x1, y1 = quad[(edge + 1) % 4, 0], quad[(edge + 1) % 4, 1]
+    x2, y2 = quad[(edge + 2) % 4, 0], quad[(edge + 2) % 4, 1]
+    x3, y3 = quad[(edge + 3) % 4, 0], quad[(edge + 3) % 4, 1]
+    ax, ay, bx, by = x1 - x2, y1 - y2, x3 - x2, y3 - y2
+    sx, sy = x0 - x1 + x2 - x3, y0 - y1 + y2 - y3
+    area = ax * by - bx * ay
+    along, across = (sx * by - bx * sy) / area, (ax * sy - sx * ay) / area
+    plane[0], plane[1], plane[2] = x1 - x0 + along * x1, x3 - x0 + across * x3, x0
+    plane[3], plane[4], plane[5] = y1 - y0 + along * y1, y3 - y0 + across * y3, y0
+    plane[6], plane[7] = along, across
+
+
+@compiled
+def beside(quad: Array, edge: int, plane: Array, a: float, b: float) -> tuple[float, float]:
+    """A place of the square, as distances along and outside of an edge, [px]."""
+    depth = plane[6] * a + plane[7] * b + 1.0
+    x0, y0, ax, ay, _ = edge_frame(quad, edge)
+    dx = (plane[0] * a + plane[1] * b + plane[2]) / depth - x0
+    dy = (plane[3] * a + plane[4] * b + plane[5]) / depth - y0
+    return dx * ax + dy * ay, dx * ay - dy * ax
+
+
+# What is known of one edge, as columns of an array.
+#
+# Along an edge places are told by q, from -1 at the first pixel that was read to 1 at the last one.
+
+
+OFFSET = 0
+"""How far the edge lies outside of where it was looked for, at q = 0, [px]."""
+TILT = 1
+"""Change of that distance from q = 0 to q = 1, [px]."""
+SPREAD = 2
+"""Standard deviation of the blur across the edge, pixels included, [px]."""
+BOXED = 3
+"""Kind of that blur: 0 a bell (lens), 1 a box (motion, or one pixel along the grid)."""
+MIDDLE = 4
+"""Where q = 0 lies, from the edge's first corner, [px]."""
+HALF = 5
+"""Half of the way that was read: from q = 0 to q = 1, [px]."""
+OFFSET_VARIANCE = 6
+COVARIANCE = 7
+TILT_VARIANCE = 8
+SHARE = 9
+"""Share of the edge that looks like one."""
+COLUMNS = 10
+
+
+# How brightness rises across a blurred edge.
+
+
+#: Beyond so many standard deviations a blurred edge is flat.
+FLAT = 4.5
+_STEPS = 64  # of the table, a standard deviation
+_ROOT_3 = math.sqrt(3.0)
+
+
+def _bell_table() -> Array:
+    """Integral and height of the bell at the table's steps, shape (n, 2)."""
+    x = np.arange(-FLAT * _STEPS, FLAT * _STEPS + 1.0) / _STEPS
+    share = [0.5 + 0.5 * math.erf(v / math.sqrt(2.0)) for v in x.tolist()]
+    return np.column_stack([share, np.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)])
+
+
+_BELL = _bell_table()
+
+
+@compiled
+def rise(x: float, boxed: float) -> tuple[float, float, float]:
+    """Share of the step at ``x`` standard deviations behind the edge, to 1e-10.
+
+    A mixture of a step seen through a bell and of one seen through a box of the same deviation. As
+    it is symmetric, no symmetric blur moves an edge that is fitted with it, whatever its kind.
+
+    Returns:
+        The share (0 dark, 1 bright), its change with ``x`` (to 1e-7), and that with ``boxed``.
+    """
+    if x <= -FLAT:
+        return 0.0, 0.0, 0.0
+    if x >= FLAT:
+        return 1.0, 0.0, 0.0
+    step = int((x + FLAT) * _STEPS + 0.5)
+    near = step / _STEPS - FLAT
+    d, height = x - near, _BELL[step, 1]
+    half, bend = 0.5 * d * d, near * near - 1.0
+    bell = _BELL[step, 0] + height * (d - half * near + half * d * bend / 3.0)  # Taylor's series
+    bell_slope = height * (1.0 - near * d + bend * half)
+    box, box_slope = 0.0, 0.0
+    if x >= _ROOT_3:
+        box = 1.0
+    elif x > -_ROOT_3:
+        box, box_slope = 0.5 + x / (2.0 * _ROOT_3), 0.5 / _ROOT_3
+    more = box - bell
+    return bell + boxed * more, bell_slope + boxed * (box_slope - bell_slope), more
+
+
+#: Rows of what is known of each pixel; rows from `MODULES` on: share of each module along the edge.
+PLACE, ACROSS, VALUE, INK, WITHIN, BEYOND, MODULES = range(7)
+
+
+@compiled
+def read_band(
+    image: Image,
+    quad: Array,
+    edge: int,
+    shape: Array,
+    span: tuple[float, float],
+    reach: float,
+    pixels: Array,
+) -> int:
+    """Reads the pixels that lie within ``reach`` of an edge and within a span along it.
+
+    Args:
+        image: Grey.
+        quad: Corners, shape (4, 2), [px].
+        edge: Which edge of it.
+        shape: Of the edge's bow.
+        span: Along the edge, [px].
+        reach: On both sides, [px].
+        pixels: Rows `PLACE`, `ACROSS` and `VALUE` are written, shape (k, n).
+
+    Returns:
+        How many there are; no more than ``pixels`` holds, then evenly spread along the edge.
+    """
+    height, width = image.shape
+    x0, y0, ax, ay, length = edge_frame(quad, edge)
+    first, last = span
+    every = 1 + int((last - first) * 2.0 * reach / (0.9 * pixels.shape[1]))
+    middle, half = 0.5 * (first + last), 0.5 * (last - first)
+    low = y0 + min(first * ay, last * ay) - reach * abs(ax)
+    high = y0 + max(first * ay, last * ay) + reach * abs(ax)
+    count = 0
+    for row in range(max(0, math.ceil(low)), min(height - 1, math.floor(high)) + 1):
+        dy = row - y0
+        left, right = _within(ax, dy * ay, first, last)
+        other_left, other_right = _within(ay, -dy * ax, -reach, reach)
+        left, right = x0 + max(left, other_left), x0 + min(right, other_right)
+        left, right = max(left, 0.0), min(right, width - 1.0)
+        for column in range(math.ceil(left), math.floor(right) + 1):
+            dx = column - x0
+            s = dx * ax + dy * ay
+            if (every > 1 and int(s) % every) or count >= pixels.shape[1]:
+                continue
+            pixels[PLACE, count] = (s - middle) / half
+            pixels[ACROSS, count] = dx * ay - dy * ax - bow(shape, s / length)
+            pixels[VALUE, count] = image[row, column]
+            count += 1
+    return count
+
+
+@compiled
+def _within(factor: float, start: float, low: float, high: float) -> tuple[float, float]:
+    """Where ``factor * x + start`` lies between two limits."""
+    if abs(factor) < 1e-9:
+        return (-1e9, 1e9) if low <= start <= high else (1e9, -1e9)
+    one, other = (low - start) / factor, (high - start) / factor
+    return min(one, other), max(one, other)
+
+
+@compiled
+def tell_ink(
+    quad: Array, edge: int, pixels: Array, count: int, found: Array, spread: float
+) -> None:
+    """Writes the share of ink that the blurred neighbouring edges leave beside an edge.
+
+    Args:
+        quad: Corners, shape (4, 2), [px].
+        edge: Which edge of it.
+        pixels: Row `INK` is written.
+        count: Of the pixels.
+        found: Of the edge; tells the span that was read.
+        spread: Of the neighbouring edges' blur, [px].
+    """
+    _, _, ax, ay, length = edge_frame(quad, edge)
+    _, _, bx, by, _ = edge_frame(quad, (edge + 3) % 4)
+    _, _, cx, cy, _ = edge_frame(quad, (edge + 1) % 4)
+    for n in range(count):
+        s, u = found[MIDDLE] + found[HALF] * pixels[PLACE, n], pixels[ACROSS, n]
+        dx, dy = s * ax + u * ay, s * ay - u * ax
+        before = dy * bx - dx * by
+        after = (dy - length * ay) * cx - (dx - length * ax) * cy
+        pixels[INK, n] = rise(before / spread, 0.5)[0] * rise(after / spread, 0.5)[0]
+
+
+@compiled
+def tell_modules(
+    quad: Array,
+    edge: int,
+    plane: Array,
+    modules: int,
+    pixels: Array,
+    count: int,
+    found: Array,
+    spread: float,
+) -> None:
+    """Writes what lies a module inside and a module outside of an edge.
+
+    Args:
+        quad: Corners, shape (4, 2), [px].
+        edge: Which edge of it.
+        plane: From places in the square to pixels.
+        modules: Along the side of the square.
+        pixels: Rows `WITHIN`, `BEYOND` and those from `MODULES` on are written.
+        count: Of the pixels.
+        found: Of the edge; tells the span that was read.
+        spread: Of the neighbouring edges' blur, [px].
+    """
+    module = 1.0 / modules
+    s0, u0 = beside(quad, edge, plane, module, module)
+    s1, u1 = beside(quad, edge, plane, 1.0 - module, module)
+    s2, u2 = beside(quad, edge, plane, 0.0, -module)
+    s3, u3 = beside(quad, edge, plane, 1.0, -module)
+    for n in range(count):
+        s, u = found[MIDDLE] + found[HALF] * pixels[PLACE, n], pixels[ACROSS, n]
+        pixels[WITHIN, n] = u - u0 - (u1 - u0) * (s - s0) / (s1 - s0)
+        pixels[BEYOND, n] = u - u2 - (u3 - u2) * (s - s2) / (s3 - s2)
+    for k in range(modules - 1):
+        # The modules' sides are seen a little within the square.
+        side, _ = beside(quad, edge, plane, (k + 1) * module, 1.25 * module)
+        for n in range(count):
+            s = found[MIDDLE] + found[HALF] * pixels[PLACE, n]
+            share = rise((s - side) / spread, 0.5)[0]
+            if k < modules - 2:
+                pixels[MODULES + k, n] = share
+            if k > 0:
+                pixels[MODULES + k - 1, n] -= share

@@ -1,0 +1,197 @@
+"""One pose from what several cameras measured at the same time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from model.pose import (
+    Array,
+    Pose,
+    matrix_from_rotation_vector,
+    read_only,
+    rotation_vector_from_matrix,
+)
+from tracking.measurement import NoPose, Observation, PoseMeasurement, extrapolate
+from tracking.pose_log import LoggedPicture
+
+#: What a camera's place may be off by, beside the covariance of what it measures, [m] and [rad].
+PLACE = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
+#: Cameras disagree when their poses differ by more (squared, in covariances) than one pair of true
+#: ones in ten thousand does.
+GATE = 27.9
+
+
+class MultiCameraFusion:
+    """The pose of all cameras, moment after moment.
+
+    Pictures of one moment are taken a little apart in time. Each pose is carried on to the newest
+    one's time, as the same camera saw the platform go. One whose camera saw nothing shortly
+    before is left out, as nobody knows how fast the platform went: the newest pose always counts.
+    """
+
+    def __init__(self, within: float) -> None:
+        """Nothing was seen yet.
+
+        Args:
+            within: A picture that was taken farther than this from the median time of a moment's
+                pictures is not taken together with the others, [s].
+        """
+        self.apart = 0
+        """In how many moments a pose was left out for that."""
+        self.without_speed = 0
+        """In how many a pose was left out as its camera could not carry it on."""
+        self._within = within
+        self._before: dict[str, PoseMeasurement] = {}
+
+    def of(self, seen: Mapping[str, Observation]) -> Observation:
+        """The pose of a moment, as `together` finds it.
+
+        Args:
+            seen: What each camera measured, by its name, in the order of the cameras; not empty.
+        """
+        poses = {name: one for name, one in seen.items() if isinstance(one, PoseMeasurement)}
+        if not poses:
+            return together(seen)
+        near = self._near(poses)
+        newest = max(one.time for one in near.values())
+        carried = {n: extrapolate(one, self._before.get(n), newest) for n, one in near.items()}
+        at_newest = {name: one for name, one in carried.items() if one is not None}
+        self._before |= poses
+        self.apart += len(near) < len(poses)
+        self.without_speed += len(at_newest) < len(near)
+        return together(at_newest)
+
+    def _near(self, poses: Mapping[str, PoseMeasurement]) -> Mapping[str, PoseMeasurement]:
+        """Those taken about the median time; the newest where none was: no camera comes first."""
+        middle = float(np.median([one.time for one in poses.values()]))
+        near = {n: one for n, one in poses.items() if abs(one.time - middle) <= self._within}
+        newest = max(poses, key=lambda name: poses[name].time)
+        return near or {newest: poses[newest]}
+
+
+def together(seen: Mapping[str, Observation]) -> Observation:
+    """The mean of all poses, each by the weight of its information.
+
+    Of three cameras and more one that disagrees with the others is left out; of two that disagree
+    nobody knows which is wrong.
+
+    Args:
+        seen: What each camera measured, by its name; all poses are of one time.
+    """
+    poses = {name: one for name, one in seen.items() if isinstance(one, PoseMeasurement)}
+    if not poses:
+        return _nothing(seen)
+    while len(poses) > 1:
+        apart = {name: _apart(name, poses) for name in poses}
+        worst = max(apart, key=lambda name: apart[name])
+        if apart[worst] <= GATE:
+            break
+        if len(poses) == 2:
+            a, b = poses.values()
+            gap = a.pose.distance_to(b.pose) * 1e3
+            names = " and ".join(poses)
+            return NoPose(a.time, f"cameras {names} disagree by {gap:.1f} mm", ())
+        del poses[worst]
+    return _mean(list(poses.values()))
+
+
+def _nothing(seen: Mapping[str, Observation]) -> NoPose:
+    missed = {name: one for name, one in seen.items() if isinstance(one, NoPose)}
+    reasons = "; ".join(f"{name}: {one.reason}" for name, one in missed.items())
+    tags = sorted({number for one in missed.values() for number in one.seen})
+    return NoPose(next(iter(missed.values())).time, reasons, tuple(tags))
+
+
+def _apart(name: str, poses: Mapping[str, PoseMeasurement]) -> float:
+    """How far a pose lies from the others, squared, in covariances: the median of them."""
+    mine, distances = poses[name], []
+    for other in (one for key, one in poses.items() if key != name):
+        gap = _between(mine.pose, other.pose)
+        spread = mine.covariance + other.covariance + 2.0 * np.diag(PLACE**2)
+        distances.append(float(gap @ np.linalg.solve(spread, gap)))
+    return float(np.median(distances)) if len(distances) > 1 else distances[0]
+
+
+def _between(from_: Pose, to: Pose) -> Array:
+    turn = rotation_vector_from_matrix(to.rotation @ from_.rotation.T)
+    return np.concatenate([to.position - from_.position, turn])
+
+
+def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
+    first = poses[0]
+    if len(poses) == 1:
+        return first
+    weights = [np.linalg.inv(one.covariance) for one in poses]
+    covariance = np.linalg.inv(np.sum(weights, axis=0))
+    steps = [w @ _between(first.pose, one.pose) for w, one in zip(weights, poses, strict=True)]
+    step = covariance @ np.sum(steps, axis=0)
+    turned = matrix_from_rotation_vector(step[3:]) @ first.pose.rotation
+    return replace(
+        first,
+        pose=Pose(first.pose.position + step[:3], turned),
+        covariance=read_only((covariance + covariance.T) / 2.0),
+        tags=tuple(sorted({number for one in poses for number in one.tags})),
+        reprojection=float(np.sqrt(np.mean([one.reprojection**2 for one in poses]))),
+    )
+
+
+# Which pictures of several cameras belong to one moment.
+
+
+def moments(
+    streams: Mapping[str, Iterator[LoggedPicture]], within: float
+) -> Iterator[dict[str, LoggedPicture]]:
+    """Puts the pictures of all cameras in order of time, those of one moment together.
+
+    A moment has the oldest picture that is left and, of each other camera, the one nearest to it:
+    taken no later than ``within`` after it, and nearer to the pictures of this moment than to
+    those that follow them.
+
+    Args:
+        streams: What each camera measured, by its name, each in order of time.
+        within: See above, [s].
+
+    Returns:
+        By the cameras' names, in their order; each picture in one moment, until all streams end.
+    """
+    queues: dict[str, deque[LoggedPicture]] = {name: deque() for name in streams}
+    open_streams = dict(streams)
+    while True:
+        # Round after round, so that live cameras are read in turn: no one's two pictures in a row.
+        for wanted in (1, 2):
+            for name in [n for n in open_streams if len(queues[n]) < wanted]:
+                picture = next(open_streams[name], None)
+                if picture is None:
+                    del open_streams[name]
+                else:
+                    queues[name].append(picture)
+        if not any(queues.values()):
+            return
+        members = _of_one_moment(queues, within)
+        yield {name: queues[name].popleft() for name in queues if name in members}
+
+
+def _of_one_moment(queues: Mapping[str, deque[LoggedPicture]], within: float) -> list[str]:
+    """The cameras whose oldest pictures belong together, the oldest first."""
+    by_age = sorted((n for n, queue in queues.items() if queue), key=lambda n: _time(queues[n][0]))
+    members = by_age[:1]
+    for name in by_age[1:]:
+        time = _time(queues[name][0])
+        if time - _time(queues[members[0]][0]) > within:
+            break
+        if any(_is_nearer_to_the_next(queues[member], time) for member in members):
+            break
+        members.append(name)
+    return members
+
+
+def _is_nearer_to_the_next(queue: deque[LoggedPicture], time: float) -> bool:
+    return len(queue) > 1 and _time(queue[1]) - time < time - _time(queue[0])
+
+
+def _time(picture: LoggedPicture) -> float:
+    return picture.observation.time

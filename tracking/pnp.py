@@ -1,0 +1,285 @@
+"""One rigid pose from all tags of a body at once.
+
+The squares of all tags are fitted together: from both poses that each single square allows, the
+best ones are improved by Levenberg–Marquardt on the edges of all squares with Huber's loss. So no
+tag's mirror pose (a single square's usual trap) survives when more than one is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+from model.rig import Camera, Tag
+from tracking.camera_model import project_undistorted
+from tracking.detection.tags import CORNER_SIGNS, tag_corners
+from tracking.edges.refine import RefinedTag
+
+#: Edge errors beyond this many deviations count linearly (Huber).
+HUBER = 3.0
+#: The edges' stated deviations weigh as much as so many residuals when the covariance is scaled by
+#: how well all edges fit: few edges fit well by chance.
+BELIEF = 20.0
+#: Two results closer than this are the same, [m] and [rad].
+SAME = (2e-3, 0.02)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagView:
+    """A tag of a body and how it was seen."""
+
+    tag: Tag
+    seen: RefinedTag
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BundlePose:
+    """The pose of a body that fits all its tags.
+
+    Attributes:
+        camera_from_body: The pose.
+        covariance: Of position [m] and rotation vector [rad] along the camera's axes, shape (6, 6).
+        cost: Huber cost of the edges, in variances.
+        rival_cost: Cost of the best other pose, infinite without one.
+        edge_errors: Of each tag's edges in deviations, 0 where hidden, shape (t, 4).
+        corner_errors: Of each tag's corners, RMS, shape (t,), [px]; of whole tags their corners,
+            else of the edges that were measured.
+        certainties: How much each tag's edges tell, shape (t,), [1/px²].
+    """
+
+    camera_from_body: Pose
+    covariance: Array
+    cost: float
+    rival_cost: float
+    edge_errors: Array
+    corner_errors: Array
+    certainties: Array
+
+    @property
+    def reprojection(self) -> float:
+        """RMS error of all tags' corners, each tag counted for what its edges tell, [px]."""
+        return float(np.sqrt(np.average(self.corner_errors**2, weights=self.certainties)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Squares:
+    """All tags' corners on the body, and their measured edges, stacked."""
+
+    camera: Camera
+    corners: Array  # (t, 4, 3)
+    whitening: Array  # (t, 8, 8)
+    target: Array  # (t, 8)
+
+    @classmethod
+    def of(cls, camera: Camera, views: Sequence[TagView]) -> _Squares:
+        return cls(
+            camera,
+            np.array([tag_corners(v.tag) for v in views]),
+            np.array([v.seen.whitening for v in views]),
+            np.array([v.seen.target for v in views]),
+        )
+
+    def errors(self, pose: Pose) -> Array:
+        """Whitened errors of the edges, shape (t, 8)."""
+        pixels = project_undistorted(self.camera, pose.apply(self.corners))
+        return self._whitened(pixels.reshape(-1, 8)) - self.target
+
+    def _whitened(self, flat: Array) -> Array:
+        return np.asarray(np.einsum("tij,tj->ti", self.whitening, flat))
+
+    def jacobian(self, pose: Pose) -> Array:
+        """Change of the errors with a shift [m] and a turn [rad] about the camera's axes."""
+        arms = self.corners @ pose.rotation.T  # (t, 4, 3)
+        points = arms + pose.position
+        by_point = np.zeros((*points.shape[:2], 2, 3))
+        depth = points[..., 2]
+        for axis in range(2):
+            focal = self.camera.matrix[axis, axis]
+            by_point[..., axis, axis] = focal / depth
+            by_point[..., axis, 2] = -focal * points[..., axis] / depth**2
+        by_turn = _cross(arms[..., None, :], by_point)  # d(turn × arm) seen through by_point
+        flat = np.concatenate([by_point, by_turn], axis=-1).reshape(len(points), 8, 6)
+        return np.asarray(self.whitening @ flat)
+
+
+def solve_pnp(
+    camera: Camera, views: Sequence[TagView], prior: Pose | None = None
+) -> BundlePose | None:
+    """The pose of a body whose tags were seen.
+
+    Args:
+        camera: The camera that saw them (its own place does not matter here).
+        views: One or more tags.
+        prior: A guess of ``camera_from_body``, one more start of the search.
+
+    Returns:
+        The best pose, or None when no start led to one in front of the camera.
+    """
+    squares = _Squares.of(camera, views)
+    starts = [pose for view in views for pose in square_poses(camera, view)]
+    starts += [prior] if prior is not None else []
+    starts = [pose for pose in starts if _in_front(squares, pose)]
+    ranked = sorted(starts, key=lambda pose: _huber(squares.errors(pose)))
+    found: list[tuple[float, Pose]] = []
+    rivals = _different(ranked[1:], ranked[:1])[:1]
+    for start in ranked[:1] + rivals:
+        pose = _improved(squares, start)
+        found.append((_huber(squares.errors(pose)), pose))
+    if not found:
+        return None
+    found.sort(key=lambda item: item[0])
+    cost, best = found[0]
+    others = [c for c, pose in found[1:] if not _same(pose, best)]
+    return _result(squares, views, best, cost, min(others, default=float("inf")))
+
+
+def refine_pnp(camera: Camera, views: Sequence[TagView], start: Pose) -> BundlePose | None:
+    """The pose nearest to a start that is known to be the right one; knows of no rival."""
+    squares = _Squares.of(camera, views)
+    if not _in_front(squares, start):
+        return None
+    pose = _improved(squares, start)
+    return _result(squares, views, pose, _huber(squares.errors(pose)), float("inf"))
+
+
+def square_poses(camera: Camera, view: TagView) -> list[Pose]:
+    """Both poses ``camera_from_body`` that a single square allows."""
+    half = view.tag.size / 2.0
+    square = np.column_stack([CORNER_SIGNS * half, np.zeros(4)])
+    count, turns, shifts, _ = cv2.solvePnPGeneric(
+        square,
+        np.ascontiguousarray(view.seen.corners),
+        camera.matrix,
+        np.zeros(4),
+        flags=cv2.SOLVEPNP_IPPE_SQUARE,
+    )
+    tag_from_body = view.tag.pose.inverse()
+    poses = []
+    for turn, shift in zip(turns[:count], shifts[:count], strict=True):
+        rotation = matrix_from_rotation_vector(np.ravel(turn))
+        pose = Pose(np.ravel(shift).astype(np.float64), rotation).compose(tag_from_body)
+        if np.all(np.isfinite(pose.matrix())):
+            poses.append(pose)
+    return poses
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross product along the last axis; np.cross takes four times as long on small arrays."""
+    return np.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
+
+
+def _in_front(squares: _Squares, pose: Pose) -> bool:
+    return bool(np.all(pose.apply(squares.corners)[..., 2] > 1e-3))
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    return a.distance_to(b) < SAME[0] and a.angle_to(b) < SAME[1]
+
+
+def _different(poses: Sequence[Pose], from_: Sequence[Pose]) -> list[Pose]:
+    """Those that turn or lie clearly otherwise: starts that may lead elsewhere."""
+    return [p for p in poses if all(p.angle_to(q) > 0.05 for q in from_)]
+
+
+def _edge_sizes(errors: Array) -> Array:
+    """Size of each edge's error in deviations, shape (t, 4)."""
+    return np.asarray(np.linalg.norm(errors.reshape(-1, 4, 2), axis=2))
+
+
+def _huber(errors: Array) -> float:
+    size = _edge_sizes(errors)
+    near = np.minimum(size, HUBER)
+    return float(np.sum(near * (2.0 * size - near)))
+
+
+def _weights(errors: Array) -> Array:
+    """Huber weight of every error, shape (8 t,)."""
+    size = np.maximum(_edge_sizes(errors), 1e-12)
+    return np.repeat(np.minimum(1.0, HUBER / size).reshape(-1), 2)
+
+
+def _improved(squares: _Squares, pose: Pose) -> Pose:
+    """Levenberg–Marquardt from a start."""
+    errors = squares.errors(pose)
+    cost, damping = _huber(errors), 1e-4
+    for _ in range(40):
+        jacobian = squares.jacobian(pose).reshape(-1, 6)
+        weighted = jacobian * _weights(errors)[:, None]
+        normal, gradient = jacobian.T @ weighted, weighted.T @ errors.reshape(-1)
+        damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
+        step: Array = np.asarray(-np.linalg.solve(damped, gradient), dtype=np.float64)
+        candidate = moved(pose, step)
+        if _in_front(squares, candidate):
+            trial = squares.errors(candidate)
+            trial_cost = _huber(trial)
+            if trial_cost <= cost:
+                settled = cost - trial_cost < 1e-7 * (1.0 + cost)
+                pose, errors, cost = candidate, trial, trial_cost
+                damping = max(damping / 10.0, 1e-12)
+                if settled:
+                    break
+                continue
+        damping *= 10.0
+        if damping > 1e8:
+            break
+    return pose
+
+
+def moved(pose: Pose, step: Array) -> Pose:
+    """The pose after a shift [m] and a turn [rad] along the outer frame's axes, shape (6,)."""
+    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)
+
+
+def _result(
+    squares: _Squares, views: Sequence[TagView], pose: Pose, cost: float, rival: float
+) -> BundlePose:
+    errors = squares.errors(pose)
+    jacobian = squares.jacobian(pose).reshape(-1, 6)
+    normal = jacobian.T @ (jacobian * _weights(errors)[:, None])
+    freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
+    scale = (BELIEF + cost) / (BELIEF + max(freedom, 0))
+    try:
+        covariance = scale * np.linalg.inv(normal)
+    except np.linalg.LinAlgError:  # too few edges to fix all six
+        covariance = np.full((6, 6), np.inf)
+    return BundlePose(
+        pose,
+        read_only(covariance),
+        cost,
+        rival,
+        read_only(_edge_sizes(errors)),
+        read_only(_corner_errors(squares, views, pose)),
+        read_only(np.array([_certainty(view.seen) for view in views])),
+    )
+
+
+def _certainty(seen: RefinedTag) -> float:
+    """One over the variance that offsets and tilts of a tag's edges leave its corners, [1/px²]."""
+    rows = np.sum(seen.whitening**2, axis=1)[np.repeat(seen.edges, 2)]
+    return float(1.0 / np.mean(1.0 / rows))
+
+
+def _corner_errors(squares: _Squares, views: Sequence[TagView], pose: Pose) -> Array:
+    """RMS error of the corners of each tag, shape (t,), [px]."""
+    pixels = project_undistorted(squares.camera, pose.apply(squares.corners))
+    result = []
+    for view, corners, errors in zip(views, pixels, squares.errors(pose), strict=True):
+        if view.seen.whole:
+            gap = corners - view.seen.corners
+            result.append(float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))))
+            continue
+        # Of a partly hidden square the offsets of its visible edges, in pixels.
+        rows = np.linalg.norm(view.seen.whitening[::2], axis=1)[view.seen.edges]
+        result.append(float(np.sqrt(np.mean((errors[::2][view.seen.edges] / rows) ** 2))))
+    return np.array(result)
