@@ -51,7 +51,9 @@ class Motor:
     def ramp_down(self, deceleration: float, elapsed: float, load: int) -> None:
         """Slows down at a rate [counts/s²] and then holds; ``load`` as for `follow`."""
         stopping = min(elapsed, abs(self.speed) / deceleration)
-        slowed = self.speed - math.copysign(deceleration * stopping, self.speed)
+        slowed = 0.0  # in full: what rounding leaves of a speed may be too little ever to pass
+        if stopping == elapsed:
+            slowed = self.speed - math.copysign(deceleration * stopping, self.speed)
         self.demand += 0.5 * (self.speed + slowed) * stopping
         self.speed = slowed
         self._turn(elapsed, load)

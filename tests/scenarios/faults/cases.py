@@ -440,7 +440,7 @@ def _said_or_left(fault: Fault, bench: Bench) -> list[str]:
 
 def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
     """This computer held the simulated drives up, before or while the fault happened."""
-    silent = "(drive 1) did not answer" in cause and not any(word in cause for word in fault.words)
+    silent = "did not answer" in cause and not any(word in cause for word in fault.words)
     return bench.since is None or silent or "cycles late;" in cause
 
 
