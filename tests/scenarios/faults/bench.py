@@ -43,6 +43,8 @@ from tests.scenarios.stage import Stage
 _CHANNELS = itertools.count()
 FINE = 0.001
 CRUISING = 150
+ARMED_AFTER = 15
+"""SYNCs before the first set-point that moves."""
 EVERY_ID = range(0x800)
 ENDS_WITHIN_S = 60.0
 
@@ -237,6 +239,8 @@ class LiveBench(Bench):
     ) -> None:
         super().__init__()
         self.prepared, self.folder, self.line, self.rehearsal = prepared, folder, line, rehearsal
+        middle = ARMED_AFTER + len(prepared.checked.table.setpoints) // 2
+        self.fault_cycle = min(CRUISING, middle)
         self._settings, self._masters = settings, masters
         self.process = 0
         self.resumes_after: float | None = None
@@ -279,7 +283,8 @@ class LiveBench(Bench):
                 break
             signal.sigtimedwait([], 0.02)
             self._resume_when_due()
-        signal.sigtimedwait([], 0.3)  # the drives have their own time-outs
+        cycle = self.prepared.checked.table.cycle
+        signal.sigtimedwait([], max(0.3, 10.0 * cycle))  # the drives have their own time-outs
 
     def _resume_when_due(self) -> None:
         if self.resumes_after is None or self.since is None:

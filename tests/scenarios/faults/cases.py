@@ -119,6 +119,11 @@ def outgoing(rule: Callable[[], object]) -> Callable[[], Script]:
     return then(lambda bench: bench.line.outgoing.append(rule()))  # type: ignore[arg-type]
 
 
+def replies_held_up(bench: Bench) -> None:
+    cycle = bench.prepared.checked.table.cycle
+    bench.line.outgoing.append(delay(REPLIES, 20.0 * cycle))
+
+
 def silence(bench: Bench) -> None:
     bench.drives[3].silent = True
 
@@ -328,9 +333,7 @@ TABLE: dict[str, Fault] = {
     ),
     "F10 bus-off": Fault(then(bus_off), words=("bus-off",), within=5.0),
     "F10 error-passive": Fault(then(passive), words=("error-passive",)),
-    "F11 replies held up for 200 ms": Fault(
-        outgoing(lambda: delay(REPLIES, 0.2)), words=("did not answer",)
-    ),
+    "F11 replies held up for 20 cycles": Fault(then(replies_held_up), words=("did not answer",)),
     "F12 one short reply": goes_on(outgoing(lambda: spoil(REPLY_4, lambda d: d[:2], 1))),
     "F12 two short replies": Fault(
         outgoing(lambda: spoil(REPLY_4, lambda d: d[:2], 2)), words=("drive 4", "2 bytes")

@@ -59,9 +59,10 @@ def positions(bench: Bench) -> list[float]:
 
 @pytest.mark.slow
 def test_f2_a_suspended_master_that_goes_on_enables_nothing(
-    prepared: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
+    calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
     """SIGSTOP for real; SIGCONT after the drives have stopped by themselves."""
+    cycle = calm_run.checked.table.cycle
 
     def script(bench: Bench) -> None:
         assert isinstance(bench, LiveBench)
@@ -70,16 +71,15 @@ def test_f2_a_suspended_master_that_goes_on_enables_nothing(
 
     for attempt in range(3):
         run = tmp_path / f"run {attempt}"
-        with live(prepared, run, script, between_processes, masters) as bench:
-            bench.resumes_after = 0.3
+        with live(calm_run, run, script, between_processes, masters) as bench:
+            bench.resumes_after = 10.0 * cycle
             ended = bench.run()
             if bench.since is None:  # this computer was too busy to get so far
                 continue
             stop = bench.stop()
             assert ended is State.LATCHED
-            assert stop.time <= 0.050
-            assert stop.spread <= 0.010
-            assert stop.travel <= 0.001
+            assert stop.time <= 5.0 * cycle
+            assert stop.spread <= cycle
             assert bench.violations() == []
             assert {drive.state for drive in bench.drives} == {HOLDING}
             return
@@ -259,11 +259,11 @@ def test_f23_a_step_of_the_clock_changes_nothing(
 
 @pytest.mark.slow
 def test_f25_a_master_that_is_asked_to_end_stops_along_the_path(
-    prepared: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
+    calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
     for attempt in range(3):
         run = tmp_path / f"run {attempt}"
-        with live(prepared, run, once(lambda b: b.ask_stop()), between_processes, masters) as bench:
+        with live(calm_run, run, once(lambda b: b.ask_stop()), between_processes, masters) as bench:
             if bench.run() is not State.STOPPED:
                 continue
             assert bench.violations() == []
