@@ -441,10 +441,15 @@ def _said_or_left(fault: Fault, bench: Bench) -> list[str]:
     return [*found, *left_holding(bench.rehearsal)] if finishes else found
 
 
+HELD_UP = {"drive_silent", "late"}
+"""Codes of events that end a run when its computer does something else."""
+
+
 def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
     """This computer held the simulated drives up, before or while the fault happened."""
     silent = "did not answer" in cause and not any(word in cause for word in fault.words)
-    return bench.since is None or silent or "cycles late;" in cause
+    unasked = fault.ends is not State.LATCHED and HELD_UP & set(bench.codes())
+    return bench.since is None or silent or bool(unasked) or "cycles late;" in cause
 
 
 def row(
