@@ -133,10 +133,15 @@ class Bench(ABC):
 
 
 class SimulatedBench(Bench):
-    """Executor and drives in one thread; time passes with SYNC."""
+    """Executor and drives in one thread; time passes with SYNC.
+
+    Attributes:
+        line_time: Of the bus, [s].
+    """
 
     def __init__(self, stage: Stage, line: FaultBus) -> None:
         super().__init__()
+        self.line_time = 0.0
         self.stage, self.line = stage, line
         self.prepared, self.folder = stage.prepared, stage.folder
         assert isinstance(stage.rehearsal, WatchedRehearsal)
@@ -159,9 +164,12 @@ class SimulatedBench(Bench):
         self.stage.lateness = cycles
 
     def pass_time(self, seconds: float) -> None:
-        """Without a SYNC."""
+        """The executor sends nothing meanwhile; frames that wait for the bus reach the drives."""
         for _ in range(round(seconds / FINE)):
             self.rehearsal.advance(FINE)
+            self.line_time += FINE
+            while (message := self.line.recv(0.0)) is not None:
+                self.rehearsal._handle(message)
 
     def run(self) -> State | None:
         try:
@@ -201,8 +209,9 @@ def simulated(
     eds = eds or (profile_path("cia402") if profile else None)
     settings = BusSettings("virtual", f"fault-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
-        now = 0.0
-        with FaultBus(far, lambda: now, ahead=0.95 * prepared.checked.table.cycle) as line:
+        bench: SimulatedBench | None = None
+        cycle = prepared.checked.table.cycle
+        with FaultBus(far, lambda: bench.line_time if bench else 0.0, ahead=0.95 * cycle) as line:
             scene = prepared.scene
             rehearsal = WatchedRehearsal(
                 prepared.rig, line, scene.start, scene.load, behaviour=behaviour, eds=eds
@@ -211,9 +220,9 @@ def simulated(
             group.configure()
             line.bitrate = bitrate
 
-            def per_cycle(stage: Stage) -> None:
-                nonlocal now
-                now = (stage.cycle + 1) * prepared.checked.table.cycle
+            def per_cycle(_stage: Stage) -> None:
+                assert bench is not None
+                bench.line_time += cycle
                 script(bench)
 
             stage = Stage(prepared, rehearsal, group, RunFolder.create(path), per_cycle)
