@@ -21,7 +21,7 @@ def ready_to_measure(listener: Listener = SILENT) -> None:
     from model.jit import compilation
     from tracking.edges import refine
 
-    with compilation(_edges(), "the tags' edge finder", "up to a minute", listener):
+    with compilation(_edges(), "the tag edge detector", "up to a minute", listener):
         refine.load_kernels()
 
 

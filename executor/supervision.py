@@ -31,7 +31,7 @@ def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal)
         StoppedByOperator: The answer was no.
     """
     if confirm is not None and not confirm(proposal):
-        raise StoppedByOperator(proposal.otherwise, next_step="run it again when the answer is yes")
+        raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
 
 
 class Supervisor:

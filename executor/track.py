@@ -106,7 +106,7 @@ def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
         raise BadInput(
             "--plan is for the synthetic camera",
             where="track",
-            why=f"pictures come from {', '.join(named)}",
+            why=f"images come from {', '.join(named)}",
             next_step="name the obstacles with --scene, or the source 'synthetic'",
         )
 
@@ -243,7 +243,7 @@ def _opened(
     if source == SYNTHETIC:
         if plan is None or scene is None:
             raise BadInput(
-                "the synthetic camera needs a path to look at",
+                "the synthetic camera needs a path to render",
                 where=f"track, camera {camera.name!r}",
                 next_step="pass --plan plan.json",
             )

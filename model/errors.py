@@ -126,7 +126,7 @@ class Problem:
 
 
 class InvalidFile(BadInput):
-    """An input file with one or more problems, all told at once."""
+    """An input file with one or more problems, all reported at once."""
 
     code = "invalid_file"
 
@@ -137,7 +137,7 @@ class InvalidFile(BadInput):
         super().__init__(
             f"{count} problem{'s' if count != 1 else ''} in the file",
             where=path,
-            next_step=next_step or "mend the lines above and run the command again",
+            next_step=next_step or "fix the lines above and run the command again",
         )
 
     def __str__(self) -> str:

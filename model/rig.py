@@ -291,7 +291,7 @@ class Rig:
                     f"two results of kind {result.kind} for {result.name!r}:"
                     f" {seen[what]} and {result.date}",
                     where="--calibration",
-                    next_step="pass the one that holds",
+                    next_step="pass only the current one",
                 )
             seen[what] = result.date
         document = self.document

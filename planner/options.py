@@ -147,7 +147,7 @@ def _weights(given: Mapping[str, float] | Sequence[str]) -> Weights:
     for text in given:
         name, _, number = text.partition("=")
         if name in read:
-            raise BadInput(f"--weight {text}: {name!r} stands twice", next_step="give it once")
+            raise BadInput(f"--weight {text}: {name!r} appears twice", next_step="give it once")
         if name not in names:
             raise BadInput(
                 f"--weight {text}: {name!r} is no objective", next_step=f"use {', '.join(names)}"

@@ -79,7 +79,7 @@ def rig_as_built(rig: Rig) -> Rig:
 
 
 def stiffness_as_built(rig: Rig) -> Array | None:
-    """Axial stiffness of each cable, shape (m,), [N]; None where the rig file tells it."""
+    """Axial stiffness of each cable, shape (m,), [N]; None where the rig file gives it."""
     truth = simulation_of(rig).as_built
     if truth is None or truth.stiffness_n is None:
         return None

@@ -267,7 +267,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
         if isinstance(found, str):
             problems.append(Problem(picture, found, line, 1))
         elif not picture or picture in poses:
-            what = "this picture stands twice" if picture else "no picture is named"
+            what = "this picture appears twice" if picture else "no picture is named"
             problems.append(Problem(picture, what, line, 1))
         else:
             poses[picture] = found

@@ -236,7 +236,7 @@ class _Table:
             raise self.bad("the file holds no measurement", "write a line of names, then the lines")
         twice = {name for name in self.names if self.names.count(name) > 1}
         if twice:
-            raise self.bad(f"the column {min(twice)!r} stands twice", "name each column once")
+            raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
         for number, row in enumerate(self._rows, start=2):
             if len(row) != len(self.names):
                 what = f"line {number} has {len(row)} values for {len(self.names)} columns"

@@ -21,7 +21,7 @@ from model.rig import Camera
 
 #: Endings of picture files, in lower case.
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
-_NO_PICTURE, _CAMERA = "is no picture that can be read", "the camera has"
+_NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
 
 
 class ImageFolder:
@@ -31,7 +31,7 @@ class ImageFolder:
         folder: Where they are.
         camera: The camera that took them.
         rate: Pictures a second; the camera's when left out.
-        on_unused: Told the name of each file that cannot be used, and why; the others are used.
+        on_unused: Called with the name of each unusable file and the reason; the others are used.
 
     Attributes:
         files: All that end like pictures.
@@ -154,7 +154,7 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
         raise BadInput(
             "the folder has no pictures",
             where=str(folder),
-            next_step=f"name a folder with files that end in {', '.join(PICTURE_ENDINGS)}",
+            next_step=f"name a folder with files ending in {', '.join(PICTURE_ENDINGS)}",
         )
     return tuple(sorted(found, key=lambda path: _natural(path.name)))
 
@@ -190,9 +190,9 @@ def _size(image: Image | None) -> tuple[int, int]:
 
 def _no_picture(folder: Path, count: int) -> BadInput:
     return BadInput(
-        f"none of the {count} files is a picture that can be read",
+        f"none of the {count} files is a readable image",
         where=str(folder),
-        next_step="check that the files were copied whole",
+        next_step="check that the files were copied completely",
     )
 
 
@@ -201,7 +201,7 @@ def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) 
         f"none of the {len(unused)} pictures has the camera's {wanted[0]} x {wanted[1]} px",
         where=str(folder),
         why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4]),
-        next_step="use full pictures of this camera, or calibrate it in this size",
+        next_step="use full-size images of this camera, or calibrate it at this size",
     )
 
 
@@ -239,19 +239,21 @@ class PictureOutput:
         self._is_video = path.suffix.lower() in VIDEO_CODES
         if not self._is_video and path.suffix and not path.is_dir():
             raise BadInput(
-                "neither a folder nor a video that can be written",
+                "neither a folder nor a supported video file",
                 where=str(path),
-                next_step=f"name a folder, or a file that ends in {', '.join(VIDEO_CODES)}",
+                next_step=f"name a folder, or a file ending in {', '.join(VIDEO_CODES)}",
             )
         if path.exists() and not force:
             raise BadInput(
-                "it exists already", where=str(path), next_step="name another one, or pass --force"
+                "the file already exists",
+                where=str(path),
+                next_step="name another one, or pass --force",
             )
         try:
             (path.parent if self._is_video else path).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BadInput(
-                "the folder cannot be made", where=str(path), why=error.strerror or str(error)
+                "the folder cannot be created", where=str(path), why=error.strerror or str(error)
             ) from None
 
     def __enter__(self) -> PictureOutput:
@@ -278,7 +280,7 @@ class PictureOutput:
         count = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
         reader.release()
         if count < self._count:
-            why = f"only {count} of {self._count} pictures are in it: the disk may be full"
+            why = f"it holds only {count} of {self._count} images; the disk may be full"
             raise _unwritable(self._path, why)
         try:
             self._unfinished.replace(self._path)
@@ -319,7 +321,7 @@ class PictureOutput:
             size = (picture.shape[1], picture.shape[0])
             self._video = cv2.VideoWriter(str(self._unfinished), code, self._rate, size)
             if not self._video.isOpened():
-                raise _unwritable(self._path, "OpenCV cannot write such a video here")
+                raise _unwritable(self._path, "OpenCV has no encoder for this kind of video here")
         self._video.write(picture)
         self._count += 1
 
@@ -329,5 +331,5 @@ def _unwritable(path: Path, why: str) -> Fault:
         "the picture cannot be written",
         where=str(path),
         why=why,
-        next_step="free some space, or name another place",
+        next_step="free some space, or name another folder",
     )

@@ -21,7 +21,7 @@ from model.rig import Camera
 
 # The newest picture of a camera that takes them faster than anybody asks for them.
 #
-# A camera's pictures wait in queues: of the network, of its driver, of the decoder. Whoever takes
+# A camera's pictures wait in queues: of the network, of its driver, of the decoder. Who takes
 # one of three falls behind by the other two, and measures an ever older platform. So a thread takes
 # them all, as they come, and keeps the last.
 
@@ -49,7 +49,7 @@ class Arrived:
     """A picture as it came.
 
     Attributes:
-        number: Of the camera's pictures, from 0; those that nobody asked for count.
+        number: Of the camera's pictures, from 0; those not requested count.
         time: When it arrived, on the reader's clock, [s].
         picture: As the camera gave it.
     """
@@ -205,7 +205,7 @@ class VideoFile:
         capture = _opened(str(path))
         if not capture.isOpened():
             raise BadInput(
-                "the file is no video that can be read",
+                "the file is not a readable video",
                 where=str(path),
                 next_step="convert it, for example with ffmpeg to MJPEG or H.264",
             )
@@ -221,7 +221,7 @@ class VideoFile:
                 f"the video states pictures of {width:.0f} x {height:.0f} px",
                 where=str(path),
                 why="the file is damaged",
-                next_step="take another one",
+                next_step="use another file",
             )
 
     def __len__(self) -> int:
@@ -251,7 +251,7 @@ class VideoFile:
         finally:
             capture.release()
         if number == 0:
-            raise BadInput("the video has no picture that can be read", where=str(self._path))
+            raise BadInput("the video has no readable image", where=str(self._path))
 
 
 class LiveCamera:
@@ -275,7 +275,7 @@ class LiveCamera:
         numbered = isinstance(source, int) or source.isdecimal()
         if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
             raise BadInput(
-                f"no camera has the index {str(source)[:40]}",
+                f"there is no camera with index {str(source)[:40]}",
                 where=self.name[:100],
                 next_step=f"give an index from 0 to {LAST_CAMERA}; `ls /dev/video*` lists them",
             )
@@ -286,13 +286,13 @@ class LiveCamera:
                 "the camera cannot be opened",
                 where=self.name,
                 why="it is not connected, another program uses it, or you may not read it",
-                next_step="check the cable and `ls -l /dev/video*`, close other programs, or pass"
+                next_step="check the cable and `ls -l /dev/video*`, close other programs, or name"
                 " another camera",
             )
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
         self._reader = PictureReader(capture, clock)
-        # Whoever only iterates over it closes nothing, and its thread must not outlive it.
+        # A caller that only iterates closes nothing, and the thread must not outlive it.
         self._let_go = weakref.finalize(self, self._reader.close)
         try:
             refuse_wrong_size(self.read().image, camera, self.name)
@@ -330,9 +330,9 @@ class LiveCamera:
             return Frame(arrived.time, _grey(arrived.picture), f"picture {arrived.number}")
         kind = Fault if self._seen else HardwareMissing
         raise kind(
-            f"the camera gave no picture {LOST_PICTURES} times in a row",
+            f"the camera delivered no image {LOST_PICTURES} times in a row",
             where=self.name,
-            why="it was unplugged, or the bus it hangs on is too slow for its pictures",
+            why="it was unplugged, or its USB bus is too slow for its images",
             next_step="check the cable, then start again",
         )
 
@@ -358,8 +358,8 @@ def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
             f"the picture has {width} x {height} px, camera {camera.name!r} has {camera.width} x"
             f" {camera.height} px",
             where=where,
-            why="it is of another camera, or was cut or scaled",
-            next_step="use full pictures of this camera, or calibrate it in this size",
+            why="it is from another camera, or was cropped or scaled",
+            next_step="use full-size images of this camera, or calibrate it at this size",
         )
 
 

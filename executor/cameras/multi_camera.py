@@ -21,12 +21,12 @@ from tracking.track import rates
 # Watches measured clearance, picture by picture, for one whose upper bound is below the limit.
 
 
-#: So many pictures in a row must show too little clearance before the run is stopped for it.
+#: This many images in a row must show too little clearance before the run is stopped for it.
 NEAR_PICTURES = 2
 
 
 class ClearanceMonitor:
-    """Tells when clearance was below a limit in the last pictures, whatever they are off by.
+    """Detects clearance below a limit in the last images, beyond their uncertainty.
 
     One picture alone may be wrong for a reason that its covariance does not know.
     """
@@ -55,7 +55,7 @@ class ClearanceMonitor:
         near, spread = clearance.nearest[at], float(clearance.uncertainties[at])
         return (
             f"{near.first} to {near.second}: {near.distance * 1e3:.1f} ± {spread * 1e3:.1f} mm;"
-            f" the scene asks for {self._limit * 1e3:g} mm"
+            f" the scene requires {self._limit * 1e3:g} mm"
         )
 
 
@@ -92,9 +92,9 @@ class MultiCameraMonitor:
         self.near = ""
         """Between what the measured clearance fell below the limit, with numbers; else nothing."""
         self.news: list[CameraNews] = []
-        """What began since whoever reads this cleared it."""
+        """Conditions that began since the reader cleared this."""
         self._model, self._several = model, len(names) > 1
-        # Each camera has its own: where they disagree, nobody knows which one is right.
+        # Each camera has its own: where they disagree, the right one is unknown.
         self._watches = {name: ClearanceMonitor(limit) for name in names}
         self._within = 0.5 / rate
         self._common = MultiCameraFusion(self._within)
@@ -120,15 +120,15 @@ class MultiCameraMonitor:
         poses = {name: one for name, one in each.items() if isinstance(one, PoseMeasurement)}
         self._count_disagreement(found.reason if poses else "")
         for name, one in poses.items():
-            self._watch(name, clearance_of(self._model, one), f", as camera {name} alone sees it")
+            self._watch(name, clearance_of(self._model, one), f", measured by camera {name} alone")
         return CameraSample(frame, found, picture)
 
     def finish(self) -> None:
-        """Tells in how many moments a camera was left out as its picture was too far apart."""
+        """Reports how often a camera was left out because its image was too far apart in time."""
         if self._common.apart:
             text = (
-                f"in {self._common.apart} of {self._moments} moments not all cameras were taken"
-                f" together: pictures were taken more than {self._within * 1e3:.0f} ms apart from"
+                f"at {self._common.apart} of {self._moments} times not all cameras were used"
+                f": images were taken more than {self._within * 1e3:.0f} ms from"
                 " the others"
             )
             self.news.append(CameraNews("pictures_dropped", text))
@@ -142,8 +142,8 @@ class MultiCameraMonitor:
         self._disagree = self._disagree + 1 if reason else 0
         if self._disagree == BLIND_PICTURES:
             text = (
-                f"{reason}, {BLIND_PICTURES} times in a row; clearance is not measured together,"
-                " only watched by each alone"
+                f"{reason}, {BLIND_PICTURES} times in a row; fused clearance is not measured,"
+                " each camera monitors it alone"
             )
             self.news.append(CameraNews("camera_sees_nothing", text))
 
@@ -226,7 +226,7 @@ class RunCameras:
             time: Since the start of the run, [s].
             asked: The same moment on the monotonic clock, [s].
             true_pose: Where the simulated platform is; None with real cameras.
-            by_drives: Where the drives' positions put it; None when they do not tell.
+            by_drives: Where the drives' positions put it; None when they are unknown.
         """
         self._now = asked
         for eye in self._eyes:
@@ -251,7 +251,7 @@ class RunCameras:
         return [eye.as_dict(self._now) for eye in self._eyes]
 
     def finish(self, stopped: Callable[[], bool]) -> CameraRecords:
-        """Waits for the last pictures of all cameras; what is missing then is told.
+        """Waits for the last pictures of all cameras; what is missing then is reported.
 
         Args:
             stopped: Whether a stop is wished; the wait is a short one then.
@@ -369,7 +369,7 @@ class RunWatch:
         near, all_failed = self._cameras.near, self._cameras.all_failed
         if near and self._clearance_stop:
             who = "the cameras" if len(each) > 1 else "the camera"
-            less = f"{who} measured less clearance than the scene asks for: {near}"
+            less = f"{who} measured less clearance than the scene requires: {near}"
             self._stop("too near", near, "clearance_low", less)
         if all_failed:
             self._stop("stopping", all_failed, "camera", all_failed)
@@ -380,13 +380,13 @@ class RunWatch:
         Args:
             at: The end of the run, on the loop's clock, [s].
         """
-        with self._listener.waiting("waiting for the last pictures"):
+        with self._listener.waiting("waiting for the last images"):
             seen = self._cameras.finish(lambda: self._board.read().stop)
         self._tell_news(at)
         for camera in seen.cameras:
             if camera.dropped:
-                what = f"{camera.dropped} of {camera.dropped + camera.pictures} pictures left out"
-                text = f"camera {camera.name}: {what}, the one before was not done"
+                what = f"{camera.dropped} of {camera.dropped + camera.pictures} images skipped"
+                text = f"camera {camera.name}: {what}; the previous one was still being processed"
                 self._tell("pictures_dropped", text, at)
         return seen
 

@@ -34,7 +34,7 @@ from tracking.measurement import Observation
 if TYPE_CHECKING:  # a real camera loads no simulator
     from simulation.camera.camera import Film
 
-#: About so many pictures of a run are kept for its report.
+#: Approximate number of a run's images kept for its report.
 KEPT_PICTURES = 12
 
 
@@ -64,7 +64,7 @@ def open_cameras(
 
     Raises:
         StoppedByOperator: A stop was wished before all were open.
-        CdprError: A camera cannot be used, for the reason told.
+        CdprError: A camera cannot be used, for the reason given.
     """
     if not eyes:
         yield None
@@ -103,7 +103,7 @@ def require_no_stop(board: RequestBoard) -> None:
     """
     if board.read().stop:
         raise StoppedByOperator(
-            "stopped before anything moved", next_step="run it again when all is well"
+            "stopped before anything moved", next_step="run it again when ready"
         )
 
 
@@ -144,7 +144,7 @@ class RenderedPictures:
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """Renders the platform where it truly is."""
         if trigger.true_pose is None:
-            raise Fault("the synthetic camera was not told where the platform is")
+            raise Fault("the synthetic camera has no platform pose")
         return self._film.picture(trigger.time, trigger.true_pose, trigger.frame), 0.0
 
     def close(self) -> None:

@@ -30,7 +30,7 @@ class RestPose:
     Attributes:
         pose: ``world_from_platform``.
         uncertainty: Of the position along its worst direction, standard deviation, [m].
-        length_uncertainty: Of the cable length that it tells worst, [m].
+        length_uncertainty: Of the cable length known worst, [m].
         pictures: How many gave a pose.
     """
 
@@ -53,7 +53,7 @@ def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
     if not found or len(found) < SEEN_SHARE * len(looks):
         reasons = {getattr(look, "reason", "") for look in looks} - {""}
         raise _refusal(
-            f"{len(found)} of {len(looks)} pictures show where the platform is",
+            f"{len(found)} of {len(looks)} images give a platform pose",
             "; ".join(sorted(reasons)),
         )
     first = found[0].pose
@@ -64,8 +64,8 @@ def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
     scatter = float(np.max(np.std(positions, axis=0)))
     if not scatter <= MOST_SCATTER:
         raise _refusal(
-            f"the platform does not stand still: its poses scatter by {scatter * 1000:.2f} mm,"
-            f" allowed {MOST_SCATTER * 1000:g} mm",
+            f"the platform is not at rest: its poses scatter by {scatter * 1000:.2f} mm,"
+            f" limit {MOST_SCATTER * 1000:g} mm",
             "it swings, or the light flickers",
         )
     turned = matrix_from_rotation_vector(turns.mean(axis=0))
@@ -76,9 +76,9 @@ def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
     allowed = rig.motion.start_tolerance / 2.0
     if not lengths <= allowed:
         raise _refusal(
-            f"a cable's length is known to {lengths * 1000:.2f} mm only, allowed"
+            f"the uncertainty of a cable's length is {lengths * 1000:.2f} mm, limit"
             f" {allowed * 1000:.2f} mm",
-            "few tags are seen, far away or aslant",
+            "few tags are visible, from far away or at a steep angle",
         )
     worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance[:3, :3]))))
     return RestPose(pose, worst, lengths, len(found))
@@ -89,7 +89,7 @@ def _refusal(what: str, why: str) -> Refused:
         what,
         where="tracked pose",
         why=why,
-        next_step="see to camera, light and tags (`cdpr track RIG SOURCE`), then home again; the"
+        next_step="check camera, light and tags (`cdpr track RIG SOURCE`), then home again; the"
         " cables are taut and held",
     )
 
@@ -141,8 +141,8 @@ def _answer(
         unless_stopped()
         if time.monotonic() > latest:
             raise Fault(
-                f"the camera gave no picture for {PATIENCE:g} s",
+                f"the camera delivered no image for {PATIENCE:g} s",
                 where=f"camera {process.name}",
-                why="it hangs, or what connects it",
-                next_step="check its cable, then begin again",
+                why="the camera or its connection hangs",
+                next_step="check its cable, then start again",
             )

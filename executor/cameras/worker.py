@@ -28,7 +28,7 @@ class FrameRequest:
         time: Since the start of the run, [s].
         asked: When, monotonic, [s].
         true_pose: Where the simulated platform is; None with a real camera.
-        by_drives: Where the drives' positions put the platform; None when they do not tell.
+        by_drives: Where the drives' positions put the platform; None when they are unknown.
     """
 
     frame: int

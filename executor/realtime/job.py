@@ -241,4 +241,4 @@ class Gone:
 
 
 class ReadDrives:
-    """The supervisor asks what the drives tell after the motion; a `CycleStatus` answers it."""
+    """The supervisor asks for the drives' state after the motion; a `CycleStatus` answers it."""

@@ -157,7 +157,7 @@ def write_messages(path: Path, messages: Sequence[Message], start: int) -> None:
             "the log cannot be written",
             where=str(path),
             why=error.strerror or str(error),
-            next_step="free some space; the CSV files hold the same numbers",
+            next_step="free some space; the CSV files hold the same data",
         ) from None
 
 

@@ -167,7 +167,7 @@ def camera_table(run: RunData) -> str:
         )
         for one in run.summary["cameras"]
     ]
-    head = ("Camera", "Source", "Poses", "Left out", "Time a picture", "Alone to plan", "Failed")
+    head = ("Camera", "Source", "Poses", "Left out", "Time per image", "Alone to plan", "Failed")
     return list_table(head, rows) if rows else ""
 
 
@@ -238,7 +238,7 @@ def _planner(
         case PlannerDocument():
             return _tree(planner)
         case WaypointsDocument(author=author):
-            return [("Planner", author or "waypoints of the user's own")]
+            return [("Planner", author or "user's waypoints")]
 
 
 def _improving(planner: OptimalPlannerDocument) -> list[tuple[str, str]]:

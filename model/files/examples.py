@@ -112,7 +112,7 @@ def copy_examples(
             "the file exists already",
             where=shown(existing[0]),
             why=f"{len(existing)} of the {len(wanted)} copies exist; nothing was copied",
-            next_step="pass --force to replace it, or name another folder with -o",
+            next_step="replace it with --force, or name another folder with -o",
         )
     for example, target in wanted:
         _copy(example.source, target)

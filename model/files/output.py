@@ -28,10 +28,10 @@ def require_new_file(path: Path, replace: bool = False) -> None:
         )
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise BadInput(
-            "the file cannot be written there",
+            "the file cannot be written",
             where=str(path),
             why="the folder does not exist or is read-only",
-            next_step="choose a folder that you may write to",
+            next_step="choose a folder with write permission",
         )
 
 
@@ -61,14 +61,14 @@ def make_place(folder: Path) -> None:
         next(folder.iterdir(), None)
     except OSError as error:
         raise BadInput(
-            "the folder cannot be made",
+            "the folder cannot be created",
             where=str(folder),
             why=str(error.strerror),
-            next_step="name a folder, not a file, in a place where you may write",
+            next_step="name a folder (not a file) where you have write permission",
         ) from error
     if not os.access(folder, os.W_OK):
         raise BadInput(
             "the folder is read-only",
             where=str(folder),
-            next_step="name a folder in a place where you may write",
+            next_step="name a folder where you have write permission",
         )

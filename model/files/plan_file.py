@@ -92,7 +92,7 @@ class NearestDocument(Document):
 
 
 class QualityDocument(Document):
-    """What the path is worth, as the planner found it; `cdpr check` finds it anew."""
+    """Quality of the path as the planner computed it; `cdpr check` recomputes it."""
 
     length_mm: NonNegative
     raw_length_mm: NonNegative

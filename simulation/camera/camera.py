@@ -63,7 +63,7 @@ class PlatformMotion:
         return cls((after.position - before.position) / seconds, turn / seconds)
 
     def moved(self, pose: Pose, seconds: float) -> Pose:
-        """The pose so much later, or earlier."""
+        """The pose at a later or earlier time."""
         turn = matrix_from_rotation_vector(self.turning * seconds)
         return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)
 
@@ -101,7 +101,7 @@ class Film:
 PLATFORM = 168.0
 #: A platform that is nearer to the lens is not drawn, or not smeared, [m].
 NEAREST = 0.02
-#: A smear is drawn as so many poses that neighbours are this far apart, [px], but no more than:
+#: Motion blur is drawn as poses this far apart, [px], but no more of them than:
 SMEAR_STEP, MOST_POSES = 0.5, 64
 #: A shorter smear is not to be seen, [px].
 LEAST_SMEAR = 0.02
@@ -128,7 +128,7 @@ class SyntheticCamera:
     ) -> None:
         if not rig.tag_family:
             raise BadInput(
-                "the rig has no tags, a camera can measure nothing",
+                "the rig has no tags, so a camera cannot measure it",
                 where=f"rig {rig.name}",
                 next_step="add a `tags` section to the rig file",
             )
@@ -166,7 +166,7 @@ class SyntheticCamera:
         return self._with_noise(np.asarray(np.minimum(mean, 255.0), dtype=np.uint8), frame)
 
     def _while_exposed(self, pose: Pose, motion: PlatformMotion | None) -> list[Pose]:
-        """Poses in the middles of equal parts of the exposure, so many that the smear is even."""
+        """Poses in the middles of equal parts of the exposure, close enough for even blur."""
         time = self.optics.exposure
         if motion is None or time <= 0.0:
             return [pose]

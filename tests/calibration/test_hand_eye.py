@@ -166,7 +166,7 @@ def test_poses_are_read_by_picture_and_rows_without_one_left_out(tmp_path: Path)
         (HEAD + "a.png,1,2,x,1,0,0,0\n", "2:1: a.png: 1, 2, x, 1, 0, 0, 0 are not seven numbers"),
         (HEAD + "a.png,1,2,nan,1,0,0,0\n", "not finite"),
         (HEAD + "a.png,1,2,3,1,1,0,0\n", "length 1"),
-        (HEAD + "a.png,1,2,3,1,0,0,0\n" * 2, "stands twice"),
+        (HEAD + "a.png,1,2,3,1,0,0,0\n" * 2, "appears twice"),
         (HEAD + ",1,2,3,1,0,0,0\n", "no picture is named"),
     ],
 )

@@ -165,7 +165,7 @@ def test_a_read_only_folder_is_told_before_the_work(read_only: Path, verb: str) 
             timeout=60,
             check=False,
         )
-    one_message(Answer(done.returncode, done.stdout, done.stderr), 2, "you may write to")
+    one_message(Answer(done.returncode, done.stdout, done.stderr), 2, "writable folder")
 
 
 # The bus and the drives.

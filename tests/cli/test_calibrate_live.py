@@ -74,7 +74,7 @@ def test_a_video_that_is_missing_leaves_no_folder_behind(tmp_path: Path) -> None
         answer = call(
             "calibrate", "camera", tmp_path / "taken", "--live", tmp_path / "no.mp4", *BOARD
         )
-    one_message(answer, 2, "neither a folder of pictures, nor a video file, nor a camera")
+    one_message(answer, 2, "not a folder of images, a video file or a camera")
 
 
 def test_pictures_of_before_are_not_mixed_with_new_ones(video: Path, tmp_path: Path) -> None:

@@ -138,7 +138,7 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
         ("time", "line 3: time_s does not rise"),
         ("quaternion", "line 3: the quaternion's length is"),
         ("more", "the rig has 8 cables, the file more"),
-        ("twice", "the column 'actual_1_counts' stands twice"),
+        ("twice", "the column 'actual_1_counts' appears twice"),
         ("empty", "the file holds no measurement"),
         ("deviation", "a standard deviation is not positive"),
     ],
@@ -182,7 +182,7 @@ def test_a_file_in_place_of_the_folder_is_told_with_a_next_step(file: Path) -> N
     other.write_text("mine")
     done = call("calibrate", "rig", RIG, file, "-o", other, "--json")
     assert done.code == 2, done
-    assert "name a folder, not a file" in json.loads(done.out)["next_step"]
+    assert "name a folder (not a file)" in json.loads(done.out)["next_step"]
 
 
 def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:

@@ -126,7 +126,7 @@ def test_people_read_what_changed_against_the_rig_file(folder) -> None:
     assert answer.code == 3
     assert answer.out.splitlines()[1].split()[:4] == ["verdict", "not", "good", "enough:"]
     assert "moved" in answer.out
-    assert "broken.png is no picture that can be read" in answer.out
+    assert "broken.png is not a readable image" in answer.out
 
 
 @pytest.mark.parametrize(

@@ -118,13 +118,13 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
 
 
 def test_monitor_calls_itself_by_its_name() -> None:
-    with pytest.raises(Fault, match="no run of yours") as caught:
+    with pytest.raises(Fault, match="no active run") as caught:
         told("status", None, verb="monitor")
     assert caught.value.where == "cdpr monitor"
     assert "cdpr status" not in str(caught.value)
     answer = call("monitor", "--once")
     assert answer.code == 1
-    assert "cdpr monitor: no run of yours" in answer.err
+    assert "cdpr monitor: no active run" in answer.err
 
 
 def test_a_jig_has_no_uncertainty_of_nothing() -> None:

@@ -30,7 +30,7 @@ SCENE = CONFIGS / "environment_1.yaml"
         (["--budget-ms", "5", "--rounds", "5"], ["--budget-ms", "--rounds", "give one"]),
         (["--cost", "length", "--weight", "length=1"], ["--cost", "--weight", "give one"]),
         (["--weight", "speed=1"], ["speed", "no objective", "kinematic"]),
-        (["--weight", "length=1", "--weight", "length=2"], ["length", "stands twice"]),
+        (["--weight", "length=1", "--weight", "length=2"], ["length", "appears twice"]),
         (["--weight", "length=much"], ["much", "no number"]),
         (["--weight", "length"], ["no number"]),
         (["--weight", "length=-1"], ["length", "0 or more"]),

@@ -115,7 +115,7 @@ CASES = {
     "a drive starts anew": Case(
         lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
     ),
-    "a winch jams": Case(jam, "drive_stuck", ("(drive 2) stood still",), lost=(1,)),
+    "a winch jams": Case(jam, "drive_stuck", ("(drive 2) did not move",), lost=(1,)),
     "a winch slips": Case(slip, "following_error", ("cable 2", "allowed 2.00 mm"), lost=(1,)),
     "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "torn"), within=5),
     "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "102.0 N"), within=60),
@@ -223,7 +223,7 @@ def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
     profile.write_text(f"name: Gentle\nsources: [this test]\n{gentle}\n")
     document = prepared.rig.document.model_dump()
     document["drives"]["profile"] = str(profile)
-    with pytest.raises(Refused, match="without the master the platform goes on for up to 31"):
+    with pytest.raises(Refused, match="without its master the platform travels up to 31"):
         prepare(prepared.plan, rig_from_document(RigDocument.model_validate(document)))
 
 
@@ -269,7 +269,7 @@ def test_a_full_disk_stops_the_drives(
     """An event that cannot be written is a fault; the drives are stopped before it is told."""
 
     def full(_folder: RunFolder, _event: RunEvent) -> None:
-        raise Fault("the run folder cannot be written to", why="No space left on device")
+        raise Fault("the run folder cannot be written", why="No space left on device")
 
     with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
         monkeypatch.setattr(RunFolder, "append_event", full)

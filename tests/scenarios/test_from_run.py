@@ -157,7 +157,7 @@ def test_a_plan_from_a_stopped_run_runs_to_the_goal_through_the_stops_left(
         nothing = call(
             "plan", RIG, scene_file, "-o", plan, "--force", "--from-run", tmp_path / "run"
         )
-    one_message(nothing, 2, "nothing is left to do", "--goal-mm")
+    one_message(nothing, 2, "nothing remains to be done", "--goal-mm")
 
 
 def test_a_dwell_cut_short_is_done_again_with_the_load_before_it(
@@ -194,7 +194,7 @@ def test_a_stop_that_was_changed_since_is_refused(stopped: Ended, tmp_path: Path
     path.write_text(yaml.safe_dump(changed), encoding="utf-8")
     out = tmp_path / "plan.json"
     answer = call("plan", RIG, path, "-o", out, "--from-run", stopped.folder.path)
-    one_message(answer, 2, "visited 'take' as other stops than the scene's")
+    one_message(answer, 2, "visited 'take' as stops that differ from the scene's")
 
 
 def test_a_clearance_that_is_not_there_is_told_with_the_one_that_is(
@@ -243,7 +243,7 @@ def test_drives_that_contradict_the_plan_or_each_other_are_refused(
     folder.write_cycles(replace(cycles, actual_counts=counts))
     out = tmp_path / "plan.json"
     answer = call("plan", RIG, scene_file, "-o", out, "--from-run", folder.path)
-    one_message(answer, 3, "where the platform is cannot be told", words, "--start-mm")
+    one_message(answer, 3, "the platform pose is unknown", words, "--start-mm")
     assert not out.exists()
 
 
@@ -258,7 +258,7 @@ def test_a_folder_without_its_cycles_or_with_silent_drives_is_refused(
     folder.write_cycles(replace(cycles, missing=missing))
     one_message(call(*arguments), 3, "2 drives did not answer in the last cycle")
     (folder.path / "cycles.csv").unlink()
-    one_message(call(*arguments), 2, "not a whole run folder", "cycles.csv missing")
+    one_message(call(*arguments), 2, "incomplete run folder", "cycles.csv missing")
     both = call(*arguments, "--start-mm", "0", "0", "445")
     one_message(both, 2, "--from-run and --start-mm both say where to begin")
 

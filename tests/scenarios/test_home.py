@@ -82,7 +82,7 @@ class Place:
     script: Callable[[Place, int], None] = lambda _place, _cycle: None
     at_rest: Callable[[WinchesStand], HomingReference | None] = lambda _stand: None
     custody: MotionInterlock | None = None
-    anew: bool = True
+    rehome: bool = True
     board: LocalRequests = field(default_factory=LocalRequests)
     records: list[CycleRecord] = field(default_factory=list)
     events: list[LoopEvent] = field(default_factory=list)
@@ -106,7 +106,7 @@ class Place:
             self.custody or MotionInterlock(self.rig),
             Told(on_cycle, self.events.append),
             record=Path("nowhere"),
-            anew=self.anew,
+            rehome=self.rehome,
             at_rest=lambda stand, _true_pose: self.at_rest(stand),
         )
 
@@ -479,7 +479,7 @@ def no_more_heard(place: Place) -> None:
     place.rehearsal.drives[5].silent = True
 
 
-@pytest.mark.parametrize("anew", [True, False])
+@pytest.mark.parametrize("rehome", [True, False])
 @pytest.mark.parametrize(
     ("happens", "told", "counts"),
     [
@@ -489,7 +489,7 @@ def no_more_heard(place: Place) -> None:
     ],
 )
 def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
-    anew: bool, happens: Callable[[Place], None], told: str, counts: bool
+    rehome: bool, happens: Callable[[Place], None], told: str, counts: bool
 ) -> None:
     """The reference of before counts only where every cable was held, and none is made."""
     rig = load_rig(RIG)
@@ -505,7 +505,7 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
             happens(place)
             return reference_at(kept, kept.home, stand.counts, tensions, "new", 0.0)
 
-        place.custody, place.at_rest, place.anew = custody, at_rest, anew
+        place.custody, place.at_rest, place.rehome = custody, at_rest, rehome
         with pytest.raises(CdprError, match=told):
             place.take_up()
         assert place.events[-1].code == "not_held"
@@ -516,7 +516,7 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
     reference = custody.kept_reference()
     assert reference is not None
     assert reference.how == "stated pose"
-    assert bool(reference.lost) is (anew or not counts)
+    assert bool(reference.lost) is (rehome or not counts)
     if not reference.lost:
         assert reference.stands_at == pytest.approx(moved, abs=1.0)
         assert reference.stands_at != list(begin)
@@ -560,7 +560,7 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         stand = move_winches(
             mover(limited, law, group, LocalRequests()), rig, MotionInterlock(rig),
             Told(lambda _record: None, lambda _event: None),
-            record=Path("nowhere"), anew=True, at_rest=lambda _stand, _true_pose: None,
+            record=Path("nowhere"), rehome=True, at_rest=lambda _stand, _true_pose: None,
         )  # fmt: skip
         assert stand.state is State.FINISHED, stand.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0

@@ -157,7 +157,7 @@ CASES = {
     "no heartbeat": Case(
         lambda stage: stage.drives[2].silent.add("heartbeat"),
         "drive_fault",
-        "its heartbeat is missing",
+        "heartbeat missing",
         18,
     ),
     "no position": Case(

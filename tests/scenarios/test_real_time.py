@@ -161,7 +161,7 @@ def test_a_real_time_process_that_hangs_is_ended_and_told(
         wait_until_all_hold(rehearsal)
     summary = RunFolder.open(run).summary()
     assert summary["final_state"] == "latched"
-    assert any("hung and was ended" in reason for reason in summary["reasons"])
+    assert any("hung and was killed" in reason for reason in summary["reasons"])
     assert summary["events"][-1]["code"] == "real_time_lost"
 
 

@@ -59,7 +59,7 @@ def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
         answer = call("status", counting, *bus)
         assert answer.code == 0, answer
         assert re.search(r"latched fault +none; process \d+ moves or resets it", answer.out)
-        assert "never referenced: cable 1 (drive 1)" in answer.out.replace("\n", " ")
+        assert "never homed: cable 1 (drive 1)" in answer.out.replace("\n", " ")
         assert "switch on disabled" not in answer.out, "who runs them must not be disturbed"
 
 
@@ -102,7 +102,10 @@ def test_who_sets_drives_up_waits_for_who_asks_and_does_so_alone(
     with SetUpLock(settings).held():
         with SetUpLock(settings).tried() as alone:
             assert not alone
-        with pytest.raises(Refused, match="sets these drives up"), SetUpLock(settings).held():
+        with (
+            pytest.raises(Refused, match="configuring or reading"),
+            SetUpLock(settings).held(),
+        ):
             pytest.fail("two programs set the same drives up")
         with SetUpLock(BusSettings("socketcan", "can7")).held():
             pass

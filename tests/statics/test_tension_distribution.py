@@ -251,7 +251,7 @@ def test_feasibility_and_capacity_margin_agree_along_a_way_out_of_the_workspace(
 
 
 def test_an_overload_names_the_cables_and_the_missing_newtons():
-    with pytest.raises(TensionInfeasible, match=r"give way by [\d.]+ N") as refusal:
+    with pytest.raises(TensionInfeasible, match=r"relaxed by [\d.]+ N") as refusal:
         solve_tensions(paper_matrix(), 100.0 * PAPER_WEIGHT, 1.0, 100.0)
     upper, lower = set(range(4)), set(range(4, 8))
     assert refusal.value.at_largest

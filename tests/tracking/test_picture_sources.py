@@ -89,7 +89,7 @@ def test_pictures_that_are_all_of_another_size_are_refused_by_name(
     with pytest.raises(BadInput, match="none of the 2 pictures has the camera's 1280 x 7") as told:
         list(ImageFolder(tmp_path, camera))
     assert "small.png has 640 x 480 px" in told.value.why
-    assert "broken.png is no picture" in told.value.why
+    assert "broken.png is not a readable image" in told.value.why
 
 
 def test_a_video_is_measured_picture_by_picture(

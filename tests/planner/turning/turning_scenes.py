@@ -67,7 +67,7 @@ class Judge:
         self._obstacles, self._model = CoalScene(scene), ClearanceModel(rig, scene)
 
     def room(self, pose: Pose) -> float:
-        """Least of obstacle and self clearance above what the scene asks for, [m]."""
+        """Least of obstacle and self clearance above what the scene requires, [m]."""
         away = self._obstacles.pose_distance(self.rig, pose) - self.scene.obstacle_clearance
         own = self._model.self_clearance(pose).distance - self.scene.self_clearance
         return min(away, own)
