@@ -77,7 +77,7 @@ def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: i
             raise BadInput(
                 "--pictures is for a video or a camera",
                 where=str(source),
-                next_step="leave it out: a folder's pictures are all used",
+                next_step="leave it out: all images of a folder are used",
             )
         folder = OneCamerasPictures(path, (camera.width, camera.height))
         return Pictures(folder, len(folder.names), folder.unused)
@@ -141,10 +141,10 @@ def take_pictures(
                 break
     if not guide.views:
         raise BadInput(
-            "no picture was taken",
+            "no image was captured",
             where=f"camera {source}",
-            why=f"{board} was never seen standing still",
-            next_step="check the board's kind and numbers and the light, and hold it still",
+            why=f"{board} was never detected at rest",
+            next_step="check the board's kind, its dimensions and the light, and hold it still",
         )
     return len(guide.views)
 

@@ -187,7 +187,7 @@ def calibrate_camera(
     source = pictures if isinstance(pictures, Pictures) else pictures_in(pictures)
     to = to or Destination()
     to.require_free("camera", name)
-    with source.reported("looking for the board", listener) as images:
+    with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused)
     quality = judge_camera(found, wanted, distance)
     result = camera_result(found, quality, name, to.on)
@@ -231,7 +231,7 @@ def locate_camera(
     source, to = _pictures(pictures, camera, USUAL_PICTURES), to or Destination()
     to.require_free("extrinsics", camera.name)
     ready_to_measure(listener)
-    with source.reported("looking for tags", listener) as images:
+    with source.reported("detecting tags", listener) as images:
         sights = sights_of(images, rig, camera, [tag.id for tag in tags], source.unused)
     if known is None:
         found = locate_by_frame_tags(rig, camera, sights, survey or Survey(0.5e-3, None))
@@ -272,7 +272,7 @@ def locate_tags(
     source, to = _pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
     to.require_free("tags", rig.name)
     ready_to_measure(listener)
-    with source.reported("looking for tags", listener) as images:
+    with source.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
         sights = sights_of(images, rig, camera, numbers, source.unused)
     found = measure_layout(rig, camera, sights, fixed_tag)
@@ -309,12 +309,12 @@ def calibrate_rig(
     """Finds outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
 
     Args:
-        rig: As its file tells it.
+        rig: As in its file.
         data: Run folders, and CSV files (docs/data-formats.md).
         deviations: How far off the rig file may be by group of numbers, one standard deviation;
             groups left out are taken as known.
         length_deviation: Of a cable's length from the encoders, [m].
-        pose_deviations: Of poses beside what their file tells, [m] and [rad].
+        pose_deviations: Of poses, added to that of their file, [m] and [rad].
         without_poses: Drive positions alone, as without a camera.
         tilt: How far the platform will be rotated, [rad].
         wanted: What is good enough, 95 %, [m].
@@ -344,7 +344,7 @@ def calibrate_rig(
                 f"the measurements do not fit the rig file {rig_file or rig.name}",
                 where=", ".join(map(str, data)),
                 why=error.what,
-                next_step="check units, the order of the cables, the reference of the drives and"
+                next_step="check units, the order of the cables, the homing of the drives and"
                 " the rig file",
             ) from error
     return Calibration(

@@ -83,8 +83,8 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
     if image.shape != wanted or image.dtype != np.uint8:
         size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))
         raise BadInput(
-            f"a picture has {size} px ({image.dtype}, {image.ndim} dimensions); camera"
-            f" {camera.name!r} takes grey 8-bit pictures of {wanted[1]} x {wanted[0]} px",
+            f"the image has {size} px ({image.dtype}, {image.ndim} dimensions); camera"
+            f" {camera.name!r} takes grey 8-bit images of {wanted[1]} x {wanted[0]} px",
             where=f"rig {rig}",
-            next_step="use pictures of this camera in full size, or mend the rig file",
+            next_step="use full-size images of this camera, or correct the rig file",
         )

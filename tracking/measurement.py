@@ -103,7 +103,7 @@ def extrapolate(
         time: Of the later one, [s]; not before the measurement's own.
 
     Returns:
-        None where `predicted` knows no speed: nobody can tell where the platform is then.
+        None where `predicted` knows no speed: the pose is unknown then.
     """
     if time == last.time:
         return last

@@ -30,7 +30,7 @@ class MultiCameraFusion:
 
     Pictures of one moment are taken a little apart in time. Each pose is carried on to the newest
     one's time, as the same camera saw the platform go. One whose camera saw nothing shortly
-    before is left out, as nobody knows how fast the platform went: the newest pose always counts.
+    before is left out, as the platform's speed is unknown: the newest pose always counts.
     """
 
     def __init__(self, within: float) -> None:
@@ -77,7 +77,7 @@ def together(seen: Mapping[str, Observation]) -> Observation:
     """The mean of all poses, each by the weight of its information.
 
     Of three cameras and more one that disagrees with the others is left out; of two that disagree
-    nobody knows which is wrong.
+    it is unknown which is wrong.
 
     Args:
         seen: What each camera measured, by its name; all poses are of one time.

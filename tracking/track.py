@@ -69,9 +69,9 @@ def track(
         source: Pictures in order of time.
         tracker: Keeps the last pose between pictures.
         count: Kept up to date while pictures are measured.
-        give_up_after: Ends a source without an end after so many pictures without any pose.
+        give_up_after: Ends a source without an end after this many images without any pose.
         model: Where obstacles are; the clearance is measured too.
-        on_picture: Told every picture with what was measured in it.
+        on_picture: Called with every image and its measurement.
 
     Raises:
         NoPlatformSeen: At the end, when no picture gave a pose.
@@ -114,20 +114,20 @@ def _nothing_seen(
 ) -> NoPlatformSeen:
     where = f"camera {tracker.camera.name!r}"
     if last is None:
-        return NoPlatformSeen("the source has no pictures", where=where)
+        return NoPlatformSeen("the source has no images", where=where)
     wanted = ", ".join(map(str, tracker.expected_tags))
     instead = what_else_is_seen(last.image, tracker.rig.tag_family, tracker.expected_tags)
     next_step = (
-        "check that the camera sees the platform, that the light suffices and that the rig file"
-        " names the family and numbers of the printed tags"
+        "check that the camera sees the platform, that the light suffices, and that the rig file"
+        " has the family and numbers of the printed tags"
     )
     if len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
     return NoPlatformSeen(
-        f"none of {pictures} picture{'s' if pictures != 1 else ''} gives a pose of the platform:"
+        f"none of {pictures} image{'s' if pictures != 1 else ''} gives a platform pose:"
         f" {reasons.most_common(1)[0][0]}",
         where=where,
-        why=f"expected are {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
+        why=f"expected {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
         next_step=next_step,
         values={"pictures": pictures, "family": tracker.rig.tag_family, "expected": wanted},
     )
@@ -174,7 +174,7 @@ def track_together(
         BadInput: A picture is not of its camera's size.
         CameraMoved: Frame tags are not where they should be.
     """
-    poses, reason, common = 0, "the sources have no pictures", MultiCameraFusion(within)
+    poses, reason, common = 0, "the sources have no images", MultiCameraFusion(within)
     running = {name: _without_end(stream) for name, stream in streams.items()}
     for alone in moments(running, 2.0 * within):
         found = common.of({name: one.observation for name, one in alone.items()})
@@ -189,10 +189,10 @@ def track_together(
         yield LoggedPicture(next(iter(alone.values())).name, found, clearance), alone
     if not poses:
         raise NoPlatformSeen(
-            f"no camera gives a pose of the platform: {reason}",
+            f"no camera gives a platform pose: {reason}",
             where=f"cameras {', '.join(streams)}",
             next_step="check that the cameras see the platform; `cdpr track` with one source alone"
-            " tells more",
+            " gives details",
         )
 
 
@@ -207,7 +207,7 @@ def _without_end(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPicture]:
 # How fast pictures are measured now.
 
 
-#: Live figures are those of so many of the newest pictures.
+#: Live figures are those of this many of the newest images.
 NEWEST = 10
 
 
@@ -215,7 +215,7 @@ def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: i
     """Live figures: how fast, how long a picture takes, how many tags are seen."""
     fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
     long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
-    return f"{fast} pictures/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
+    return f"{fast} images/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
 
 
 class FrameRate:

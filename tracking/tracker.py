@@ -19,12 +19,12 @@ from tracking.settings import TrackerSettings
 
 # Where the platform should be seen, by the positions of its drives.
 #
-# Drives are off by whatever cable lengths are off, so a camera's last pose tells by how much; from
-# there on they tell how the platform went, however fast and however long no tag was to be seen.
-# This says only where to look: what is found there is judged as if nobody had said so.
+# Drives are off by whatever cable lengths are off, so a camera's last pose shows by how much; from
+# there on they show the platform's motion, however fast and however long no tag was detected.
+# This sets only where to look: what is found there is judged without it.
 
 
-#: Drives' poses farther apart in time than this do not tell how the platform goes on, [s].
+#: Drives' poses farther apart in time than this do not predict the platform's motion, [s].
 MEMORY = 0.5
 
 
@@ -98,7 +98,7 @@ class Tracker:
     def __init__(self, rig: Rig, camera: Camera, settings: TrackerSettings | None = None) -> None:
         if not rig.platform_tags:
             raise BadInput(
-                "the rig has no tags on its platform, so no camera can measure it",
+                "the rig has no platform tags, so no camera can measure it",
                 where=f"rig {rig.name}",
                 next_step="add a `tags` section to the rig file",
             )
@@ -166,9 +166,9 @@ class Tracker:
         return found if self._goes_on(found, last) else None
 
     def _guided(self, image: Image, time: float, expected: Pose) -> Observation | None:
-        """As `_follow`, at a pose that nobody has seen.
+        """As `_follow`, at a pose without a camera measurement.
 
-        So it tells no pose from its mirror pose, and a tag alone is not enough: where drives are
+        So it cannot exclude the mirror pose, and a tag alone is not enough: where drives are
         wrong, that may be another print of it.
         """
         found = self._sight.measured_at(image, time, expected, "guided")

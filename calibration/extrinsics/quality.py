@@ -77,15 +77,15 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
     """
     lacks, error = list(result.lacks), result.error
     if not error <= wanted:
-        more = "survey more tags, all around what the camera sees"
+        more = "survey more tags, all around the camera's view"
         if result.by == "rig motion":
-            more = "take pictures at more poses, far apart and turned up to 20° every way"
+            more = "take images at more poses, far apart and rotated up to 20° in every direction"
         what = (
-            f"points of the work space are seen within {error * 1e3:.2g} mm,"
-            f" {wanted * 1e3:.2g} mm are wanted"
+            f"points of the workspace are measured within {error * 1e3:.2g} mm;"
+            f" {wanted * 1e3:.2g} mm are required"
         )
         lacks.append(Issue(what, more))
-    return CalibrationVerdict.of(error, wanted, "in the work space", lacks)
+    return CalibrationVerdict.of(error, wanted, "in the workspace", lacks)
 
 
 def widths_of(covariance: Array, without: Sequence[Array]) -> Array:

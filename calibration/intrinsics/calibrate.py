@@ -20,10 +20,10 @@ from tracking.camera_model import Image
 LEAST_VIEWS = 4
 """Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
 _FAR_OFF, _OFF = 4.0, 0.5
-"""A view is left out whose error is so many times the median, and so many pixels at least."""
+"""A view is left out whose error is this many times the median, and this many pixels at least."""
 _LOOKED_AT = 5
-"""So many pictures without the board, spread over all, are looked at for what they show instead."""
-_MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
+"""Number of images without the board, spread over all, that are examined for what they show."""
+_MIRRORED = "its mirror image, so the images or the board's print are mirrored"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,9 +103,9 @@ def fit_camera(
         size = size or own
         if own != size:
             raise BadInput(
-                f"the picture has {own[0]} x {own[1]} px, the ones before {size[0]} x {size[1]} px",
+                f"the image has {own[0]} x {own[1]} px, others {size[0]} x {size[1]} px",
                 where=name,
-                next_step="use pictures of one camera in one size",
+                next_step="use images of one camera at one size",
             )
         seen = board.find(image)
         if seen is None:
@@ -115,7 +115,7 @@ def fit_camera(
             left_out[name] = as_in(first)
         else:
             views[name] = seen
-            left_out |= {f"{name}, {k}": "is seen more than once" for k in seen.twice}
+            left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
     return calibrate_from_views(views, size, left_out)
@@ -142,7 +142,7 @@ def calibrate_from_views(
     bad = {name: error for name, error in fit.errors.items() if error > limit}
     if bad and len(used) - len(bad) >= LEAST_VIEWS:
         for name, error in bad.items():
-            left_out[name] = f"has corners that are {error:.2f} px off, far more than the others"
+            left_out[name] = f"has a corner error of {error:.2f} px, far more than the others"
             del used[name]
         fit = _fit(used, size)
     return CameraCalibration(
@@ -191,9 +191,9 @@ def _fit(views: Mapping[str, Seen], size: tuple[int, int]) -> _Fit:
 
 def _undetermined() -> BadInput:
     return BadInput(
-        "these pictures do not determine a camera",
-        why="the fit found no finite answer, as when the board stands the same way in all of them",
-        next_step="take more pictures, with the board tilted up to 40° every way",
+        "these images do not determine a camera",
+        why="the fit has no finite solution, as when the board has the same tilt in all of them",
+        next_step="take more images, with the board tilted up to 40° in every direction",
     )
 
 
@@ -209,7 +209,7 @@ def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
     what, names = max(shown.items(), key=lambda item: len(item[1]))
     verb = "shows"
     if len(names) > 1:
-        verb = f"and {len(names) - 1} of {len(without) - 1} others that were looked at show"
+        verb = f"and {len(names) - 1} of {len(without) - 1} others that were examined show"
     return f"; {names[0]} {verb} {what}"
 
 
@@ -220,14 +220,14 @@ def _too_few(
     without: Sequence[tuple[str, Image]],
 ) -> BadInput:
     count = len(views) + len(unused)
-    why = f"{board} was looked for{_instead(board, without)}"
+    why = f"expected {board}{_instead(board, without)}"
     told = [f"{name} {reason}" for name, reason in unused.items()]
     if told:
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""
         why += "; " + "; ".join(told[: 4 if more else 5]) + more
     return BadInput(
-        f"the board is to be seen in {len(views)} of {count} pictures; {LEAST_VIEWS} are the least",
+        f"the board is detected in {len(views)} of {count} images; {LEAST_VIEWS} are required",
         why=why,
-        next_step="check the board's kind and numbers, or take more pictures of it, tilted up to"
-        " 40°; 40 are good",
+        next_step="check the board's kind and dimensions, or take more images of it, tilted up to"
+        " 40°; 40 are recommended",
     )

@@ -21,7 +21,7 @@ STILL_PX = 0.7
 ENOUGH_TILT = 18.0
 """Degrees to each side that must be seen."""
 _FAR, _FAR_TILT = 0.12, 12.0
-"""So far from all others, as part of the picture's width, or turned so much [deg], it is new."""
+"""It is new at this distance from all others, as share of the image width, or rotation [deg]."""
 _PARTS = (("left", "middle", "right"), ("top", "middle", "bottom"))
 _AWAY = ("lower", "upper", "right", "left")
 """Edges of the board, as seen in the picture, that are away from the camera by tilt: − and + about
@@ -90,16 +90,16 @@ class CaptureGuide:
             return self._advice(False, "hold it still")
         view = _view(self._last, size)
         if not self._is_new(view, size):
-            return self._advice(False, self.missing() or "move it to another place and tilt")
+            return self._advice(False, self.missing() or "move it to another position and tilt it")
         self.views.append(view)
-        return self._advice(True, self.missing() or "move it to another place and tilt")
+        return self._advice(True, self.missing() or "move it to another position and tilt it")
 
     def missing(self) -> str:
         """The first thing that no picture shows yet; empty when all is there."""
         covered = {part for view in self.views for part in view.parts}
         for part in sorted(product(range(3), range(3)), key=lambda p: (p == (1, 1), p[1], p[0])):
             if part not in covered:
-                return f"bring the board to the {_name(part)} of the picture"
+                return f"bring the board to the {_name(part)} of the image"
         for which, name in enumerate(_AWAY):
             axis, sign = which // 2, (-1.0, 1.0)[which % 2]
             if not any(sign * view.tilt[axis] > ENOUGH_TILT for view in self.views):
@@ -118,7 +118,7 @@ class CaptureGuide:
 
     def _advice(self, taken: bool, text: str) -> Advice:
         done = len(self.views) >= self.wanted and not self.missing()
-        count = f"{len(self.views)} of {self.wanted} pictures"
+        count = f"{len(self.views)} of {self.wanted} images"
         return Advice(taken, f"{count}: {'enough' if done else text}", done)
 
 

@@ -81,9 +81,9 @@ def uncertainty_of(
     scale = np.sqrt(np.diag(information))
     if not (scale > 0.0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
         raise BadInput(
-            "these pictures do not determine a camera",
-            why="other numbers would explain them as well",
-            next_step="take more pictures, with the board tilted up to 40° every way",
+            "these images do not determine a camera",
+            why="other parameters would explain them as well",
+            next_step="take more images, with the board tilted up to 40° in every direction",
         )
     by_scatter = np.linalg.inv(information) * squares / max(residuals - 9, 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
@@ -113,5 +113,5 @@ def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
 
 
 def _quantile(count: int) -> float:
-    """Of Student's distribution, for so many pictures."""
+    """Of Student's distribution, for a number of images."""
     return float(student.ppf(0.5 + CONFIDENCE / 2.0, max(count - 1, 1)))

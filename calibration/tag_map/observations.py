@@ -76,8 +76,8 @@ def sights_of(
 ) -> TagSights:
     """Looks for tags.
 
-    A number that is seen twice in a picture is left out there: nobody knows which is the rig's.
-    A copy of a picture is left out: it tells nothing more. Pictures of a camera that stands still
+    A number that is seen twice in a picture is left out there: it is unknown which is the rig's.
+    A copy of a picture is left out: it adds no information. Pictures of a camera that stands still
     differ by their noise at least.
 
     Args:
@@ -99,16 +99,16 @@ def sights_of(
     for name, image in pictures:
         first = names.setdefault(hashlib.sha256(image.tobytes()).digest(), name)
         if first != name:
-            left_out[name] = f"is the same picture as {first}"
+            left_out[name] = f"is the same image as {first}"
             continue
         mine = [d for d in detector.detect_all(image) if d.id in wanted]
         twice = [number for number, count in Counter(d.id for d in mine).items() if count > 1]
-        left_out |= {f"{name}, tag {number}": "is seen more than once" for number in twice}
+        left_out |= {f"{name}, tag {number}": "is detected more than once" for number in twice}
         squares = _whole(image, camera, [d for d in mine if d.id not in twice], modules)
         if squares:
             found[name] = squares
         elif not twice:
-            left_out[name] = "shows none of the tags whole"
+            left_out[name] = "shows no complete tag"
             example = example or (name, image)
     if not found:
         raise _nothing_seen(camera, family, wanted, left_out, example)
@@ -144,11 +144,11 @@ def _nothing_seen(
         name, image = example
         why += f"; {name} shows {what_else_is_seen(image, family, list(wanted))}"
     return BadInput(
-        f"none of the {family} tags {', '.join(map(str, wanted))} is to be seen whole",
+        f"none of the {family} tags {', '.join(map(str, wanted))} is completely visible",
         where=f"camera {camera.name}",
         why=why,
         next_step="check that the camera sees them, that the light suffices, and that the rig file"
-        " names the family and numbers of the printed tags",
+        " has the family and numbers of the printed tags",
     )
 
 

@@ -23,8 +23,8 @@ class Seen:
     Attributes:
         points: In the board's plane, shape (n, 3), [m].
         corners: Where they are in the picture, shape (n, 2), [px].
-        twice: Numbers of markers or tags that were seen more than once and are left out: nobody
-            knows which of them is the board's.
+        twice: Numbers of markers or tags that were detected more than once and are left out: it is
+            unknown which of them is the board's.
     """
 
     points: Array
@@ -54,7 +54,7 @@ def mirrored(board: Board, image: Image) -> bool:
 
 
 def require_board(
-    holds: bool, what: str, next_step: str = "check the numbers of the board"
+    holds: bool, what: str, next_step: str = "check the dimensions of the board"
 ) -> None:
     """Refuses boards that cannot be.
 

@@ -16,7 +16,7 @@ _WINDOW = 0.3
 _SEARCHED = 1600
 """Longer side of the picture in which the board is looked for, [px]."""
 _LARGEST, _SHARE = 11, 120
-"""It is at most so many pixels, or that share of the picture's width: large pictures are softer."""
+"""At most this many pixels, or this share of the image width: large images are softer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,8 @@ class Chessboard:
             BadInput: Fewer than three inner corners a side, or a square without a size.
         """
         require_board(
-            min(self.columns, self.rows) >= 3, "a chessboard needs at least 3 inner corners a side"
+            min(self.columns, self.rows) >= 3,
+            "a chessboard needs at least 3 inner corners per side",
         )
         require_board(self.square > 0.0, "the side of a square must be above 0 mm")
 
@@ -84,8 +85,8 @@ class Chessboard:
             return ""
         if not found:
             return ""
-        columns, rows = max(meta.shape), min(meta.shape)  # which way round, a board does not tell
-        return f"a chessboard of {columns} x {rows} inner corners, or a part of one"
+        columns, rows = max(meta.shape), min(meta.shape)  # a board does not show its orientation
+        return f"a chessboard of {columns} x {rows} inner corners, or part of one"
 
     def _refined(self, image: Image, corners: Array) -> Array:
         """Corners at the saddles of brightness, which halves the error; shape (n, 2), [px].

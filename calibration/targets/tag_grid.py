@@ -57,7 +57,7 @@ class TagGrid:
         last = self.first + self.columns * self.rows - 1
         require_board(
             self.first >= 0 and last < tags_in(self.family),
-            f"{self.family} has the tags 0 to {tags_in(self.family) - 1}, the grid needs"
+            f"{self.family} has the tags 0 to {tags_in(self.family) - 1}; the grid needs"
             f" {self.first} to {last}",
             "choose a smaller first number, fewer tags or a larger family",
         )

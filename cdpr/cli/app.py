@@ -24,7 +24,7 @@ EPILOG = (
 )
 
 
-def _tell_version(wanted: bool) -> None:
+def _show_version(wanted: bool) -> None:
     if wanted:
         # Takes longer to import than all else here, and only this option needs it.
         from importlib.metadata import version
@@ -52,7 +52,7 @@ def _options(
     _version: Annotated[
         bool,
         typer.Option(
-            "--version", help="Show the version and exit.", callback=_tell_version, is_eager=True
+            "--version", help="Show the version and exit.", callback=_show_version, is_eager=True
         ),
     ] = False,
 ) -> None:
@@ -78,7 +78,12 @@ def main() -> None:
     except OSError as error:
         _end(_of_the_system(error))
     except MemoryError:
-        _end(Fault("not enough memory", next_step="take less of it at once, or a larger computer"))
+        _end(
+            Fault(
+                "not enough memory",
+                next_step="reduce the problem size, or use a computer with more memory",
+            )
+        )
     except Exception as error:
         _tell_bug(error)
         sys.exit(1)
@@ -123,11 +128,11 @@ def _of_the_system(error: OSError) -> CdprError:
     """The operating system refused a file that a verb did not expect it to, or its output."""
     why = error.strerror or str(error)
     if error.filename is not None:
-        hint = "check the path, who may use it, and the space on its disk"
+        hint = "check the path, its permissions and the free space"
         return BadInput(
             "the path cannot be used", where=shown(str(error.filename)), why=why, next_step=hint
         )
-    hint = "check where its output goes, and the space there"
+    hint = "check the output's destination and its free space"
     return Fault("the command could not write all its output", why=why, next_step=hint)
 
 
@@ -138,14 +143,14 @@ def _tell(error: CdprError) -> None:
 
 
 def _tell_bug(error: Exception) -> None:
-    """An error nobody foresaw: one line for the user, the trace for us in a file."""
+    """An unexpected error: one line for the user, the trace in a file."""
     with tempfile.NamedTemporaryFile(
         "w", prefix="cdpr-error-", suffix=".txt", delete=False, encoding="utf-8"
     ) as file:
         file.write("".join(traceback.format_exception(error)))
     print(
         f"error: {type(error).__name__}: {error}\n"
-        "  why: this is a defect of cdpr, not of your input\n"
+        "  why: this is a defect in cdpr, not in your input\n"
         f"  next: please report it with the file {file.name}",
         file=sys.stderr,
     )

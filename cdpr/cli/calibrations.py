@@ -15,7 +15,7 @@ CalibrationOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--calibration",
-        help="result file of `cdpr calibrate`, in place of the rig file's numbers; again for more",
+        help="result file of `cdpr calibrate`, used instead of the rig file's values; repeatable",
         metavar="FILE",
     ),
 ]

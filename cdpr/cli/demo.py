@@ -26,10 +26,10 @@ RIG = "gachon_8_6.yaml"
 
 def demo(
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder to make", metavar="DIR")
+        Path | None, typer.Option("-o", "--output", help="folder to create", metavar="DIR")
     ] = None,
     environment: Annotated[
-        int, typer.Option(min=1, max=3, help="which of the paper's environments")
+        int, typer.Option(min=1, max=3, help="number of the paper's environment")
     ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
 ) -> None:

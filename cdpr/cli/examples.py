@@ -10,16 +10,17 @@ import typer
 
 def examples(
     names: Annotated[
-        list[str] | None, typer.Argument(help="which to copy; all are listed without one")
+        list[str] | None, typer.Argument(help="examples to copy; without a name, all are listed")
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help="folder to copy to; the present one without it", metavar="DIR"
+            "-o", "--output", help="folder to copy to (default: the current one)", metavar="DIR"
         ),
     ] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="copy all, into configs/ and examples/ as in a clone")
+        bool,
+        typer.Option("--all", help="copy all, into configs/ and examples/ as in the repository"),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the list as JSON")] = False,
@@ -40,7 +41,7 @@ def examples(
     from model.files.examples import copy_examples, find_examples, select_examples
 
     if names and everything:
-        raise BadInput("--all copies every example already", next_step="leave the names out")
+        raise BadInput("--all copies every example already", next_step="leave out the names")
     if output is not None and not (names or everything):
         raise BadInput("-o needs something to copy", next_step="name an example, or pass --all")
     known = find_examples(configs(), configs("examples"))

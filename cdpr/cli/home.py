@@ -47,43 +47,42 @@ def home(
     ] = False,
     pose_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--pose-mm", help="a jig holds it level at x y z"),
+        typer.Option("--pose-mm", help="a jig holds the platform level at x y z"),
     ] = None,
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="it hangs free, and this camera measures it: 'synthetic', an index, or of another"
-            " camera than the rig file's first NAME=SOURCE",
+            help="the platform hangs freely and a camera measures it: 'synthetic', an index, or for"
+            " a camera other than the rig file's first, NAME=SOURCE",
             metavar="SOURCE",
         ),
     ] = None,
     calibration: CalibrationOption = None,
     as_rig_file: Annotated[
         bool,
-        typer.Option(
-            "--as-rig-file", help="move nothing: absolute encoders count what the rig file says"
-        ),
+        typer.Option("--as-rig-file", help="move nothing: absolute encoders match the rig file"),
     ] = False,
     tension_n: Annotated[
         float | None, typer.Option(help="pretension (default: twice the rig's smallest tension)")
     ] = None,
     limit_n: Annotated[
-        float | None, typer.Option(help="no cable may carry more (default: 60 % of the range)")
+        float | None, typer.Option(help="tension limit of any cable (default: 60 % of the range)")
     ] = None,
     reach_mm: Annotated[
         float,
-        typer.Option(min=0.1, max=1000.0 * FURTHEST, help="take up at most so much of a cable"),
+        typer.Option(min=0.1, max=1000.0 * FURTHEST, help="largest length to take up per cable"),
     ] = REACH_MM,
     speed_mm_s: Annotated[
-        float, typer.Option(min=0.01, max=FASTEST_MM_S, help="no winch is faster")
+        float, typer.Option(min=0.01, max=FASTEST_MM_S, help="largest winch speed")
     ] = SPEED_MM_S,
     pictures: Annotated[
-        int, typer.Option(min=FEWEST_PICTURES, max=MOST_PICTURES, help="to measure the pose in")
+        int,
+        typer.Option(min=FEWEST_PICTURES, max=MOST_PICTURES, help="number of images for the pose"),
     ] = PICTURES,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     simulated_slack_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="how slack simulated cables hang at most")
+        float, typer.Option(min=0.0, max=100.0, help="largest slack of simulated cables")
     ] = SLACK_MM,
     fast: FastOption = False,
     yes: YesOption = False,
@@ -120,7 +119,7 @@ def home(
                 "--fast": fast,
                 "--without-real-time": without_real_time,
             },
-            "--as-rig-file moves nothing and measures nothing",
+            "--as-rig-file neither moves nor measures",
         )
         _use_rig_file_counts(the_rig, asks, as_json)
         return
@@ -155,4 +154,4 @@ def _use_rig_file_counts(rig: Rig, asks: bool, as_json: bool) -> None:
     if as_json:
         show_json({"file": None})
     else:
-        out.print("no reference is kept; drives count what the rig file says at home")
+        out.print("no reference is stored; drives match the rig file at home")

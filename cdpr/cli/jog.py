@@ -36,35 +36,35 @@ def jog(
     rig: RigArgument,
     by_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--by-mm", help="how far: x y z, at most 50 mm"),
+        typer.Option("--by-mm", help="distance x y z, at most 50 mm"),
     ] = None,
     to_home: Annotated[
-        bool, typer.Option("--to-home", help="instead: to the rig's home pose, and turned as there")
+        bool, typer.Option("--to-home", help="move to the rig's home pose and orientation")
     ] = False,
     cable: Annotated[
         int | None, typer.Option("--cable", min=1, help="move one winch alone, with --mm")
     ] = None,
     mm: Annotated[
-        float | None, typer.Option("--mm", help="pay out so much; negative winds in; at most 50")
+        float | None, typer.Option("--mm", help="length to pay out, at most 50; negative winds in")
     ] = None,
     limit_n: Annotated[
-        float | None, typer.Option(help="with --cable: no cable may carry more (default: 60 %)")
+        float | None, typer.Option(help="with --cable: tension limit of any cable (default: 60 %)")
     ] = None,
-    scene: Annotated[
-        Path | None, typer.Option(help="what is in the way, and what the platform carries")
-    ] = None,
+    scene: Annotated[Path | None, typer.Option(help="scene file: obstacles and payload")] = None,
     no_scene: Annotated[
-        bool, typer.Option("--no-scene", help="jog although nobody says what is in the way")
+        bool, typer.Option("--no-scene", help="jog without a description of obstacles")
     ] = False,
     clearance_mm: Annotated[
         float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
     ] = None,
     speed_mm_s: Annotated[
-        float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="at most the rig's own speed")
+        float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
     ] = 1000.0 * SPEED,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="run folder to make (default: runs/jog, runs/jog-2 …)"),
+        typer.Option(
+            "-o", "--output", help="run folder to create (default: runs/jog, runs/jog-2 …)"
+        ),
     ] = None,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
@@ -100,12 +100,12 @@ def jog(
                 "--clearance-mm": clearance_mm,
                 "--output": output,
             },
-            "one cable alone is moved without a path, and nothing in its way is looked at",
+            "a single cable is moved without a path, and obstacles are not checked",
         )
         _one_cable(the_rig, cable, mm, limit_n, speed, fast, yes, without_real_time, as_json)
         return
     require_unused(
-        "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path has the rig's own limits"
+        "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
     by = None if by_mm is None else millimetres(list(by_mm))
     jogging.require_distance(by, to_home=to_home)
@@ -141,7 +141,7 @@ def _one_cable(
 ) -> None:
     if cable is None or mm is None:
         raise BadInput(
-            "one cable is moved with --cable N and --mm X together",
+            "a single cable needs both --cable N and --mm X",
             where="cdpr jog",
             next_step="pass both, or --by-mm X Y Z to move the platform",
         )
@@ -170,9 +170,9 @@ def _scene(path: Path | None, without: bool, clearance_mm: float | None) -> Scen
     """What is around; nothing only when somebody says so."""
     if (path is None) != without:
         raise BadInput(
-            "say what is in the way: either --scene SCENE or --no-scene",
+            "obstacles are not given: pass either --scene SCENE or --no-scene",
             where="--scene",
-            next_step="pass --scene with the file, or --no-scene if there is nothing to hit",
+            next_step="pass --scene with the file, or --no-scene if there are no obstacles",
         )
     if path is None:
         return None

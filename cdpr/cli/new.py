@@ -21,7 +21,7 @@ def new(
     coordinates: Annotated[
         Path | None,
         typer.Option(
-            "--from", help="CSV with a line a cable; asks nothing, defaults for all that is left"
+            "--from", help="CSV with one line per cable; no questions, defaults for the rest"
         ),
     ] = None,
     platform_mm: Annotated[_Point | None, typer.Option(metavar="X Y Z", help="its size")] = None,
@@ -38,14 +38,18 @@ def new(
     min_tension_n: Annotated[float | None, typer.Option(help="least tension of a cable")] = None,
     max_tension_n: Annotated[float | None, typer.Option(help="largest tension of a cable")] = None,
     drum_radius_mm: Annotated[float | None, typer.Option(help="radius of the drums")] = None,
-    gear_ratio: Annotated[float | None, typer.Option(help="motor turns a drum turn")] = None,
-    counts_per_rev: Annotated[int | None, typer.Option(help="encoder counts a motor turn")] = None,
+    gear_ratio: Annotated[float | None, typer.Option(help="motor turns per drum turn")] = None,
+    counts_per_rev: Annotated[
+        int | None, typer.Option(help="encoder counts per motor turn")
+    ] = None,
     encoder: Annotated[str | None, typer.Option(help="absolute or incremental")] = None,
     max_speed_mm_s: Annotated[float | None, typer.Option(help="largest cable speed")] = None,
-    torque_constant_n: Annotated[float | None, typer.Option(help="tension at rated torque")] = None,
-    interface: Annotated[str | None, typer.Option(help="python-can's name of the bus")] = None,
+    torque_constant_n: Annotated[
+        float | None, typer.Option(help="cable tension at rated torque")
+    ] = None,
+    interface: Annotated[str | None, typer.Option(help="python-can interface of the bus")] = None,
     channel: Annotated[str | None, typer.Option(help="channel of the bus")] = None,
-    bitrate: Annotated[int | None, typer.Option(help="of the bus, bit/s")] = None,
+    bitrate: Annotated[int | None, typer.Option(help="bit rate of the bus, bit/s")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
     """Ask for the least that a rig file needs, and write a commented one.
@@ -79,7 +83,7 @@ def new(
     name = shlex.quote(str(rig))
     out.print(f"wrote {rig}: {answers['cables']} cables", markup=False, soft_wrap=True)
     out.print(
-        f"next: read it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE",
+        f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE",
         markup=False,
         soft_wrap=True,
     )
@@ -95,13 +99,13 @@ def _ask(question: RigQuestion, default: str) -> str:
     if not line.endswith("\n"):
         print(file=sys.stderr)
         raise BadInput(
-            f"the answers ended at the question about {question.text!r}",
+            f"no answer to the question about {question.text!r}",
             where="cdpr new",
-            why="standard input is at its end; nothing was written",
+            why="standard input ended; nothing was written",
             next_step="answer every question, or give the cables with --from FILE.csv",
         )
     return line.strip()
 
 
 def _refuse(reason: str) -> None:
-    print(f"  {reason}; once more", file=sys.stderr)
+    print(f"  {reason}; try again", file=sys.stderr)

@@ -10,9 +10,9 @@ from cdpr.cli.output import out, show_json
 from executor.remote.client import request_run
 
 _Process = Annotated[
-    int | None, typer.Option("--process", help="which run, where several are under way")
+    int | None, typer.Option("--process", help="process number, if several runs are in progress")
 ]
-_Json = Annotated[bool, typer.Option("--json", help="print how the run stands, as JSON")]
+_Json = Annotated[bool, typer.Option("--json", help="print the run's status as JSON")]
 
 
 def hold(process: _Process = None, as_json: _Json = False) -> None:
@@ -37,7 +37,8 @@ def resume(process: _Process = None, as_json: _Json = False) -> None:
 
 def speed(
     percent: Annotated[
-        int, typer.Argument(min=1, max=100, help="of the planned speed", metavar="PERCENT")
+        int,
+        typer.Argument(min=1, max=100, help="percentage of the planned speed", metavar="PERCENT"),
     ],
     process: _Process = None,
     as_json: _Json = False,
@@ -56,9 +57,9 @@ def _tell(verb: str, process: int | None, as_json: bool, percent: int | None = N
     if as_json:
         show_json(status)
         return
-    wish = {"hold": "hold", "resume": "go on", "speed": f"go at {percent} %"}[verb]
+    wish = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
     out.print(
-        f"process {status['process']} was told to {wish}; it is {status['state']}", soft_wrap=True
+        f"asked process {status['process']} to {wish}; it is {status['state']}", soft_wrap=True
     )
     if verb == "speed" and status["wished"]["hold"]:
-        out.print("it holds: the speed counts from `cdpr resume` on")
+        out.print("it is on hold: the speed applies after `cdpr resume`")

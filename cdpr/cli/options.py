@@ -22,10 +22,10 @@ PlanFileOption = Annotated[Path, typer.Option("-o", "--output", help="plan file 
 ReplacePlanOption = Annotated[bool, typer.Option("--force", help="replace an existing plan file")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
 WorkersOption = Annotated[
-    int | None, typer.Option(min=1, help="processes; else one a core", metavar="N")
+    int | None, typer.Option(min=1, help="number of processes (default: one per core)", metavar="N")
 ]
 DaskOption = Annotated[
-    str | None, typer.Option(help="do the work on this Dask cluster", metavar="ADDRESS")
+    str | None, typer.Option(help="compute on this Dask cluster", metavar="ADDRESS")
 ]
 Triple = tuple[float, float, float]
 
@@ -78,13 +78,13 @@ def _parameters(group: Any) -> list[inspect.Parameter]:
 
 InterfaceOption = Annotated[
     str | None,
-    typer.Option("--interface", help="python-can interface instead of the rig file's"),
+    typer.Option("--interface", help="python-can interface, overriding the rig file's"),
 ]
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="its channel")]
-FastOption = Annotated[
-    bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
+FastOption = Annotated[bool, typer.Option("--fast", help="simulated time, as fast as possible")]
+YesOption = Annotated[
+    bool, typer.Option("--yes", help="do not ask before moving drives on a real bus")
 ]
-YesOption = Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")]
 NoQuestionOption = Annotated[bool, typer.Option("--yes", help="do not ask")]
 WithoutRealTimeOption = Annotated[
     bool,
@@ -104,7 +104,7 @@ def rig_on_bus(
 
 
 def require_unused(verb: str, options: Mapping[str, object], why: str) -> None:
-    """Refuses options that would have no effect: whoever gave one expects something else.
+    """Refuses options that would have no effect, as they show a misunderstanding.
 
     Args:
         verb: As it is called, ``cdpr jog``.

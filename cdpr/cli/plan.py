@@ -44,28 +44,28 @@ def plan(
     output: PlanFileOption,
     seed: Annotated[
         int,
-        typer.Option(min=0, help="of the random numbers; with --rounds the same plan again"),
+        typer.Option(min=0, help="random seed; with --rounds the plan is reproducible"),
     ] = 0,
     calibration: CalibrationOption = None,
     clearance_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
+        float | None, typer.Option(min=0.0, help="obstacle clearance, overriding the scene's")
     ] = None,
     search: SearchOptions = DEFAULT_SEARCH,
     start_mm: Annotated[
-        Triple | None, typer.Option(help="start instead of the scene's: x y z")
+        Triple | None, typer.Option(help="start position x y z, overriding the scene's")
     ] = None,
     goal_mm: Annotated[
-        Triple | None, typer.Option(help="goal instead of the scene's: x y z")
+        Triple | None, typer.Option(help="goal position x y z, overriding the scene's")
     ] = None,
     via_mm: Annotated[
         list[str] | None,
         typer.Option(
-            help="way-pose before the scene's stops: x y z; again for more", metavar="X Y Z"
+            help="position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
         ),
     ] = None,
     from_run: Annotated[
         Path | None,
-        typer.Option(help="begin where this run ended, with the stops left", metavar="RUNDIR"),
+        typer.Option(help="start where this run ended, with the remaining stops", metavar="RUNDIR"),
     ] = None,
     force: ReplacePlanOption = False,
     as_json: JsonOption = False,
@@ -87,7 +87,9 @@ def plan(
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
     if from_run is not None and start_mm is not None:
-        raise BadInput("--from-run and --start-mm both say where to begin", next_step="give one")
+        raise BadInput(
+            "--from-run and --start-mm contradict each other", next_step="leave out one of them"
+        )
     the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
     done: Sequence[StopDocument] = ()
     begun: list[tuple[str, str]] = []

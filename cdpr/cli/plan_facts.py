@@ -57,7 +57,7 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
 
 def _before(document: PlanDocument) -> str:
     is_paper = isinstance(document.planner, PlannerDocument)
-    return "before post-processing" if is_paper else "when first found"
+    return "before post-processing" if is_paper else "first path found"
 
 
 def _rotation(document: PlanDocument) -> list[tuple[str, str]]:
@@ -71,7 +71,7 @@ def _rotation(document: PlanDocument) -> list[tuple[str, str]]:
     way = sum(
         math.hypot(a.distance_to(b) * 1e3, radius * a.angle_to(b)) for a, b in pairwise(poses)
     )
-    text = f"tilted up to {tilt:.2f}°, turned up to {turn:.2f}°; {way:.1f} mm long with turning"
+    text = f"tilted up to {tilt:.2f}°, rotated up to {turn:.2f}°; {way:.1f} mm with rotation"
     return [("rotation", text)]
 
 
@@ -79,7 +79,7 @@ def _search_sentence(document: PlanDocument) -> str:
     statistics, planner = document.statistics, document.planner
     rest = f"{statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s"
     if isinstance(planner, OptimalPlannerDocument):
-        search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of it searching"
+        search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of search"
         again = " ".join(f"--rounds {rounds}" for rounds in planner.rounds)
-        return f"{sum(planner.rounds)} rounds (again: {again}), {rest}{search}"
+        return f"{sum(planner.rounds)} rounds (to repeat: {again}), {rest}{search}"
     return f"{statistics.nodes} nodes, {statistics.iterations} samples, {rest}"

@@ -47,5 +47,5 @@ def release(
         reference = reference_dict(result.reference)
         show_json({"drives": list(result.drives), "reference": reference})
         return
-    out.print(f"no drive has torque any more: {', '.join(sorted(set(result.drives)))}")
+    out.print(f"all drives are without torque: {', '.join(sorted(set(result.drives)))}")
     out.print(f"reference: {reference_text(result.reference)}", soft_wrap=True, markup=False)

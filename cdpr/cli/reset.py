@@ -54,7 +54,7 @@ def reset(
     out.print(f"drives: {', '.join(sorted(set(result.drives)))}", soft_wrap=True)
     if result.restarted:
         names = ", ".join(the_rig.drive_names[node] for node in result.restarted)
-        out.print(f"switched on since they were last set up: {names}", soft_wrap=True)
+        out.print(f"power-cycled since their last configuration: {names}", soft_wrap=True)
     out.print(f"reference: {reference_text(result.reference)}", soft_wrap=True, markup=False)
-    latch_now = "the latch is off" if result.was_latched else "nothing was latched"
-    out.print(f"{latch_now}; the next run starts only from where the platform stands now")
+    latch_now = "the fault latch is released" if result.was_latched else "no fault was latched"
+    out.print(f"{latch_now}; the next run must start from the platform's present pose")

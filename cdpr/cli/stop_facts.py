@@ -1,4 +1,4 @@
-"""How the stops of a scene are told."""
+"""How the stops of a scene are shown."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
             x, y, z = map(float, text.split())
         except ValueError:
             raise BadInput(
-                f"--via-mm {text}: needs three numbers", next_step="write --via-mm 0 40 430"
+                f"--via-mm {text}: three numbers are required", next_step="write --via-mm 0 40 430"
             ) from None
         if not all(map(math.isfinite, (x, y, z))):
             raise BadInput(
-                f"--via-mm {text}: needs finite numbers", next_step="write --via-mm 0 40 430"
+                f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
             )
         ways.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
     return scene.changed(stops=[*ways, *scene.document.stops]) if ways else scene

@@ -74,7 +74,7 @@ def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
             (f"{name}_costs", partial(cost_figure, maps)),
         ]
         text = (
-            "Red lines: where a limit is reached. Colours leave out the most extreme hundredth"
+            "Red lines: where a limit is reached. Colours leave out the most extreme 1 %"
             " at each end. The two surfaces are the paper's Fig. 7."
         )
         return f"Slice {title_of(maps.grid)}", text, figures

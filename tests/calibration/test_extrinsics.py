@@ -178,7 +178,7 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
     verdict = judge_extrinsics(found, 1.0)
     assert not verdict.good
     assert any("from where the rig file puts it" in reason for reason in verdict.reasons)
-    assert any("again, or take it out of the rig file" in step for step in verdict.next_steps)
+    assert any("again, or remove it from the rig file" in step for step in verdict.next_steps)
 
 
 @pytest.mark.parametrize(("count", "seen"), [(1, "1 frame tag is"), (2, "2 frame tags are")])
@@ -189,7 +189,7 @@ def test_too_few_tags_are_not_good_enough(rig: Rig, count: int, seen: str) -> No
     found = locate_by_frame_tags(rig, camera, sights, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
     assert f"{seen} seen, 3 are needed" in verdict.reasons
-    assert "survey more tags, all around what the camera sees" in verdict.next_steps
+    assert "survey more tags, all around the camera's view" in verdict.next_steps
 
 
 def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> None:
@@ -276,7 +276,7 @@ def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
     more = [("blank.png", blank), ("copy.png", image.copy())]
     sights = sights_of([*pictures, *more], rig, camera, numbers(rig))
     assert sights.unused == {
-        "blank.png": "shows none of the tags whole",
+        "blank.png": "shows no complete tag",
         "copy.png": f"is the same picture as {first}",
     }
     assert sights.squares.keys() == {name for name, _ in pictures}
@@ -308,7 +308,7 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(rig: Rig, pictures) -> 
     doubled = image.copy()
     doubled[4 : 4 + patch.shape[0], 4 : 4 + patch.shape[1]] = patch
     sights = sights_of([(name, doubled)], rig, camera, numbers(rig))
-    assert sights.unused == {f"{name}, tag 402": "is seen more than once"}
+    assert sights.unused == {f"{name}, tag 402": "is detected more than once"}
     assert 402 not in sights.squares[name]
     assert sights.squares[name].keys() == seen.keys() - {402}
 

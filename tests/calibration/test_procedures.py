@@ -45,7 +45,7 @@ def test_a_folder_becomes_a_result_file_and_a_report(folder: Path, tmp_path: Pat
     heard = Heard()
     to = Destination(tmp_path, on=ON)
     made = calibrate_camera(folder, BOARD, name="front", to=to, listener=heard)
-    assert heard.totals == [("looking for the board", 6)]
+    assert heard.totals == [("detecting the board", 6)]
     assert [path.name for path in made.files] == [
         "calibration_camera_front_2026-03-01.yaml",
         "calibration_camera_front_2026-03-01.html",

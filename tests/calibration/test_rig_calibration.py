@@ -548,7 +548,7 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
             covariances=run.covariances[:8],
         ),
     )
-    assert blind.unused == {"blind, rest 2": "no picture taken there gave a pose"}
+    assert blind.unused == {"blind, rest 2": "no image taken there gave a pose"}
     assert len(joined([found, blind])) == 3
 
 
@@ -586,7 +586,7 @@ def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool)
     result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     compliance = compliance_told(result)
     assert compliance is not None
-    assert 1.0 / compliance.told == pytest.approx(6000.0, rel=0.05 if poses else 0.35)
+    assert 1.0 / compliance.estimated == pytest.approx(6000.0, rel=0.05 if poses else 0.35)
     verdict = judge_rig(result, 1e-3, 0.0).verdict
     assert not verdict.good
     assert any("848230 N" in reason for reason in verdict.reasons)
@@ -602,8 +602,8 @@ def test_the_stiffness_that_the_data_tell_is_the_same_for_every_rig_file(
     compliance, differences = compliance_told(result), differences_told(result)
     assert compliance is not None
     assert differences is not None
-    assert 1.0 / compliance.told == pytest.approx(6000.0, rel=0.05)
-    assert 1.0 / differences.told == pytest.approx(6000.0, rel=0.3)
+    assert 1.0 / compliance.estimated == pytest.approx(6000.0, rel=0.05)
+    assert 1.0 / differences.estimated == pytest.approx(6000.0, rel=0.3)
 
 
 def test_a_stiffness_far_from_the_rig_file_is_told_as_a_factor(rig: Rig, turned: Truth) -> None:
@@ -645,8 +645,8 @@ def test_cables_that_differ_are_told_and_others_are_not(rig: Rig) -> None:
         assert differences is not None
         reasons = judge_rig(result, 1e-3, 0.0).verdict.reasons
         assert any("the cables differ" in reason for reason in reasons) == (weak < 6000.0)
-    assert np.argmax(differences.told) == 2
-    assert 1.0 / differences.told[2] == pytest.approx(3000.0, rel=0.25)
+    assert np.argmax(differences.estimated) == 2
+    assert 1.0 / differences.estimated[2] == pytest.approx(3000.0, rel=0.25)
     blind = replace(data, tensions=np.full_like(data.tensions, np.nan))
     told = fit_rig(built, blind, {"offsets": 2e-3}, LENGTH_DEVIATION)
     assert differences_told(told) is None

@@ -146,10 +146,10 @@ def test_what_pictures_cannot_tell_is_said(rig: Rig) -> None:
     }
     squares["alone.png"] = {301: next(s[301] for s in squares.values() if 301 in s)}
     found = measure_layout(rig, rig.cameras[0], TagSights(squares, {}))
-    assert found.unseen == {306: "was not seen together with the others"}
+    assert found.unseen == {306: "was not detected together with the others"}
     assert "one tag only" in found.unused["alone.png"]
     verdict = judge_layout(found, 1e-3)
-    assert "take pictures that show tag 306 together with others" in verdict.next_steps
+    assert "take images that show tag 306 together with others" in verdict.next_steps
 
 
 def test_sizes_that_are_not_as_told_are_noticed(rig: Rig) -> None:
@@ -198,7 +198,7 @@ def test_pictures_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
     sights = sights_at(camera, rig.platform_tags, poses, 0.02, rng)
     verdict = judge_layout(measure_layout(rig, camera, sights), 1.0)
     assert any("all pictures are taken from within" in reason for reason in verdict.reasons)
-    assert "take pictures from all sides, not alike" in verdict.next_steps
+    assert "take images from all sides, all different" in verdict.next_steps
 
 
 def test_too_few_pictures_and_tags_are_refused(rig: Rig) -> None:

@@ -110,7 +110,7 @@ def test_a_poor_set_with_small_errors_is_not_good_enough(tmp_path) -> None:
     found = json.loads(answer.out)
     assert found["rms_px"] < 0.1
     assert found["verdict"].startswith("not good enough")
-    assert "tilt the board up to 40° every way" in found["next_steps"]
+    assert "tilt the board up to 40° in every direction" in found["next_steps"]
     assert any("edges and corners" in step for step in found["next_steps"])
 
 

@@ -121,7 +121,7 @@ def test_the_pictures_of_another_camera_are_refused(short_plan: Path, tmp_path: 
     two.write_text(yaml.safe_dump(document))
     options = ("--poses", run, "--camera", "side")
     answer = call("calibrate", "extrinsics", two, run / "pictures", *options)
-    one_message(answer, 2, "camera 'side' took no pictures in this run", "front")
+    one_message(answer, 2, "camera 'side' took no images in this run", "front")
 
 
 @pytest.mark.parametrize("number", ["inf", "nan"])

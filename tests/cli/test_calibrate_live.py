@@ -53,7 +53,7 @@ def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None
     other = ("--board", "charuco", "--columns", "5", "--rows", "4", "--square-mm", "25")
     other += ("--marker-mm", "20")
     answer = call("calibrate", "camera", tmp_path / "taken", "--live", video, *other)
-    one_message(answer, 2, "no picture was taken", "a ChArUco board of 5 x 4 squares")
+    one_message(answer, 2, "no image was captured", "a ChArUco board of 5 x 4 squares")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None
     [
         (("--live", "nowhere.avi"), 2, "neither a folder of pictures"),
         (("--live", "97"), 4, "the camera cannot be opened"),
-        (("--pictures", "12"), 2, "are for taking pictures"),
+        (("--pictures", "12"), 2, "are for capturing images"),
     ],
 )
 def test_cameras_that_are_none_are_told(tmp_path: Path, options, code: int, named: str) -> None:

@@ -146,4 +146,4 @@ def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: st
 def test_pictures_of_no_platform_are_told(folder, tmp_path) -> None:
     (tmp_path / "a.png").write_bytes((folder / "wall.png").read_bytes())
     answer = call("calibrate", "tags", RIG, tmp_path)
-    one_message(answer, 2, "none of the tag36h11 tags 301", "a.png shows none of the tags whole")
+    one_message(answer, 2, "none of the tag36h11 tags 301", "a.png shows no complete tag")

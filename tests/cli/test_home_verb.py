@@ -143,7 +143,7 @@ def test_a_lost_reference_can_be_dropped_for_what_absolute_encoders_count(tmp_pa
         MotionInterlock(rig).require_ready()
     asked = call("home", RIG, "--as-rig-file", *bus, answers="n\n")
     assert asked.code == 130
-    assert "does not count: the homing reference is lost: emergency stop" in asked.out
+    assert "not valid: the homing reference is lost: emergency stop" in asked.out
     assert MotionInterlock(rig).file.path.is_file()
     assert call("home", RIG, "--as-rig-file", *bus, "--yes").code == 0
     MotionInterlock(rig).require_ready()

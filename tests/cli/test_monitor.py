@@ -159,7 +159,7 @@ def _record(cycle: int) -> CycleRecord:
         ({"state": "finished"}, 0, "ended: finished"),
         ({"state": "stopped", "cause": "stop requested"}, 130, "ended: stopped, stop requested"),
         ({"state": "latched", "cause": "cable 6 is slack"}, 1, "latched, cable 6 is slack"),
-        ({}, 1, "without a last word; last seen holding"),
+        ({}, 1, "without a final status; last state holding"),
     ],
 )
 def test_the_monitor_ends_as_the_run_did(

@@ -84,7 +84,7 @@ def test_a_run_that_failed_has_a_next_step_and_its_faults_explained(
     lines = capsys.readouterr().out.splitlines()
     assert says in lines[-1]
     assert lines[-1].startswith("  next: ")
-    (explained,) = (commands_in(line)[0] for line in lines if "more about it" in line)
+    (explained,) = (commands_in(line)[0] for line in lines if "details" in line)
     assert call(*explained).out.strip() == page_text("drive_silent").strip()
 
 
@@ -96,7 +96,7 @@ def test_a_run_that_went_well_points_to_no_fault(
     events = [{"code": "pass"}, {"code": "reply_lost"}]
     summary = {"verdict": verdict, "sentence": "", "reasons": [], "events": events}
     show_summary(summary, Path("run"), as_json=False)
-    assert "more about it" not in capsys.readouterr().out
+    assert "details" not in capsys.readouterr().out
 
 
 STANDING: dict[str, Any] = {
@@ -131,7 +131,7 @@ def test_a_jig_has_no_uncertainty_of_nothing() -> None:
     homed = call("home", RIG, "--at-home", "--fast")
     assert homed.code == 0, homed
     assert "0.000" not in homed.out
-    assert "that of the jig, which was not measured" in homed.out
+    assert "that of the jig (not measured)" in homed.out
 
 
 def test_no_coordinate_is_a_negative_zero(short: Path, tmp_path: Path) -> None:

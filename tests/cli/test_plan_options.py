@@ -29,13 +29,13 @@ SCENE = CONFIGS / "environment_1.yaml"
         (["--planner", "adaptive", "--cost", "clearance"], ["adaptive", "clearance"]),
         (["--budget-ms", "5", "--rounds", "5"], ["--budget-ms", "--rounds", "give one"]),
         (["--cost", "length", "--weight", "length=1"], ["--cost", "--weight", "give one"]),
-        (["--weight", "speed=1"], ["speed", "no objective", "kinematic"]),
+        (["--weight", "speed=1"], ["speed", "not an objective", "kinematic"]),
         (["--weight", "length=1", "--weight", "length=2"], ["length", "appears twice"]),
-        (["--weight", "length=much"], ["much", "no number"]),
-        (["--weight", "length"], ["no number"]),
+        (["--weight", "length=much"], ["much", "not a number"]),
+        (["--weight", "length"], ["not a number"]),
         (["--weight", "length=-1"], ["length", "0 or more"]),
         (["--weight", "length=nan"], ["length", "0 or more"]),
-        (["--weight", "clearance=1"], ["no reason to end", "length"]),
+        (["--weight", "clearance=1"], ["path length is unbounded", "length"]),
     ],
 )
 def test_options_that_cannot_be_heeded_are_one_clear_message(

@@ -88,7 +88,9 @@ def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), grey[:, ::-1])
     rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
     answer = call("track", rig, tmp_path, "-o", tmp_path / "poses.csv")
-    one_message(answer, 2, "a.png shows no tag of any known family; flipped over they are there")
+    one_message(
+        answer, 2, "a.png shows no tag of any known family; the expected tags appear mirrored"
+    )
 
 
 def test_tags_that_are_not_as_told_are_named_as_the_cause(tmp_path: Path) -> None:

@@ -164,7 +164,7 @@ FAULTS: dict[str, tuple[Callable[[OdriveBench], object], str, int]] = {
         "(drive 3) does not report its torque",
         7,
     ),
-    "no number": (
+    "not a number": (
         lambda b: setattr(b.drives[2].motor, "position", float("nan")),
         "(drive 3): its position is not a number",
         3,

@@ -91,7 +91,7 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     run = tmp_path / "run"
     answer = call("run", narrow_plan, "--rig", rig_file, "-o", run, "--fast")
     assert answer.code == 1, answer
-    assert "below 10 mm, as the cameras see it" in answer.out
+    assert "below 10 mm, measured by the cameras" in answer.out
     assert "front (synthetic)" in answer.out
     assert "too near" in answer.said
     assert "the scene requires 10 mm" in answer.said
@@ -104,7 +104,7 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     (low,) = (event["text"] for event in summary["events"] if event["code"] == "clearance_low")
     assert re.search(r"to block \[/left\]: \d+\.\d ± \d\.\d mm; the scene requires 10 mm", low)
     assert "to block [/left]: " in answer.said
-    assert "more about it: cdpr explain clearance_low" in answer.said
+    assert "details: cdpr explain clearance_low" in answer.said
 
 
 def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(

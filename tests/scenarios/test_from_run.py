@@ -260,7 +260,7 @@ def test_a_folder_without_its_cycles_or_with_silent_drives_is_refused(
     (folder.path / "cycles.csv").unlink()
     one_message(call(*arguments), 2, "incomplete run folder", "cycles.csv missing")
     both = call(*arguments, "--start-mm", "0", "0", "445")
-    one_message(both, 2, "--from-run and --start-mm both say where to begin")
+    one_message(both, 2, "--from-run and --start-mm contradict each other")
 
 
 def test_way_poses_of_the_command_line_are_met_before_the_scenes_stops(

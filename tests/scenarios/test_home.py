@@ -152,7 +152,7 @@ def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
     custody = MotionInterlock(kept)
 
     def at_rest(stand: WinchesStand) -> HomingReference:
-        with pytest.raises(Refused, match="under way"):
+        with pytest.raises(Refused, match="in progress"):
             MotionInterlock(kept).require_free()
         return reference_at(kept, kept.home, stand.counts, stand.tensions, "stated pose", 0.0)
 
@@ -535,7 +535,7 @@ def test_a_pose_that_is_not_known_well_is_refused() -> None:
     rig = load_rig(RIG)
     home = rig.home
     away = Pose.level(home.position + np.array([0.004, 0.0, 0.0]))
-    with pytest.raises(Refused, match="does not stand still"):
+    with pytest.raises(Refused, match="is not at rest"):
         rest_pose(rig, looks(rig, home, away, home, away))
     far = Pose.level(home.position + np.array([5.0, 5.0, 0.0]))
     with pytest.raises(Refused, match="0 of 2 pictures"):

@@ -72,7 +72,7 @@ def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
     running = FaultLatch(BUS)
     running.engage("rig", tmp_path)
     for ask in (FaultLatch(BUS).require_disengaged, FaultLatch(BUS).require_no_run):
-        with pytest.raises(Refused, match=f"process {os.getpid()}.*under way"):
+        with pytest.raises(Refused, match=f"process {os.getpid()}.*in progress"):
             ask()
     running.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
     FaultLatch(BUS).require_no_run()
@@ -101,7 +101,7 @@ def test_of_two_that_begin_at_once_one_is_refused(
     first = FaultLatch(BUS)
     first.path.parent.mkdir(parents=True)
     first._hold()  # it is about to write why
-    with pytest.raises(Refused, match="under way"):
+    with pytest.raises(Refused, match="in progress"):
         FaultLatch(BUS).engage("rig", tmp_path)
     assert first.read() is None
     first.engage("rig", tmp_path)
@@ -147,7 +147,7 @@ def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
     tmp_path: Path,
 ) -> None:
     latch = FaultLatch(BUS)
-    with pytest.raises(Refused, match=r"reset .*under way"), latch.held_for_reset("rig", None):
+    with pytest.raises(Refused, match=r"reset .*in progress"), latch.held_for_reset("rig", None):
         FaultLatch(BUS).engage("rig", tmp_path)
     latch.require_disengaged()
     latch.engage("rig", tmp_path, "cable 3 is slack")

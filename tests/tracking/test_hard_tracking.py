@@ -72,7 +72,7 @@ def test_two_prints_of_one_tag_are_told_apart_by_nothing(
     image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
     found = Tracker(one, camera).observe(image, 0.0)
     assert isinstance(found, NoPose)
-    assert "do not agree" in found.reason
+    assert "inconsistent" in found.reason
 
 
 def test_another_print_of_a_frame_tag_does_not_move_the_camera(

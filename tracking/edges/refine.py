@@ -1,7 +1,7 @@
 """Tag corners to hundredths of a pixel: lines fitted to the four edges of the black square.
 
 A blurred step from ink to paper is fitted to the pixels beside each edge, freed of what its corners
-and the modules next to it add. Pixels tell their noise themselves, so each line comes with what it
+and the modules next to it add. Pixels show their noise themselves, so each line comes with what it
 may be off. The lines are freed of lens distortion and meet at the corners.
 """
 
@@ -62,7 +62,7 @@ def meet(lines: Lines, rough: Array) -> Array:
 
 #: An edge is used only if this share of it looks like one.
 LEAST_SHARE = 0.4
-#: Where the brightness of pixels tells so little that one pixel of its length places an edge no
+#: Where the brightness of pixels says so little that one pixel of its length places an edge no
 #: better than this, there is none, [px].
 MOST_SCATTER = 1.2
 
@@ -181,7 +181,7 @@ SECOND_ROW = 1.0
 CROWDED = 0.22
 #: Elsewhere they are fitted again only if they move by more than `FAR`, [px].
 NEAR, FAR = 0.03, 0.3
-#: At most so many fits.
+#: Largest number of fits.
 MOST_FITS = 4
 
 
@@ -233,7 +233,7 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     if not len(corners):
         return []
     pixels = np.ascontiguousarray(image)[:]
-    pixels.flags.writeable = False  # kernels are compiled for pictures that nobody writes to
+    pixels.flags.writeable = False  # kernels are compiled for pictures that are read-only
     rough = np.array(corners, dtype=np.float64)
     inside = _inside(rough, image.shape)
     curves = EdgeCurves.between(camera, np.where(inside, rough, _somewhere(image.shape)))

@@ -19,7 +19,7 @@ def apply(
         list[Path], typer.Argument(help="result files of `cdpr calibrate`", metavar="RESULT...")
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="rig file to write; it must not exist yet")
+        Path, typer.Option("-o", "--output", help="rig file to write; must not exist yet")
     ],
     as_json: JsonOption = False,
 ) -> None:

@@ -34,14 +34,16 @@ def extrinsics(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="go by the rig's motion: poses by picture (CSV), or the folder of a run",
+            help="use the rig's motion: poses per image (CSV), or a run folder",
             metavar="FILE",
         ),
     ] = None,
     survey_mm: Annotated[
         float,
         typer.Option(
-            min=0.0, callback=finite, help="how well corners of frame tags were surveyed, deviation"
+            min=0.0,
+            callback=finite,
+            help="standard deviation of the surveyed corners of frame tags",
         ),
     ] = 0.5,
     survey_deg: Annotated[
@@ -49,7 +51,7 @@ def extrinsics(
         typer.Option(
             min=0.0,
             callback=finite,
-            help="how well turns of frame tags are known, deviation; --survey-mm is then of whole"
+            help="standard deviation of frame tags' rotations; --survey-mm is then of whole"
             " tags (default: each corner was surveyed by itself)",
         ),
     ] = None,
@@ -88,7 +90,7 @@ def extrinsics(
     found = made.found
     facts = [
         ("by", f"{found.by}, {found.pictures} pictures"),
-        *((f"tag {k}", f"{error:.3f} px off") for k, error in found.tag_errors.items()),
+        *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
         *moved_rows(the_camera.world_from_camera, found.world_from_camera),
     ]
     show_calibration(made, facts, as_json)

@@ -30,7 +30,9 @@ def tags(
     camera: CameraOption = None,
     fixed_tag: Annotated[
         int | None,
-        typer.Option(min=0, help="this tag is as in the rig file (default: all fit it best)"),
+        typer.Option(
+            min=0, help="keep this tag as in the rig file (default: best fit of all tags)"
+        ),
     ] = None,
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
@@ -63,9 +65,12 @@ def tags(
     )
     found = made.found
     facts = [
-        ("pictures", f"{len(found.errors)} used, corners {found.reprojection:.3f} px off (RMS)"),
+        (
+            "pictures",
+            f"{len(found.errors)} used, reprojection error {found.reprojection:.3f} px RMS",
+        ),
         *(
-            (name, f"moved {shift} mm, turned {turn}° against the rig file; {count}")
+            (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
             for name, shift, turn, _, count in change_rows(found)
         ),
     ]

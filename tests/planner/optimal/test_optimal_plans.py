@@ -162,7 +162,7 @@ def test_a_longest_path_below_the_straight_way_is_refused_before_the_search(
     gachon, ready_scene
 ) -> None:
     settings = OptimalSettings(longest=0.5, budget=3600.0)
-    with pytest.raises(BadInput, match=r"500\.0 mm .* straight way is 518\.8 mm") as refusal:
+    with pytest.raises(BadInput, match=r"500\.0 mm .* straight line is 518\.8 mm") as refusal:
         make_plan(gachon, ready_scene("environment_1"), settings)
     assert "--longest-mm" in str(refusal.value)
 
@@ -237,7 +237,7 @@ def test_settings_that_no_search_could_use_are_refused(wrong, words) -> None:
         ({"length": -1.0}, "length"),
         ({"length": 1.0, "kinematic": math.nan}, "kinematic"),
         ({"length": math.inf}, "length"),
-        ({}, "no reason to end"),
+        ({}, "path length is unbounded"),
         ({"clearance": 1.0}, "give length a small weight"),
     ],
 )

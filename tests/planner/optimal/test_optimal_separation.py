@@ -104,7 +104,7 @@ def test_a_search_that_ends_too_early_says_that_nothing_is_proved(
         )
     said = str(nothing.value)
     assert "no path after 9 rounds" in said
-    assert "it is not proved that there is none" in said
+    assert "it is not proved that no path exists" in said
     assert "workspace" in said
     assert "raise --rounds" in said
     assert "proved" not in nothing.value.values
@@ -114,5 +114,5 @@ def test_a_limit_below_the_shortest_path_is_told(gachon, ready_scene) -> None:
     settings = OptimalSettings(weights=OBJECTIVES["kinematic"], rounds=20, longest=0.6)
     with pytest.raises(NoSolution, match=r"no path of at most 600\.0 mm was found") as nothing:
         make_plan(gachon, ready_scene("environment_1"), settings)
-    assert "the straight way 518.8 mm" in str(nothing.value)
+    assert "the straight line 518.8 mm" in str(nothing.value)
     assert nothing.value.values["found_mm"] > 600.0

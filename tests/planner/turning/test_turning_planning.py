@@ -135,7 +135,7 @@ def test_without_limits_in_the_scene_the_next_step_is_told() -> None:
 
 
 def test_ends_turned_differently_need_the_option() -> None:
-    with pytest.raises(BadInput, match="turned against each other by 6 deg") as caught:
+    with pytest.raises(BadInput, match="differ in orientation by 6 deg") as caught:
         make_plan(GACHON, RAMP)
     assert "--free-rotation" in str(caught.value)
 
