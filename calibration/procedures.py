@@ -1,4 +1,4 @@
-"""Whole calibrations: from pictures or runs to a judged result and its report.
+"""Whole calibrations: from images or runs to a judged result and its report.
 
 `calibration.load.with_calibrations` puts their result files into a rig.
 """
@@ -50,7 +50,7 @@ Found = TypeVar("Found", covariant=True)
 Quality = TypeVar("Quality", covariant=True)
 
 PicturesFrom = Pictures | str | Path | Callable[[], Pictures]
-"""Pictures, what opens them, or where they are: a folder, a video, a camera's index or address."""
+"""Images, what opens them, or where they are: a folder, a video, a camera's index or address."""
 USUAL_PICTURES, USUAL_TAG_PICTURES = 20, 40
 """Taken of a camera or a video to find where the camera is, and where tags are on the platform."""
 
@@ -181,7 +181,7 @@ def calibrate_camera(
         listener: Receives how far it is.
 
     Raises:
-        BadInput: Pictures of different sizes, or too few that show the board.
+        BadInput: Images of different sizes, or too few that show the board.
     """
     require_file_name(name, "--name")
     source = pictures if isinstance(pictures, Pictures) else pictures_in(pictures)
@@ -213,7 +213,7 @@ def locate_camera(
         rig: The robot, with its tags.
         camera: Its matrix and distortion hold.
         pictures: Taken while the camera does not move.
-        poses: The platform's by picture, or a CSV file of them, or a run folder: go by the rig's
+        poses: The platform's by image, or a CSV file of them, or a run folder: go by the rig's
             motion. Left out, by the tags on the frame.
         survey: How well the frame tags were surveyed; each corner to 0.5 mm when left out.
         wanted: What is good enough in the work space, 95 %, [m].
@@ -221,7 +221,7 @@ def locate_camera(
         listener: Receives how far it is.
 
     Raises:
-        BadInput: There are no tags, or too few pictures that show them.
+        BadInput: There are no tags, or too few images that show them.
     """
     require_file_name(camera.name, "cameras")
     known = poses_by_picture(poses, camera.name) if isinstance(poses, Path) else poses
@@ -253,7 +253,7 @@ def locate_tags(
     to: Destination | None = None,
     listener: Listener = SILENT,
 ) -> TagsOutcome:
-    """Finds where the tags are on the platform, from pictures that show two or more at once.
+    """Finds where the tags are on the platform, from images that show two or more at once.
 
     Args:
         rig: The robot, with its tags.
@@ -265,7 +265,7 @@ def locate_tags(
         listener: Receives how far it is.
 
     Raises:
-        BadInput: There are no tags, or too few pictures that show them.
+        BadInput: There are no tags, or too few images that show them.
     """
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)

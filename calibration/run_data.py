@@ -23,16 +23,16 @@ from model.rig import Rig
 
 
 def poses_by_picture(path: Path, camera: str) -> Mapping[str, Pose]:
-    """The platform's poses by picture, from a CSV file or the encoders of a run folder.
+    """The platform's poses by image, from a CSV file or the encoders of a run folder.
 
     Raises:
-        BadInput: It cannot be read, or the camera took no pictures in the run.
+        BadInput: It cannot be read, or the camera took no images in the run.
     """
     return poses_of_run(path, camera) if path.is_dir() else read_poses(path)
 
 
 def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
-    """Poses from the encoders when a camera's kept pictures of a run were taken.
+    """Poses from the encoders when a camera's kept images of a run were taken.
 
     Raises:
         BadInput: The camera took none.

@@ -197,7 +197,7 @@ class CyclicGroup(ABC):
 
     @abstractmethod
     def _advance(self) -> None:
-        """Sees whether the way under way has come to its end, or was not in time."""
+        """Checks whether the transition in progress has finished or timed out."""
 
     @abstractmethod
     def _status(self) -> CycleStatus:

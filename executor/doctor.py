@@ -190,7 +190,7 @@ def rig_bus(rig: Rig) -> list[MachineCheck]:
 
 
 def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
-    """Whether a camera opens and its pictures have the size that the rig file states."""
+    """Whether a camera opens and its images have the size that the rig file states."""
     if not rig.cameras:
         return [
             MachineCheck("camera", source is None, "the rig file has none", "leave out --camera")

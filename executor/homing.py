@@ -29,9 +29,9 @@ from model.rig import Camera, Rig
 
 #: A cable is taken up no further than this, [m], and no faster than that, [m/s].
 FURTHEST, FASTEST = 0.200, 0.010
-#: Defaults: reach [m] and speed [m/s] as above, pictures, and how slack simulated cables hang, [m].
+#: Defaults: reach [m] and speed [m/s] as above, images, and how slack simulated cables hang, [m].
 REACH, SPEED, PICTURES, SLACK = 0.050, 0.002, 20, 0.005
-#: Fewest and most pictures that measure the pose.
+#: Fewest and most images that measure the pose.
 FEWEST_PICTURES, MOST_PICTURES = 5, 1000
 
 
@@ -137,7 +137,7 @@ def home(
     speed = min(speed, rig.motion.speed)
     interlock = MotionInterlock(rig)
     interlock.require_free()
-    if eye is not None:  # it gives pictures, before anything is moved for it
+    if eye is not None:  # it gives images, before anything is moved for it
         look_at_rest(rig, eye, 1, rig.home, lambda: None, listener)
     fastest = float(wind_in_speed(rig, target, limit, speed).max())
     require_confirmed(confirm, HomingProposal(rig, target, limit, reach, speed, fastest, eye))

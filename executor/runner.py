@@ -270,7 +270,7 @@ def _load_what_the_end_needs() -> None:
 
 
 def _move_and_measure(job: _Job, moved: _Moved) -> None:
-    """The motion and its pictures; what fails once something moved is part of how it ended."""
+    """The motion and its images; what fails once something moved is part of how it ended."""
     board = SharedRequests() if job.options.realtime else LocalRequests()
     try:
         try:

@@ -48,7 +48,7 @@ class Supervisor:
         self.interrupted = False
 
     def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
-        """Runs a motion, from the opening of its devices to the last picture.
+        """Runs a motion, from the opening of its devices to the last image.
 
         Args:
             board: Takes requests to stop.

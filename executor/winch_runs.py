@@ -38,7 +38,7 @@ LIMIT_SHARE = 0.6
 _OF_COURSE = frozenset({"enabled", "moving", "held", "traceback"})
 
 AtRest = Callable[[WinchesStand, Pose | None, RequestBoard], HomingReference | None]
-"""Called after a motion that came to its end, with where the simulated platform is and where a stop
+"""Called after a motion that finished, with where the simulated platform is and where a stop
 is wished; the drives must have held all the while before the reference that it makes is kept."""
 
 

@@ -23,7 +23,7 @@ class CameraMoved(Fault):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCheck:
-    """How far frame tags lie from where the rig file puts them in the picture.
+    """How far frame tags lie from where the rig file puts them in the image.
 
     Attributes:
         tags: Numbers of the tags seen whole.

@@ -52,7 +52,7 @@ def project_undistorted(camera: Camera, points_in_camera: Array) -> Array:
     return np.asarray(scaled * [fx, fy] + camera.matrix[:2, 2])
 
 
-# Pictures and parts of them.
+# Images and parts of them.
 
 
 Image = NDArray[np.uint8]
@@ -69,10 +69,10 @@ class Region:
 
 
 def require_image_format(image: Image, camera: Camera, rig: str) -> None:
-    """A picture of another kind than the camera was calibrated for would measure wrongly.
+    """An image of another kind than the camera was calibrated for would measure wrongly.
 
     Args:
-        image: The picture.
+        image: The image.
         camera: Whose it should be.
         rig: Name of the rig that has it.
 

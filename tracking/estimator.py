@@ -1,4 +1,4 @@
-"""The platform in one picture, by the squares of its tags."""
+"""The platform in one image, by the squares of its tags."""
 
 from __future__ import annotations
 
@@ -84,11 +84,11 @@ def without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] 
 
 
 class PlatformEstimator:
-    """Measures the platform in a picture by what is seen in it, whatever pictures came before.
+    """Measures the platform in an image by what is seen in it, whatever images came before.
 
     Args:
         rig: Its tags and platform.
-        camera: The camera that took the pictures.
+        camera: The camera that took the images.
         settings: When a pose is believed.
     """
 
@@ -123,7 +123,7 @@ class PlatformEstimator:
         """The pose by tags that the detector found, and by those that it missed.
 
         Args:
-            image: The picture.
+            image: The image.
             time: When it was taken, [s].
             detections: What the detector found; nothing when it was not asked.
             expected: Expected pose, ``world_from_platform``, to separate a pose from

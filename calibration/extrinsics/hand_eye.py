@@ -1,7 +1,7 @@
 """A camera's pose from the rig's own motion: the platform's tags seen at encoder poses.
 
 With Z = world_from_camera, X = the tags' frame in the platform's, P the encoder pose
-and M the tags' pose in the camera's frame, Z M = P X at every picture. X is known from the rig file
+and M the tags' pose in the camera's frame, Z M = P X at every image. X is known from the rig file
 up to a small error; motion without rotation cannot separate it from Z, and then the rig file holds.
 
 Source: Tsai & Lenz 1989; solved for both at once as in Zhuang & Shiu 1993, by least squares.
@@ -114,16 +114,16 @@ class _HandEyeFit:
 def locate_by_motion(
     rig: Rig, camera: Camera, sights: TagSights, poses: Mapping[str, Pose]
 ) -> ExtrinsicCalibration:
-    """Finds a camera's place from pictures of the platform at known poses.
+    """Finds a camera's place from images of the platform at known poses.
 
     Args:
         rig: Its platform tags.
         camera: Its matrix and distortion hold; its place in the rig file does not matter.
         sights: Of platform tags.
-        poses: ``world_from_platform`` at each picture, from the rig's file of poses.
+        poses: ``world_from_platform`` at each image, from the rig's file of poses.
 
     Raises:
-        BadInput: Too few pictures have a pose.
+        BadInput: Too few images have a pose.
     """
     sights = sights.each_view_once()
     unknown = {name: "has no pose" for name in sights.squares if name not in poses}
@@ -186,7 +186,7 @@ def _settled(looks: Sequence[_CameraLook]) -> _HandEyeFit:
 
 
 def _fit(stack: _Stack, start: Pose, noise: tuple[float, float]) -> _HandEyeFit:
-    """Both unknowns; a picture far off counts less (Huber)."""
+    """Both unknowns; an image far off counts less (Huber)."""
     whitening = stack.whitening(start, noise)
     at_drawing = Pose.level(np.zeros(3))
 
@@ -237,7 +237,7 @@ def _lacks(looks: Sequence[_CameraLook]) -> list[Issue]:
     return lacks
 
 
-# Poses of the platform by the names of pictures, from a CSV file with units in its columns.
+# Poses of the platform by the names of images, from a CSV file with units in its columns.
 
 
 COLUMNS = ("picture", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
@@ -245,7 +245,7 @@ COLUMNS = ("picture", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
-    """Reads ``world_from_platform`` by picture; rows without a pose are left out.
+    """Reads ``world_from_platform`` by image; rows without a pose are left out.
 
     Raises:
         BadInput: The file cannot be read.
@@ -261,7 +261,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
         texts = dict(zip(header, row, strict=False))
         picture = Path(texts.get("picture", "")).name
         values = [texts.get(name, "").strip() for name in COLUMNS[1:]]
-        if not any(values):  # as of a picture that gave no pose
+        if not any(values):  # as of an image that gave no pose
             continue
         found = _pose(values)
         if isinstance(found, str):

@@ -30,7 +30,7 @@ class ExtrinsicCalibration:
         half_widths: Of the 95 % intervals of the same, shape (6,).
         points: Places in the world that matter, shape (n, 3), [m].
         tag_errors: RMS corner error of each tag, by number, [px].
-        pictures: How many pictures it rests on.
+        pictures: How many images it rests on.
         unused: Why each of the others is not used, by name.
         lacks: What it lacks, beside precision.
         data_hash: Of what was seen.

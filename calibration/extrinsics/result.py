@@ -151,7 +151,7 @@ def extrinsics_page(
     tags = [(f"tag {k}", f"{error:.3f} px") for k, error in result.tag_errors.items()]
     return page_of(
         f"Pose of camera {document.name}",
-        f"{document.date}, by {result.by}, {result.pictures} pictures used",
+        f"{document.date}, by {result.by}, {result.pictures} images used",
         verdict,
         [
             Section(

@@ -1,7 +1,7 @@
 """A camera's place from surveyed tags on the frame.
 
-Each tag's mean corners are fitted with the covariance that the picture and the survey give them:
-the error of a survey is the same in every picture and does not average out.
+Each tag's mean corners are fitted with the covariance that the image and the survey give them:
+the error of a survey is the same in every image and does not average out.
 """
 
 from __future__ import annotations
@@ -68,14 +68,14 @@ def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Arra
 LEAST_TAGS = 3
 """Fewer cannot show that one of them was surveyed wrongly."""
 MOVED_PX = 0.5
-"""Between pictures of a camera that stands still tags do not move farther."""
+"""Between images of a camera that stands still tags do not move farther."""
 _OFF = 3.0
 """A tag this many deviations off disagrees with the survey."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SeenTag:
-    """A tag over all pictures: world corners (4, 3), mean pixels (8,), whitening of them (8, 8)."""
+    """A tag over all images: world corners (4, 3), mean pixels (8,), whitening of them (8, 8)."""
 
     number: int
     corners: Array
@@ -106,7 +106,7 @@ def require_frame_tags(rig: Rig) -> None:
 def locate_by_frame_tags(
     rig: Rig, camera: Camera, sights: TagSights, survey: Survey
 ) -> ExtrinsicCalibration:
-    """Finds the camera's place from pictures taken while it stood still.
+    """Finds the camera's place from images taken while it stood still.
 
     Args:
         rig: Its frame tags are the surveyed ones.
@@ -145,7 +145,7 @@ def locate_by_frame_tags(
 
 
 def _still(sights: TagSights) -> TagSights:
-    """Without pictures in which all is seen elsewhere than in most."""
+    """Without images in which all is seen elsewhere than in most."""
     middle = {
         number: np.median([s[number].corners for s in sights.squares.values() if number in s], 0)
         for number in sights.numbers
@@ -161,7 +161,7 @@ def _still(sights: TagSights) -> TagSights:
 
 
 def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
-    """``camera_from_world`` by the tags of one picture.
+    """``camera_from_world`` by the tags of one image.
 
     Raises:
         BadInput: They allow none.
@@ -196,7 +196,7 @@ def _seen_tags(
 
 
 def _of_picture(squares: Sequence[RefinedTag]) -> Array:
-    """Covariance of corners in one picture; more pictures of a still scene err alike."""
+    """Covariance of corners in one image; more images of a still scene err alike."""
     return np.asarray(np.mean([square.covariance for square in squares], axis=0))
 
 

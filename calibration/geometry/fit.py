@@ -75,7 +75,7 @@ class NormalEquations:
 
 MOST_STEPS = 200
 SETTLED = 1e-6
-"""The fit has come to its end where a step makes the sum of squares smaller by less, as a share."""
+"""The fit has converged where a step makes the sum of squares smaller by less, as a share."""
 MOST_DAMPING = 1e9
 """No smaller step is tried: what it would gain is below round-off."""
 START_TOLERANCE = 1e-5

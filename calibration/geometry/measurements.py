@@ -71,7 +71,7 @@ class RigMeasurements:
         )
 
     def with_doubt(self, deviations: Array) -> RigMeasurements:
-        """The same, poses less certain: errors that all pictures of a place have in common.
+        """The same, poses less certain: errors that all images of a place have in common.
 
         Args:
             deviations: Of camera and tags, shape (6,), [m, rad].
@@ -112,7 +112,7 @@ class Recording:
         asked: Set-points, shape (n, m), [counts].
         counts: Drive positions, shape (n, m), [counts].
         tensions: Shape (n, m), [N].
-        seen: Times of the pictures that gave a pose, shape (k,), [s].
+        seen: Times of the images that gave a pose, shape (k,), [s].
         positions: Measured there, world frame, shape (k, 3), [m].
         rotations: ``world_from_platform``, shape (k, 3, 3).
         covariances: Shape (k, 6, 6), [m, rad].
@@ -131,7 +131,7 @@ class Recording:
 def at_rest(name: str, run: Recording) -> RigMeasurements:
     """The places at which the platform stood still, each with the means of what was measured.
 
-    Pictures of one place have their errors in common: their mean is no more certain than each.
+    Images of one place have their errors in common: their mean is no more certain than each.
 
     Args:
         name: Of the run, for the places' names.

@@ -28,7 +28,7 @@ from model.pose import Array
 from model.rig import Rig
 
 _SHARE = 0.12
-"""The longest arrow of the picture, as a share of the frame's diagonal."""
+"""The longest arrow of the image, as a share of the frame's diagonal."""
 _LAYERS = (
     ("outlets", "Outlets moved", "limit", True),
     ("anchors", "Anchors moved", "tag", True),
@@ -271,7 +271,7 @@ def _chart(title: str, text: str, quantity: str, lines: Iterable[ChartLine], cou
 def _by_pose(result: RigCalibration) -> Chart:
     out, number = result.held_out, np.arange(1.0, len(result.measured) + 1.0)
     text = (
-        f"Error of {len(number)} poses: up to {out.before.max() * 1e3:.2f} mm with"
+        f"Line chart of the error of {len(number)} poses: {out.before.max() * 1e3:.2f} mm with"
         f" the rig file, up to {out.after.max() * 1e3:.2f} mm held out of the fit."
     )
     lines = (

@@ -1,4 +1,4 @@
-"""Camera matrix and lens distortion from pictures of a board."""
+"""Camera matrix and lens distortion from images of a board."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from tracking.camera_model import Image
 
 LEAST_VIEWS = 4
-"""Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
+"""Fewer images cannot be calibrated from; forty and more, tilted up to 40°, are good."""
 _FAR_OFF, _OFF = 4.0, 0.5
 """A view is left out whose error is this many times the median, and this many pixels at least."""
 _LOOKED_AT = 5
@@ -31,14 +31,14 @@ class CameraCalibration:
     """A camera's matrix and distortion, and what they rest on.
 
     Attributes:
-        size: Width and height of the pictures, [px].
+        size: Width and height of the images, [px].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: k1, k2, p1, p2, k3; shape (5,).
         uncertainty: What is known about their errors.
-        views: What was seen of the board in each picture used, by name.
+        views: What was seen of the board in each image used, by name.
         boards: Where the board was in the camera's frame, by name.
-        view_errors: RMS distance of each used picture's corners, by name, [px].
-        unused: Why each of the other pictures is not used, by name.
+        view_errors: RMS distance of each used image's corners, by name, [px].
+        unused: Why each of the other images is not used, by name.
         data_hash: Of the corners it rests on.
     """
 
@@ -87,12 +87,12 @@ def fit_camera(
     """Fits a pinhole with five distortion coefficients.
 
     Args:
-        pictures: Names and grey pictures of one size.
+        pictures: Names and grey images of one size.
         board: What they show.
-        unused: Pictures that were left out before, with the reasons.
+        unused: Images that were left out before, with the reasons.
 
     Raises:
-        BadInput: Pictures of different sizes, or too few that show the board.
+        BadInput: Images of different sizes, or too few that show the board.
     """
     views: dict[str, Seen] = {}
     left_out = dict(unused or {})
@@ -129,12 +129,12 @@ def _same(seen: Seen, before: Seen) -> bool:
 def calibrate_from_views(
     views: Mapping[str, Seen], size: tuple[int, int], unused: Mapping[str, str] | None = None
 ) -> CameraCalibration:
-    """Fits the camera to the board's corners in each picture.
+    """Fits the camera to the board's corners in each image.
 
-    A picture whose corners are far off, as of a board that moved or was mistaken, is left out.
+    An image whose corners are far off, as of a board that moved or was mistaken, is left out.
 
     Raises:
-        BadInput: Too few pictures are left, or they determine nothing.
+        BadInput: Too few images are left, or they determine nothing.
     """
     left_out, used = dict(unused or {}), dict(views)
     fit = _fit(used, size)
@@ -198,7 +198,7 @@ def _undetermined() -> BadInput:
 
 
 def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
-    """What most of the pictures without the board show, if anything is known."""
+    """What most of the images without the board show, if anything is known."""
     shown: dict[str, list[str]] = {}
     for name, image in without:
         flipped = mirrored(board, image)

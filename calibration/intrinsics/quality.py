@@ -1,4 +1,4 @@
-"""Whether a camera is calibrated well enough: what the pictures covered, and millimetres."""
+"""Whether a camera is calibrated well enough: what the images covered, and millimetres."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from model.pose import Array
 CELLS = (8, 6)
 """Columns and rows of the map of what is covered."""
 GOOD_VIEWS, GOOD_COVERAGE, GOOD_TILT, GOOD_ERROR = 12, 0.6, 20.0, 1.0
-"""Pictures, share of the map, degrees to either side of both axes together, pixels."""
+"""Images, share of the map, degrees to either side of both axes together, pixels."""
 GOOD_PIXELS = 1.0
-"""Of points all over the picture, 95 %, [px]: unlike millimetres, no wrong size of squares changes
+"""Of points all over the image, 95 %, [px]: unlike millimetres, no wrong size of squares changes
 them."""
 FULL_COVERAGE = 0.9
 """Share of the map beyond which nothing is gained by more of it."""
@@ -31,14 +31,14 @@ class CameraQuality:
 
     Attributes:
         verdict: The verdict.
-        coverage: How many corners were seen in each cell of the picture, shape `CELLS`.
-        tilts: Angle of each picture's board against the picture's plane, about its x and y axes,
+        coverage: How many corners were seen in each cell of the image, shape `CELLS`.
+        tilts: Angle of each image's board against the image's plane, about its x and y axes,
             shape (pictures, 2), [deg].
         distance: For which the errors are stated, [m].
         nearest: Least distance of a board, [m]; it grows with the stated size of the squares.
         farthest: Greatest distance of a board, [m].
-        halves: How far apart two halves of the pictures would see a point there, RMS over the
-            picture, [m].
+        halves: How far apart two halves of the images would see a point there, RMS over the
+            image, [m].
     """
 
     verdict: CalibrationVerdict
@@ -100,14 +100,14 @@ def _coverage(result: CameraCalibration) -> Array:
 
 
 def _tilts(result: CameraCalibration) -> Array:
-    """Of the board's normal against the camera's axis, about the picture's x and y axes, [deg]."""
+    """Of the board's normal against the camera's axis, about the image's x and y axes, [deg]."""
     normals = np.array([pose.rotation[:, 2] for pose in result.boards.values()])
     normals *= np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
     return np.asarray(np.degrees(np.arctan2(normals[:, [1, 0]], normals[:, 2:])))
 
 
 def picture_grid(size: tuple[int, int]) -> Array:
-    """Pixels all over a picture, shape (81, 2)."""
+    """Pixels all over an image, shape (81, 2)."""
     across = np.linspace(0.05, 0.95, 9)
     return np.array([(x * size[0], y * size[1]) for x in across for y in across])
 
@@ -123,7 +123,7 @@ def _slopes(result: CameraCalibration) -> Array:
 
 
 def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
-    """What the set of pictures lacks, and what to add."""
+    """What the set of images lacks, and what to add."""
     lacks = []
     if len(result.views) < GOOD_VIEWS:
         what = f"{len(result.views)} images show the board; {GOOD_VIEWS} are required"

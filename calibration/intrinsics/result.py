@@ -50,10 +50,10 @@ class CameraResult(ResultDocument):
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart points at the distance are seen, RMS over the picture, [mm].
+        """How far apart points at the distance are seen, RMS over the image, [mm].
 
         Raises:
-            BadInput: The pictures are of different sizes.
+            BadInput: The images are of different sizes.
         """
         size = (self.width_px, self.height_px)
         if size != (other.width_px, other.height_px):
@@ -166,7 +166,7 @@ def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, da
             Section("Parameters, with 95 % intervals", _numbers(result, quality)),
             Section("Where the board was seen", _map(result, quality), covered),
             Section("How the board was tilted", _tilts(quality), tilted),
-            Section("Pictures used", _pictures(result), used),
+            Section("Images used", _pictures(result), used),
             Section("Images not used", table_of(result.unused.items())),
         ],
     )
@@ -210,7 +210,7 @@ def _map(result: CameraCalibration, quality: CameraQuality) -> str:
 
 
 def _tilts(quality: CameraQuality) -> str:
-    """Tilt of each picture's board, about both axes, ± 50°."""
+    """Tilt of each image's board, about both axes, ± 50°."""
     dots = "".join(
         f'<circle cx="{140 + 2.4 * np.clip(y, -50, 50):.1f}"'
         f' cy="{140 - 2.4 * np.clip(x, -50, 50):.1f}" r="4" fill="var(--ink)"/>'
@@ -226,7 +226,7 @@ def _tilts(quality: CameraQuality) -> str:
 
 
 def _pictures(result: CameraCalibration) -> str:
-    """Error of each picture, and how much of the focal length hangs on it."""
+    """Error of each image, and how much of the focal length hangs on it."""
     change = result.uncertainty.without[:, NAMES.index("fx_px")]
     rows = [
         (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+.2f} px")

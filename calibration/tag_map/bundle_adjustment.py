@@ -1,8 +1,8 @@
-"""Where the tags are on the platform: all of them and all pictures fitted together.
+"""Where the tags are on the platform: all of them and all images fitted together.
 
-Every picture may be taken from anywhere; its camera pose is an unknown as well (bundle adjustment).
+Every image may be taken from anywhere; its camera pose is an unknown as well (bundle adjustment).
 Images give the layout only up to a rigid motion of the platform's frame; it is put where the
-layout fits the rig file best, or where one tag is as there. What a picture says of the layout, its
+layout fits the rig file best, or where one tag is as there. What an image says of the layout, its
 camera pose projected out, is added up as in `calibration.intrinsics.uncertainty`.
 """
 
@@ -29,11 +29,11 @@ HUBER = 3.0
 """Errors of edges beyond this many deviations count linearly."""
 _NARROWING = (1e4, 1e2, 2e1, HUBER)
 _FAR_OFF_PX = 2.0
-"""A picture whose corners are farther off does not show this platform as it is."""
+"""An image whose corners are farther off does not show this platform as it is."""
 
 
 def far_off(sights: TagSights, errors: Sequence[float]) -> dict[str, str]:
-    """The picture that fits the others least, and why, where it is far off: it smears the fit."""
+    """The image that fits the others least, and why, where it is far off: it smears the fit."""
     name, error = max(zip(sights.squares, errors, strict=True), key=lambda item: item[1])
     if error <= max(_FAR_OFF_PX, 4.0 * float(np.median(errors))):
         return {}
@@ -43,7 +43,7 @@ def far_off(sights: TagSights, errors: Sequence[float]) -> dict[str, str]:
 def starts_of(
     camera: Camera, drawn: Mapping[int, Tag], sights: TagSights
 ) -> tuple[dict[str, Pose], TagSights]:
-    """``camera_from_platform`` of each picture by the rig file; pictures without one are named."""
+    """``camera_from_platform`` of each image by the rig file; images without one are named."""
     starts = {}
     for name, squares in sights.squares.items():
         found = solve_pnp(camera, [TagView(drawn[k], s) for k, s in squares.items()])
@@ -136,11 +136,11 @@ def fix_gauge(tags: Sequence[Tag], fixed: int | None) -> Array:
     return np.concatenate([slopes.sum(axis=0), turns / 0.05])
 
 
-# Which tags can be located: those that pictures tie to each other.
+# Which tags can be located: those that images tie to each other.
 
 
 def connected_tags(pictures: Sequence[Iterable[int]], fixed: int | None = None) -> list[int]:
-    """The largest group of tags that are tied by pictures that show two or more of them.
+    """The largest group of tags that are tied by images that show two or more of them.
 
     Args:
         pictures: Numbers of the tags in each.
@@ -175,12 +175,12 @@ class TagLayout:
             shape (6 t, 6 t).
         half_widths: Of the 95 % intervals of the same, shape (6 t,).
         fixed: Number of the tag that is as in the rig file; None where all fit the rig file best.
-        errors: RMS corner error of each picture, by name, [px].
-        seen: In how many pictures each tag was, by number.
+        errors: RMS corner error of each image, by name, [px].
+        seen: In how many images each tag was, by number.
         unseen: Why each of the other tags is as in the rig file, by number.
-        sides: Largest angle between directions from which pictures were taken, [rad].
+        sides: Largest angle between directions from which images were taken, [rad].
         scale: Size of the layout by that of the rig file.
-        unused: Why pictures are not used, by name.
+        unused: Why images are not used, by name.
         data_hash: Of what was seen.
     """
 
@@ -208,7 +208,7 @@ class TagLayout:
 
     @property
     def reprojection(self) -> float:
-        """RMS corner error over the pictures, [px]."""
+        """RMS corner error over the images, [px]."""
         return float(np.sqrt(np.mean(np.square(list(self.errors.values())))))
 
 
@@ -248,7 +248,7 @@ def measure_layout(
         fixed: Number of the tag that is as in the rig file; left out, all fit the rig file best.
 
     Raises:
-        BadInput: Too few pictures show two tags or more, or none shows the fixed tag with others.
+        BadInput: Too few images show two tags or more, or none shows the fixed tag with others.
     """
     drawn = {tag.id: tag for tag in rig.platform_tags}
     single = {

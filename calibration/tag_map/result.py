@@ -196,7 +196,7 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdi
                 ),
             ),
             Section(
-                "Pictures used",
+                "Images used",
                 table_of((name, f"{error:.3f} px") for name, error in result.errors.items()),
             ),
             Section("Not used", table_of(document.unused.items())),
@@ -215,7 +215,7 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
                 f"{np.linalg.norm(shift):.3f}",
                 f"{np.degrees(tag.pose.angle_to(drawn.pose)):.3f}",
                 ", ".join(f"{value:+.3f}" for value in shift),
-                f"{result.seen[tag.id]} pictures",
+                f"{result.seen[tag.id]} images",
             )
         )
     return rows
@@ -233,7 +233,7 @@ def _places(document: TagsResult) -> list[tuple[str, ...]]:
 
 
 GOOD_PICTURES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
-"""Pictures in all, pictures of each tag, pixels."""
+"""Images in all, images of each tag, pixels."""
 GOOD_SIDES_DEG = 40.0
 GOOD_SCALE = 0.02
 """Share by which a layout may be larger or smaller than in the rig file."""

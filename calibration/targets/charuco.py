@@ -1,4 +1,4 @@
-"""ChArUco boards: the corners between markers, in a picture that may show a part only."""
+"""ChArUco boards: the corners between markers, in an image that may show a part only."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Charuco:
         return Seen(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
 
     def instead(self, image: Image) -> str:
-        """Tags and markers that the picture shows."""
+        """Tags and markers that the image shows."""
         family = self.dictionary if self.dictionary in FAMILIES else FAMILIES[-1]
         told = what_else_is_seen(image, family, [])
         fours = TagDetector("4X4_1000").detect(image)

@@ -1,4 +1,4 @@
-"""Grids of tags: their corners, in a picture that may show a part only."""
+"""Grids of tags: their corners, in an image that may show a part only."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class TagGrid:
         return Seen(points, np.concatenate([square.corners for _, square in whole]), twice)
 
     def instead(self, image: Image) -> str:
-        """Tags that the picture shows."""
+        """Tags that the image shows."""
         return what_else_is_seen(image, self.family, [])
 
     def _corners_of(self, number: int) -> Array:

@@ -42,7 +42,7 @@ def paper(
 
     Adaptive sampling against the goal bias, kinematic cost against length, in three environments,
     with the scene's ends and with random ones, in the rig's workspace box and in larger ones, and
-    for every reading of the text. Writes index.html, pictures, trials.csv, summary.csv and
+    for every reading of the text. Writes index.html, images, trials.csv, summary.csv and
     findings.json. The numbers depend on the seeds alone, the times aside.
 
     [dim]Example:[/dim]

@@ -338,7 +338,7 @@ def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
 
 
 def camera_line(camera: Mapping[str, Any]) -> str:
-    """One camera while pictures are measured.
+    """One camera while images are measured.
 
     Args:
         camera: As `executor.remote.status` has it.

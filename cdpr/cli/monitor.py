@@ -31,7 +31,7 @@ def monitor(
         ),
     ] = False,
     rate: Annotated[
-        float, typer.Option("--rate-hz", min=0.1, max=50.0, help="looks a second")
+        float, typer.Option("--rate-hz", min=0.1, max=50.0, help="updates per second")
     ] = 5.0,
     process: Annotated[
         int | None,
@@ -41,7 +41,7 @@ def monitor(
     """Watch a run: its state, every drive, tension, lateness, progress and events, to its end.
 
     It only looks; `cdpr stop`, `hold`, `resume` and `speed` act. Ctrl-C ends the monitor, not the
-    run. Exit code: 0 when the motion came to its end, 130 when it was stopped, 1 otherwise.
+    run. Exit code: 0 when the motion finished, 130 when it was stopped, 1 otherwise.
 
     [dim]Examples:[/dim]
 
@@ -152,7 +152,7 @@ def _plain(status: dict[str, Any]) -> str:
 
 
 def _view(status: dict[str, Any]) -> Group:
-    """The live picture."""
+    """The live image."""
     title = Text.assemble(
         (status["state"].upper(), _STATES.get(status["state"], "bold")),
         f"  {status['rig']} on {status['bus']}  process {status['process']}  {status['folder']}",

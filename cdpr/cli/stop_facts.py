@@ -20,7 +20,7 @@ def stop_facts(scene: Scene) -> list[tuple[str, str]]:
         load = f", then {after:g} kg" if after != before else ""
         dwell = f" {stop.dwell:g} s" if stop.dwell > 0.0 else ""
         told.append(f"{stop.name} ({stop.kind}{dwell}{load})")
-    return [("by way of", ", ".join(told))] if told else []
+    return [("via", ", ".join(told))] if told else []
 
 
 def by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:

@@ -1,4 +1,4 @@
-"""`cdpr track`: measures the platform in pictures."""
+"""`cdpr track`: measures the platform in images."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def track(
     force: Annotated[bool, typer.Option("--force", help="replace existing output")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the platform's pose from its tags, picture by picture.
+    """Measure the platform's pose from its tags, image by image.
 
     [dim]Examples:[/dim]
 

@@ -167,13 +167,13 @@ class DriveMonitor:
         dropped, self._dropped = self._dropped, []
         return dropped
 
-    def state_faults(self, told: Container[str], *, powered: bool) -> list[tuple[int, str]]:
+    def state_faults(self, known: Container[str], *, powered: bool) -> list[tuple[int, str]]:
         """What is wrong with the drives as they stand, by node.
 
         How often a drive may be silent is the executor's to say (`executor.safety.monitor`).
 
         Args:
-            told: Faults known already; a drive whose emergency is among them is not reported again.
+            known: Faults known already; a drive whose emergency is among them is not reported again.
             powered: The group is under power or on its way there; replies that cannot be believed
                 are a fault then.
         """
@@ -185,7 +185,7 @@ class DriveMonitor:
                 self._names[node],
                 self._emergencies.get(node, "no emergency message received"),
             )
-            if f"{name}: {cause}" not in told:
+            if f"{name}: {cause}" not in known:
                 found.append((node, f"{name} is in {state.value}: {cause}"))
         return found + (self._check.faults() if powered else [])
 

@@ -265,7 +265,7 @@ class OdriveGroup(CyclicGroup):
             self._stop, self._waited = _Stop.HOLDING if powered else idle, 0
 
     def _advance(self) -> None:
-        """Sees whether the way under way has come to its end, or was not in time."""
+        """Checks whether the transition in progress has finished or timed out."""
         if self._stop is _Stop.HOLDING and self._waited >= self._settling:
             self._stop, self._waited = _Stop.DISARMING, 0
             self._watch.forget_heartbeats()

@@ -34,11 +34,11 @@ class CameraHealth:
         self._blind = 0
 
     def ask(self, at: float) -> None:
-        """A picture was asked for, at this time, [s]."""
+        """An image was asked for, at this time, [s]."""
         self._asked = at
 
     def answer(self, seen: bool) -> None:
-        """That picture is measured.
+        """That image is measured.
 
         Args:
             seen: It gave a pose.
@@ -63,16 +63,16 @@ class CameraHealth:
 
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
-    """What became of one camera's pictures in a run.
+    """What became of one camera's images in a run.
 
     Attributes:
         name: Of the camera in the rig file.
-        source: Where its pictures came from.
+        source: Where its images came from.
         pictures: How many it was asked for.
         poses: How many of them gave a pose.
         dropped: How many were due while it was busy, and not asked for.
         measuring_ms: Median time that measuring one took; None where none was measured.
-        failed: Why it gave no pictures any more, or nothing.
+        failed: Why it gave no images any more, or nothing.
     """
 
     name: str
@@ -85,13 +85,13 @@ class CameraRecord:
 
 
 class CameraClient:
-    """Asks one camera for pictures and keeps its answers."""
+    """Asks one camera for images and keeps its answers."""
 
     def __init__(self, process: CameraProcess, source: str) -> None:
         """Nothing was asked for yet.
 
         Args:
-            process: Takes and measures the pictures.
+            process: Takes and measures the images.
             source: Where they come from, for messages.
         """
         self.name, self.source = process.name, source
@@ -100,13 +100,13 @@ class CameraClient:
         self.failed: CdprError | None = None
         """Why there will be no more of them."""
         self.dropped = 0
-        """Pictures that were due while it was busy."""
+        """Images that were due while it was busy."""
         self._poses = 0
         self._process = process
         self._sight, self._pace = CameraHealth(), FrameRate()
 
     def ask(self, trigger: FrameRequest) -> bool:
-        """Asks for a picture unless it is busy or gone; returns whether it did."""
+        """Asks for an image unless it is busy or gone; returns whether it did."""
         if self.failed is not None:
             return False
         if self._process.unanswered is not None:
@@ -149,7 +149,7 @@ class CameraClient:
         return self._sight.trouble(now)
 
     def record(self) -> CameraRecord:
-        """What became of its pictures."""
+        """What became of its images."""
         return CameraRecord(
             self.name,
             self.source,

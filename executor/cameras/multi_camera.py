@@ -18,7 +18,7 @@ from tracking.measurement import PoseMeasurement
 from tracking.multi_camera import MultiCameraFusion
 from tracking.track import rates
 
-# Watches measured clearance, picture by picture, for one whose upper bound is below the limit.
+# Watches measured clearance, image by image, for one whose upper bound is below the limit.
 
 
 #: This many images in a row must show too little clearance before the run is stopped for it.
@@ -28,11 +28,11 @@ NEAR_PICTURES = 2
 class ClearanceMonitor:
     """Detects clearance below a limit in the last images, beyond their uncertainty.
 
-    One picture alone may be wrong for a reason that its covariance does not know.
+    One image alone may be wrong for a reason that its covariance does not know.
     """
 
     def __init__(self, limit: float) -> None:
-        """Begins without a picture.
+        """Begins without an image.
 
         Args:
             limit: Clearance that the scene asks for, [m].
@@ -40,10 +40,10 @@ class ClearanceMonitor:
         self._limit, self._pictures = limit, 0
 
     def take(self, clearance: MeasuredClearance | None) -> str:
-        """What is too near, with numbers, when the last pictures say so; else nothing.
+        """What is too near, with numbers, when the last images say so; else nothing.
 
         Args:
-            clearance: Of the newest picture with a pose; None in a scene without obstacles.
+            clearance: Of the newest image with a pose; None in a scene without obstacles.
         """
         if clearance is None or clearance.at_most >= self._limit:
             self._pictures = 0
@@ -148,7 +148,7 @@ class MultiCameraMonitor:
             self.news.append(CameraNews("camera_sees_nothing", text))
 
 
-#: At the end of a run the last pictures are waited for no longer than this, [s],
+#: At the end of a run the last images are waited for no longer than this, [s],
 PATIENCE = 20.0
 #: and after a stop no longer than this, [s]; whether there is one is asked every so often, [s].
 HURRY, ROUND = 2.0, 0.05
@@ -220,7 +220,7 @@ class RunCameras:
     def trigger(
         self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
     ) -> None:
-        """Takes in what the cameras have seen, and asks for a picture of this moment.
+        """Takes in what the cameras have seen, and asks for an image of this moment.
 
         Args:
             time: Since the start of the run, [s].
@@ -251,7 +251,7 @@ class RunCameras:
         return [eye.as_dict(self._now) for eye in self._eyes]
 
     def finish(self, stopped: Callable[[], bool]) -> CameraRecords:
-        """Waits for the last pictures of all cameras; what is missing then is reported.
+        """Waits for the last images of all cameras; what is missing then is reported.
 
         Args:
             stopped: Whether a stop is wished; the wait is a short one then.
@@ -327,14 +327,14 @@ Tell = Callable[[str, str, float], None]
 
 
 class RunWatch:
-    """Asks the cameras for pictures, and stops the run when they see too little clearance."""
+    """Asks the cameras for images, and stops the run when they see too little clearance."""
 
     def __init__(
         self,
         cameras: RunCameras,
         status: RunStatus,
         board: RequestBoard,
-        tell: Tell,
+        report: Tell,
         *,
         clearance_stop: bool,
         listener: Listener = SILENT,
@@ -345,19 +345,19 @@ class RunWatch:
             cameras: Those of the run.
             status: Kept up to date for those who ask.
             board: Where a stop is asked for.
-            tell: Takes in what happens.
+            report: Called with each event.
             clearance_stop: Ask for a stop when clearance is too small.
             listener: Receives the same.
         """
         self.rates = ""
         """How fast each camera is and how many tags it sees, for the progress bar."""
         self._cameras, self._status, self._board = cameras, status, board
-        self._tell, self._clearance_stop, self._listener = tell, clearance_stop, listener
+        self._tell, self._clearance_stop, self._listener = report, clearance_stop, listener
 
     def trigger(
         self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
     ) -> None:
-        """A picture is due; arguments as for `RunCameras.trigger`."""
+        """An image is due; arguments as for `RunCameras.trigger`."""
         self._cameras.trigger(time, asked, true_pose, by_drives)
         self._tell_news(asked)
         each = self._cameras.as_dict()
@@ -375,7 +375,7 @@ class RunWatch:
             self._stop("stopping", all_failed, "camera", all_failed)
 
     def finish(self, at: float) -> CameraRecords:
-        """Waits for the last pictures.
+        """Waits for the last images.
 
         Args:
             at: The end of the run, on the loop's clock, [s].

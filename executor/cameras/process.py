@@ -1,7 +1,7 @@
-"""A camera's own process, so that pictures never delay the loop, nor one camera another.
+"""A camera's own process, so that images never delay the loop, nor one camera another.
 
-It takes (or renders) a picture when it is asked, measures the pose, and says so at once. In real
-time it is not asked again before it has answered, and a picture that was due is counted as dropped.
+It takes (or renders) an image when it is asked, measures the pose, and says so at once. In real
+time it is not asked again before it has answered, and an image that was due is counted as dropped.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class CameraProcess:
         return self._asked
 
     def ask(self, trigger: FrameRequest) -> None:
-        """Asks for a picture; the one before must have been answered.
+        """Asks for an image; the one before must have been answered.
 
         Raises:
             CdprError: The process is gone, for the reason given.

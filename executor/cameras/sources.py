@@ -1,4 +1,4 @@
-"""Which of the rig's cameras look at it, and where the pictures of each come from."""
+"""Which of the rig's cameras look at it, and where the images of each come from."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ the drives are simulated in this process, an error on a bus."""
 
 
 def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool) -> str | None:
-    """Where pictures come from: ``synthetic``, a camera's index or address, or None.
+    """Where images come from: ``synthetic``, a camera's index or address, or None.
 
     Raises:
         BadInput: The wish cannot be met; nothing is left out silently.
@@ -68,7 +68,7 @@ def _require_live(source: str) -> None:
 def choose_cameras(
     rig: Rig, wanted: list[str], without: bool, in_process: bool
 ) -> dict[Camera, str]:
-    """Which of the rig's cameras look at a run, and where the pictures of each come from.
+    """Which of the rig's cameras look at a run, and where the images of each come from.
 
     Args:
         rig: Its cameras.
@@ -116,7 +116,7 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
 
 
 def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:
-    """The one camera that measures a platform at rest, and where its pictures come from.
+    """The one camera that measures a platform at rest, and where its images come from.
 
     Args:
         rig: Its cameras.
@@ -140,7 +140,7 @@ def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Ca
 def parse_camera_sources(
     rig: Rig, sources: list[str], wanted: str | None, where: str = "track"
 ) -> dict[Camera, str]:
-    """Which camera's pictures come from where.
+    """Which camera's images come from where.
 
     Args:
         rig: Its cameras.
@@ -194,7 +194,7 @@ def _is_unnamed(source: str, names: list[str]) -> bool:
 
 
 def _require_own(place: str, eyes: Mapping[Camera, str], name: str, where: str) -> None:
-    """Two cameras cannot take the same pictures."""
+    """Two cameras cannot take the same images."""
     for camera, other in eyes.items():
         if place != SYNTHETIC and _device(place) == _device(other):
             raise BadInput(
@@ -231,7 +231,7 @@ def is_camera(source: str) -> bool:
 
 
 def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
-    """In simulated time a real camera's pictures would be stamped with times that mean nothing.
+    """In simulated time a real camera's images would be stamped with times that mean nothing.
 
     Raises:
         BadInput: ``--fast`` is given, and a source is a real camera.

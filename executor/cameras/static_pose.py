@@ -1,4 +1,4 @@
-"""Where a platform at rest is, from several pictures of it."""
+"""Where a platform at rest is, from several images of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_m
 from model.rig import Rig
 from tracking.measurement import Observation, PoseMeasurement
 
-#: At least this share of the pictures must give a pose.
+#: At least this share of the images must give a pose.
 SEEN_SHARE = 0.8
 #: The platform moves, or the light flickers, when poses scatter by more, [m].
 MOST_SCATTER = 0.5e-3
@@ -41,12 +41,12 @@ class RestPose:
 
 
 def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
-    """The pose in which the platform stood still in all pictures.
+    """The pose in which the platform stood still in all images.
 
-    What is wrong with one picture is wrong with all, so the mean is not more certain than each.
+    What is wrong with one image is wrong with all, so the mean is not more certain than each.
 
     Raises:
-        Refused: Too few pictures show it, it did not stand still, or it is not known well enough
+        Refused: Too few images show it, it did not stand still, or it is not known well enough
             for a run to start: to half the rig's start tolerance, in cable length.
     """
     found = [look for look in looks if isinstance(look, PoseMeasurement)]
@@ -94,10 +94,10 @@ def _refusal(what: str, why: str) -> Refused:
     )
 
 
-# Pictures of a platform that stands still, and an operator who may end the looking at any time.
+# Images of a platform that stands still, and an operator who may end the looking at any time.
 
 
-#: A picture that has not come after so long will not come, [s].
+#: An image that has not come after so long will not come, [s].
 PATIENCE = 20.0
 
 
@@ -108,14 +108,14 @@ def looks_at_rest(
     true_pose: Pose | None,
     unless_stopped: Callable[[], None],
 ) -> list[Observation]:
-    """What a camera measures in some pictures, one after another.
+    """What a camera measures in some images, one after another.
 
     Args:
         process: Of the camera, which is open.
         pictures: How many.
-        period: Between pictures in simulated time, [s]; None where a real camera takes them.
+        period: Between images in simulated time, [s]; None where a real camera takes them.
         true_pose: Where the simulated platform is.
-        unless_stopped: Called before each picture and while one is waited for; what it raises ends
+        unless_stopped: Called before each image and while one is waited for; what it raises ends
             the looking.
 
     Raises:

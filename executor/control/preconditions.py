@@ -164,7 +164,7 @@ def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"winches": winches_here}))
 
 
-def set_up_here(rig: Rig, told: DriveSnapshot) -> tuple[Rig, float]:
+def set_up_here(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
     """What drives are set up for that move nothing: their limits lie about where they stand.
 
     The rig file's counts are no guide: a drive that is enabled beyond its own position limits runs
@@ -172,12 +172,12 @@ def set_up_here(rig: Rig, told: DriveSnapshot) -> tuple[Rig, float]:
 
     Args:
         rig: The robot.
-        told: Positions of its drives.
+        snapshot: Positions of its drives.
 
     Returns:
         The rig, see `counted_here`, and the largest tension, [N].
     """
-    return counted_here(rig, told.positions.tolist(), rig.home), rig.max_tension
+    return counted_here(rig, snapshot.positions.tolist(), rig.home), rig.max_tension
 
 
 def careful(rig: Rig, *, limit: float, speed: float) -> Rig:

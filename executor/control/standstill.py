@@ -31,7 +31,7 @@ class Standstill(ABC):
     """One procedure on drives that stay where they are; a `Procedure` of the real-time process.
 
     Attributes:
-        cause: Why it did not come to its end.
+        cause: Why it did not finish.
         error: The same, to be raised where the operator is.
         holding: Every cable was held in every cycle.
     """
@@ -102,7 +102,7 @@ class Standstill(ABC):
         """The procedure itself; how it leaves the drives.
 
         Raises:
-            CdprError: It did not come to its end.
+            CdprError: It did not finish.
         """
 
     def _cycle(self) -> CycleStatus:

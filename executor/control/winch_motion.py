@@ -51,29 +51,29 @@ class WinchesStand:
     tensions: Array
 
 
-def require_held(rig: Rig, stand: WinchesStand, told: CycleStatus) -> None:
+def require_held(rig: Rig, stand: WinchesStand, found: CycleStatus) -> None:
     """The drives hold at the positions where the motion ended, without new commands.
 
     Args:
         rig: The robot.
         stand: Where the motion ended.
-        told: Present state of the drives.
+        found: Present state of the drives.
 
     Raises:
         Fault: One moved, or does not hold.
     """
     per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
-    moved = np.abs((told.positions - stand.counts) / per_metre)
+    moved = np.abs((found.positions - stand.counts) / per_metre)
     worst = int(moved.argmax())
     name = list(rig.drive_names.values())[worst]
     if not moved[worst] <= HELD_SHARE * rig.motion.start_tolerance:
         what = f"{name} moved by {moved[worst] * 1000:.2f} mm after all winches were at rest"
-    elif told.faults:
-        what = "; ".join(text for _, text in told.faults)
-    elif told.missing.any():
-        silent = compress(rig.drive_names.values(), told.missing.tolist())
+    elif found.faults:
+        what = "; ".join(text for _, text in found.faults)
+    elif found.missing.any():
+        silent = compress(rig.drive_names.values(), found.missing.tolist())
         what = f"{', '.join(silent)}: no answer after all winches were at rest"
-    elif not told.holding:
+    elif not found.holding:
         what = "not all drives still hold"
     else:
         return
@@ -124,9 +124,9 @@ def move_winches(
         rig: The robot as its file is.
         custody: Of that rig.
         records: Takes in what happens.
-        record: What the latch names, should this not come to its end.
+        record: What the latch names, should this not finish.
         rehome: The drives are to be homed again afterwards.
-        at_rest: Called after a motion that came to its end, while the drives are locked,
+        at_rest: Called after a motion that finished, while the drives are locked,
             with where the simulated platform is; the reference that it makes is kept if the drives
             held all the while.
 
@@ -143,23 +143,23 @@ def move_winches(
     if armed.denied:
         last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
     custody.begin(record, custody.still_counts(armed.stands_at), rehome=rehome)
-    ended, told = _CUT_SHORT, None
+    ended, found = _CUT_SHORT, None
     try:
         ended = mover.run()
         stand = _stand(rig, armed.stands_at, ended, last.cycles)
         if stand.state is State.FINISHED:
             reference = at_rest(stand, ended.true_pose)
             try:
-                told = mover.stands_now()
-                require_held(rig, stand, told)
+                found = mover.stands_now()
+                require_held(rig, stand, found)
             except CdprError as error:
-                ended = _not_held(ended, told, error.what)
+                ended = _not_held(ended, found, error.what)
                 last.tell("not_held", error.what)
                 raise
             if reference is not None:
                 custody.take(reference)
     finally:
-        not_kept = _kept(custody, ended, record, _stands_at(last.cycles, told))
+        not_kept = _kept(custody, ended, record, _stands_at(last.cycles, found))
     if not_kept:
         last.tell("recorder", not_kept)
         stand = replace(stand, state=State.LATCHED, cause=stand.cause or not_kept)
@@ -177,17 +177,17 @@ def _stand(
     return WinchesStand(ended.state, ended.cause, before, counts.mean(axis=0), tensions)
 
 
-def _not_held(ended: Ended, told: CycleStatus | None, cause: str) -> Ended:
-    """A motion that came to its end, with what was found wrong with the drives afterwards."""
+def _not_held(ended: Ended, found: CycleStatus | None, cause: str) -> Ended:
+    """A motion that finished, with what was found wrong with the drives afterwards."""
     # Drives that are silent held when they last answered.
-    holding = ended.holding if told is None else told.holding
+    holding = ended.holding if found is None else found.holding
     return replace(ended, state=State.LATCHED, cause=cause, holding=holding)
 
 
-def _stands_at(last: Sequence[CycleRecord], told: CycleStatus | None) -> Sequence[int] | None:
+def _stands_at(last: Sequence[CycleRecord], found: CycleStatus | None) -> Sequence[int] | None:
     """Last known positions of the drives, [counts]; None when there are none."""
-    if told is not None:
-        return [int(position) for position in told.positions]
+    if found is not None:
+        return [int(position) for position in found.positions]
     return last[-1].actual if last else None
 
 

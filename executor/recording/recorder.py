@@ -271,7 +271,7 @@ class RecordWriter:
                 self._trouble = self._trouble or Fault(what, where=str(self._folder.path))
 
 
-#: Asks for a picture: time since the start of the run [s], the same moment on the monotonic clock
+#: Asks for an image: time since the start of the run [s], the same moment on the monotonic clock
 #: [s], where the simulated platform is then, and where the drives' positions put it.
 FrameTrigger = Callable[[float, float, Pose | None, Pose | None], None]
 
@@ -298,8 +298,8 @@ class Recorder:
             prepared: What is run.
             folder: Where cycles and events are written as they happen.
             status: Kept up to date for those who ask.
-            trigger: Called for every picture.
-            every: Cycles from one picture to the next.
+            trigger: Called for every image.
+            every: Cycles from one image to the next.
             progress: Called now and then with the number of rows that are done.
             announce: Called with a sentence when a stop is reached and left.
             on_event: Called with each event, after it is on record.
@@ -315,7 +315,7 @@ class Recorder:
         self._status = status
         self._trigger, self._progress = trigger, progress
         self.every = every
-        """Cycles from one picture to the next."""
+        """Cycles from one image to the next."""
         self._began: float | None = None
         self.last = 0.0
         """When the last cycle began, on the loop's clock, [s]."""
@@ -323,7 +323,7 @@ class Recorder:
         """Where the run was then."""
 
     def wants_pose(self, cycle: int) -> bool:
-        """Whether a picture will be asked for in this cycle."""
+        """Whether an image will be asked for in this cycle."""
         return self._trigger is not None and cycle % self.every == 0
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
@@ -331,7 +331,7 @@ class Recorder:
 
         Args:
             record: What happened in it.
-            true_pose: Where the simulated platform is, in cycles with a picture.
+            true_pose: Where the simulated platform is, in cycles with an image.
 
         Raises:
             CdprError: The record cannot be written; all else is done.

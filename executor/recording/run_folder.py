@@ -72,7 +72,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path) -> RunFolder:
-        """Makes a new folder, empty but for its folder of pictures, and its missing parents.
+        """Makes a new folder, empty but for its folder of images, and its missing parents.
 
         Raises:
             BadInput: The path exists, or it cannot be made or written to.
@@ -160,7 +160,7 @@ class RunFolder:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every file of a run that came to its end is there."""
+        """Whether every file of a run that finished is there."""
         return all((self.path / name).is_file() for name in NEEDED)
 
     @contextmanager
@@ -353,7 +353,7 @@ class RunFolder:
         write_atomic(self.path / EVENTS, "".join(event.line for event in events))
 
     def write_picture(self, frame: int, image: NDArray[np.uint8], camera: str = "") -> str:
-        """Keeps a camera picture, grey or BGR, as JPEG.
+        """Keeps a camera image, grey or BGR, as JPEG.
 
         Args:
             frame: Number of the moment at which it was taken.
@@ -372,7 +372,7 @@ class RunFolder:
         name = "/".join([PICTURES, *([camera] if camera else []), f"frame_{frame:06d}.jpg"])
         done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
-            raise ValueError(f"no picture: shape {image.shape}, type {image.dtype}")
+            raise ValueError(f"no image: shape {image.shape}, type {image.dtype}")
         try:
             (self.path / name).parent.mkdir(exist_ok=True)
             (self.path / name).write_bytes(data.tobytes())
@@ -384,7 +384,7 @@ class RunFolder:
         """The JPEG that `write_picture` named.
 
         Raises:
-            BadInput: It is gone, or not in the folder of pictures.
+            BadInput: It is gone, or not in the folder of images.
         """
         try:
             place = (self.path / name).resolve()

@@ -94,7 +94,7 @@ def judge(
         cycles: What the drives did.
         poses: What the cameras saw together.
         clearance: How near it came.
-        cameras: What became of each camera's pictures.
+        cameras: What became of each camera's images.
         too_near: It was stopped for what the cameras measured, and not by the operator.
         silent: It was stopped for drives that did not answer.
         troubles: What of its record is lost, a sentence each.
@@ -295,12 +295,12 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
         return []
     seen = int(poses.ok.sum())
     if not seen:
-        text = f"None of {len(poses)} pictures gave a pose: {poses.status[0]}."
+        text = f"None of {len(poses)} images gave a pose: {poses.status[0]}."
         return [Check("camera", False, text)]
     error = poses.error[poses.ok] * 1e3
     rms = float(np.sqrt(np.mean(error**2)))
     text = (
-        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} pictures,"
+        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} images,"
         f" {rms:.2f} mm RMS from the plan (largest {error.max():.2f} mm)."
     )
     if len(cameras) > 1:

@@ -104,7 +104,7 @@ class QualityDocument(Document):
 
 
 class TreeDocument(Document):
-    """The search trees, for pictures: positions, and the parent of each node (-1: a root)."""
+    """The search trees, for images: positions, and the parent of each node (-1: a root)."""
 
     positions_mm: list[Vector]
     parents: list[Annotated[int, Field(ge=-1, le=WHOLE_LARGEST)]]

@@ -24,7 +24,7 @@ TEXT_LIMIT = 256 * MEGABYTE
 YAML_LIMIT = 1 * MEGABYTE
 """Of a YAML file, [bytes]; its parser needs several seconds for that."""
 PICTURE_LIMIT = 256 * MEGABYTE
-"""Of a picture file, [bytes]."""
+"""Of an image file, [bytes]."""
 
 
 def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:

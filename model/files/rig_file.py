@@ -89,7 +89,7 @@ ArucoDictionary = Literal[
     "ARUCO_ORIGINAL", "ARUCO_MIP_36H12",
 ]  # fmt: skip
 TagFamily = Literal[AprilTagFamily, ArucoDictionary]
-#: What finds tags in pictures: OpenCV, or pyapriltags of the extra `apriltag`.
+#: What finds tags in images: OpenCV, or pyapriltags of the extra `apriltag`.
 TagDetectorName = Literal["opencv", "apriltag"]
 
 APRILTAG_FAMILIES: tuple[str, ...] = get_args(AprilTagFamily)
@@ -108,7 +108,7 @@ def opencv_dictionary(family: str) -> str:
 def drawn_upside_down(family: str) -> bool:
     """Whether OpenCV draws the family turned by 180° against the prints of its own project.
 
-    It does so with the families of the AprilTag project, whose pictures labs print.
+    It does so with the families of the AprilTag project, whose images labs print.
     """
     return family in APRILTAG_FAMILIES
 

@@ -63,7 +63,7 @@ class LensDocument(Document):
 
 
 class SimulatedCameraDocument(Document):
-    """What the simulated pictures of one of the rig's cameras show."""
+    """What the simulated images of one of the rig's cameras show."""
 
     name: Annotated[str, Field(min_length=1)] = Field(description="of the camera in `cameras`")
     lens: LensDocument | None = Field(default=None, description="left out, as in `cameras`")
@@ -94,7 +94,7 @@ class SimulationDocument(Document):
         Args:
             cables: Number of outlets.
             pulleys: The rig has pulleys.
-            cameras: Names of its cameras and how many pictures they take, [1/s].
+            cameras: Names of its cameras and how many images they take, [1/s].
         """
         found: list[Finding] = []
         if self.as_built is not None:

@@ -39,7 +39,7 @@ _QUANTITIES = {
 
 
 def page(results: Results, about: dict[str, Any]) -> str:
-    """The whole page, HTML, with its pictures beside it as SVG."""
+    """The whole page, HTML, with its images beside it as SVG."""
     lead = _paragraph(
         f"{about['seeds']} seeds in each of {len(results.environments)} environments. Changes"
         " are of the mean over the seeds, averaged over the environments; in brackets the 95 %"

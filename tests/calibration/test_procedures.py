@@ -34,7 +34,7 @@ class Heard(Listener):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six pictures of the board."""
+    """Six images of the board."""
     path = tmp_path_factory.mktemp("pictures")
     for number, image in enumerate(pictures(6, 0.09)):
         cv2.imwrite(str(path / f"{number}.png"), image)
@@ -70,5 +70,5 @@ def test_a_result_that_exists_is_refused_before_any_picture_is_read(tmp_path: Pa
 
 
 def _unread():  # type: ignore[no-untyped-def]
-    raise AssertionError("a picture was read")
+    raise AssertionError("an image was read")
     yield

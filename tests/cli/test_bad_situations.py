@@ -319,7 +319,7 @@ def test_wishes_that_contradict_each_other_are_told(
 @pytest.mark.parametrize(
     ("source", "code", "part"),
     [
-        ("no such thing", 2, "neither a folder of pictures"),
+        ("no such thing", 2, "not a folder of images"),
         ("77", 4, "camera front (77)"),
         ("empty", 2, "empty"),
         ("text.mp4", 2, "text.mp4"),

@@ -48,7 +48,7 @@ def test_the_tags_of_a_rig_are_printed(tmp_path: Path) -> None:
         (("--columns", "9", "--rows", "6"), "needs --square-mm"),
         (
             ("--board", "tags", "--columns", "3", "--rows", "2", "--tag-mm", "40", "--gap-mm", "2"),
-            "less than a module",
+            "less than one module",
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""`cdpr calibrate tags` on rendered pictures of a platform whose tags were glued by hand."""
+"""`cdpr calibrate tags` on rendered images of a platform whose tags were glued by hand."""
 
 from __future__ import annotations
 

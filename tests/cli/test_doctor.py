@@ -159,7 +159,7 @@ def test_locked_memory(limit: int, privileged: bool, good: bool) -> None:
 
 
 class FakeCapture:
-    """A camera of OpenCV with pictures of one size."""
+    """A camera of OpenCV with images of one size."""
 
     size = (720, 1280)
 

@@ -65,7 +65,7 @@ def test_a_bad_answer_is_asked_again_with_the_reason(
     rig = tmp_path / "rig.yaml"
     answer = call("new", rig, answers="\n" * question + f"{bad}\n" + "\n" * 50)
     assert answer.code == 0, answer
-    assert answer.err.count("; once more") == 1
+    assert answer.err.count("; try again") == 1
     assert reason in answer.err
     load_rig(rig)
 

@@ -10,7 +10,7 @@ from executor.cameras.client import BLIND_PICTURES, SILENCE, CameraHealth
 
 
 def looked(seen: list[bool]) -> list[str]:
-    """What is told after each picture, ten a second, each answered at once."""
+    """What is told after each image, ten a second, each answered at once."""
     sight, told = CameraHealth(), []
     for frame, pose in enumerate(seen):
         sight.ask(frame / 10)

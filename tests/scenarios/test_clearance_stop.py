@@ -148,7 +148,7 @@ def test_the_loop_tells_what_the_stop_was_for(
 
 
 class Rendered:
-    """Pictures of the platform where a trigger says that it is."""
+    """Images of the platform where a trigger says that it is."""
 
     def __init__(self, camera: SyntheticCamera) -> None:
         self._camera = camera

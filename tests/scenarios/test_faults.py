@@ -424,7 +424,7 @@ def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
     answer = call("run", short_plan, "--rig", rig, "-o", run, "--fast")
     assert answer.code == 1, answer
     assert "FAILED" in answer.out
-    assert "pictures gave a pose: " in answer.said
+    assert "images gave a pose: " in answer.said
     summary = RunFolder.open(run).summary()
     codes = [event["code"] for event in summary["events"]]
     assert codes.count("camera_sees_nothing") == 1

@@ -221,7 +221,7 @@ def copied(folder: RunFolder, path: Path) -> RunFolder:
 
 @pytest.mark.parametrize(
     ("cable", "off_mm", "words"),
-    [(None, 3.0, "mm from where it was told to be"), (4, 2.2, "longer or shorter than")],
+    [(None, 3.0, "mm from the commanded pose"), (4, 2.2, "longer or shorter than")],
 )
 def test_drives_that_contradict_the_plan_or_each_other_are_refused(
     stopped: Ended, scene_file: Path, tmp_path: Path, cable: int | None, off_mm: float, words: str

@@ -65,7 +65,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         elsewhere = {**kept, "stands_at": [count + 10**6 for count in kept["stands_at"]]}
         Path(told["file"]).write_text(json.dumps(elsewhere))
         killed = call(*run, "-o", tmp_path / "killed")
-        assert (killed.code, "away from where it was left" in killed.err) == (3, True)
+        assert (killed.code, "from its last known position" in killed.err) == (3, True)
         reset = call("reset", rig, *bus[:5], "--json")
         assert reset.code == 0
         after = json.loads(reset.out)

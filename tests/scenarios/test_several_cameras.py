@@ -126,7 +126,7 @@ def test_the_kept_pictures_of_each_camera_have_the_drives_poses(
     kept = [Path(name).name for name in folder.poses_by_camera()["side"].picture if name]
     poses = poses_of_run(folder.path, "side")
     assert set(kept[1:-1]) <= poses.keys() <= set(kept)
-    with pytest.raises(BadInput, match="camera 'back' took no pictures") as told:
+    with pytest.raises(BadInput, match="camera 'back' took no images") as told:
         poses_of_run(folder.path, "back")
     assert "front, side" in told.value.next_step
 

@@ -16,7 +16,7 @@ TOLD = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000
 
 
 def what_else_is_seen(image: Image, family: str, expected: Sequence[int]) -> str:
-    """Says which tags a picture shows that are not the expected ones, for an error message.
+    """Says which tags an image shows that are not the expected ones, for an error message.
 
     Also whether the expected ones are there once it is flipped over.
     """

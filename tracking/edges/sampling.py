@@ -14,7 +14,7 @@ from model.jit import compiled
 from model.pose import Array
 from tracking.camera_model import Image
 
-# A tag's square in the picture: its edges' frames, and where its modules lie beside an edge.
+# A tag's square in the image: its edges' frames, and where its modules lie beside an edge.
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""`cdpr calibrate camera`: from pictures of a board."""
+"""`cdpr calibrate camera`: from images of a board."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def camera(
 def _take_pictures(
     source: str, folder: Path, board: Board, wanted: int, size: tuple[int, int]
 ) -> None:
-    """Takes pictures until enough are there, the video ends, or Ctrl-C."""
+    """Takes images until enough are there, the video ends, or Ctrl-C."""
     requests = LocalRequests()
     with stop_requests(requests):
         take_pictures(

@@ -64,7 +64,7 @@ def extrinsics(
 ) -> None:
     """Find where a camera stands, by surveyed tags on the frame or by the rig's own motion.
 
-    Pictures must be taken while the camera stands still. Exit code 3 where the result is not good
+    Images must be taken while the camera stands still. Exit code 3 where the result is not good
     enough.
 
     [dim]Examples:[/dim]
@@ -89,7 +89,7 @@ def extrinsics(
     )
     found = made.found
     facts = [
-        ("by", f"{found.by}, {found.pictures} pictures"),
+        ("by", f"{found.by}, {found.pictures} images"),
         *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
         *moved_rows(the_camera.world_from_camera, found.world_from_camera),
     ]

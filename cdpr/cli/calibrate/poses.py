@@ -78,7 +78,7 @@ def poses(
     if as_json:
         show_json({"plan": str(output), "turned_deg": angles, **facts_of(made.document)})
         return
-    sentences = [s for s in sentences_of(made.document) if s[0] not in ("by way of", "search")]
+    sentences = [s for s in sentences_of(made.document) if s[0] not in ("via", "search")]
     text = f"{len(made.poses)}, rotated by up to {max(angles):.1f}°"
     next_step = f"cdpr run {output} --rig {rig} -o RUNDIR, then cdpr calibrate rig {rig} RUNDIR"
     show_facts(f"plan {output}", [("poses", text), *sentences, ("next", next_step)])

@@ -40,7 +40,7 @@ class Deviations:
         ),
     ] = 4.0
     anchors_mm: Annotated[
-        float, typer.Option(min=1e-6, callback=finite, help="likewise anchors")
+        float, typer.Option(min=1e-6, callback=finite, help="standard deviation of the anchors")
     ] = 1.0
     pulleys_mm: Annotated[
         float,

@@ -41,9 +41,9 @@ def tags(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where the tags are on the platform, from pictures that show two or more at once.
+    """Find where the tags are on the platform, from images that show two or more at once.
 
-    Turn the platform before the camera, or carry the camera around it: every picture may be taken
+    Turn the platform before the camera, or carry the camera around it: every image may be taken
     from anywhere. Exit code 3 where the result is not good enough.
 
     [dim]Examples:[/dim]

@@ -56,7 +56,7 @@ def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> 
     told = dict(sentences_of(document))["rotation"]
     tilt = float(told.removeprefix("tilted up to ").split("°")[0])
     assert 6.0 <= tilt <= 8.0
-    assert "turned up to" in told
+    assert "rotated up to" in told
     assert document.planner.rounds == [60]
 
 
