@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from cdpr.cli.demo import RIG, configs
+from cdpr.cli.demo import RIG
+from cdpr.cli.examples import configs
 from cdpr.cli.options import DaskOption, WorkersOption
 from cdpr.cli.output import Terminal, out, show_json
 from model.files.output import make_folder

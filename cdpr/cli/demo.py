@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-import cdpr
+from cdpr.cli.examples import configs
 from cdpr.cli.output import Terminal, out, show_facts
 from cdpr.cli.plan_facts import sentences_of
 from cdpr.cli.run import agreement, show, show_files
@@ -58,14 +58,3 @@ def demo(
         show_files(result, False)
     out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
     raise typer.Exit(result.exit_code)
-
-
-def configs(name: str = "configs") -> Path:
-    """The folder of the ready rigs and scenes: in the package, or in the repository.
-
-    Args:
-        name: ``examples`` for the recorded sessions instead.
-    """
-    package = Path(cdpr.__file__).resolve().parent
-    inside = package / name
-    return inside if inside.is_dir() else package.parent / name

@@ -7,6 +7,11 @@ from typing import Annotated
 
 import typer
 
+import cdpr
+from cdpr.cli.output import out, show_json
+from model.errors import BadInput
+from model.files.examples import copy_examples, find_examples, select_examples
+
 
 def examples(
     names: Annotated[
@@ -35,11 +40,6 @@ def examples(
 
       cdpr examples --all
     """
-    from cdpr.cli.demo import configs
-    from cdpr.cli.output import out, show_json
-    from model.errors import BadInput
-    from model.files.examples import copy_examples, find_examples, select_examples
-
     if names and everything:
         raise BadInput("--all copies every example already", next_step="leave out the names")
     if output is not None and not (names or everything):
@@ -61,3 +61,14 @@ def examples(
         return
     for path in copies:
         out.print(f"copied {path}", markup=False, soft_wrap=True)
+
+
+def configs(name: str = "configs") -> Path:
+    """The folder of the ready rigs and scenes: in the package, or in the repository.
+
+    Args:
+        name: ``examples`` for the recorded sessions instead.
+    """
+    package = Path(cdpr.__file__).resolve().parent
+    inside = package / name
+    return inside if inside.is_dir() else package.parent / name

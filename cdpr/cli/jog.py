@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import show_cable
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     FastOption,
     InterfaceOption,
@@ -19,6 +20,7 @@ from cdpr.cli.options import (
     YesOption,
     require_unused,
     rig_on_bus,
+    with_option_groups,
 )
 from cdpr.cli.output import Terminal, out, show_json
 from cdpr.cli.run import agreement, show, show_files
@@ -32,15 +34,50 @@ from model.rig import Rig
 from model.scene import Scene, load_scene
 
 
-def jog(
-    rig: RigArgument,
+@dataclass(frozen=True, slots=True)
+class PathOptions:
+    """How far the platform is moved, among what; every field is an option of `cdpr jog`."""
+
     by_mm: Annotated[
         tuple[float, float, float] | None,
         typer.Option("--by-mm", help="distance x y z, at most 50 mm"),
-    ] = None,
+    ] = None
     to_home: Annotated[
         bool, typer.Option("--to-home", help="move to the rig's home pose and orientation")
-    ] = False,
+    ] = False
+    scene: Annotated[Path | None, typer.Option(help="scene file: obstacles and payload")] = (None,)
+    no_scene: Annotated[
+        bool, typer.Option("--no-scene", help="jog without a description of obstacles")
+    ] = False
+    clearance_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
+    ] = None
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="run folder to create (default: runs/jog, runs/jog-2 …)"
+        ),
+    ] = None
+
+    def given(self) -> dict[str, object]:
+        """Each option by name with its value."""
+        return {
+            "--by-mm": self.by_mm,
+            "--to-home": self.to_home,
+            "--scene": self.scene,
+            "--no-scene": self.no_scene,
+            "--clearance-mm": self.clearance_mm,
+            "--output": self.output,
+        }
+
+
+DEFAULT_PATH = PathOptions()
+
+
+@with_option_groups
+def jog(
+    rig: RigArgument,
+    path: PathOptions = DEFAULT_PATH,
     cable: Annotated[
         int | None, typer.Option("--cable", min=1, help="move one winch alone, with --mm")
     ] = None,
@@ -50,22 +87,9 @@ def jog(
     limit_n: Annotated[
         float | None, typer.Option(help="with --cable: tension limit of any cable (default: 60 %)")
     ] = None,
-    scene: Annotated[Path | None, typer.Option(help="scene file: obstacles and payload")] = None,
-    no_scene: Annotated[
-        bool, typer.Option("--no-scene", help="jog without a description of obstacles")
-    ] = False,
-    clearance_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
-    ] = None,
     speed_mm_s: Annotated[
         float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
     ] = 1000.0 * SPEED,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="run folder to create (default: runs/jog, runs/jog-2 …)"
-        ),
-    ] = None,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     calibration: CalibrationOption = None,
@@ -92,14 +116,7 @@ def jog(
     if cable is not None or mm is not None:
         require_unused(
             "cdpr jog",
-            {
-                "--by-mm": by_mm,
-                "--to-home": to_home,
-                "--scene": scene,
-                "--no-scene": no_scene,
-                "--clearance-mm": clearance_mm,
-                "--output": output,
-            },
+            path.given(),
             "a single cable is moved without a path, and obstacles are not checked",
         )
         _one_cable(the_rig, cable, mm, limit_n, speed, fast, yes, without_real_time, as_json)
@@ -107,17 +124,17 @@ def jog(
     require_unused(
         "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
-    by = None if by_mm is None else millimetres(list(by_mm))
-    jogging.require_distance(by, to_home=to_home)
-    the_scene = _scene(scene, no_scene, clearance_mm)
+    by = None if path.by_mm is None else millimetres(list(path.by_mm))
+    jogging.require_distance(by, to_home=path.to_home)
+    the_scene = _scene(path.scene, path.no_scene, path.clearance_mm)
     with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
         result = jogging.jog(
             the_rig,
             the_scene,
             by=by,
-            to_home=to_home,
+            to_home=path.to_home,
             speed=speed,
-            folder=output,
+            folder=path.output,
             realtime=not fast,
             need_real_time_rights=not without_real_time,
             listener=Terminal(quiet=as_json),

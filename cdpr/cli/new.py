@@ -5,12 +5,15 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from model.files.new_rig import RigQuestion
+from cdpr.cli.output import out
+from model.errors import BadInput
+from model.files.documents import write_atomic
+from model.files.new_rig import OPTIONS, RigQuestion, collect_answers, read_coordinates
+from model.files.rig_template import rig_text
 
 _Point = tuple[float, float, float]
 
@@ -62,12 +65,6 @@ def new(
 
       cdpr new my_rig.yaml --from cables.csv --mass-kg 2.5 --interface socketcan --channel can0
     """
-    from cdpr.cli.output import out
-    from model.errors import BadInput
-    from model.files.documents import write_atomic
-    from model.files.new_rig import OPTIONS, collect_answers, read_coordinates
-    from model.files.rig_template import rig_text
-
     if rig.exists() and not force:
         raise BadInput(
             "the file exists already",
@@ -91,8 +88,6 @@ def new(
 
 def _ask(question: RigQuestion, default: str) -> str:
     """The typed answer; standard error has the question, so that output can go to a file."""
-    from model.errors import BadInput
-
     unit = f" {question.unit}" if question.unit else ""
     print(f"{question.text} [{default}]{unit}: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()

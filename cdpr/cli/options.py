@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from cdpr.cli.calibrations import calibrated_rig
+from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.rig import Rig, load_rig
 
@@ -72,6 +72,32 @@ def _parameters(group: Any) -> list[inspect.Parameter]:
         inspect.Parameter(option.name, kind, default=option.default, annotation=hints[option.name])
         for option in fields(group)
     ]
+
+
+# Calibration results in place of the rig file's values.
+
+CalibrationOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--calibration",
+        help="result file of `cdpr calibrate`, used instead of the rig file's values; repeatable",
+        metavar="FILE",
+    ),
+]
+
+
+def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
+    """See `calibration.load.with_calibrations`.
+
+    Raises:
+        BadInput: A file cannot be used, or is not about this rig.
+    """
+    if not files:
+        return rig
+    # Scientific libraries, of which `cdpr stop` and others without this option must not wait.
+    from calibration.load import with_calibrations
+
+    return with_calibrations(rig, files, Terminal())
 
 
 # Verbs that reach drives: the rig, its bus, and how its drives are moved.

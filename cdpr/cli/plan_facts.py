@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cdpr.cli.stop_facts import stop_facts
 from model.files.plan_file import OptimalPlannerDocument, PlanDocument, PlannerDocument
 from model.rotation_limits import largest_rotations
-from model.scene import scene_from_document
+from model.scene import Scene, legs_of, scene_from_document
 from model.statics.dexterity import rms_anchor_radius
 
 
@@ -83,3 +82,14 @@ def _search_sentence(document: PlanDocument) -> str:
         again = " ".join(f"--rounds {rounds}" for rounds in planner.rounds)
         return f"{sum(planner.rounds)} rounds (to repeat: {again}), {rest}{search}"
     return f"{statistics.nodes} nodes, {statistics.iterations} samples, {rest}"
+
+
+def stop_facts(scene: Scene) -> list[tuple[str, str]]:
+    """Stops with what happens there and what is carried on; nothing for a scene without."""
+    carried = [leg.scene.load.payload_mass for leg in legs_of(scene)]
+    shown = []
+    for stop, before, after in zip(scene.stops, carried[:-1], carried[1:], strict=True):
+        load = f", then {after:g} kg" if after != before else ""
+        dwell = f" {stop.dwell:g} s" if stop.dwell > 0.0 else ""
+        shown.append(f"{stop.name} ({stop.kind}{dwell}{load})")
+    return [("via", ", ".join(shown))] if shown else []

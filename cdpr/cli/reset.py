@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import reference_dict, reference_text, show_reset
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     InterfaceOption,
     JsonOption,

@@ -8,15 +8,16 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
 from cdpr.cli.facts import show_missing, show_prepared, show_summary
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     FastOption,
     InterfaceOption,
     SummaryJsonOption,
     WithoutRealTimeOption,
     YesOption,
+    calibrated_rig,
     require_unused,
     rig_on_bus,
 )

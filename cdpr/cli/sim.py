@@ -7,8 +7,15 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import ChannelOption, InterfaceOption, RigArgument, Triple, rig_on_bus
+from cdpr.cli.options import (
+    CalibrationOption,
+    ChannelOption,
+    InterfaceOption,
+    RigArgument,
+    Triple,
+    calibrated_rig,
+    rig_on_bus,
+)
 from cdpr.cli.output import Terminal, out
 from cdpr.cli.supervision import stop_requests
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus

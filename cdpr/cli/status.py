@@ -6,9 +6,9 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import show_status, status_dict
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     InterfaceOption,
     JsonOption,

@@ -11,8 +11,7 @@ import numpy as np
 import typer
 
 from cdpr.cli.arguments import refuse_overwriting
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import JsonOption, RigArgument
+from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import Terminal, show_facts, show_json
 from cdpr.cli.supervision import stop_requests
 from executor.cameras.sources import parse_camera_sources

@@ -173,7 +173,7 @@ class DriveMonitor:
         How often a drive may be silent is the executor's to say (`executor.safety.monitor`).
 
         Args:
-            known: Faults known already; a drive whose emergency is among them is not reported again.
+            known: Faults known already; a drive whose emergency is among them is left out.
             powered: The group is under power or on its way there; replies that cannot be believed
                 are a fault then.
         """

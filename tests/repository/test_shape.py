@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 MOST_FILES, MOST_LINES, MOST_IN_FUNCTION = 20, 450, 80
 FULL_FOLDERS: set[str] = {"cdpr/cli"}
 LONG_MODULES: set[str] = set()
-LONG_FUNCTIONS: set[str] = {"cdpr/cli/home.py:home", "cdpr/cli/jog.py:jog"}
+LONG_FUNCTIONS: set[str] = set()
 CIRCLES: list[list[str]] = []
 
 

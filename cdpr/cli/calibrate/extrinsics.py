@@ -21,8 +21,7 @@ from cdpr.cli.calibrate.output import (
     WantedOption,
     show_calibration,
 )
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import JsonOption, RigArgument, finite
+from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig, finite
 from cdpr.cli.output import Terminal
 from model.rig import load_rig
 

@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from calibration.geometry.pose_selection import measurement_poses
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
 from cdpr.cli.options import (
+    CalibrationOption,
     JsonOption,
     PlanFileOption,
     ReplacePlanOption,
     RigArgument,
     SceneArgument,
+    calibrated_rig,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
 from cdpr.cli.plan_facts import facts_of, sentences_of
