@@ -45,7 +45,7 @@ class PathOptions:
     to_home: Annotated[
         bool, typer.Option("--to-home", help="move to the rig's home pose and orientation")
     ] = False
-    scene: Annotated[Path | None, typer.Option(help="scene file: obstacles and payload")] = (None,)
+    scene: Annotated[Path | None, typer.Option(help="scene file: obstacles and payload")] = None
     no_scene: Annotated[
         bool, typer.Option("--no-scene", help="jog without a description of obstacles")
     ] = False
