@@ -119,7 +119,7 @@ def looks_at_rest(
             the looking.
 
     Raises:
-        CdprError: The camera failed, for the reason told.
+        CdprError: The camera failed, for the reason given.
     """
     began, looks = time.monotonic(), []
     for frame in range(pictures):
