@@ -45,7 +45,7 @@ class WatchLimits:
         following_error: Cable length, [m].
         min_tension: Slack below this, [N].
         max_tension: Over-tension above this, [N].
-        no_tension: Below this a cable is torn or hangs loose, [N].
+        no_tension: Below this a cable is broken or slack, [N].
         slack_cycles: Cycles of slack or over-tension that are one too many.
         loose_cycles: Cycles without tension that are one too many.
         missing_cycles: Missing replies in a row that are one too many.
