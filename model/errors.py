@@ -87,6 +87,13 @@ class BadInput(CdprError):
     exit_code = 2
 
 
+class AlreadyExists(BadInput):
+    """A file or folder that would be replaced; the caller can allow it."""
+
+    def __init__(self, what: str, where: str, why: str = "") -> None:
+        super().__init__(what, where=where, why=why, next_step="choose another name")
+
+
 class Refused(CdprError):
     """A safety check said no before anything moved."""
 

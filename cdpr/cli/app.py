@@ -15,7 +15,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from cdpr.cli.verbs import LazyGroup
-from model.errors import BadInput, CdprError, Fault
+from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.reading import shown
 
 EPILOG = (
@@ -85,7 +85,7 @@ def main() -> None:
             )
         )
     except Exception as error:
-        _tell_bug(error)
+        _print_defect(error)
         sys.exit(1)
     finally:
         # Nor is there rubbish to be found in them at the end, which took another fifth.
@@ -101,7 +101,7 @@ def _print_anything() -> None:
 
 def _end(error: CdprError) -> NoReturn:
     with suppress(OSError):  # the cause may be that nothing can be written
-        _tell(error)
+        _print_error(error)
     with suppress(OSError):
         sys.stdout.flush()
     _forget_output()
@@ -136,13 +136,15 @@ def _of_the_system(error: OSError) -> CdprError:
     return Fault("the command could not write all its output", why=why, next_step=hint)
 
 
-def _tell(error: CdprError) -> None:
+def _print_error(error: CdprError) -> None:
+    if isinstance(error, AlreadyExists):  # the library knows no options
+        error.next_step += ", or pass --force to replace it"
     if "--json" in sys.argv:
         print(json.dumps(error.as_dict(), indent=1))
     print(f"error: {error}", file=sys.stderr)
 
 
-def _tell_bug(error: Exception) -> None:
+def _print_defect(error: Exception) -> None:
     """An unexpected error: one line for the user, the trace in a file."""
     with tempfile.NamedTemporaryFile(
         "w", prefix="cdpr-error-", suffix=".txt", delete=False, encoding="utf-8"

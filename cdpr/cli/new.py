@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from cdpr.cli.output import out
-from model.errors import BadInput
+from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_atomic
 from model.files.new_rig import OPTIONS, RigQuestion, collect_answers, read_coordinates
 from model.files.rig_template import rig_text
@@ -66,11 +66,7 @@ def new(
       cdpr new my_rig.yaml --from cables.csv --mass-kg 2.5 --interface socketcan --channel can0
     """
     if rig.exists() and not force:
-        raise BadInput(
-            "the file exists already",
-            where=str(rig),
-            next_step="choose another name, or pass --force to replace it",
-        )
+        raise AlreadyExists("the file exists already", str(rig))
     given = {key: context.params[key] for key in OPTIONS if context.params[key] is not None}
     if coordinates is None:
         answers = collect_answers(rig.stem, given, _ask, _refuse)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import Frame, Image, is_too_large
-from model.errors import BadInput, Fault
+from model.errors import AlreadyExists, BadInput, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, read_bytes
 from model.rig import Camera
@@ -244,11 +244,7 @@ class PictureOutput:
                 next_step=f"name a folder, or a file ending in {', '.join(VIDEO_CODES)}",
             )
         if path.exists() and not force:
-            raise BadInput(
-                "the file already exists",
-                where=str(path),
-                next_step="name another one, or pass --force",
-            )
+            raise AlreadyExists("the file exists already", str(path))
         try:
             (path.parent if self._is_video else path).mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from model.errors import BadInput
+from model.errors import AlreadyExists, BadInput
 
 
 def require_new_file(path: Path, replace: bool = False) -> None:
@@ -21,11 +21,7 @@ def require_new_file(path: Path, replace: bool = False) -> None:
     if path.is_dir():
         raise BadInput("this is a folder", where=str(path), next_step="name a file")
     if path.exists() and not replace:
-        raise BadInput(
-            "the file exists already",
-            where=str(path),
-            next_step="choose another name, or pass --force to replace it",
-        )
+        raise AlreadyExists("the file exists already", str(path))
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise BadInput(
             "the file cannot be written",
@@ -43,11 +39,7 @@ def make_folder(folder: Path, force: bool = False) -> None:
     """
     make_place(folder)
     if any(folder.iterdir()) and not force:
-        raise BadInput(
-            "the folder is not empty",
-            where=str(folder),
-            next_step="choose another name, or pass --force to write into it",
-        )
+        raise AlreadyExists("the folder is not empty", str(folder))
 
 
 def make_place(folder: Path) -> None:
