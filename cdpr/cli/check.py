@@ -25,7 +25,7 @@ def check(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Prove a plan by an independent route: distances on dense poses, with a stated bound.
+    """Check a plan with an independent method: distances at dense poses, with bounds.
 
     Exits with 3 when anything is below what the scene asks.
 

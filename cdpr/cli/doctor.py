@@ -32,7 +32,7 @@ def doctor(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look whether this machine has what a run needs; with a rig file, whether its bus opens.
+    """Check that this machine can run a rig; with a rig file, also its bus and cameras.
 
     Each thing that is missing comes with the command that mends it. Nothing is sent on the bus;
     with --drives only questions are, and no drive is changed.

@@ -113,7 +113,7 @@ def home(
     without_real_time: WithoutRealTimeOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the reference as JSON")] = False,
 ) -> None:
-    """Wind slack cables in until all are taut, then reference the drives at a pose that is known.
+    """Pretension all cables, then set the encoder reference at a known pose.
 
     All winches together, slowly, each until its cable carries the pretension; a cable that carries
     too much, or none after the whole reach, stops all. The reference is a file of its own, which

@@ -98,7 +98,7 @@ def jog(
     without_real_time: WithoutRealTimeOption = False,
     as_json: SummaryJsonOption = False,
 ) -> None:
-    """Move the platform straight by a few millimetres, slowly, from where it stands.
+    """Move the platform straight slowly by a few millimetres from its present pose.
 
     A jog is a run: planned, proved, checked and gated like any other, and it can be stopped, held
     and watched. With the interface 'virtual' the simulated platform hangs at home. With --cable one

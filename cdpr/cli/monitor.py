@@ -38,7 +38,7 @@ def monitor(
         typer.Option("--process", help="process number, if several runs are in progress"),
     ] = None,
 ) -> None:
-    """Watch a run: its state, every drive, tension, lateness, progress and events, to its end.
+    """Show a run live: state, drives, tensions, lateness, progress and events.
 
     It only looks; `cdpr stop`, `hold`, `resume` and `speed` act. Ctrl-C ends the monitor, not the
     run. Exit code: 0 when the motion finished, 130 when it was stopped, 1 otherwise.

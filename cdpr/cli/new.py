@@ -55,7 +55,7 @@ def new(
     bitrate: Annotated[int | None, typer.Option(help="bit rate of the bus, bit/s")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Ask for the least that a rig file needs, and write a commented one.
+    """Ask for the essentials of a rig, and write a commented rig file.
 
     Each question has a unit and a default, which Enter takes; what an option gives is not asked.
 

@@ -16,7 +16,7 @@ _Json = Annotated[bool, typer.Option("--json", help="print the run's status as J
 
 
 def hold(process: _Process = None, as_json: _Json = False) -> None:
-    """Feed hold: the platform slows down along the path, waits there, and keeps its tension.
+    """Feed hold: the platform slows down along the path and waits there under tension.
 
     [dim]Example:[/dim]
 
@@ -26,7 +26,7 @@ def hold(process: _Process = None, as_json: _Json = False) -> None:
 
 
 def resume(process: _Process = None, as_json: _Json = False) -> None:
-    """Go on after `cdpr hold`, at the speed that was asked for last.
+    """Continue after `cdpr hold`, at the last requested speed.
 
     [dim]Example:[/dim]
 
@@ -43,7 +43,7 @@ def speed(
     process: _Process = None,
     as_json: _Json = False,
 ) -> None:
-    """Go at a share of the planned speed along the path, from the next cycle on.
+    """Scale the speed along the path to a percentage of the planned one.
 
     [dim]Example:[/dim]
 

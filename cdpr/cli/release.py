@@ -27,7 +27,7 @@ def release(
     without_real_time: WithoutRealTimeOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """End the day: with the platform on a support, close the brakes and take the torque off.
+    """Release the drives with the platform on a support: close brakes, remove torque.
 
     All drives together; set-points move nothing. Winches without brakes let their cables go, so
     that the drives have to be referenced again.

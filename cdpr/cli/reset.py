@@ -25,7 +25,7 @@ def reset(
     yes: NoQuestionOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Take a latched fault off, after its cause is gone: resets drives in fault; moves nothing.
+    """Release a latched fault once its cause is removed: resets drives in fault, moves nothing.
 
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
     Afterwards a run starts only from where the platform stands.

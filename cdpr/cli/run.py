@@ -79,7 +79,7 @@ def run(
     ] = False,
     as_json: SummaryJsonOption = False,
 ) -> None:
-    """Run a plan: prove it, make its set-points, arm the drives, move, measure, report.
+    """Run a plan: check it, compute set-points, arm the drives, move, measure, report.
 
     With the interface 'virtual' the drives, the platform and the camera are simulated in this
     process. Ctrl-C and `cdpr stop` slow all drives down together along the path; they then hold.

@@ -65,7 +65,7 @@ def workspace(
     force: Annotated[bool, typer.Option("--force", help="replace the maps in the folder")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> None:
-    """Map where the robot can be and how well it can work there.
+    """Map the workspace: feasibility, wrench closure, capacity margin and dexterity.
 
     Wrench closure and feasibility, dexterity, forces and clearances, as one page.
 

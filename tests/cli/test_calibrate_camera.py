@@ -91,7 +91,7 @@ def test_squares_told_too_small_do_not_make_a_result_good(folder) -> None:
     """All millimetres shrink with the squares, pixels do not."""
     answer = call("calibrate", "camera", folder, *BOARD, "--wanted-mm", "5", "--square-mm", "2")
     assert answer.code == 3, answer
-    assert "1 px is needed" in answer.said
+    assert "1 px is required" in answer.said
     assert "pass --distance-m" in answer.said
 
 
@@ -118,7 +118,7 @@ def test_one_picture_many_times_is_never_good_enough(tmp_path) -> None:
     for k, image in enumerate(pictures(1, 0.0) * 8):
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
-    one_message(answer, 2, "seen in 1 of 8 images", "1.png shows the same as 0.png")
+    one_message(answer, 2, "detected in 1 of 8 images", "1.png shows the same as 0.png")
     assert "tilt" in answer.said
 
 
@@ -144,7 +144,7 @@ def test_a_wrong_size_of_squares_shows_in_the_distance_of_the_boards(folder) -> 
         ((*BOARD, "--name", "front/left"), "--name"),
         (("--square-mm", "25"), "needs --columns and --rows"),
         (("--columns", "9", "--rows", "6"), "needs --square-mm"),
-        ((*BOARD, "--tag-mm", "30"), "knows no --tag-mm"),
+        ((*BOARD, "--tag-mm", "30"), "does not take --tag-mm"),
         (("--columns", "2", "--rows", "5", "--square-mm", "25"), "3 inner corners"),
     ],
 )
@@ -160,4 +160,4 @@ def test_three_pictures_are_too_few(tmp_path) -> None:
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
     assert answer.code == 2
-    assert "seen in 3 of 3 images; 4 are the least" in answer.err
+    assert "detected in 3 of 3 images; 4 are required" in answer.err

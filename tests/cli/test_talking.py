@@ -120,7 +120,7 @@ def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
 def test_a_wish_that_reaches_no_run_is_no_success(verb: tuple[str, ...]) -> None:
     told = call(*verb)
     assert told.code == 1
-    assert "no active run is going on" in told.err
+    assert "no active run found" in told.err
     assert "emergency stop" in told.err
 
 
@@ -133,7 +133,7 @@ def test_a_stop_that_stops_nothing_is_no_success() -> None:
     """Who presses stop and sees something move must not read that all is well."""
     told = call("stop")
     assert told.code == 1
-    assert "no active run is going on" in told.err
+    assert "no active run found" in told.err
     assert "emergency stop" in told.err
     nobody = {"stopped_processes": [], "silent_processes": []}
     assert document(call("stop", "--json")) == nobody

@@ -116,8 +116,8 @@ CASES = {
         lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
     ),
     "a winch jams": Case(jam, "drive_stuck", ("(drive 2) did not move",), lost=(1,)),
-    "a winch slips": Case(slip, "following_error", ("cable 2", "allowed 2.00 mm"), lost=(1,)),
-    "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "torn"), within=5),
+    "a winch slips": Case(slip, "following_error", ("cable 2", "limit 2.00 mm"), lost=(1,)),
+    "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "broken"), within=5),
     "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "102.0 N"), within=60),
     "the loop is late": Case(late, "late", ("1.4 cycles late; stopped along",), within=40),
     "the loop hung": Case(far_too_late, "late", ("1371.9 cycles late; quick stop",)),

@@ -140,7 +140,7 @@ def test_a_plan_from_a_stopped_run_runs_to_the_goal_through_the_stops_left(
     folder = stopped.folder.path
     answer = call("plan", RIG, scene_file, "-o", plan, "--from-run", folder, "--rounds", "3")
     assert answer.code == 0, answer
-    assert "carrying 1.5 kg; 1 stops done, 2 left" in answer.said
+    assert "with 1.5 kg; 1 stops done, 2 left" in answer.said
     rest = load_plan(plan)
     assert [stop.name for stop in rest.scene.stops] == ["by", "leave"]
     assert [stop.name for stop in rest.document.done] == ["take"]
@@ -275,4 +275,4 @@ def test_way_poses_of_the_command_line_are_met_before_the_scenes_stops(
     np.testing.assert_allclose(made.waypoints[made.stops[0]].position, [0.005, -0.005, 0.45])
     for wrong in ("1 2", "1 2 x", "1 2 nan"):
         told = call(*arguments, "--force", "--via-mm", *wrong.split())
-        one_message(told, 2, f"--via-mm {wrong}: needs")
+        one_message(told, 2, f"--via-mm {wrong}:", "numbers are required")

@@ -538,7 +538,7 @@ def test_a_pose_that_is_not_known_well_is_refused() -> None:
     with pytest.raises(Refused, match="is not at rest"):
         rest_pose(rig, looks(rig, home, away, home, away))
     far = Pose.level(home.position + np.array([5.0, 5.0, 0.0]))
-    with pytest.raises(Refused, match="0 of 2 pictures"):
+    with pytest.raises(Refused, match="0 of 2 images"):
         rest_pose(rig, looks(rig, far, far))
 
 

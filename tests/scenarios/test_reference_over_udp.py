@@ -41,7 +41,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         loss.happen_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         first = call(*run, "-o", tmp_path / "first")
         assert first.code == 3
-        assert "never referenced" in first.err
+        assert "never homed" in first.err
         start = [f"{x:.6f}" for x in slow_run.scene.start.position * 1000.0]
         homed = call("home", rig, "--pose-mm", *start, *bus, "--json")
         assert homed.code == 0, homed

@@ -239,7 +239,7 @@ def test_a_camera_that_hangs_is_told_and_the_run_goes_on_with_the_other(
     folder = RunFolder.open(run)
     hangs, end = told_of(folder, "camera_sees_nothing"), told_of(folder, "camera")
     assert [e["text"] for e in hangs] == [
-        "camera side gave no answer for 2 s; clearance is measured by front"
+        "camera side did not answer for 2 s; clearance is measured by front"
     ]
     assert "camera side failed (no answer since 0." in end[0]["text"]
     moved = [e["time_s"] for e in folder.summary()["events"] if e["code"] == "held"]
@@ -267,7 +267,7 @@ def test_a_run_whose_only_camera_hangs_comes_to_its_end_and_does_not_pass(
     summary = folder.summary()
     assert summary["final_state"] == "finished"
     (hangs,) = told_of(folder, "camera_sees_nothing")
-    assert hangs["text"] == "camera front gave no answer for 2 s; clearance is not measured"
+    assert hangs["text"] == "camera front did not answer for 2 s; clearance is not measured"
     assert any("Camera front failed: no answer" in reason for reason in summary["reasons"])
     assert folder.poses().ok[:-1].all(), "what was measured before is on record"
     assert not folder.poses().ok[-1]

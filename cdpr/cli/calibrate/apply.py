@@ -23,7 +23,7 @@ def apply(
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Write a new rig file with calibration results in place of the rig file's numbers.
+    """Write a new rig file with calibration results in place of its own values.
 
     The rig file itself is never changed, and comments of it are not copied.
 

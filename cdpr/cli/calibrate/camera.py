@@ -53,7 +53,7 @@ def camera(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find a camera's matrix and lens distortion, and say whether they are good enough.
+    """Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.
 
     Exit code 3 where they are not. Files that cannot be used are named; the others are used.
 

@@ -61,7 +61,7 @@ def extrinsics(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where a camera stands, by surveyed tags on the frame or by the rig's own motion.
+    """Find a camera's pose, from surveyed tags on the frame or from the rig's motion.
 
     Images must be taken while the camera stands still. Exit code 3 where the result is not good
     enough.

@@ -138,7 +138,7 @@ def rig(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
+    """Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.
 
     Each is given with its uncertainty.
 

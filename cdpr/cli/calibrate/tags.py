@@ -40,7 +40,7 @@ def tags(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where the tags are on the platform, from images that show two or more at once.
+    """Find the tags' poses on the platform, from images that show two or more at once.
 
     Turn the platform before the camera, or carry the camera around it: every image may be taken
     from anywhere. Exit code 3 where the result is not good enough.

@@ -38,7 +38,7 @@ def print_(
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a board, or the tags of a rig, as PDF in exact size, with the white that they need.
+    """Make a calibration board, or the tags of a rig, as a PDF in exact size.
 
     [dim]Examples:[/dim]
 

@@ -379,7 +379,7 @@ TABLE: dict[str, Fault] = {
         broken(1, by=slip),
         within=BELIEVED,
         late=MAY_BE_LATE,
-        words=("cable 2", "allowed 2.00 mm"),
+        words=("cable 2", "limit 2.00 mm"),
     ),
     "F18 a cable slackens": Fault(then(feels(0.05)), within=PATH_STOP, words=("cable 6", "slack")),
     "F18 a cable is overloaded": Fault(
