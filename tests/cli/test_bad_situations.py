@@ -300,7 +300,7 @@ def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
         ({"camera": "0", "fast": True}, ["--camera 0", "--fast needs synthetic cameras"]),
         (
             {"camera": "plan.json"},
-            ["'plan.json' is not a live camera source", "while the platform moves"],
+            ["'plan.json' is not a live camera source", "during the motion"],
         ),
         (
             {"camera": "/nowhere/run.avi"},

@@ -118,7 +118,7 @@ def test_one_picture_many_times_is_never_good_enough(tmp_path) -> None:
     for k, image in enumerate(pictures(1, 0.0) * 8):
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
-    one_message(answer, 2, "detected in 1 of 8 images", "1.png shows the same as 0.png")
+    one_message(answer, 2, "detected in 1 of 8 images", "1.png duplicates 0.png")
     assert "tilt" in answer.said
 
 

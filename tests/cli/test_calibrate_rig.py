@@ -130,7 +130,7 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
 @pytest.mark.parametrize(
     ("how", "what"),
     [
-        ("few", "only 5 places"),
+        ("few", "only 5 stationary samples"),
         ("nan", "line 4, x_mm: 'nan' is not a finite number"),
         ("text", "line 6, actual_1_counts: 'lost' is not a finite number"),
         ("short", "line 5 has 22 values for 23 columns"),

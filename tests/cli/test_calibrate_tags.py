@@ -115,7 +115,7 @@ def test_pictures_that_were_saved_anew_count_once(folder, tmp_path) -> None:
         if k < 6:
             cv2.imwrite(str(tmp_path / f"copy_{k}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
     found = json.loads(call("calibrate", "tags", RIG, tmp_path, "--json").out)
-    copies = {name: why for name, why in found["unused"].items() if "shows the same as" in why}
+    copies = {name: why for name, why in found["unused"].items() if "duplicates" in why}
     assert len(copies) == sum(f"{k}.png" in found["picture_errors_px"] for k in range(6))
 
 

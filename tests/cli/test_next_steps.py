@@ -66,7 +66,7 @@ def test_a_plan_that_was_made_for_calibrated_numbers_is_refused_with_that_as_a_r
     [
         ("latched", "socketcan", "cdpr reset RIG"),
         ("latched", "virtual", "run again into a new folder"),
-        ("finished", "socketcan", "see in the report"),
+        ("finished", "socketcan", "check the report"),
     ],
 )
 def test_a_run_that_failed_has_a_next_step_and_its_faults_explained(

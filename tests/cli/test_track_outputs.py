@@ -123,7 +123,10 @@ def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("drawn.gif", "neither a folder nor a video"), ("there.avi", "the file exists already")],
+    [
+        ("drawn.gif", "neither a folder nor a supported video"),
+        ("there.avi", "the file exists already"),
+    ],
 )
 def test_a_place_that_cannot_be_drawn_to_is_refused(
     plan: Path, tmp_path: Path, name: str, words: str

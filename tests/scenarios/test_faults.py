@@ -138,7 +138,7 @@ CASES = {
     "a drive does not go over to hold": Case(
         lambda stage: setattr(stage.drives[4], "_command_quick_stop", lambda: None),
         "hold_timeout",
-        ("did not go over to hold",),
+        ("did not hold within",),
         within=600,
         lost=(4,),
     ),

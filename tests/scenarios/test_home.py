@@ -457,7 +457,7 @@ def moved_by_hand(place: Place) -> None:
     [
         (lambda _place: None, None),
         (moved_by_hand, r"cable 4 \(drive 4\) moved by 0.20 mm"),
-        (loses_all_torque, "not all drives hold"),
+        (loses_all_torque, "not all drives still hold"),
         (fails, "drive 7"),
     ],
 )
@@ -484,7 +484,7 @@ def no_more_heard(place: Place) -> None:
     ("happens", "told", "counts"),
     [
         (moved_by_hand, "moved by 0.20 mm", True),
-        (loses_all_torque, "not all drives hold", False),
+        (loses_all_torque, "not all drives still hold", False),
         (no_more_heard, "no answer after", True),
     ],
 )

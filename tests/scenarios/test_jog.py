@@ -39,7 +39,7 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: P
 @pytest.mark.parametrize(
     ("options", "code", "part"),
     [
-        (("--by-mm", "30", "30", "30", "--no-scene"), 3, "longer than 50 mm"),
+        (("--by-mm", "30", "30", "30", "--no-scene"), 3, "exceeds 50 mm"),
         (("--by-mm", "0", "0", "0", "--no-scene"), 2, "jog distance is zero"),
         (("--by-mm", "nan", "0", "0", "--no-scene"), 2, "must be a finite number"),
         (WAY, 2, "obstacles are not given"),

@@ -143,7 +143,7 @@ def test_f24_set_points_that_were_changed_after_their_check_are_not_armed(
     setpoints[200, 3] += change
     try:
         with simulated(prepared, tmp_path / "run", nothing) as bench:
-            with pytest.raises(Refused, match="not those that were checked"):
+            with pytest.raises(Refused, match="differ from those that were checked"):
                 bench.run()
             assert all(ENABLED not in sample.states for sample in bench.rehearsal.samples)
     finally:
