@@ -2,9 +2,9 @@
 
     python benchmarks/camera_calibration.py [--trials 50] [--pictures 20]
 
-Every trial renders a chessboard with a lens, noise and random poses, finds it in the pictures and
+Every trial renders a chessboard with a lens, noise and random poses, finds it in the images and
 calibrates; the peer is plain OpenCV (`findChessboardCornersSB`, `calibrateCamera`) on the same
-pictures.
+images.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ TRUTH = np.array([MATRIX[0, 0], MATRIX[1, 1], MATRIX[0, 2], MATRIX[1, 2], *DISTO
 
 
 def rendered(count: int, seed: int) -> list[tuple[str, np.ndarray]]:
-    """Pictures of the board."""
+    """Images of the board."""
     poses = poses_before_the_camera(MIDDLE, count, seed=seed, spread=0.10)
     return [
         (f"{k}", with_noise(picture_of(chessboard_print(), 0.0005, np.full(2, 0.05), pose), k))
@@ -74,7 +74,7 @@ def main() -> None:
         verdicts.append(judge_camera(found, 1e-3).verdict.good)
     ours, theirs = (np.sqrt(np.mean(np.square(part), axis=0)) for part in (errors, peers))
     print(
-        f"{arguments.trials} trials of {arguments.pictures} pictures; good enough for 1 mm:", end=""
+        f"{arguments.trials} trials of {arguments.pictures} images; good enough for 1 mm:", end=""
     )
     print(f" {sum(verdicts)}")
     print(f"{'':8s}{'in 95 %':>9s}{'RMS error':>12s}{'OpenCV alone':>14s}")

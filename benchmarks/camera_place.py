@@ -75,7 +75,7 @@ def bound(rig: Rig, tags: tuple[Tag, ...], survey: Survey) -> float:
 def error(
     rig: Rig, tags: tuple[Tag, ...], survey: Survey, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Of one survey and one picture: mean square of points of the work space, and as stated."""
+    """Of one survey and one image: mean square of points of the work space, and as stated."""
     camera = rig.cameras[0]
     there, squares = camera.world_from_camera.inverse(), {}
     for tag in tags:

@@ -3,7 +3,7 @@
     python benchmarks/detection.py [--pictures 60] [--family tag36h11]
 
 Every column holds one condition: size, tilt, motion blur, lens blur, contrast. All detectors get
-the same rendered pictures, whose corners are known exactly. The peers are
+the same rendered images, whose corners are known exactly. The peers are
 `cv2.aruco.ArucoDetector` without refinement, with sub-pixel refinement and with its AprilTag
 refinement, and, where it is installed (extra `apriltag`), pyapriltags without decimation.
 """
@@ -36,7 +36,7 @@ from tracking.edges.refine import refine
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Corners farther off than this share of a module are of something else, not a tag found.
 NEAR = 0.7
-#: Number to corners, shape (4, 2), of one picture; the number that is in it helps nobody but us,
+#: Number to corners, shape (4, 2), of one image; the number that is in it helps nobody but us,
 #: as it stands in the rig file.
 Finder = Callable[[Image, int], Mapping[int, Array]]
 
@@ -115,7 +115,7 @@ def apriltag_library(family: str) -> Finder | None:
 
 @dataclass
 class Score:
-    """What a finder made of the pictures of one condition."""
+    """What a finder made of the images of one condition."""
 
     pictures: int = 0
     found: int = 0
@@ -124,7 +124,7 @@ class Score:
     seconds: float = 0.0
 
     def add(self, found: Mapping[int, Array], picture: HardPicture, side_px: float) -> None:
-        """Counts one picture."""
+        """Counts one image."""
         self.pictures += 1
         self.false += sum(number != picture.number for number in found)
         corners = found.get(picture.number)
@@ -181,7 +181,7 @@ def table(family: str, count: int, seed: int) -> bool:
 
 
 def times(rounds: int) -> None:
-    """Prints the time of one detection in a rendered picture of the rig, 1280 x 720 px."""
+    """Prints the time of one detection in a rendered image of the rig, 1280 x 720 px."""
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     scene = load_scene(CONFIGS / "environment_1.yaml")
     camera = SyntheticCamera(rig, scene, rig.cameras[0], seed=1)

@@ -3,7 +3,7 @@
 `python benchmarks/guidance.py` flies the ready rig's cube before the synthetic camera (lens blur
 0.6 px), hides it now and then, and lays bars over the tags' outlines, through which no detector
 finds them. The drives' pose is off by 2 mm and 0.3° all the way, and by 20 mm more once a drum has
-slipped. Poses, their errors, and CPU time a picture are printed, with and without the drives.
+slipped. Poses, their errors, and CPU time an image are printed, with and without the drives.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Cover = Callable[[np.ndarray, int], np.ndarray]
 
 
 def hidden(k: int) -> bool:
-    """A third of the pictures shows nothing."""
+    """A third of the images shows nothing."""
     return k % 15 >= 10
 
 
@@ -57,7 +57,7 @@ def where(k: int, speed: float) -> Pose:
 
 
 def bars(width: int) -> Cover:
-    """Bars of so many pixels, 70 px apart, that wander over the picture; none for nought."""
+    """Bars of so many pixels, 70 px apart, that wander over the image; none for nought."""
 
     def cover(image: np.ndarray, k: int) -> np.ndarray:
         if hidden(k):
@@ -99,7 +99,7 @@ def fly(rig: Rig, eye: SyntheticCamera, speed: float, cover: Cover, slips: bool,
         print(
             f"  {'with' if guided else 'without'} drives: {len(errors)} of {len(seconds)} poses,"
             f" RMS {rms:.3f} mm, median NEES {np.median(nees):.1f},"
-            f" {np.mean(seconds) * 1e3:.1f} ms a picture",
+            f" {np.mean(seconds) * 1e3:.1f} ms an image",
             flush=True,
         )
 

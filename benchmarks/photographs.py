@@ -2,11 +2,11 @@
 
     python benchmarks/photographs.py [--family tag36h11] [PICTURE ...]
 
-Without pictures those of the AprilTag library's own test, which lie in the repository. Where a
-listing of what that library finds lies beside a picture (``NAME.txt``), the last columns tell how
+Without images those of the AprilTag library's own test, which lie in the repository. Where a
+listing of what that library finds lies beside an image (``NAME.txt``), the last columns tell how
 many of its tags are found, and how far their corners lie from its own.
 
-Other pictures that fit are in Debian's package `visp-images-data` (GPL-2, hence not here):
+Other images that fit are in Debian's package `visp-images-data` (GPL-2, hence not here):
 ``apt-get download visp-images-data && dpkg -x visp-images-data*.deb visp`` and then the files of
 ``visp/usr/share/visp-images-data/ViSP-images/AprilTag``.
 """
@@ -34,7 +34,7 @@ from tracking.edges.refine import refine
 ROOT = Path(__file__).parents[1]
 #: Corners farther off than this are of another tag, [px].
 NEAR = 2.0
-#: Corners of every tag in a picture, each of shape (4, 2), [px].
+#: Corners of every tag in an image, each of shape (4, 2), [px].
 Finder = Callable[[Image], Sequence[Array]]
 
 
@@ -54,7 +54,7 @@ def ours(family: str, thorough: bool) -> Finder:
 
 
 def _some_camera(image: Image) -> Camera:
-    """A camera without lens distortion, whose ideal pixels are the picture's."""
+    """A camera without lens distortion, whose ideal pixels are the image's."""
     camera = load_rig(ROOT / "configs" / "gachon_8_6.yaml").cameras[0]
     height, width = image.shape
     matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
@@ -100,7 +100,7 @@ def told(found: Sequence[Array], listing: Path) -> str:
 
 
 def main() -> int:
-    """Prints a line for each picture and finder."""
+    """Prints a line for each image and finder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("pictures", nargs="*", type=Path)
     parser.add_argument("--family", default="tag36h11")
@@ -118,7 +118,7 @@ def main() -> int:
     for picture in arguments.pictures or shipped:
         image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
         if image is None:
-            print(f"{picture} cannot be read as a picture", file=sys.stderr)
+            print(f"{picture} cannot be read as an image", file=sys.stderr)
             return 2
         for name, find in finders.items():
             print(f"{picture.name:28s}{name:16s}{told(find(image), picture.with_suffix('.txt'))}")

@@ -6,7 +6,7 @@
 With the program itself, on configs/gachon_8_6_rehearsal.yaml: plans where to measure, runs it with
 the synthetic camera, calibrates, and runs environment 3 before and after. Then, with the truth that
 only the simulation knows: how far off places are that were never measured, and what is told of the
-rig when the platform is never turned. Measured faster than the rig file says (50 mm/s, 4 pictures
+rig when the platform is never turned. Measured faster than the rig file says (50 mm/s, 4 images
 a second), which changes nothing at rest. With --plants only: how often the 95 % intervals hold the
 truth of so many other rigs, when the rig file tells the right stiffness and wrong ones.
 """

@@ -4,7 +4,7 @@
 
 The ready rig's cube (96 mm tags on 130 mm faces) flies a smooth curve with turns of up to 10°,
 about 1.6 m before the camera, which sees three faces, at 1280 x 720 and at 1920 x 1080 px. Peers
-get every fifth of the same pictures: their corners of all platform tags go through
+get every fifth of the same images: their corners of all platform tags go through
 `cv2.solvePnP` (SQPnP, then Levenberg-Marquardt). NEES is the squared error in units of the stated
 covariance; its mean is 6 when that covariance is exact.
 """
@@ -36,7 +36,7 @@ from tracking.tracker import Tracker
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: A pose turned farther from the truth than this is a flip, [rad].
 FLIP = np.radians(5.0)
-#: Targets of position [m] and rotation [rad], RMS, by picture height.
+#: Targets of position [m] and rotation [rad], RMS, by image height.
 TARGETS = {720: (0.8e-3, np.radians(0.1)), 1080: (0.3e-3, np.radians(0.03))}
 
 
@@ -50,7 +50,7 @@ class Score:
     missed: int = 0
 
     def add(self, found: Pose | None, truth: Pose, seconds: float) -> None:
-        """Counts one picture."""
+        """Counts one image."""
         self.seconds.append(seconds)
         if found is None:
             self.missed += 1
@@ -81,7 +81,7 @@ class Score:
 
 
 def curve(count: int) -> Iterator[Pose]:
-    """Smooth motion through the workspace at 20 pictures a second and up to 0.1 m/s."""
+    """Smooth motion through the workspace at 20 images a second and up to 0.1 m/s."""
     for k in range(count):
         s = k / 20.0
         place = [

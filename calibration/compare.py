@@ -60,7 +60,7 @@ class Comparison:
         """What to do now."""
         if self.agree:
             return "use the newer one, or the one with the smaller intervals"
-        return "find out what was changed, moved or refocused between them; calibrate once more"
+        return "find what was changed, moved or refocused in between, then calibrate again"
 
     def as_dict(self) -> dict[str, object]:
         """For programs."""
@@ -92,8 +92,8 @@ class Comparison:
                 f"they agree: {self.apart_mm:.2g} mm apart, {self.stated_mm:.2g} mm stated; {what}"
             )
         return (
-            f"they differ: {self.apart_mm:.2g} mm apart, more than the {self.stated_mm:.2g} mm"
-            f" stated; {what}"
+            f"they differ: {self.apart_mm:.2g} mm apart, more than the stated"
+            f" {self.stated_mm:.2g} mm; {what}"
         )
 
 
@@ -107,7 +107,7 @@ def compare(first: ResultDocument, second: ResultDocument) -> Comparison:
         raise BadInput(
             f"a result of kind {first.kind} for {first.name!r} cannot be compared with one of kind"
             f" {second.kind} for {second.name!r}",
-            next_step="name two results of one kind for one thing",
+            next_step="pass two results of the same kind for the same part",
         )
     mine, others = first.stated, second.stated
     changes = [

@@ -37,8 +37,8 @@ def load_result(path: Path) -> ResultDocument:
         raise BadInput(
             "the result's hash does not match its content",
             where=str(path),
-            why="the file was edited or damaged, or written by a program with other defaults",
-            next_step=f"run `cdpr calibrate {result.kind}` again; numbers of your own belong into"
+            why="the file was edited, damaged, or written by a version with other defaults",
+            next_step=f"run `cdpr calibrate {result.kind}` again; put your own values into"
             " the rig file",
         )
     return result
@@ -49,10 +49,10 @@ def _kind_of(path: Path) -> type[ResultDocument]:
     kind = plain.get("kind") if isinstance(plain, dict) else None
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadInput(
-            "this is no calibration result",
+            "not a calibration result",
             where=str(path),
             why=f"its kind must be one of {', '.join(KINDS)}; it is {kind!r}",
-            next_step="name a file calibration_*.yaml that `cdpr calibrate` has written",
+            next_step="pass a file calibration_*.yaml written by `cdpr calibrate`",
         )
     return KINDS[kind]
 
@@ -94,8 +94,8 @@ def write_calibrated_rig(path: Path, rig: Rig, results: Sequence[ResultDocument]
         raise BadInput(
             "the file exists already",
             where=str(path),
-            why="a rig file is never replaced by a calibration",
-            next_step="choose a name that does not exist yet",
+            why="a calibration never replaces a rig file",
+            next_step="choose a new name",
         )
     better = rig.with_calibration(*results)
     used = [f"{one.kind} {one.name} of {one.date}" for one in in_order(results)]

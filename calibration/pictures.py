@@ -1,4 +1,4 @@
-"""Pictures that a calibration is made from: of a folder, a video, or a camera."""
+"""Images that a calibration is made from: of a folder, a video, or a camera."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from tracking.camera_model import Image
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """Pictures of one size.
+    """Images of one size.
 
     Attributes:
-        images: Names and grey pictures.
+        images: Names and grey images.
         count: How many there will be.
         unused: Why files are not used, by name.
     """
@@ -37,7 +37,7 @@ class Pictures:
 
     @contextmanager
     def reported(self, text: str, listener: Listener) -> Iterator[Iterator[tuple[str, Image]]]:
-        """The pictures, each reported when it was used."""
+        """The images, each reported when it was used."""
         with listener.progress(text, self.count) as advance:
             yield self._advancing(advance)
 
@@ -48,17 +48,17 @@ class Pictures:
 
 
 def pictures_in(folder: Path) -> Pictures:
-    """The pictures of a folder, all of one size.
+    """The images of a folder, all of one size.
 
     Raises:
-        BadInput: The folder is missing or has no pictures.
+        BadInput: The folder is missing or has no images.
     """
     images = OneCamerasPictures(folder)
     return Pictures(images, len(images.names), images.unused)
 
 
 def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: int) -> Pictures:
-    """The pictures of a source.
+    """The images of a source.
 
     Args:
         source: A folder, a video file, a camera's index or its address.
@@ -67,7 +67,7 @@ def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: i
         usual: How many where that is left out.
 
     Raises:
-        BadInput: It is none of these, its pictures are of another size, or a number is wanted of
+        BadInput: It is none of these, its images are of another size, or a number is wanted of
             a folder.
         HardwareMissing: The camera does not open.
     """
@@ -77,7 +77,7 @@ def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: i
             raise BadInput(
                 "--pictures is for a video or a camera",
                 where=str(source),
-                next_step="leave it out: a folder's pictures are all used",
+                next_step="leave it out: all images of a folder are used",
             )
         folder = OneCamerasPictures(path, (camera.width, camera.height))
         return Pictures(folder, len(folder.names), folder.unused)
@@ -107,23 +107,23 @@ def take_pictures(
     on_advice: Callable[[str], None] = SILENT.note,
     stopped: Callable[[], bool] = lambda: False,
 ) -> int:
-    """Takes pictures of a board that is moved, until enough are there or the video ends.
+    """Takes images of a board that is moved, until enough are there or the video ends.
 
     Args:
         source: A camera's index, device or address, or a video file.
-        folder: Where pictures go, which exists.
+        folder: Where images go, which exists.
         board: What is shown.
-        wanted: How many pictures at least.
-        size: Width and height of the camera's pictures, [px]; a video has its own.
+        wanted: How many images at least.
+        size: Width and height of the camera's images, [px]; a video has its own.
         on_advice: Receives what the person who moves the board should do, when that changes.
-        stopped: Whether to take no more; asked after each picture.
+        stopped: Whether to take no more; asked after each image.
 
     Returns:
         How many were taken.
 
     Raises:
         HardwareMissing: The camera does not open.
-        BadInput: The source is none, its pictures are of another size, or none was taken.
+        BadInput: The source is none, its images are of another size, or none was taken.
     """
     guide, last = CaptureGuide(board, wanted), ""
     with _frames(source, size) as frames:
@@ -141,17 +141,17 @@ def take_pictures(
                 break
     if not guide.views:
         raise BadInput(
-            "no picture was taken",
+            "no image was captured",
             where=f"camera {source}",
-            why=f"{board} was never seen standing still",
-            next_step="check the board's kind and numbers and the light, and hold it still",
+            why=f"{board} was never detected at rest",
+            next_step="check the board's kind, its dimensions and the light, and hold it still",
         )
     return len(guide.views)
 
 
 @contextmanager
 def _frames(source: str, size: tuple[int, int]) -> Iterator[Iterator[Image]]:
-    """Grey pictures of a camera or a video."""
+    """Grey images of a camera or a video."""
     path = Path(source)
     if path.is_file():
         yield (frame.image for frame in VideoFile(path, plain_camera(video_size(path), source)))

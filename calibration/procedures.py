@@ -1,4 +1,4 @@
-"""Whole calibrations: from pictures or runs to a judged result and its report.
+"""Whole calibrations: from images or runs to a judged result and its report.
 
 `calibration.load.with_calibrations` puts their result files into a rig.
 """
@@ -50,7 +50,7 @@ Found = TypeVar("Found", covariant=True)
 Quality = TypeVar("Quality", covariant=True)
 
 PicturesFrom = Pictures | str | Path | Callable[[], Pictures]
-"""Pictures, what opens them, or where they are: a folder, a video, a camera's index or address."""
+"""Images, what opens them, or where they are: a folder, a video, a camera's index or address."""
 USUAL_PICTURES, USUAL_TAG_PICTURES = 20, 40
 """Taken of a camera or a video to find where the camera is, and where tags are on the platform."""
 
@@ -181,13 +181,13 @@ def calibrate_camera(
         listener: Receives how far it is.
 
     Raises:
-        BadInput: Pictures of different sizes, or too few that show the board.
+        BadInput: Images of different sizes, or too few that show the board.
     """
     require_file_name(name, "--name")
     source = pictures if isinstance(pictures, Pictures) else pictures_in(pictures)
     to = to or Destination()
     to.require_free("camera", name)
-    with source.reported("looking for the board", listener) as images:
+    with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused)
     quality = judge_camera(found, wanted, distance)
     result = camera_result(found, quality, name, to.on)
@@ -213,7 +213,7 @@ def locate_camera(
         rig: The robot, with its tags.
         camera: Its matrix and distortion hold.
         pictures: Taken while the camera does not move.
-        poses: The platform's by picture, or a CSV file of them, or a run folder: go by the rig's
+        poses: The platform's by image, or a CSV file of them, or a run folder: go by the rig's
             motion. Left out, by the tags on the frame.
         survey: How well the frame tags were surveyed; each corner to 0.5 mm when left out.
         wanted: What is good enough in the work space, 95 %, [m].
@@ -221,7 +221,7 @@ def locate_camera(
         listener: Receives how far it is.
 
     Raises:
-        BadInput: There are no tags, or too few pictures that show them.
+        BadInput: There are no tags, or too few images that show them.
     """
     require_file_name(camera.name, "cameras")
     known = poses_by_picture(poses, camera.name) if isinstance(poses, Path) else poses
@@ -231,7 +231,7 @@ def locate_camera(
     source, to = _pictures(pictures, camera, USUAL_PICTURES), to or Destination()
     to.require_free("extrinsics", camera.name)
     ready_to_measure(listener)
-    with source.reported("looking for tags", listener) as images:
+    with source.reported("detecting tags", listener) as images:
         sights = sights_of(images, rig, camera, [tag.id for tag in tags], source.unused)
     if known is None:
         found = locate_by_frame_tags(rig, camera, sights, survey or Survey(0.5e-3, None))
@@ -253,7 +253,7 @@ def locate_tags(
     to: Destination | None = None,
     listener: Listener = SILENT,
 ) -> TagsOutcome:
-    """Finds where the tags are on the platform, from pictures that show two or more at once.
+    """Finds where the tags are on the platform, from images that show two or more at once.
 
     Args:
         rig: The robot, with its tags.
@@ -265,14 +265,14 @@ def locate_tags(
         listener: Receives how far it is.
 
     Raises:
-        BadInput: There are no tags, or too few pictures that show them.
+        BadInput: There are no tags, or too few images that show them.
     """
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
     source, to = _pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
     to.require_free("tags", rig.name)
     ready_to_measure(listener)
-    with source.reported("looking for tags", listener) as images:
+    with source.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
         sights = sights_of(images, rig, camera, numbers, source.unused)
     found = measure_layout(rig, camera, sights, fixed_tag)
@@ -309,12 +309,12 @@ def calibrate_rig(
     """Finds outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
 
     Args:
-        rig: As its file tells it.
+        rig: As in its file.
         data: Run folders, and CSV files (docs/data-formats.md).
         deviations: How far off the rig file may be by group of numbers, one standard deviation;
             groups left out are taken as known.
         length_deviation: Of a cable's length from the encoders, [m].
-        pose_deviations: Of poses beside what their file tells, [m] and [rad].
+        pose_deviations: Of poses, added to that of their file, [m] and [rad].
         without_poses: Drive positions alone, as without a camera.
         tilt: How far the platform will be rotated, [rad].
         wanted: What is good enough, 95 %, [m].
@@ -344,7 +344,7 @@ def calibrate_rig(
                 f"the measurements do not fit the rig file {rig_file or rig.name}",
                 where=", ".join(map(str, data)),
                 why=error.what,
-                next_step="check units, the order of the cables, the reference of the drives and"
+                next_step="check units, the order of the cables, the homing of the drives and"
                 " the rig file",
             ) from error
     return Calibration(

@@ -39,7 +39,7 @@ Bounds = Annotated[list[AnyNumber], Field(min_length=2, max_length=2)]
 
 
 class ResultDocument(Document, ABC):
-    """What every calibration result tells."""
+    """What every calibration result has."""
 
     order: ClassVar[int]
     """Results of lower order are applied first: those of higher order rest on them."""
@@ -49,17 +49,17 @@ class ResultDocument(Document, ABC):
     name: str = Field(description="of what was calibrated, such as the camera in the rig file")
     date: Annotated[str, AfterValidator(_is_date)]
     rests_on: str = Field(
-        default="", description="hash of the parts of the rig file that were taken as known"
+        default="", description="hash of the parts of the rig file taken as known"
     )
     data_sha256: str = Field(description="of the measurements")
     intervals: dict[str, Bounds] = Field(description="95 %, by name with unit")
-    error_mm: AnyNonNegative = Field(description="of what is measured with it, 95 %")
-    wanted_mm: AnyNonNegative = Field(description="what was asked for")
+    error_mm: AnyNonNegative = Field(description="of measurements with it, 95 %")
+    wanted_mm: AnyNonNegative = Field(description="required error")
     verdict: str
     good_enough: bool
     next_steps: list[str]
     unused: dict[str, str] = Field(default={}, description="why data were left out, by name")
-    hash: str = Field(default="", description="over everything else in the file")
+    hash: str = Field(default="", description="over the rest of the file")
 
     @property
     def file_name(self) -> str:
@@ -67,7 +67,7 @@ class ResultDocument(Document, ABC):
         return result_file_name(self.kind, self.name, self.date)
 
     def sealed(self) -> Self:
-        """The result with its hash, by which one that was edited is told."""
+        """The result with its hash, by which an edited one is detected."""
         return self.model_copy(update={"hash": document_hash(self, {"hash"})})
 
     @property
@@ -108,9 +108,9 @@ class ResultDocument(Document, ABC):
         """
         if content_hash(parts) != self.rests_on:
             raise BadInput(
-                f"this result rests on other {what} than the rig's",
+                f"this result was made with {what} that differ from the rig's",
                 where=f"calibration {self.kind} {self.name}, {self.date}",
-                why="the rig file was changed since, it is of another rig, or a calibration that"
+                why="the rig file was changed since, it is from another rig, or a calibration that"
                 " was applied then is not applied now",
                 next_step=f"pass the calibrations it was made with, or run `cdpr calibrate"
                 f" {self.kind}` again",
@@ -158,7 +158,7 @@ def result_file_name(kind: str, name: str, day: str) -> str:
 
 
 def require_file_name(name: str, where: str) -> None:
-    """The name becomes part of a file's; told before the long work, not after it.
+    """The name becomes part of a file's; reported before the long work, not after it.
 
     Raises:
         BadInput: It cannot.

@@ -1,4 +1,4 @@
-"""What runs tell a calibration: poses of the encoders, and where the platform was at rest."""
+"""Data of runs for a calibration: encoder poses and stationary samples."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from model.rig import Rig
 
 
 def poses_by_picture(path: Path, camera: str) -> Mapping[str, Pose]:
-    """The platform's poses by picture, from a CSV file or the encoders of a run folder.
+    """The platform's poses by image, from a CSV file or the encoders of a run folder.
 
     Raises:
-        BadInput: It cannot be read, or the camera took no pictures in the run.
+        BadInput: It cannot be read, or the camera took no images in the run.
     """
     return poses_of_run(path, camera) if path.is_dir() else read_poses(path)
 
 
 def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
-    """Poses from the encoders when a camera's kept pictures of a run were taken.
+    """Poses from the encoders when a camera's kept images of a run were taken.
 
     Raises:
         BadInput: The camera took none.
@@ -42,7 +42,7 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
     names = [one["name"] for one in run.summary().get("cameras", [])]
     if camera not in names:
         raise BadInput(
-            f"camera {camera!r} took no pictures in this run",
+            f"camera {camera!r} took no images in this run",
             where=str(folder),
             next_step=f"name one of its cameras with --camera: {', '.join(names)}",
         )
@@ -67,7 +67,7 @@ def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasuremen
     """The rig as its drives counted, and where the platform was at rest.
 
     Args:
-        rig: As its file tells it.
+        rig: As in its file.
         data: Run folders, and CSV files (docs/data-formats.md).
 
     Raises:
@@ -88,10 +88,10 @@ def _require_once(data: Sequence[Path]) -> None:
     for path in data:
         if path.resolve() in named:
             raise BadInput(
-                f"{path} is named twice",
+                f"{path} is given twice",
                 where="DATA",
                 why=f"it is the same as {named[path.resolve()]}",
-                next_step="name each file and each run once",
+                next_step="pass each file and each run once",
             )
         named[path.resolve()] = path
 

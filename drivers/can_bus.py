@@ -201,7 +201,7 @@ def _check_kernel_interface(settings: BusSettings) -> None:
             f"the transmit queue of {settings.channel} holds {queue} frames,"
             f" at least {MIN_TRANSMIT_QUEUE} are needed",
             where=f"bus {settings}",
-            why="a stop is sent as one batch and must not be refused because a cycle is queued",
+            why="a stop is sent as one batch, which must fit in the queue after a cycle",
             next_step=f"sudo ip link set {settings.channel} txqueuelen 128",
             values={"tx_queue_len": queue},
         )
@@ -221,13 +221,13 @@ def bring_up(settings: BusSettings) -> str:
 def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
     cause = error.__cause__ or error
     number = getattr(cause, "errno", None)
-    step = "check the adapter, its driver and the channel's name, then run `cdpr doctor`"
+    step = "check the adapter, its driver and the channel name, then run `cdpr doctor`"
     if settings.interface == "socketcan":
         step = bring_up(settings)
         if number == errno.EAFNOSUPPORT:
             step = "load the kernel's CAN support: sudo modprobe can_raw"
     elif settings.interface == "udp_multicast":
-        step = "let multicast through the loopback: sudo ip route add 239.0.0.0/8 dev lo"
+        step = "route multicast through the loopback: sudo ip route add 239.0.0.0/8 dev lo"
     return HardwareMissing(
         "the bus cannot be opened",
         where=f"bus {settings}",
@@ -257,9 +257,9 @@ def echoes_own_frames(bus: can.BusABC) -> bool:
 
 
 def lost_frames(bus: can.BusABC) -> int:
-    """Frames the kernel threw away since the bus was opened, because nobody fetched them in time.
+    """Frames the kernel dropped since the bus was opened, because they were not read in time.
 
-    0 for buses without a socket; there only missing replies tell.
+    0 for buses without a socket; there only missing replies show it.
     """
     try:
         descriptor = bus.fileno()
@@ -286,7 +286,7 @@ def transmit(bus: can.BusABC, message: can.Message) -> None:
     try:
         bus.send(message)
     except Exception as error:  # back ends raise errors of their own libraries
-        raise bus_fault("the bus did not take a frame", bus_name(bus), error) from error
+        raise bus_fault("a frame could not be sent", bus_name(bus), error) from error
 
 
 def take(bus: can.BusABC, timeout: float) -> can.Message | None:
@@ -306,7 +306,7 @@ def bus_name(bus: can.BusABC) -> str:
     return f"bus {bus.channel_info}"
 
 
-# Tells frames that only a master sends apart: ours, and those of another master. No bus.
+# Distinguishes own frames of a master's kind from those of another master. No bus.
 
 
 class EchoFilter:

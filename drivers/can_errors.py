@@ -19,7 +19,7 @@ class BusFault(Fault):
 
     def __init__(self, what: str, where: str, values: dict[str, float | str] | None = None) -> None:
         """Takes what was seen and on which bus."""
-        step = f"the drives stop by themselves; {self.remedy}"
+        step = f"the drives stop on their own; {self.remedy}"
         super().__init__(what, where=where, why=self.cause, next_step=step, values=values)
 
 
@@ -27,8 +27,8 @@ class BusDown(BusFault):
     """The network interface was taken down."""
 
     code = "bus_down"
-    cause = "somebody set the interface down, or its driver did after an error"
-    remedy = "bring it up again (`cdpr doctor RIG` tells how), then start again"
+    cause = "the interface was set down by a user, or by its driver after an error"
+    remedy = "bring it up again (`cdpr doctor RIG` shows how), then start again"
 
 
 class BusGone(BusFault):
@@ -36,7 +36,7 @@ class BusGone(BusFault):
 
     code = "bus_gone"
     cause = "the adapter was unplugged or lost its power"
-    remedy = "plug it in, bring the interface up (`cdpr doctor RIG` tells how), then start again"
+    remedy = "plug it in, bring the interface up (`cdpr doctor RIG` shows how), then start again"
 
 
 class BusOff(BusFault):
@@ -48,10 +48,10 @@ class BusOff(BusFault):
 
 
 class BusPassive(BusFault):
-    """The controller counts so many errors that it may no longer signal them."""
+    """The controller's error counter is too high to signal errors any longer."""
 
     code = "bus_passive"
-    cause = "nobody acknowledges frames (drives without power, broken cable), or a wrong bit rate"
+    cause = "no node acknowledges frames (drives without power, broken cable), or a wrong bit rate"
     remedy = "check the drives' power, cable, termination and bit rate, then start again"
 
 
@@ -59,7 +59,7 @@ class BusErrors(BusFault):
     """Error frames cycle after cycle."""
 
     code = "bus_errors"
-    cause = "a loose contact, missing termination, interference, or too long a cable"
+    cause = "a loose contact, missing termination, interference, or a cable that is too long"
     remedy = "check cable and termination, then start again"
 
 
@@ -67,24 +67,24 @@ class TransmitQueueFull(BusFault):
     """A frame was not taken because others still wait; sent late, a set-point is wrong."""
 
     code = "transmit_queue_full"
-    cause = "nobody acknowledges frames, the bus is overloaded, or txqueuelen is too short"
-    remedy = "check the drives' power and the cable; `cdpr doctor RIG` looks at the queue"
+    cause = "no node acknowledges frames, the bus is overloaded, or txqueuelen is too short"
+    remedy = "check the drives' power and the cable; `cdpr doctor RIG` checks the queue"
 
 
 class ReceiveOverflow(BusFault):
     """Frames were lost because they were not fetched in time."""
 
     code = "receive_overflow"
-    cause = "this program was held up, or something floods the bus"
-    remedy = "run with real-time scheduling and nothing else beside it (`cdpr doctor RIG`)"
+    cause = "this program was delayed, or another node floods the bus"
+    remedy = "run with real-time scheduling and close other programs (`cdpr doctor RIG`)"
 
 
 class ForeignMaster(BusFault):
     """Another program commands drives on this bus."""
 
     code = "foreign_master"
-    cause = "two masters would move the same drives"
-    remedy = "end the other program, or wait until its run is over"
+    cause = "two masters must not command the same drives"
+    remedy = "end the other program, or wait for its run to finish"
 
 
 SOCKET_FULL = "Transmit buffer full"
@@ -113,10 +113,10 @@ def bus_fault(what: str, where: str, error: Exception) -> BusFault:
     return kind(f"{what}: {str(error) or type(error).__name__}", where)
 
 
-# Error frames of CAN controllers: what they tell, and when it ends a run. Pure.
+# Error frames of CAN controllers: what they mean, and when one ends a run. Pure.
 #
 # Source: Linux, include/uapi/linux/can/error.h. Other back ends of python-can mark a message as an
-# error frame without telling the class; it then counts as an error on the bus.
+# error frame without stating the class; it then counts as an error on the bus.
 
 
 ERROR_CYCLES = 10
@@ -140,7 +140,7 @@ class ControllerState(IntFlag):
 
 
 def error_frame_fault(identifier: int, data: bytes | bytearray, where: str) -> BusFault | None:
-    """The fault that one error frame tells; None for an error that the controller recovers from.
+    """The fault that one error frame reports; None for an error that the controller recovers from.
 
     Args:
         identifier: Of the error frame, without its flags.
@@ -173,7 +173,7 @@ class ErrorFrames:
         self._in_a_row = 0
 
     def take(self, identifier: int, data: bytes | bytearray) -> BusFault | None:
-        """Takes in an error frame; the fault it tells, if it tells one."""
+        """Counts an error frame; returns the fault it reports, if any."""
         self.total += 1
         self._now += 1
         return error_frame_fault(identifier, data, self._where)
@@ -197,32 +197,32 @@ SETTING_UP = "configuring the drives"
 def answers_twice(node: int) -> Refused:
     """Two devices have the node id of a drive."""
     return Refused(
-        f"drive {node} answers twice",
+        f"drive {node} answered twice",
         where=SETTING_UP,
         why="two devices have this node id, or `cdpr sim` was started twice",
-        next_step="give every device on the bus its own node id",
+        next_step="give each device on the bus a unique node id",
         values={"node": node},
     )
 
 
 def moved_by_another(node: int, what: str, where: str) -> Refused:
-    """A drive is not at rest: it is ``what``, as it told in ``where``."""
+    """A drive is not at rest: it is ``what``, as reported in ``where``."""
     return Refused(
         f"drive {node} is {what}",
         where=f"drive {node}, {where}",
-        why="another program moves it, or it did not stop when its master went away",
-        next_step="end the other program; otherwise press the emergency stop",
+        why="another program moves it, or it did not stop when its master was lost",
+        next_step="end the other program, or press the emergency stop",
         values={"node": node},
     )
 
 
 def in_fault(node: int, what: str, where: str, why: str) -> Refused:
-    """A drive stopped itself; ``what`` it tells of it, in ``where``, and what that means."""
+    """A drive stopped itself; ``what`` it reports in ``where``, and what that means."""
     return Refused(
         f"drive {node} is in fault{what}",
         where=f"drive {node}, {where}",
         why=why,
-        next_step="remove the cause, then `cdpr reset RIG`",
+        next_step="remove the cause, then run `cdpr reset RIG`",
         values={"node": node},
     )
 
@@ -239,10 +239,10 @@ def keeps_another(node: int, place: str, found: str, wanted: str, why: str, manu
         manual: Where the setting is described.
     """
     return Refused(
-        f"the drive holds {found}, it must hold {wanted}",
+        f"the drive has {found}; {wanted} is required",
         where=f"drive {node}, {place}",
-        why=f"needed because: {why}",
-        next_step=f"look it up in {manual}; the drives stay as they are",
+        why=f"required because: {why}",
+        next_step=f"see {manual}; the drives were not changed",
         values={"node": node, "object": place, "found": found, "wanted": wanted},
     )
 
@@ -263,9 +263,9 @@ def all_of_them(refusals: Sequence[Refused]) -> Refused:
     found = "".join(f"\n  drive {', '.join(each)}, {text}" for text, each in nodes.items())
     return Refused(
         f"{len(nodes)} object{'s' if len(nodes) > 1 else ''} of {len(drives)}"
-        f" drive{'s' if len(drives) > 1 else ''} cannot be used as they are:{found}",
+        f" drive{'s' if len(drives) > 1 else ''} have unsuitable values:{found}",
         where=SETTING_UP,
         next_step="compare with the drive's manual; `cdpr doctor RIG --drives` lists every object,"
-        " and drives.profile of the rig file says what the drives have",
+        " and drives.profile of the rig file describes the drives",
         values={"nodes": ", ".join(sorted(drives)), "count": len(nodes)},
     )

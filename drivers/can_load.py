@@ -97,7 +97,7 @@ def check_bus_load(rig: Rig) -> float:
             f" {bus.bitrate} bit/s; the limit is {MAX_LOAD:.0%}",
             where=f"rig {rig.name}: bus",
             why=f"a cycle is {load * bus.bitrate * bus.cycle_ms / 1e3:.0f} bits at worst;"
-            " a stop must get through",
+            " a stop must still fit",
             next_step=_advice(rig),
             values={"load": load, "limit": MAX_LOAD, "cycle_ms": bus.cycle_ms},
         )
@@ -106,8 +106,8 @@ def check_bus_load(rig: Rig) -> float:
 
 def _advice(rig: Rig) -> str:
     """The shortest cycle with room for everything, but none that arming would refuse."""
-    seldom = ", or longer drives.*_ms" if rig.document.drives.type == "odrive" else ""
+    seldom = ", or lengthen drives.*_ms" if rig.document.drives.type == "odrive" else ""
     for tenths in range(FASTEST_TENTHS_MS, SLOWEST_TENTHS_MS + 1):
         if _load(rig, tenths / 10_000.0) <= MAX_LOAD:
             return f"set bus.cycle_ms to {tenths / 10.0:g} or more{seldom}, or raise the bitrate"
-    return f"raise the bitrate{seldom}; no cycle that a rig may have is long enough for this one"
+    return f"raise the bitrate{seldom}; no permitted cycle is long enough at this rate"

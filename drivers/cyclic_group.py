@@ -49,7 +49,7 @@ class CyclicBus:
 
         Args:
             bus: The caller's.
-            own: Tells another master's frames from ours.
+            own: Filters own frames from another master's.
             foreign_text: What another master does that sends a frame of an identifier.
         """
         self._bus, self._where = bus, bus_name(bus)
@@ -81,7 +81,7 @@ class CyclicBus:
             raise failure
 
     def forget_waiting(self) -> None:
-        """Throws away what came while nobody listened; that it overflowed then is no fault.
+        """Drops what arrived while nothing was read; an overflow then is not a fault.
 
         Raises:
             BusFault: The bus failed.
@@ -101,7 +101,7 @@ class CyclicBus:
             if message is None:
                 return
             self._hand_over(message, listener, stale=True)
-        raise ReceiveOverflow(f"more than {MOST_STALE} frames waited to be fetched", self._where)
+        raise ReceiveOverflow(f"more than {MOST_STALE} frames waited to be read", self._where)
 
     def take_replies(self, listener: ReplyListener, timeout: float) -> None:
         """Hands frames over until every drive has answered or the time [s] is over.
@@ -170,7 +170,7 @@ class GroupWatch(ReplyListener, Protocol):
 class CyclicGroup(ABC):
     """A group that is sent to and heard once a cycle; see `drivers.drive_group.DriveGroup`.
 
-    What a protocol adds makes `_cyclic` and `_watch` anew with every set-up.
+    What a protocol adds makes new `_cyclic` and `_watch` with every set-up.
     """
 
     _cyclic: CyclicBus
@@ -193,15 +193,15 @@ class CyclicGroup(ABC):
 
     @abstractmethod
     def _look_for_faults(self) -> None:
-        """What the drives told in this cycle, and is wrong."""
+        """Faults that the drives reported in this cycle."""
 
     @abstractmethod
     def _advance(self) -> None:
-        """Sees whether the way under way has come to its end, or was not in time."""
+        """Checks whether the transition in progress has finished or timed out."""
 
     @abstractmethod
     def _status(self) -> CycleStatus:
-        """What the drives told in this cycle."""
+        """What the drives reported in this cycle."""
 
     @property
     def state(self) -> GroupState:
@@ -209,7 +209,7 @@ class CyclicGroup(ABC):
         return self._state
 
     def receive(self, timeout_s: float) -> CycleStatus:
-        """Takes what the drives tell in this cycle; see `DriveGroup.receive`."""
+        """Takes what the drives report in this cycle; see `DriveGroup.receive`."""
         self._online()
         if self._pump is not None:
             self._pump()
@@ -248,7 +248,7 @@ class CyclicGroup(ABC):
     def _online(self) -> None:
         if self._state is GroupState.OFFLINE:
             raise Refused(
-                "the drives are not set up",
+                "the drives are not configured",
                 where="drive group",
                 next_step="call configure() first",
             )
@@ -261,7 +261,7 @@ class CyclicGroup(ABC):
         """
         if self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping:
             raise Refused(
-                "the drives are enabled; they cannot be set up now",
+                "the drives are enabled; they cannot be configured now",
                 where=SETTING_UP,
                 next_step="stop them first",
             )

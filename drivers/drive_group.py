@@ -33,12 +33,12 @@ class GroupState(Enum):
     CONFIGURED = auto()
     """Set up and read back; positions are valid after the first cycle; no drive is enabled."""
     ENABLING = auto()
-    """On the way to ENABLED; each drive is told to stay where it is. The group gives up by itself,
+    """On the way to ENABLED; each drive is commanded to hold its position. The group gives up,
     in FAULT, when a drive takes too long."""
     ENABLED = auto()
     """All drives follow the set-points."""
     QUICK_STOP = auto()
-    """All drives were told to stop and hold under torque."""
+    """All drives were commanded to stop and hold under torque."""
     FAULT = auto()
     """As QUICK_STOP, because of a fault; latched until RESET_FAULT."""
     RELEASED = auto()
@@ -105,23 +105,23 @@ class DriveWarning:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleStatus:
-    """What the drives told in one cycle; arrays are read-only and in the order of the winches.
+    """What the drives reported in one cycle; arrays are read-only and in the order of the winches.
 
     Attributes:
-        positions: Actual positions at the cycle's SYNC, or as told in it, shape (m,), [counts];
+        positions: Actual positions at the cycle's SYNC, or as reported in it, shape (m,), [counts];
             the last known one where a drive is missing.
-        demands: Where the drives were to be when they told their positions, shape (m,), [counts]:
+        demands: Commanded positions when the drives reported theirs, shape (m,), [counts]:
             at a SYNC the targets of one cycle before. `positions - demands` is the following error.
         torques: Actual torques, positive where they pull the cable in, shape (m,), [per mille of
             rated torque]. Tension at rest is torque / 1000 times the winch's `torque_constant`.
         status_words: The state of each drive in its protocol's code, shape (m,); `drive_states`
-            tells what they say.
+            gives their meaning.
         missing: True for drives from which this cycle's answer is overdue, shape (m,).
         faults: Node and text of every fault since the last reset, oldest first; the text names
             cable and drive, and the node is `WHOLE_BUS` where it is the bus that failed.
         state: State of the group.
         holding: Every cable is held: by its drive under torque, or by its closed brake.
-        stopped: Every drive told in this cycle that it follows no set-points.
+        stopped: Every drive reported in this cycle that it follows no set-points.
         rejected: Frames thrown away since `configure` because their length or their content could
             not be true.
         error_frames: Error frames of the bus since `configure`.
@@ -144,12 +144,12 @@ class CycleStatus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveSnapshot:
-    """What drives tell who only looks; in the order of the winches, as in `CycleStatus`.
+    """State of drives that are only read; in the order of the winches, as in `CycleStatus`.
 
     Attributes:
         positions: Shape (m,), [counts].
         torques: Positive where they pull the cable in, shape (m,), [per mille of rated torque].
-        status_words: Shape (m,); `drive_states` tells what they say.
+        status_words: Shape (m,); `drive_states` gives their meaning.
         restarted: Nodes that do not hold this program's set-up: switched on since, or never set up.
             Of drives that keep their settings without power all whose encoder is not absolute.
     """
@@ -199,7 +199,7 @@ class DriveGroup(Protocol):
         Args:
             to_reset: Also takes drives in fault, which are going to be reset.
             on_restarted: Called with `restarted` before the first setting is written: the set-up
-                wipes out what tells of it. What it raises leaves the drives as they were.
+                wipes out its evidence. What it raises leaves the drives as they were.
 
         Returns:
             Remarks for the operator: what drives cannot do although a run would use it.
@@ -211,7 +211,7 @@ class DriveGroup(Protocol):
         ...
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
-        """Waits until every drive has told its position; changes no drive's state.
+        """Waits until every drive has reported its position; changes no drive's state.
 
         Args:
             pace: Called before each cycle that is sent: waits for its moment and returns the time
@@ -230,9 +230,9 @@ class DriveGroup(Protocol):
 
         Args:
             targets: One position a drive, [counts]. They count in state ENABLED; in every other
-                state each drive is told to stay where it is.
+                state each drive is commanded to stay where it is.
             may_enable: Asked at the last moment, just before the frame that makes set-points count.
-                Where it is false no drive is told to follow: a cycle that would do so becomes a
+                Where it is false no drive is commanded to follow: such a cycle becomes a
                 quick stop of all drives, for good.
 
         Raises:

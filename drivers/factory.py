@@ -25,7 +25,7 @@ def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
 
 
 def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSnapshot:
-    """Asks drives that nobody moves how they stand; changes nothing, not even their set-up.
+    """Reads the state of drives at rest; changes nothing, not even their configuration.
 
     Args:
         rig: The robot; its winches name the nodes.
@@ -34,7 +34,7 @@ def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSna
 
     Raises:
         HardwareMissing: A drive does not answer.
-        Refused: It will not tell.
+        Refused: A drive refuses to answer.
         Fault: The bus failed.
     """
     document = rig.document.drives

@@ -68,7 +68,7 @@ class ReplyCheck:
         if last is not None:
             step, allowed = abs(position - last), self._max_steps[drive] * self._age[drive]
             if step > allowed:
-                text = f"its position jumped by {step} counts, at most {allowed:.0f} are possible"
+                text = f"its position jumped by {step} counts, the limit is {allowed:.0f}"
                 self.reject(drive, text)
                 return False
         self._reasons[drive] = ""
@@ -99,7 +99,7 @@ class ReplyCheck:
             if bad >= BAD_CYCLES
         ]
         found += [
-            (node, f"{name} answers twice: two devices have this node id")
+            (node, f"{name} answered twice: two devices have this node id")
             for (node, name), repeats in zip(self._names, self._repeats, strict=True)
             if repeats >= BAD_CYCLES
         ]
@@ -129,9 +129,9 @@ def position_limits(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[int, int
     low, high = math.floor(min(ends)), math.ceil(max(ends))
     if low < -(2**31) or high >= 2**31:
         raise BadInput(
-            f"positions from {low} to {high} counts do not fit the drive's 32 bits",
+            f"positions from {low} to {high} counts exceed the drive's 32-bit range",
             where=f"rig {rig.name}: winches[{drive}]",
-            next_step="choose home_counts nearer to 0, or fewer counts a metre of cable",
+            next_step="choose home_counts nearer to 0, or fewer counts per metre of cable",
         )
     return low, high
 
@@ -151,11 +151,11 @@ def require_within_limits(rig: Rig, positions: Sequence[int]) -> None:
         low, high = position_limits(rig, drive, winch_map)
         if not low <= position <= high:
             raise Refused(
-                f"{names[node]} is at {position} counts, beyond its position limits of {low} and"
+                f"{names[node]} is at {position} counts, outside its position limits {low} to"
                 f" {high}",
                 where="drive group",
-                why="once enabled it would run to its limit (607Dh)",
-                next_step="set the drives up for where they are, or reference them with"
+                why="once enabled it would drive to its limit (607Dh)",
+                next_step="configure limits that include this position, or home with"
                 " `cdpr home RIG`; nothing was enabled",
                 values={"node": node},
             )

@@ -1,4 +1,4 @@
-"""What Linux tells about a CAN interface: there, up, bit rate, queue, state of its controller."""
+"""What Linux reports about a CAN interface: there, up, bit rate, queue, state of its controller."""
 
 from __future__ import annotations
 
@@ -68,13 +68,13 @@ def can_interfaces() -> tuple[KernelInterface, ...]:
     """All CAN interfaces of this machine.
 
     Raises:
-        HardwareMissing: The program ``ip`` is missing or does not tell.
+        HardwareMissing: The program ``ip`` is missing or fails.
     """
     path = os.pathsep.join((os.environ.get("PATH", ""), *SYSTEM_FOLDERS))
     program = shutil.which("ip", path=path)
     if program is None:
         raise HardwareMissing(
-            "the program `ip` is not there, so interfaces cannot be looked at",
+            "the program `ip`, which lists interfaces, is not installed",
             where="SocketCAN",
             next_step="sudo apt-get install iproute2",
         )

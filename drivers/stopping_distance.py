@@ -67,10 +67,10 @@ def require_stopping_room(rig: Rig, clearance: float) -> None:
     if not clearance < lost.distance:
         return
     raise Refused(
-        f"the path comes within {clearance * 1000:.1f} mm of an obstacle; without the master the"
-        f" platform goes on for up to {lost.distance * 1000:.1f} mm",
+        f"the path comes within {clearance * 1000:.1f} mm of an obstacle; without its master the"
+        f" platform travels up to {lost.distance * 1000:.1f} mm",
         where="set-point table",
-        why=f"the drives notice by {lost.noticed_by} alone after {lost.notice * 1000:.0f} ms, at"
+        why=f"the drives detect the loss by {lost.noticed_by} after {lost.notice * 1000:.0f} ms, at"
         f" {rig.motion.speed * 1000:g} mm/s",
         next_step="plan with a larger clearance, or lower motion.speed_mm_s; nothing was armed",
         values={"clearance_mm": clearance * 1000.0, "distance_mm": lost.distance * 1000.0},

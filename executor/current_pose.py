@@ -42,21 +42,21 @@ def standing_pose(rig: Rig, counts: Array, load: Load) -> Pose:
             break
     else:
         raise Fault(
-            "the pose of the platform could not be told from the drives' positions",
+            "the platform pose could not be computed from the drive positions",
             where="drive positions",
-            why="the search for it did not settle",
-            next_step="report it with the rig file and the positions; nothing has moved",
+            why="the solver did not converge",
+            next_step="report this with the rig file and the positions; nothing has moved",
         )
     place = found.pose.position
     inside = np.all((rig.workspace_lower <= place) & (place <= rig.workspace_upper))
     if not (inside and found.worst <= rig.motion.start_tolerance):
         x, y, z = place * 1000.0
         raise Refused(
-            f"the drives' positions fit no pose of the workspace: the nearest is {x:.1f}, {y:.1f},"
+            f"the drive positions fit no pose in the workspace: the nearest is {x:.1f}, {y:.1f},"
             f" {z:.1f} mm, with a cable {found.worst * 1000:.1f} mm off",
             where="drive positions",
-            why="the drives lost their reference, a cable slipped, or it is another rig's file",
-            next_step="reference the drives at a known pose (home_counts in the rig file);"
+            why="the homing reference is lost, a cable slipped, or the rig file is wrong",
+            next_step="home the drives at a known pose (home_counts in the rig file);"
             " nothing was moved",
         )
     return found.pose

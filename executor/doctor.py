@@ -111,8 +111,8 @@ def own_packages() -> list[MachineCheck]:
         spec = find_spec(name)
         origin = Path(spec.origin).resolve() if spec and spec.origin else None
         good = origin is not None and origin.parents[1] == ours
-        text = "ours" if good else f"another package: {origin}" if origin else "not found"
-        fix = f"uninstall the other {name!r}, or use an environment of its own for cdpr"
+        text = "own package" if good else f"another package: {origin}" if origin else "not found"
+        fix = f"uninstall the other {name!r}, or install cdpr in its own environment"
         checks.append(MachineCheck(f"package {name}", good, text, fix))
     return checks
 
@@ -130,7 +130,7 @@ def libraries() -> list[MachineCheck]:
 
 
 def machine() -> list[MachineCheck]:
-    """What real time and real buses need; only told, since a rehearsal needs none of it."""
+    """Needs of real time and real buses; only reported, since simulation needs none."""
     cores = os.cpu_count() or 1
     kernel = kernel_support()
     text = kernel.text if kernel.good else f"{kernel.text}; other interfaces work"
@@ -154,7 +154,9 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
             read_endpoints(Path(drives.endpoints), drives)
     except BadInput as error:
         return [MachineCheck("drives", False, f"{error.where}: {error.what}", error.next_step)]
-    known = "read back" if drives.endpoints else "not read back: the rig file names no endpoints"
+    known = (
+        "read back" if drives.endpoints else "not read back: the rig file has no drives.endpoints"
+    )
     return [MachineCheck("drives", True, f"ODrives; their settings are {known}")]
 
 
@@ -188,15 +190,15 @@ def rig_bus(rig: Rig) -> list[MachineCheck]:
 
 
 def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
-    """Whether a camera opens and its pictures have the size that the rig file states."""
+    """Whether a camera opens and its images have the size that the rig file states."""
     if not rig.cameras:
         return [
-            MachineCheck("camera", source is None, "the rig file has none", "leave --camera out")
+            MachineCheck("camera", source is None, "the rig file has none", "leave out --camera")
         ]
     camera = rig.cameras[0]
     if source is None:
         devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
-        text = f"not tried (--camera INDEX tries it); devices here: {devices or 'none'}"
+        text = f"not tested (--camera INDEX tests it); devices here: {devices or 'none'}"
         return [MachineCheck(f"camera {camera.name}", True, text)]
     from drivers.cameras.live import LiveCamera  # needs OpenCV
 
@@ -204,7 +206,7 @@ def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
         LiveCamera(source, camera).close()
     except CdprError as error:
         return [MachineCheck(f"camera {camera.name}", False, error.what, error.next_step)]
-    text = f"{source} opens and gives pictures of {camera.width} x {camera.height} px"
+    text = f"{source} opens and delivers images of {camera.width} x {camera.height} px"
     return [MachineCheck(f"camera {camera.name}", True, text)]
 
 
@@ -227,7 +229,7 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
     found = next((interface for interface in interfaces if interface.name == name), None)
     if found is None:
         there = ", ".join(interface.name for interface in interfaces) or "none"
-        text = f"not there; CAN interfaces here: {there}"
+        text = f"missing; CAN interfaces here: {there}"
         return [MachineCheck(f"interface {name}", False, text, bring_up(settings))]
     checks = [_up(found, settings), _queue(found)]
     if found.has_hardware:
@@ -241,9 +243,9 @@ def kernel_support() -> MachineCheck:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (AttributeError, OSError) as error:
         text = f"no SocketCAN: {error}"
-        fix = "sudo modprobe can_raw; where there is no such module, boot the ordinary kernel"
+        fix = "sudo modprobe can_raw; without that module, boot the standard kernel"
         return MachineCheck("kernel", False, text, f"{fix} (linux-image-amd64)")
-    return MachineCheck("kernel", True, "SocketCAN is there")
+    return MachineCheck("kernel", True, "SocketCAN is available")
 
 
 def _up(found: KernelInterface, settings: BusSettings) -> MachineCheck:
@@ -259,7 +261,7 @@ def _queue(found: KernelInterface) -> MachineCheck:
     return MachineCheck(
         f"txqueuelen of {found.name}",
         found.queue >= MIN_TRANSMIT_QUEUE,
-        f"{found.queue} frames; {MIN_TRANSMIT_QUEUE} or more are needed",
+        f"{found.queue} frames; {MIN_TRANSMIT_QUEUE} or more are required",
         f"sudo ip link set {found.name} txqueuelen 128",
     )
 
@@ -268,19 +270,19 @@ def _bitrate(found: KernelInterface, wanted: int) -> MachineCheck:
     text = f"{found.bitrate} bit/s" if found.bitrate else "not set"
     if found.bitrate != wanted:
         text += f"; the rig file says {wanted}"
-    fix = _set_anew(found.name, wanted)
+    fix = _set_again(found.name, wanted)
     return MachineCheck(f"bit rate of {found.name}", found.bitrate == wanted, text, fix)
 
 
 def _controller(found: KernelInterface, bitrate: int) -> MachineCheck:
     healthy = found.state in HEALTHY
-    fix = f"check power, cable and termination (60 ohm), then {_set_anew(found.name, bitrate)}"
+    fix = f"check power, cable and termination (60 ohm), then {_set_again(found.name, bitrate)}"
     text = found.state or "unknown"
-    # Down it has no state worth a word; that it is down is told already.
+    # Down it has no state worth reporting; that it is down is reported already.
     return MachineCheck(f"controller of {found.name}", healthy or not found.up, text, fix)
 
 
-def _set_anew(name: str, bitrate: int) -> str:
+def _set_again(name: str, bitrate: int) -> str:
     """A bit rate can be set only while the interface is down."""
     return (
         f"sudo ip link set {name} down && sudo ip link set {name} up txqueuelen 128"
@@ -314,7 +316,7 @@ def priority_check(limit: int, wanted: int, *, privileged: bool) -> MachineCheck
 def memory_check(limit: int, *, privileged: bool) -> MachineCheck:
     """Whether the loop's memory may be locked, so that it never waits for a disk."""
     unlimited = limit == resource.RLIM_INFINITY
-    text = "allowed" if privileged or unlimited else f"{limit // 1024} KiB; all of it is needed"
+    text = "allowed" if privileged or unlimited else f"{limit // 1024} KiB; unlimited is required"
     return MachineCheck(
         "locked memory", privileged or unlimited, text, _allow("memlock", "unlimited")
     )
@@ -346,7 +348,7 @@ def examine(rig: Rig) -> Examined:
         raise BadInput(
             f"the drives of {rig.name} are not CANopen drives",
             where="--drives",
-            next_step="leave --drives out; `cdpr doctor RIG` looks at the files that they need",
+            next_step="leave out --drives; `cdpr doctor RIG` checks the files that they need",
         )
     settings = BusSettings.of(rig)
     with ExitStack() as stack:
@@ -367,6 +369,6 @@ def stopping_text(rig: Rig) -> str:
 
     lost = lost_master(rig)
     return (
-        f"without the master drives stop by {lost.noticed_by} after {lost.notice * 1000:.0f} ms:"
+        f"without the master, drives stop by {lost.noticed_by} after {lost.notice * 1000:.0f} ms:"
         f" up to {lost.distance * 1000:.1f} mm at {rig.motion.speed * 1000:g} mm/s"
     )

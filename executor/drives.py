@@ -43,9 +43,9 @@ def require_other_process(rig: Rig) -> None:
     """
     if is_simulated(rig):
         raise BadInput(
-            "nothing is kept on the interface 'virtual'",
+            "the interface 'virtual' keeps no state",
             where="bus",
-            why="its drives are simulated in the process of a run and end with it",
+            why="its drives are simulated inside a run and end with it",
             next_step="name the bus with --interface and --channel",
         )
 
@@ -58,10 +58,10 @@ def require_own_time(rig: Rig, realtime: bool) -> None:
     """
     if not (realtime or is_simulated(rig)):
         raise BadInput(
-            "--fast needs drives that are simulated in this process",
+            "--fast needs drives simulated in this process",
             where="--fast",
-            why="time on a real bus cannot be made faster",
-            next_step="leave --fast out, or use the interface 'virtual'",
+            why="time on a real bus cannot run faster",
+            next_step="leave out --fast, or use the interface 'virtual'",
         )
 
 
@@ -85,7 +85,7 @@ def _reached(
     lost_power: PowerLoss | None = None,
     listener: Listener = SILENT,
 ) -> Iterator[_Drives]:
-    """The bus, while nobody else sets drives up on it; arguments and errors as `open_drives`."""
+    """The bus, with its drives locked; arguments and errors as `open_drives`."""
     settings = BusSettings.of(rig)
     with ExitStack() as stack:
         stack.enter_context(SetUpLock(settings).held())

@@ -317,7 +317,7 @@ def _pose_table(looks: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
 
 
 def _planned(looks: Sequence[CameraSample], cycles: CycleTable) -> list[Pose]:
-    """Where the platform should have been when each picture was taken."""
+    """Where the platform should have been when each image was taken."""
     times = np.array([look.found.time for look in looks])
     nearest = np.clip(np.searchsorted(cycles.time, times), 0, len(cycles) - 1)
     return _poses(_planned_positions(looks, cycles), cycles.planned_rotation[nearest])

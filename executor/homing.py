@@ -29,9 +29,9 @@ from model.rig import Camera, Rig
 
 #: A cable is taken up no further than this, [m], and no faster than that, [m/s].
 FURTHEST, FASTEST = 0.200, 0.010
-#: Defaults: reach [m] and speed [m/s] as above, pictures, and how slack simulated cables hang, [m].
+#: Defaults: reach [m] and speed [m/s] as above, images, and how slack simulated cables hang, [m].
 REACH, SPEED, PICTURES, SLACK = 0.050, 0.002, 20, 0.005
-#: Fewest and most pictures that measure the pose.
+#: Fewest and most images that measure the pose.
 FEWEST_PICTURES, MOST_PICTURES = 5, 1000
 
 
@@ -137,7 +137,7 @@ def home(
     speed = min(speed, rig.motion.speed)
     interlock = MotionInterlock(rig)
     interlock.require_free()
-    if eye is not None:  # it gives pictures, before anything is moved for it
+    if eye is not None:  # it gives images, before anything is moved for it
         look_at_rest(rig, eye, 1, rig.home, lambda: None, listener)
     fastest = float(wind_in_speed(rig, target, limit, speed).max())
     require_confirmed(confirm, HomingProposal(rig, target, limit, reach, speed, fastest, eye))
@@ -181,8 +181,8 @@ class ForgetProposal:
         interlock: Of the bus, whose reference it is.
     """
 
-    question: ClassVar[str] = "Do all drives count what the rig file says?"
-    otherwise: ClassVar[str] = "the reference is as it was"
+    question: ClassVar[str] = "Do all drive positions match the rig file?"
+    otherwise: ClassVar[str] = "the homing reference was not changed"
 
     interlock: MotionInterlock
 
@@ -209,10 +209,10 @@ def require_one_pose(at_home: bool, pose: Pose | None, cameras: Sequence[str]) -
     """
     if (at_home, pose is not None, bool(cameras)).count(True) != 1:
         raise BadInput(
-            "say how the platform's pose is known: --at-home, --pose-mm or --camera alone",
+            "state the platform pose by exactly one of --at-home, --pose-mm and --camera",
             where="cdpr home",
-            why="counts are referenced at a pose that is known, and at no guess",
-            next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z; or let it"
+            why="homing needs a known pose",
+            next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z, or let it"
             " hang in view of a calibrated camera and pass --camera INDEX",
         )
 
@@ -227,15 +227,15 @@ def _require_slow(reach: float, speed: float, pictures: int) -> None:
     for name, value, largest, unit in bounds:
         if not 0.0 < value <= largest:
             raise BadInput(
-                f"the {name} of {value:g} {unit} is not above 0 and up to {largest:g} {unit}",
+                f"the {name} of {value:g} {unit} must be above 0 and at most {largest:g} {unit}",
                 where="home",
                 next_step=f"give a smaller {name}",
             )
     if not FEWEST_PICTURES <= pictures <= MOST_PICTURES:
         raise BadInput(
-            f"{pictures} pictures are not from {FEWEST_PICTURES} to {MOST_PICTURES}",
+            f"{pictures} images: must be from {FEWEST_PICTURES} to {MOST_PICTURES}",
             where="home",
-            next_step="give another number of pictures",
+            next_step="give another number of images",
         )
 
 
@@ -250,9 +250,9 @@ def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:
     inside = (rig.workspace_lower <= pose.position) & (pose.position <= rig.workspace_upper)
     if not inside.all():
         raise BadInput(
-            "this pose is outside the workspace",
+            "the pose is outside the workspace",
             where="--pose-mm",
-            next_step="name the position of the platform's origin in the world frame, in mm",
+            next_step="give the position of the platform's origin in the world frame, in mm",
         )
     return pose
 
@@ -266,11 +266,11 @@ def _target(rig: Rig, tension: float | None, limit: float) -> float:
     target = 2.0 * rig.min_tension if tension is None else tension
     if not rig.min_tension <= target <= 0.8 * limit:
         raise Refused(
-            f"a pretension of {target:g} N is not from {rig.min_tension:g} N up to 80 % of the"
+            f"a pretension of {target:g} N must be from {rig.min_tension:g} N to 80 % of the"
             f" limit of {limit:g} N",
             where="--tension-n",
-            why="cables must be taut afterwards, and winding in must have room below the limit",
-            next_step="name another pretension or limit",
+            why="cables must be taut afterwards, with headroom below the limit while winding in",
+            next_step="set another pretension or limit",
         )
     return target
 
@@ -307,10 +307,10 @@ def _referenced(
         if board.read().stop:
             raise StoppedByOperator(
                 "stopped before the pose was measured; the cables are taut and held",
-                next_step="home again when all is well",
+                next_step="home again when ready",
             )
 
     looks = look_at_rest(rig, eye, pictures, true_pose, unless_stopped, SILENT)
     found = rest_pose(rig, looks)
-    how = f"tags in {found.pictures} of {pictures} pictures, camera {eye[0].name!r}"
+    how = f"tags in {found.pictures} of {pictures} images, camera {eye[0].name!r}"
     return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)

@@ -114,7 +114,7 @@ def with_speed(rig: Rig, speed: float) -> Rig:
     """
     if not 0.0 < speed <= FASTEST:
         raise BadInput(
-            f"the speed of {speed:g} m/s is not above 0 and up to {FASTEST:g} m/s",
+            f"the speed of {speed:g} m/s must be above 0 and at most {FASTEST:g} m/s",
             where="jog",
             next_step="give a smaller speed",
         )
@@ -160,11 +160,11 @@ def straight_way(
         document = make_plan(rig, way, settings(seed=0, rounds=1))
     if document.quality.length_mm > straight + 0.01:
         raise Refused(
-            f"the straight way of {straight:.1f} mm is not free; the way around is"
+            f"the straight path of {straight:.1f} mm is not free; the detour is"
             f" {document.quality.length_mm:.1f} mm",
             where="cdpr jog",
-            why="cables or platform would come too near to something on the straight way",
-            next_step="jog another way, or plan a path with `cdpr plan --start-mm`",
+            why="cables or platform would be too close to an obstacle on the straight path",
+            next_step="jog in another direction, or plan a path with `cdpr plan --start-mm`",
         )
     return document
 
@@ -178,7 +178,7 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
     """
     if (by is None) != to_home:
         raise BadInput(
-            "say how far: --by-mm X Y Z, --to-home, or --cable N --mm X",
+            "no motion given: use --by-mm X Y Z, --to-home, or --cable N --mm X",
             where="cdpr jog",
             next_step="see `cdpr jog --help`",
         )
@@ -187,7 +187,7 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
     length_mm = math.hypot(*by) * 1000.0
     if not 0.0 < length_mm < math.inf:
         raise BadInput(
-            "that is no way to go", where="--by-mm", next_step="give x y z in mm, not all 0"
+            "the jog distance is zero", where="--by-mm", next_step="give X Y Z in mm, not all 0"
         )
     _require_jog(length_mm, 0.0)
 
@@ -195,10 +195,10 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
 def _require_jog(length_mm: float, turn_deg: float) -> None:
     if length_mm > LONGEST_MM * _ROUNDED or turn_deg > MOST_DEG:
         raise Refused(
-            f"a jog of {length_mm:.1f} mm and {turn_deg:.1f}° is longer than {LONGEST_MM:g} mm or"
-            f" turns more than {MOST_DEG:g}°",
+            f"a jog of {length_mm:.1f} mm and {turn_deg:.1f}° exceeds {LONGEST_MM:g} mm or"
+            f" {MOST_DEG:g}°",
             where="cdpr jog",
-            why="a longer way is planned around what is in it",
+            why="longer motions need a plan that avoids obstacles",
             next_step="jog less far, or plan a path from here with `cdpr plan --start-mm`",
         )
 
@@ -227,14 +227,16 @@ def _require_cable(rig: Rig, cable: int, length: float) -> None:
             next_step=f"name one from 1 to {rig.cable_count}, in the order of the rig file",
         )
     if length == 0.0 or not math.isfinite(length):
-        raise BadInput("that is no way to go", where="--mm", next_step="give mm, not 0")
+        raise BadInput(
+            "the jog distance is zero", where="--mm", next_step="give a length in mm other than 0"
+        )
     length_mm = abs(length) * 1000.0
     if length_mm > LONGEST_MM * _ROUNDED:
         raise Refused(
-            f"{length_mm:g} mm are more than {LONGEST_MM:g} mm",
+            f"{length_mm:g} mm exceeds the limit of {LONGEST_MM:g} mm",
             where="--mm",
-            why="one cable alone is moved in short steps, somebody looking",
-            next_step="go there in several steps",
+            why="a single cable is moved in short steps, under observation",
+            next_step="use several steps",
         )
 
 

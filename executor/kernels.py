@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 
 def ready_to_measure(listener: Listener = SILENT) -> None:
-    """Loads what finds the edges of tags, so that no picture waits for it."""
+    """Loads what finds the edges of tags, so that no image waits for it."""
     from model.jit import compilation
     from tracking.edges import refine
 
-    with compilation(_edges(), "the tags' edge finder", "up to a minute", listener):
+    with compilation(_edges(), "the tag edge detector", "up to a minute", listener):
         refine.load_kernels()
 
 

@@ -8,10 +8,10 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class StopReason:
-    """Why a run is to end that nobody stopped.
+    """Why a run is to end without an operator's stop.
 
     Attributes:
-        code: Of the event that tells it.
+        code: Of the event that reports it.
         text: A clause, with numbers.
     """
 
@@ -29,7 +29,7 @@ class OperatorRequests:
             the operator wishes it.
         hold: Come to rest on the path and wait there.
         speed: Share of the planned speed along the path, from 0.01 to 1.
-        lost: Why nobody supervises the run any more; nothing while somebody does.
+        lost: Why the run has lost its supervisor; empty while it has one.
     """
 
     stop: bool = False

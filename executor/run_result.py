@@ -44,7 +44,7 @@ class RunResult:
 
     @property
     def passed(self) -> bool:
-        """Whether the run came to its end within all limits."""
+        """Whether the run finished within all limits."""
         return bool(self.summary["passed"])
 
     @property

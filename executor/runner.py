@@ -141,7 +141,7 @@ def run(
     require_own_time(rig, realtime)
     if start is not None and not is_simulated(rig):
         raise BadInput(
-            "only a platform that is simulated in this process can be placed",
+            "only a platform simulated in this process can be placed",
             where="--simulated-start-mm",
             next_step="leave it out, or use the interface 'virtual'",
         )
@@ -192,7 +192,7 @@ def run_prepared(
     """
     proposal = MotionProposal(prepared, cameras, options.clearance_stop)
     require_confirmed(options.confirm, proposal)
-    with options.listener.waiting("loading what the end of the run needs"):
+    with options.listener.waiting("loading the report generator"):
         _load_what_the_end_needs()
     interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
     course = RunCourse(datetime.now(UTC), interface, simulated, not options.realtime)
@@ -270,7 +270,7 @@ def _load_what_the_end_needs() -> None:
 
 
 def _move_and_measure(job: _Job, moved: _Moved) -> None:
-    """The motion and its pictures; what fails once something moved is part of how it ended."""
+    """The motion and its images; what fails once something moved is part of how it ended."""
     board = SharedRequests() if job.options.realtime else LocalRequests()
     try:
         try:
@@ -283,11 +283,11 @@ def _move_and_measure(job: _Job, moved: _Moved) -> None:
             raise
         text = f"{type(error).__name__}: {error}".rstrip(": ")
         if moved.outcome is None:
-            text = f"the program broke while the platform moved: {text}"
+            text = f"the program failed during the motion: {text}"
             log = moved.recorder.log
             moved.outcome = Outcome(State.LATCHED, text, log, False, datetime.now(UTC))
         else:
-            moved.troubles.append(f"the end of the run broke: {text}")
+            moved.troubles.append(f"writing the results failed: {text}")
 
 
 def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Moved) -> None:
@@ -404,7 +404,7 @@ def _conclude(job: _Job, moved: _Moved, course: RunCourse) -> RunResult:
     evaluated, summary = _evaluated(job.prepared, moved, outcome, course)
     result = RunResult(job.folder.path, summary)
     supervisor.on_verdict(result)
-    with job.options.listener.waiting("writing the run folder and its report"):
+    with job.options.listener.waiting("writing the run folder and report"):
         moved.close()
         events, left_out = outcome.log.events, supervisor.leaves_files_out
         missing = write_end(job.folder, course, evaluated, events, left_out)

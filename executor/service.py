@@ -184,7 +184,7 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     forgot = [w.node_id for w in rig.winches if not w.absolute and w.node_id in seen.restarted]
     if reference.counts and forgot:
         names = ", ".join(rig.drive_names[node] for node in forgot)
-        why = f"{names}: switched on since it was made"
+        why = f"{names}: power-cycled after homing"
         reference = replace(reference, counts=False, why_not=why)
     columns = zip(
         rig.winches,
@@ -218,7 +218,7 @@ class ResetProposal:
         latched: What is latched, if anything.
     """
 
-    question: ClassVar[str] = "Is the cause gone and the platform safe?"
+    question: ClassVar[str] = "Is the cause removed and the platform safe?"
     otherwise: ClassVar[str] = "nothing was reset"
 
     bus: str
@@ -301,7 +301,7 @@ class ReleaseProposal:
         reference: Of the drives' counts, which is given up without brakes.
     """
 
-    question: ClassVar[str] = "Does the platform stand on something, so that no cable carries it?"
+    question: ClassVar[str] = "Is the platform supported, so that no cable carries it?"
     otherwise: ClassVar[str] = "the drives hold as before"
 
     rig: Rig

@@ -16,7 +16,7 @@ from model.rig import Rig
 
 #: By what the reference is lost where no brake holds the drums.
 _RELEASED = "the drives were released by the operator, and no brake holds the cables"
-_CUT_SHORT = Ended(State.LATCHED, "the program was ended", holding=False, true_pose=None)
+_CUT_SHORT = Ended(State.LATCHED, "the program was terminated", holding=False, true_pose=None)
 
 
 class Unrecorded:
@@ -65,7 +65,7 @@ def release_drives(
         raise
     finally:
         if ended.state is not State.FINISHED:
-            cause = f"the drives were being released: {ended.cause}"
+            cause = f"while releasing the drives: {ended.cause}"
             custody.end(State.LATCHED, cause, record, holding=False, stands_at=None)
     if left is None:
         raise ended.error or Fault(ended.cause, where="release")

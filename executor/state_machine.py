@@ -118,7 +118,7 @@ class Machine:
         return State.STOPPED if self._stopped else State.FINISHED
 
 
-# What the loop tells while it runs: a record a cycle, and events.
+# What the loop reports while it runs: a record per cycle, and events.
 
 
 #: Code of the event that the drives say that they are simulated.
@@ -164,7 +164,7 @@ class CycleRecord:
 
 @dataclass(frozen=True, slots=True)
 class LoopEvent:
-    """Something worth telling.
+    """Something worth reporting.
 
     Attributes:
         cycle: In which cycle.

@@ -31,7 +31,7 @@ def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal)
         StoppedByOperator: The answer was no.
     """
     if confirm is not None and not confirm(proposal):
-        raise StoppedByOperator(proposal.otherwise, next_step="run it again when the answer is yes")
+        raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
 
 
 class Supervisor:
@@ -48,7 +48,7 @@ class Supervisor:
         self.interrupted = False
 
     def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
-        """Runs a motion, from the opening of its devices to the last picture.
+        """Runs a motion, from the opening of its devices to the last image.
 
         Args:
             board: Takes requests to stop.

@@ -1,4 +1,4 @@
-"""Measures the platform in folders of pictures, videos, live and synthetic cameras."""
+"""Measures the platform in folders of images, videos, live and synthetic cameras."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tracking.pose_log import LoggedPicture, write_pose_log
 from tracking.track import FrameRate, Picture, TogetherCount, TrackCount, track, track_together
 from tracking.tracker import Tracker
 
-#: A live camera that shows no tag for this number of pictures is given up.
+#: A live camera that shows no tag for this number of images is given up.
 PATIENCE = 50
 
 
@@ -42,7 +42,7 @@ class TrackResult:
     Attributes:
         pictures: Of all cameras together, in order of time.
         by_camera: Of each of several cameras alone, by its name; empty for one camera.
-        count: How many pictures were measured, and how long each took.
+        count: How many images were measured, and how long each took.
         together: Of several cameras, what was not taken together; None for one camera.
         unused: Why files were not used, by camera and name.
         with_clearance: Whether obstacles are known.
@@ -90,13 +90,13 @@ def own_file(path: Path, name: str) -> Path:
 
 
 def own_drawing(overlay: Path, name: str) -> Path:
-    """Where one of several cameras' pictures are drawn: a video like a log, or a folder inside."""
+    """Where one of several cameras' images are drawn: a video like a log, or a folder inside."""
     is_folder = overlay.is_dir() or not overlay.suffix
     return overlay / name if is_folder else own_file(overlay, name)
 
 
 def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
-    """Refuses a plan where no source renders pictures of it.
+    """Refuses a plan where no source renders images of it.
 
     Raises:
         BadInput: No source is ``synthetic``.
@@ -106,7 +106,7 @@ def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
         raise BadInput(
             "--plan is for the synthetic camera",
             where="track",
-            why=f"pictures come from {', '.join(named)}",
+            why=f"images come from {', '.join(named)}",
             next_step="name the obstacles with --scene, or the source 'synthetic'",
         )
 
@@ -123,7 +123,7 @@ def track_sources(
     stopped: Callable[[], bool] = lambda: False,
     listener: Listener = SILENT,
 ) -> TrackResult:
-    """Measures the platform's pose picture by picture, by one camera or several together.
+    """Measures the platform's pose image by image, by one camera or several together.
 
     Args:
         rig: The robot.
@@ -132,14 +132,14 @@ def track_sources(
         scene: Its obstacles, to which the clearance is measured; the plan's when left out.
         plan: Followed by the platform that synthetic cameras see.
         pictures: How many of each camera at most.
-        overlay: Folder or video into which the pictures are drawn with what was measured.
+        overlay: Folder or video into which the images are drawn with what was measured.
         replace_overlay: It may exist.
-        stopped: Whether to end; asked before each picture.
+        stopped: Whether to end; asked before each image.
         listener: Receives how far it is, and which files are not used.
 
     Raises:
-        NoPlatformSeen: No picture gave a pose.
-        BadInput: A source cannot be used, or a picture is of another size.
+        NoPlatformSeen: No image gave a pose.
+        BadInput: A source cannot be used, or an image is of another size.
         HardwareMissing: A camera does not open.
         CameraMoved: Frame tags are not where they should be.
     """
@@ -173,7 +173,7 @@ def track_sources(
                 model=model,
                 on_picture=drawing.enter_context(_overlay(place, rig, camera, replace_overlay)),
             )
-        # The fastest camera defines how close in time pictures belong together.
+        # The fastest camera defines how close in time images belong together.
         within = 0.5 / max(camera.rate for camera in sources)
         _measure(_together(streams, within, result.together, model), result, advance)
     result.seconds = (time.time_ns() - result.began) * 1e-9
@@ -185,7 +185,7 @@ def _measure(
     result: TrackResult,
     advance: Callable[[float, str], None],
 ) -> None:
-    """Takes all pictures into the result."""
+    """Takes all images into the result."""
     pace = FrameRate()
     for found, alone in measured:
         result.pictures.append(found)
@@ -217,7 +217,7 @@ def _together(
 def _overlay(
     place: Path | None, rig: Rig, camera: Camera, replace: bool
 ) -> Iterator[Callable[[Picture, LoggedPicture], None] | None]:
-    """What draws each picture's measurement into it; None without a place for it."""
+    """What draws each image's measurement into it; None without a place for it."""
     if place is None:
         yield None
         return
@@ -239,11 +239,11 @@ def _opened(
     unused: dict[str, str],
     listener: Listener,
 ) -> tuple[Iterable[Picture], int | None]:
-    """The pictures of a source, and how many there are where that is known."""
+    """The images of a source, and how many there are where that is known."""
     if source == SYNTHETIC:
         if plan is None or scene is None:
             raise BadInput(
-                "the synthetic camera needs a path to look at",
+                "the synthetic camera needs a path to render",
                 where=f"track, camera {camera.name!r}",
                 next_step="pass --plan plan.json",
             )
@@ -266,7 +266,7 @@ def _opened(
 
 
 def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Pose]]:
-    """Times and poses at which the synthetic camera takes pictures: those of a run of the plan."""
+    """Times and poses at which the synthetic camera takes images: those of a run of the plan."""
     require_same_rig(plan, rig, f"plan for {plan.rig.name}")
     table = prepare(verify(plan, rig), rig).checked.table
     poses = table.poses()

@@ -38,7 +38,7 @@ LIMIT_SHARE = 0.6
 _OF_COURSE = frozenset({"enabled", "moving", "held", "traceback"})
 
 AtRest = Callable[[WinchesStand, Pose | None, RequestBoard], HomingReference | None]
-"""Called after a motion that came to its end, with where the simulated platform is and where a stop
+"""Called after a motion that finished, with where the simulated platform is and where a stop
 is wished; the drives must have held all the while before the reference that it makes is kept."""
 
 
@@ -106,7 +106,7 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
         Fault: It ended with a fault, which is latched; with its cause.
         StoppedByOperator: The operator stopped it.
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
-        CdprError: Nothing was enabled, for the reason told.
+        CdprError: Nothing was enabled, for the reason given.
     """
     board = SharedRequests() if motion.realtime else LocalRequests()
     try:
@@ -117,13 +117,13 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
     if stand.state in (State.STOPPED, State.FINISHED):
         motion.supervisor.finish()
     if stand.state is State.STOPPED:
-        raise StoppedByOperator("stopped; the drives hold", next_step="begin anew when all is well")
+        raise StoppedByOperator("stopped; the drives hold", next_step="start again when ready")
     if stand.state is not State.FINISHED:
         raise Fault(
             stand.cause,
             where="winches",
             why="the motion was stopped, all drives together; they hold",
-            next_step="find the cause; simulated drives begin anew"
+            next_step="find the cause; simulated drives start fresh"
             if is_simulated(motion.rig)
             else "find the cause and look at the platform, then `cdpr reset RIG`",
         )
@@ -151,7 +151,7 @@ def _supervised(
             interlock,
             _EventSink(status, kept, advance, motion.listener),
             record=kept.folder if kept is not None else interlock.file.path,
-            anew=motion.rehome,
+            rehome=motion.rehome,
             at_rest=lambda stand, true_pose: at_rest(stand, true_pose, board),
         )
         status.take_end(stand.state, stand.cause)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from model.scene import Scene, load_scene
     from model.statics.gravity import working_tensions
 
-# Read by OpenCV when it is first imported: no picture of any format is decoded beyond it, whatever
+# Read by OpenCV when it is first imported: no image of any format is decoded beyond it, whatever
 # its header states (`drivers.cameras.files` says so in words for the usual ones).
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
 

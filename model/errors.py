@@ -87,6 +87,13 @@ class BadInput(CdprError):
     exit_code = 2
 
 
+class AlreadyExists(BadInput):
+    """A file or folder that would be replaced; the caller can allow it."""
+
+    def __init__(self, what: str, where: str, why: str = "") -> None:
+        super().__init__(what, where=where, why=why, next_step="choose another name")
+
+
 class Refused(CdprError):
     """A safety check said no before anything moved."""
 
@@ -126,7 +133,7 @@ class Problem:
 
 
 class InvalidFile(BadInput):
-    """An input file with one or more problems, all told at once."""
+    """An input file with one or more problems, all reported at once."""
 
     code = "invalid_file"
 
@@ -137,7 +144,7 @@ class InvalidFile(BadInput):
         super().__init__(
             f"{count} problem{'s' if count != 1 else ''} in the file",
             where=path,
-            next_step=next_step or "mend the lines above and run the command again",
+            next_step=next_step or "fix the lines above and run the command again",
         )
 
     def __str__(self) -> str:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from model.scene import Scene
 
 _MM = 1e3
-#: Okabe and Ito's palette, which people with any colour vision can tell apart.
+#: Okabe and Ito's palette, distinguishable with any colour vision.
 _PLATFORM, _PATH, _RAW, _OBSTACLE, _FRAME = "#0072B2", "#D55E00", "#999999", "#56606B", "#BBBBBB"
 
 

@@ -32,12 +32,12 @@ from model.progress import Listener
 #
 # Every state of the kernels has a folder of its own (`model.jit`). A process holds a
 # shared lock in each folder it uses until it ends; beginning a new one throws away those that
-# nobody holds and nobody began to use for two days. Folders that the user named
+# no process holds and none began to use for two days. Folders that the user named
 # (``NUMBA_CACHE_DIR``) are left alone.
 
 
 UNUSED = 2 * 24 * 3600.0
-"""How long nobody must have begun to use a folder before it is thrown away, [s]."""
+"""How long a folder must be unused before it is deleted, [s]."""
 _LOCK = "in-use"
 _OURS = re.compile(r"[0-9a-f]{16}|removed-\w+")
 """Names of versions, and of what a process that was ended did not get to remove."""
@@ -98,7 +98,7 @@ def _hold(folder: Path) -> None:
             os.utime(folder)
             return  # the file stays open, and the lock with it
         os.close(lock)  # thrown away in between
-    raise OSError(f"{folder} is thrown away again and again")
+    raise OSError(f"{folder} is deleted again and again")
 
 
 def _throw_away(folder: Path) -> None:
@@ -172,7 +172,7 @@ def _version(folders: frozenset[Path]) -> str:
 #
 # Numba finds machine code by the path and the date of a kernel's file, in a folder that is named
 # after the content of all kernels. So another copy of the program, or a file that was only touched,
-# compiles anew; hence the stamp of a task is named after path, date and size of every kernel's
+# compiles again; hence the stamp of a task is named after path, date and size of every kernel's
 # file.
 
 
@@ -231,11 +231,11 @@ def compilation(task: KernelSet, what: str, duration: str, listener: Listener) -
         yield True
         return
     if can_be_kept(task):
-        listener.remark(f"compiling {what} for this machine, once; {duration} …")
+        listener.remark(f"compiling {what} for this machine (once, {duration}) …")
     else:
         listener.remark(
-            f"compiling {what}, {duration}, and every time anew: no folder for it can be written;"
-            " name one by the variable NUMBA_CACHE_DIR"
+            f"compiling {what} ({duration}) on every start: no cache folder can be written;"
+            " set NUMBA_CACHE_DIR to a writable folder"
         )
     with listener.waiting("compiling"):
         yield False

@@ -68,7 +68,7 @@ def cables_to(rig: Rig, anchors_in_world: Array) -> Cables:
     if rig.pulley_radius == 0.0:
         straight = rig.outlets - anchors_in_world
         lengths = np.linalg.norm(straight, axis=-1)
-        _demand(lengths > 0.0, "its anchor lies at its outlet")
+        _demand(lengths > 0.0, "its anchor is at its outlet")
         exits = np.broadcast_to(rig.outlets, anchors_in_world.shape)
         return Cables(exits, anchors_in_world, straight / lengths[..., None], lengths)
     return _over_pulleys(rig, anchors_in_world)
@@ -82,8 +82,8 @@ def _over_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
     reach = np.linalg.norm(radial, axis=-1)
     outward = reach - radius  # from the pulley's centre, in the pulley's plane
     centre_distance = np.hypot(outward, along)
-    _demand(reach > 0.0, "its anchor lies on the swivel axis of its pulley")
-    _demand(centre_distance > radius, "its anchor lies inside its pulley")
+    _demand(reach > 0.0, "its anchor is on the swivel axis of its pulley")
+    _demand(centre_distance > radius, "its anchor is inside its pulley")
     swivel = radial / reach[..., None]
     straight = np.sqrt(centre_distance**2 - radius**2)
     # The tangent point, as an angle about the pulley's centre from the swivel direction to k.
@@ -102,7 +102,7 @@ def _demand(sound: NDArray[np.bool_], what: str) -> None:
     number = int(np.argwhere(~sound)[0][-1]) + 1
     raise NoCable(
         f"cable {number} cannot run: {what}",
-        why="the pose is out of the rig's reach, or holds a value that is not a number",
+        why="the pose is out of the rig's reach, or a value is not a number",
         next_step="choose a pose inside the workspace",
         values={"cable": number},
     )

@@ -21,7 +21,7 @@ from model.scene import Scene, scene_from_document
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ANEW = "make the plan anew with `cdpr plan`"
+PLAN_AGAIN = "plan again with `cdpr plan`"
 STOP_TOLERANCE = 1e-6
 """How far a marked waypoint may be from its stop, [m] and [rad]."""
 
@@ -131,12 +131,12 @@ def load_plan(path: str | Path) -> Plan:
     path = Path(path)
     data = _json_object(path)
     if data.get("kind") != "cdpr-plan":
-        raise BadInput("this is not a plan file", where=str(path), next_step=ANEW)
-    check_version(data, PlanDocument, path, {}, ANEW)
+        raise BadInput("this is not a plan file", where=str(path), next_step=PLAN_AGAIN)
+    check_version(data, PlanDocument, path, {}, PLAN_AGAIN)
     try:
         document = PlanDocument.model_validate(data)
     except ValidationError as error:
-        raise InvalidFile(str(path), problems_of(error, PlanDocument, {}), ANEW) from None
+        raise InvalidFile(str(path), problems_of(error, PlanDocument, {}), PLAN_AGAIN) from None
     _check_hash("hash", document.hash, _digest(document), path)
     plan = plan_from_document(document)
     _check_hash("rig_hash", document.rig_hash, plan.rig.plan_hash, path)
@@ -150,23 +150,23 @@ def _check_stops(plan: Plan, path: Path) -> None:
     marks, stops = plan.document.stops, plan.scene.stops
     places = [mark.waypoint for mark in marks]
     if [mark.name for mark in marks] != [stop.name for stop in stops]:
-        what = f"marks the stops {[m.name for m in marks]}, its scene has {[s.name for s in stops]}"
+        what = f"marks the stops {[m.name for m in marks]}; its scene has {[s.name for s in stops]}"
     elif places != sorted(set(places)) or not all(0 < p < len(plan.waypoints) for p in places):
-        what = f"marks the waypoints {places} of {len(plan.waypoints)} as stops, which is no order"
+        what = f"marks the waypoints {places} of {len(plan.waypoints)} as stops, out of order"
     else:
         away = [plan.waypoints[p].distance_to(s.pose) for p, s in zip(places, stops, strict=True)]
         turned = [plan.waypoints[p].angle_to(s.pose) for p, s in zip(places, stops, strict=True)]
         if max([*away, *turned], default=0.0) <= STOP_TOLERANCE:
             return
-        what = f"passes a stop {max(away) * 1000.0:.4g} mm off"
+        what = f"misses a stop by {max(away) * 1000.0:.4g} mm"
     why = "the file was not made by `cdpr plan`"
-    raise BadInput(f"the plan {what}", where=str(path), why=why, next_step=ANEW)
+    raise BadInput(f"the plan {what}", where=str(path), why=why, next_step=PLAN_AGAIN)
 
 
 def _json_object(path: Path) -> dict[str, Any]:
-    data = read_json(path, ANEW)
+    data = read_json(path, PLAN_AGAIN)
     if not isinstance(data, dict):
-        raise BadInput("this is not a plan file", where=str(path), next_step=ANEW)
+        raise BadInput("this is not a plan file", where=str(path), next_step=PLAN_AGAIN)
     return data
 
 
@@ -179,8 +179,8 @@ def _check_hash(key: str, stated: str, actual: str, path: Path) -> None:
         raise BadInput(
             f"the plan's {key} does not match its content",
             where=str(path),
-            why="the file was edited or damaged, or written by a program with other defaults",
-            next_step=f"{ANEW}; a plan cannot be edited by hand",
+            why="the file was edited, damaged, or written by a version with other defaults",
+            next_step=f"{PLAN_AGAIN}; a plan cannot be edited by hand",
         )
 
 

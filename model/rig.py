@@ -99,12 +99,12 @@ class Camera:
 
     Attributes:
         name: Name in the rig file.
-        width: Picture width, [px].
-        height: Picture height, [px].
+        width: Image width, [px].
+        height: Image height, [px].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: OpenCV coefficients, shape (k,).
         world_from_camera: Pose; x right, y down, z along the view.
-        rate: Pictures a second, [Hz].
+        rate: Images a second, [Hz].
     """
 
     name: str
@@ -291,7 +291,7 @@ class Rig:
                     f"two results of kind {result.kind} for {result.name!r}:"
                     f" {seen[what]} and {result.date}",
                     where="--calibration",
-                    next_step="pass the one that holds",
+                    next_step="pass only the current one",
                 )
             seen[what] = result.date
         document = self.document

@@ -59,7 +59,7 @@ class Excess:
     def sentence(self) -> str:
         """In words, with figures."""
         measured, limit = math.degrees(self.measured), math.degrees(self.limit)
-        return f"{self.how} by {measured:.4g} deg, where rotation_limits allow {limit:.4g} deg"
+        return f"{self.how} by {measured:.4g} deg, rotation_limits allow {limit:.4g} deg"
 
 
 def largest_rotations(start: Array, end: Array) -> tuple[float, float]:

@@ -101,7 +101,7 @@ class Scene:
         start: ``world_from_platform`` at the start.
         goal: ``world_from_platform`` at the goal.
         load: What the cables carry from the start on.
-        stops: Where the way leads through, in their order; `model.scene` tells the loads between.
+        stops: Intermediate stops in order; `model.scene` gives the loads between them.
         rotation_limits: How far the platform may be tilted and turned; None where the scene does
             not say, and the platform then keeps its orientation.
     """

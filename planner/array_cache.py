@@ -1,7 +1,7 @@
 """Arrays that depend on rig and load alone, kept between runs beside the kernels that made them.
 
 The folder is named after the content of the kernels, so a change of theirs forgets what they made.
-Where no folder can be written, arrays are computed anew.
+Where no folder can be written, arrays are recomputed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def stored(
         found = np.load(path, allow_pickle=False)
         if found.shape == shape:
             return found  # type: ignore[no-any-return]
-    except (OSError, ValueError, EOFError):  # not there yet, or cut off: made anew below
+    except (OSError, ValueError, EOFError):  # not there yet, or cut off: recomputed below
         pass
     made = compute()
     _keep(path, made)

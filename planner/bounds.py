@@ -96,7 +96,7 @@ def to_be_proved(smallest: float, required: float, tolerance: float) -> float:
 def _known(values: Array) -> Array:
     """Values as they are; one that is no number would prove whatever stands beside it."""
     if np.isnan(values).any():
-        raise Fault("a value along the path is no number, so nothing can be proved")
+        raise Fault("a value along the path is not a number, so nothing can be proved")
     return values
 
 
@@ -152,5 +152,5 @@ def _distance(model: ClearanceModel, pose: Pose) -> float:
     """The smallest distance; one that is no number would prove whatever stands beside it."""
     found = model.smallest(pose)
     if found is None or found.distance != found.distance:
-        raise Fault("a distance along the path is not known, so nothing can be proved")
+        raise Fault("a distance along the path is unknown, so nothing can be proved")
     return found.distance

@@ -67,7 +67,7 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
         raise PlanRejected(
             report,
             where=f"plan for {plan.rig.name} in {plan.scene.name}",
-            next_step="make the plan anew with `cdpr plan`; nothing has moved",
+            next_step="plan again with `cdpr plan`; nothing has moved",
         )
     return verified(plan, report)
 
@@ -118,7 +118,7 @@ def parted(poses: Sequence[Pose], stops: Sequence[int], count: int) -> list[Sequ
     bounds = [0, *stops, len(poses) - 1]
     if len(stops) != count or any(a > b for a, b in pairwise(bounds)):
         raise BadInput(
-            f"the path's stops are its poses {list(stops)}; needed are {count} in order"
+            f"the path's stops are its poses {list(stops)}; required are {count} in order"
             f" between 0 and {len(poses) - 1}",
             where="stops of a path",
         )
@@ -183,7 +183,7 @@ class _Check:
             (ends[0], poses[0], scene.start),
             (ends[1], poses[-1], scene.goal),
         ):
-            what = f"the path does not meet the scene's {name}"
+            what = f"the path does not reach the scene's {name}"
             away, turned = pose.distance_to(wanted), pose.angle_to(wanted)
             if not away <= END_TOLERANCE:
                 self._violation(what, away, END_TOLERANCE, "mm", pose.position)
@@ -219,7 +219,7 @@ class _Check:
             k = int(np.argmin(reach))
             nearest = float(reach[k]) - SPACING  # between two places it may come nearer
             if not nearest >= 4.0 * radius:
-                what = f"cable {k + 1} comes too near to its pulley's axis to bound its motion"
+                what = f"cable {k + 1} is too close to its pulley's axis to bound its motion"
                 self._violation(what, nearest, 4.0 * radius, "mm", pose.position)
                 return
 
@@ -316,7 +316,7 @@ class _Check:
         tolerance = MARGIN_TOLERANCE * self.rig.max_tension
         found = smallest_along(self.places, evaluate, self._margin_slope(), 0.0, tolerance)
         if not found.proved >= 0.0:
-            what = "the cables cannot hold every load asked for: capacity margin"
+            what = "the cables cannot hold every required load: capacity margin"
             place = self._pose(found.at).position
             self._violation(what, min(found.value, found.proved), 0.0, "N", place)
         return found
@@ -373,7 +373,7 @@ class _Check:
             largest = max(largest, float(speeds.max()))
             over = int(np.argmax(speeds - limits))
             if not speeds[over] <= limits[over]:
-                what = f"cable {over + 1} would have to run faster than its winch"
+                what = f"cable {over + 1} would have to move faster than its winch"
                 self._violation(what, speeds[over], limits[over], "mm/s", pose.position)
                 break
         return largest

@@ -51,7 +51,7 @@ class Violation:
         what: What it is, without figures.
         measured: SI.
         limit: SI.
-        unit: In which people are told: "mm", "mm/s", "°" or "N".
+        unit: Unit of display: "mm", "mm/s", "°" or "N".
         position: Of the platform there, shape (3,), [m].
     """
 
@@ -237,7 +237,7 @@ def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckRep
 
     Args:
         reports: Of the legs in their order, all of one rig and of the same clearances.
-        motions: Of the legs, by which places on the path are told, [m].
+        motions: Of the legs, to which positions on the path refer, [m].
     """
     if len(reports) == 1:
         return reports[0]

@@ -166,5 +166,5 @@ class ExactChecks:
 
 
 def _own(values: ArrayLike) -> Array:
-    """A writable copy: compiled code is made anew for arrays that may not be written to."""
+    """A writable copy: read-only arrays would be compiled separately."""
     return np.array(values, dtype=np.float64, order="C")

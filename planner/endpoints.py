@@ -1,4 +1,4 @@
-"""Whether start, stops and goal can be planned from and to, told in words when they cannot."""
+"""Whether start, stops and goal can be planned from and to, and the reasons when they cannot."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def require_room_for_the_way(scene: Scene, longest: float) -> None:
     if longest >= straight - 1e-9:
         return
     raise BadInput(
-        f"no path of at most {longest * 1e3:.1f} mm joins start and goal: the straight way is"
+        f"no path of at most {longest * 1e3:.1f} mm joins start and goal: the straight line is"
         f" {straight * 1e3:.1f} mm long",
         where=f"scene {scene.name}",
         next_step="allow a longer path with --longest-mm, or leave it out",
@@ -59,12 +59,11 @@ def _require_same_orientation(leg: Leg) -> None:
     angle = leg.scene.start.angle_to(leg.scene.goal)
     if angle > 1e-9:
         raise BadInput(
-            f"{leg.begin} and {leg.end} are turned against each other by"
-            f" {np.degrees(angle):.3g} deg",
+            f"{leg.begin} and {leg.end} differ in orientation by {np.degrees(angle):.3g} deg",
             where=f"scene {leg.scene.name}",
             why="without --free-rotation the search keeps the platform's orientation",
             next_step=f"plan with --free-rotation (the scene then needs rotation_limits), or give"
-            f" the {leg.end} the rotation_wxyz of the start",
+            f" the {leg.end} the start's rotation_wxyz",
             values={"angle_deg": float(np.degrees(angle))},
         )
 
@@ -79,7 +78,7 @@ def _require_in_workspace(rig: Rig, name: str, pose: Pose) -> None:
     low, high = rig.workspace_lower[axis] * 1e3, rig.workspace_upper[axis] * 1e3
     raise BadInput(
         f"the {name} is {outside * 1e3:.1f} mm outside the workspace:"
-        f" {'xyz'[axis]} = {pose.position[axis] * 1e3:.1f} mm, allowed {low:g} to {high:g} mm",
+        f" {'xyz'[axis]} = {pose.position[axis] * 1e3:.1f} mm, limits {low:g} to {high:g} mm",
         where=f"scene {name}",
         next_step=f"move the {name} into the workspace box of the rig file",
         values={"outside_mm": outside * 1e3},
@@ -105,13 +104,13 @@ def _too_near(name: str, near: Nearest, needed: float, key: str) -> BadInput:
     else:
         what = (
             f"at the {name} {near.first} is {distance:.2f} mm from {near.second},"
-            f" which is less than the {limit:.2f} mm asked for"
+            f" less than the required {limit:.2f} mm"
         )
     return BadInput(
         what,
         where=f"scene {name}",
-        why=f"the scene's clearance.{key}, and 0.05 mm that the planner keeps in reserve",
-        next_step=f"move the {name} or the obstacle, or ask for less clearance",
+        why=f"the scene's clearance.{key} plus 0.05 mm that the planner keeps in reserve",
+        next_step=f"move the {name} or the obstacle, or reduce the clearance",
         values={"distance_mm": distance, "required_mm": limit, "pair": _pair(near)},
     )
 
@@ -127,7 +126,7 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
         return
     raise BadInput(
         f"at the {name} the cables cannot hold the platform: the capacity margin is"
-        f" {margin:.2f} N, needed {reserve:.2f} N",
+        f" {margin:.2f} N, required {reserve:.2f} N",
         where=f"scene {name}",
         why="weight, payload and disturbances need tensions outside min_tension_n..max_tension_n",
         next_step=f"move the {name} inward, lower the load, or widen the tension limits",

@@ -98,13 +98,13 @@ def _refuse_unheeded(options: PlanningOptions) -> None:
     if left:
         named = ", ".join("--" + name.replace("_", "-") for name in left)
         raise BadInput(
-            f"--planner {options.planner} knows no {named}",
-            next_step="leave it out, or choose another planner; cdpr plan --help tells whose it is",
+            f"--planner {options.planner} does not take {named}",
+            next_step="leave it out, or choose another planner; see `cdpr plan --help`",
         )
     if options.steer is not None and options.mode != "paper":
         raise BadInput(
-            "--steer is about the steps of --mode paper; RRT* goes no farther than to the sample",
-            next_step="give --mode paper too, or leave --steer out",
+            "--steer applies only to --mode paper; RRT* steps never pass the sample",
+            next_step="pass --mode paper as well, or leave out --steer",
         )
 
 
@@ -114,9 +114,13 @@ def _is_given(value: object) -> bool:
 
 def _optimal_settings(options: PlanningOptions) -> OptimalSettings | TurningSettings:
     if options.weight and options.cost is not None:
-        raise BadInput("--cost and --weight both say what to optimise", next_step="give one")
+        raise BadInput(
+            "--cost and --weight contradict each other", next_step="leave out one of them"
+        )
     if options.budget_ms is not None and options.rounds:
-        raise BadInput("--budget-ms and --rounds both say how long to go on", next_step="give one")
+        raise BadInput(
+            "--budget-ms and --rounds contradict each other", next_step="leave out one of them"
+        )
     budget = options.budget_ms
     given: dict[str, Any] = {} if budget is None else {"budget": budget / 1000.0}
     cost = options.cost or "length"
@@ -133,7 +137,7 @@ def _optimal_settings(options: PlanningOptions) -> OptimalSettings | TurningSett
 def _require_objective(name: str) -> None:
     if name not in OBJECTIVES:
         raise BadInput(
-            f"{name!r} is no objective", next_step=f"use one of: {', '.join(OBJECTIVES)}"
+            f"{name!r} is not an objective", next_step=f"use one of: {', '.join(OBJECTIVES)}"
         )
 
 
@@ -147,16 +151,17 @@ def _weights(given: Mapping[str, float] | Sequence[str]) -> Weights:
     for text in given:
         name, _, number = text.partition("=")
         if name in read:
-            raise BadInput(f"--weight {text}: {name!r} stands twice", next_step="give it once")
+            raise BadInput(f"--weight {text}: {name!r} appears twice", next_step="give it once")
         if name not in names:
             raise BadInput(
-                f"--weight {text}: {name!r} is no objective", next_step=f"use {', '.join(names)}"
+                f"--weight {text}: {name!r} is not an objective",
+                next_step=f"use {', '.join(names)}",
             )
         try:
             read[name] = float(number)
         except ValueError:
             raise BadInput(
-                f"--weight {text}: {number!r} is no number", next_step="write --weight length=1"
+                f"--weight {text}: {number!r} is not a number", next_step="write --weight length=1"
             ) from None
     return Weights(**read)
 
@@ -165,7 +170,7 @@ def _paper_settings(options: PlanningOptions) -> PlannerSettings:
     cost = options.cost
     if cost in ("clearance", "capacity"):
         raise BadInput(
-            f"--planner {options.planner} knows no cost {cost!r}",
+            f"--planner {options.planner} has no cost {cost!r}",
             next_step="use --planner optimal, or --cost kinematic or length",
         )
     most = options.max_iterations

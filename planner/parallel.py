@@ -27,7 +27,7 @@ class Count:
 
 @contextmanager
 def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
-    """What does the work: a Dask cluster, processes of this computer, or nobody else.
+    """What does the work: a Dask cluster, processes of this computer, or this process alone.
 
     Args:
         workers: Number of processes; with 1 there is no pool.
@@ -83,14 +83,14 @@ def _dask_client(address: str) -> Any:
         raise BadInput(
             "Dask is not installed",
             next_step="pip install 'cdpr[dask]' (in a source checkout as docs/workspace.md says),"
-            " or leave --dask out",
+            " or leave out --dask",
         ) from error
     try:
         return client(address, timeout="10s")
     except (OSError, ValueError) as error:
         raise BadInput(
-            "no Dask scheduler answers there",
+            "no Dask scheduler answers at this address",
             where=address,
             why=str(error) or type(error).__name__,
-            next_step="start one (dask scheduler), or leave --dask out",
+            next_step="start one (dask scheduler), or leave out --dask",
         ) from error

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from model.pose import Array
 
 Progress = Callable[[float, float, float], None]
-"""Told by a search: what is done, the most there will be, and how near or how good it has come."""
+"""Reported by a search: work done, its limit, and how close or how good it is so far."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ _MOST = 64.0
 
 
 class LengthLimit:
-    """The search for λ, told after every round.
+    """The search for λ, updated after every round.
 
     Attributes:
         price: λ, what a metre costs beside the objective.
@@ -79,7 +79,7 @@ class LengthLimit:
         Args:
             path: Of the round before, shape (k, n).
             length: Its length, [m].
-            cost: Tells what it costs by the objective alone.
+            cost: Computes its cost by the objective alone.
 
         Returns:
             Whether the price is another now.

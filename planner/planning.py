@@ -78,7 +78,7 @@ def plan_segments(
         legs: In their order.
         settings: Which planner, and its settings, for each leg.
         kinematic: The cost of poses at the legs' orientation.
-        progress: Told how the search of each leg goes on.
+        progress: Called with the progress of each leg's search.
         clock: Seconds.
 
     Raises:
@@ -123,19 +123,19 @@ def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> S
     """
     if isinstance(settings, PlannerSettings):
         if rounds:
-            raise BadInput("the paper's planners know no rounds", next_step="leave them out")
+            raise BadInput("the paper's planners have no rounds", next_step="leave them out")
         return [settings] * count
     if count > 1 and settings.longest < np.inf:
         raise BadInput(
-            "a longest path cannot be asked for in a scene with stops",
-            why="each leg is planned for itself, and none knows what the others need",
-            next_step="leave --longest-mm out, or plan from stop to stop",
+            "a scene with stops cannot have a limit of the path length",
+            why="each leg is planned on its own, without knowing the others' lengths",
+            next_step="leave out --longest-mm, or plan from stop to stop",
         )
     if not rounds:
         return [settings] * count
     if len(rounds) != count:
         raise BadInput(
-            f"rounds are given for {len(rounds)} legs; the scene's stops make {count} of the way",
+            f"rounds are given for {len(rounds)} legs; the scene has {count}",
             next_step="give one number for all legs, or one for each",
         )
     return [replace(settings, rounds=own) for own in rounds]
@@ -182,14 +182,14 @@ def make_plan(
 
     The same rig, scene and settings give the same path on every machine of the same libraries. The
     clock is read for the statistics alone; except that settings without a number of rounds
-    go on until a budget is spent: the plan then tells the rounds, which give its path again.
+    continue until a budget is spent: the plan then states the rounds, which reproduce its path.
 
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
         settings: Which planner, and its settings; the planner we recommend when left out. A budget
             is that of each leg between stops.
-        progress: Told how the search goes on.
+        progress: Called with the progress of the search.
         clock: Seconds, for the planning time and the budget.
         rounds: Of each leg, in place of those in the settings.
         done: Stops that a run before visited; the plan only remembers them.
@@ -325,7 +325,7 @@ def plan_from_waypoints(
         raise BadInput(
             f"a path needs two waypoints, not {len(waypoints)}",
             where=f"plan for {rig.name} in {scene.name}",
-            next_step="begin with scene.start and end with scene.goal",
+            next_step="start at scene.start and end at scene.goal",
         )
     report = check_path(rig, scene, waypoints, stops)
     if not report.passed:

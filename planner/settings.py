@@ -1,4 +1,4 @@
-"""What a search is told: sampler, cost, mode, seed and sizes."""
+"""Settings of a search: sampler, cost, mode, seed and sizes."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ class Weights:
                 )
         if self.length + self.kinematic == 0.0:
             raise BadInput(
-                "without a weight of length or kinematic a path would have no reason to end",
-                next_step="give length a small weight too, such as length=0.02",
+                "without a weight of length or kinematic the path length is unbounded",
+                next_step="give length a small weight as well, such as length=0.02",
             )
 
     @property
@@ -145,14 +145,14 @@ LEAST_ROUNDS = 12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnytimeSettings:
-    """What every search in rounds is told.
+    """Settings of every search in rounds.
 
     Attributes:
         weights: What is made small.
         longest: Longest path allowed, [m]; infinite for any.
         seed: Of the random numbers.
         budget: How long paths are sought and improved, [s]; what is prepared before is not in it.
-        rounds: Instead of the budget, for the same path again: exactly so many rounds.
+        rounds: Instead of the budget, for reproducible paths: the exact number of rounds.
     """
 
     weights: Weights = field(default_factory=lambda: OBJECTIVES["length"])
@@ -177,13 +177,13 @@ class AnytimeSettings:
             raise BadInput(f"the longest path must be above 0 mm, not {self.longest * 1e3:g} mm")
 
     def is_over(self, rounds: int, spent: float, least: int = LEAST_ROUNDS) -> bool:
-        """Whether a search may end after so many rounds and seconds; ``least`` for the clock."""
+        """Whether a search may end after these rounds and seconds; ``least`` for the clock."""
         if self.rounds is not None:
             return rounds >= self.rounds
         return rounds >= least and spent >= self.budget
 
     def tell(self, progress: Progress, rounds: int, spent: float, cost: float) -> None:
-        """Tells how far a search is, in rounds where their number is given, else in seconds."""
+        """Progress of a search, in rounds where their number is given, else in seconds."""
         if self.rounds is not None:
             progress(float(rounds), float(self.rounds), cost)
         else:
@@ -195,10 +195,10 @@ class AnytimeSettings:
         return "raise --budget-ms" if self.rounds is None else "raise --rounds"
 
     def not_found(self, rounds: int, gap: float) -> str:
-        """What is told after so many rounds without a path; ``gap`` between the trees, [m]."""
+        """Message after a number of rounds without a path; ``gap`` between the trees, [m]."""
         of_budget = f" of the {self.budget * 1e3:g} ms budget" if self.rounds is None else ""
         return (
-            f"no path after {rounds} rounds{of_budget}; what start and goal reach comes within"
+            f"no path after {rounds} rounds{of_budget}; the trees from start and goal come within"
             f" {gap * 1e3:.1f} mm of each other"
         )
 
@@ -210,14 +210,14 @@ class AnytimeSettings:
         return NoSolution(
             f"no path of at most {limit:.1f} mm was found",
             where=where,
-            why=f"the path found has {length:.1f} mm, and the straight way {straight * 1e3:.1f} mm",
+            why=f"the path found has {length:.1f} mm, the straight line {straight * 1e3:.1f} mm",
             next_step=f"allow a longer path, or {self.longer}; `--cost length` without a limit"
-            " tells how short paths can be",
+            " shows how short paths can be",
             values={**values, "longest_mm": limit, "found_mm": length},
         )
 
 
-# What the search is told that keeps the orientation of the start.
+# Settings of the search that keeps the orientation of the start.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,7 +225,7 @@ class OptimalSettings(AnytimeSettings):
     """Settings of the search that keeps the orientation of the start."""
 
 
-# What the search is told that may turn the platform.
+# Settings of the search that may rotate the platform.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -74,7 +74,7 @@ class WinchDrive(Protocol):
 
 
 class DriveTrain:
-    """Moves the platform as the motors stand, and tells the drives how their cables pull.
+    """Moves the platform to the motors' positions; sets the drives' cable tensions.
 
     Feeling goes step by step, for who has something else to do meanwhile: it may take long to find
     the platform's place.

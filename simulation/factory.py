@@ -59,9 +59,9 @@ def check_drives(rig: Rig, behaviour: DriveBehaviour, eds: Path | None) -> None:
         eds_of(rig, eds)
     elif eds is not None or behaviour != STRICT:
         raise BadInput(
-            "simulated ODrives have no EDS file and no behaviours to choose",
+            "simulated ODrives have neither an EDS file nor selectable behaviours",
             where="drives.type",
-            next_step="leave --eds and --drive-behaviour out",
+            next_step="leave out --eds and --drive-behaviour",
         )
 
 

@@ -1,6 +1,6 @@
 """A bus that loses, delays, repeats and spoils frames, by rules; for tests of what depends on it.
 
-It stands between one end of a bus and whoever uses that end. Nothing in it is random by itself:
+It sits between one end of a bus and that end's user. Nothing in it is random by itself:
 rules that draw take a generator.
 """
 
@@ -25,7 +25,7 @@ _Box = list[tuple[float, int, can.Message]]
 BUS_OFF = can.Message(
     arbitration_id=0x040, data=bytes(8), is_error_frame=True, is_extended_id=False
 )
-"""What a controller that left the bus tells its own side. Source: linux/can/error.h."""
+"""What a controller in bus-off reports to its own host. Source: linux/can/error.h."""
 
 
 class FaultBus(can.BusABC):
@@ -169,7 +169,7 @@ def delay(ids: Container[int], seconds: float) -> Rule:
 
 
 def repeat(ids: Container[int], seconds: float = 0.0) -> Rule:
-    """Frames of some identifiers come twice, the second time so much later."""
+    """Frames of some identifiers come twice, the second after a delay."""
 
     def rule(message: can.Message) -> Arrivals:
         again = [(seconds, message)] if message.arbitration_id in ids else []

@@ -22,7 +22,7 @@ from model.rig import Camera, Rig, rig_from_document
 from simulation.drives.motion import Motor
 from simulation.plant import Plant
 
-# What the synthetic camera's lens and sensor do to a picture.
+# What the synthetic camera's lens and sensor do to an image.
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +31,9 @@ class Optics:
 
     Attributes:
         noise: Standard deviation, [grey levels of 255].
-        vignetting: Light lost in the corners of the picture, share of 1.
+        vignetting: Light lost in the corners of the image, share of 1.
         blur: Standard deviation of the lens's and focus's blur, [px].
-        exposure: Time for which the platform's motion is smeared, [s]; 0 for sharp pictures.
+        exposure: Time for which the platform's motion is smeared, [s]; 0 for sharp images.
         light: Share of full light; less leaves less contrast, more overexposes.
         cables: Cables hide what is behind them.
     """
@@ -79,7 +79,7 @@ def rig_as_built(rig: Rig) -> Rig:
 
 
 def stiffness_as_built(rig: Rig) -> Array | None:
-    """Axial stiffness of each cable, shape (m,), [N]; None where the rig file tells it."""
+    """Axial stiffness of each cable, shape (m,), [N]; None where the rig file gives it."""
     truth = simulation_of(rig).as_built
     if truth is None or truth.stiffness_n is None:
         return None
@@ -92,7 +92,7 @@ def winches_as_built(rig: Rig) -> SimulatedWinchesDocument:
 
 
 def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
-    """The camera that truly takes the pictures, and what its lens and sensor do to them.
+    """The camera that truly takes the images, and what its lens and sensor do to them.
 
     Raises:
         BadInput: The true lens has a number of distortion coefficients that OpenCV does not know.

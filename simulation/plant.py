@@ -368,16 +368,18 @@ class Plant:
             if self._suspension.energy(moved, tensions) <= before + 1e-4 * share * slope + slack:
                 return moved, cables, tensions
             share /= 2.0
-        raise self._lost("the search for the equilibrium is stuck", self._suspension.unstrained)
+        raise self._lost(
+            "the search for the equilibrium does not converge", self._suspension.unstrained
+        )
 
     def _lost(self, what: str, unstrained: Array) -> Fault:
         return Fault(
-            f"the simulated platform is lost: {what}",
+            f"the simulation failed: {what}",
             where=f"plant of rig {self._rig.name}",
             why="cables were paid out or wound in far from any pose of the platform; lengths "
             + ", ".join(f"{length:.3f}" for length in unstrained)
             + " m",
-            next_step="check what the drives were told",
+            next_step="check the commands sent to the drives",
         )
 
 

@@ -36,7 +36,7 @@ IDLE_WAIT = 0.005
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RehearsalStatus:
-    """What `SimulatedRig.serve` tells while it runs.
+    """What `SimulatedRig.serve` reports while it runs.
 
     Attributes:
         cycles: Cycles seen.
@@ -159,12 +159,12 @@ class SimulatedRig(ABC, Generic[Drive]):
         status_period: float = 0.5,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Answers in real time until told to stop or interrupted from the keyboard.
+        """Answers in real time until stopped or interrupted from the keyboard.
 
         Drives answer at once; the platform's place is found while nothing is to be answered, in
         half of that time at most, and torques wait for it. When this process is held up, the
         drives' time stands still: they do not blame the master for it. While the interface is down
-        they hear and reach nobody, as with their cable pulled, and go on when it is up again.
+        they receive and send nothing, as if unplugged, and continue when it is up again.
 
         Args:
             stop_requested: Asked every few milliseconds; true ends it.
@@ -211,7 +211,7 @@ class SimulatedRig(ABC, Generic[Drive]):
         try:
             return take(self._bus, wait)
         except BusDown:
-            time.sleep(IDLE_WAIT)  # the kernel tells it at once, and time must pass all the same
+            time.sleep(IDLE_WAIT)  # the kernel reports it at once, and time must pass all the same
             return None
 
     def _advance(self, elapsed: float) -> None:
@@ -229,7 +229,7 @@ class SimulatedRig(ABC, Generic[Drive]):
         self._drive_train.settle(self.drives)
 
     def _send(self, can_id: int, data: Frame) -> None:
-        with suppress(BusDown):  # nobody is reached
+        with suppress(BusDown):  # no node is reached
             transmit(self._bus, SentFrame(can_id, data))
 
 

@@ -1,9 +1,9 @@
-"""Makes the recorded session of examples/rig_session: a rig's places at rest, and some pictures.
+"""Makes the recorded session of examples/rig_session: a rig's places at rest, and some images.
 
     python tools/rig_session.py FOLDER [--count 60] [--pictures 6]
 
 The simulated rig of gachon_8_6_rehearsal.yaml is sent to the poses that `cdpr calibrate poses`
-would choose; each is measured by the tracker in one picture of the synthetic camera. Deterministic.
+would choose; each is measured by the tracker in one image of the synthetic camera. Deterministic.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def main() -> None:
             name.write_bytes(data.tobytes())
     text = "\n".join(",".join(values) for values in rows) + "\n"
     (options.folder / "places.csv").write_text(text, encoding="utf-8")
-    print(f"{len(rows) - 1} places, {options.pictures} pictures in {options.folder}")
+    print(f"{len(rows) - 1} places, {options.pictures} images in {options.folder}")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ class CameraMoved(Fault):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCheck:
-    """How far frame tags lie from where the rig file puts them in the picture.
+    """How far frame tags lie from where the rig file puts them in the image.
 
     Attributes:
         tags: Numbers of the tags seen whole.
@@ -117,11 +117,11 @@ def refuse_moved_camera(
         values |= {"moved_mm": round(shift * 1e3, 1), "turned_deg": round(turn, 3)}
         by = f": it is off by {shift * 1e3:.1f} mm and {turn:.2f}°"
     raise CameraMoved(
-        f"camera {camera.name!r} does not stand where the rig file says{by}",
+        f"camera {camera.name!r} is not at the pose in the rig file{by}",
         where=f"frame tags {values['frame_tags']}",
-        why=f"they are seen {check.error:.2f} px ({check.distance * 1e3:.1f} mm) off, the limit is"
+        why=f"reprojection error {check.error:.2f} px ({check.distance * 1e3:.1f} mm), limit"
         f" {limit_px:g} px: the camera or the tags were moved, or the lens refocused",
-        next_step="put it back, or measure its place anew and write it into the rig file under"
+        next_step="restore it, or calibrate its pose again and write it into the rig file under"
         " cameras: world_from_camera",
         values=values,
     )

@@ -52,7 +52,7 @@ def project_undistorted(camera: Camera, points_in_camera: Array) -> Array:
     return np.asarray(scaled * [fx, fy] + camera.matrix[:2, 2])
 
 
-# Pictures and parts of them.
+# Images and parts of them.
 
 
 Image = NDArray[np.uint8]
@@ -69,10 +69,10 @@ class Region:
 
 
 def require_image_format(image: Image, camera: Camera, rig: str) -> None:
-    """A picture of another kind than the camera was calibrated for would measure wrongly.
+    """An image of another kind than the camera was calibrated for would measure wrongly.
 
     Args:
-        image: The picture.
+        image: The image.
         camera: Whose it should be.
         rig: Name of the rig that has it.
 
@@ -83,8 +83,8 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
     if image.shape != wanted or image.dtype != np.uint8:
         size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))
         raise BadInput(
-            f"a picture has {size} px ({image.dtype}, {image.ndim} dimensions); camera"
-            f" {camera.name!r} takes grey 8-bit pictures of {wanted[1]} x {wanted[0]} px",
+            f"the image has {size} px ({image.dtype}, {image.ndim} dimensions); camera"
+            f" {camera.name!r} takes grey 8-bit images of {wanted[1]} x {wanted[0]} px",
             where=f"rig {rig}",
-            next_step="use pictures of this camera in full size, or mend the rig file",
+            next_step="use full-size images of this camera, or correct the rig file",
         )

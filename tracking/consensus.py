@@ -30,7 +30,7 @@ class Consensus:
 
     Attributes:
         views: Of each tag at most one.
-        ambiguous: Numbers of tags that are seen more than once while nothing tells which is the
+        ambiguous: Numbers of tags that are seen more than once while it is unknown which is the
             body's; then there are no views.
     """
 

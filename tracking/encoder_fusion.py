@@ -1,7 +1,7 @@
 """The platform's pose from drives and camera together.
 
-Drives tell the pose every cycle, smoothly, but off by whatever cable lengths are off; a camera
-tells it now and then, where the platform truly is. So their difference is filtered: it changes
+Encoders give the pose every cycle, smoothly, but off by whatever cable lengths are off; a camera
+gives it now and then, where the platform truly is. So their difference is filtered: it changes
 slowly, as geometry errors change along the way. The fused pose is that of the drives, moved by it.
 """
 
@@ -28,7 +28,7 @@ DRIVE_NOISE = np.array([5e-5] * 3 + [np.radians(0.01)] * 3)
 #: A measurement farther off than this (squared, in covariances) is an outlier; one true measurement
 #: in ten thousand is.
 GATE = 27.9
-#: After so many outliers in a row it is the difference that is wrong.
+#: After this many outliers in a row it is the difference that is wrong.
 OUTLIERS = 5
 
 

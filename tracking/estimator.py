@@ -1,4 +1,4 @@
-"""The platform in one picture, by the squares of its tags."""
+"""The platform in one image, by the squares of its tags."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ def doubt(
     """
     if bundle.reprojection > limits.reprojection_px:
         return (
-            f"the corners fit to {bundle.reprojection:.2f} px only,"
+            f"the reprojection error is {bundle.reprojection:.2f} px,"
             f" the limit is {limits.reprojection_px:g} px"
         )
     if len(views) == 1 and bundle.rival_cost - bundle.cost < limits.single_tag_margin:
         near = prior is not None and prior.angle_to(bundle.camera_from_body) < 0.1
         if not near:
-            return f"only tag {views[0].tag.id} is to be seen, and it allows two poses"
+            return f"only tag {views[0].tag.id} is detected, and it allows two poses"
     largest = float(np.sqrt(np.linalg.norm(bundle.covariance[:3, :3], 2)))
     if not largest <= limits.position_deviation:
         return (
-            f"the position is uncertain to {largest * 1e3:.1f} mm,"
+            f"the position's uncertainty is {largest * 1e3:.1f} mm,"
             f" the limit is {limits.position_deviation * 1e3:g} mm"
         )
     return ""
@@ -84,11 +84,11 @@ def without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] 
 
 
 class PlatformEstimator:
-    """Measures the platform in a picture by what is seen in it, whatever pictures came before.
+    """Measures the platform in an image by what is seen in it, whatever images came before.
 
     Args:
         rig: Its tags and platform.
-        camera: The camera that took the pictures.
+        camera: The camera that took the images.
         settings: When a pose is believed.
     """
 
@@ -123,10 +123,10 @@ class PlatformEstimator:
         """The pose by tags that the detector found, and by those that it missed.
 
         Args:
-            image: The picture.
+            image: The image.
             time: When it was taken, [s].
             detections: What the detector found; nothing when it was not asked.
-            expected: Where the platform is expected, ``world_from_platform``, to tell a pose from
+            expected: Expected pose, ``world_from_platform``, to separate a pose from
                 its mirror pose and to start from when nothing was detected.
             status: Of the measurement.
         """
@@ -152,7 +152,7 @@ class PlatformEstimator:
         agreed = self._agreed(views)
         if agreed.ambiguous:
             twice = ", ".join(map(str, agreed.ambiguous))
-            return NoPose(time, f"tags {twice} are seen in places that do not agree", seen)
+            return NoPose(time, f"tags {twice} are detected at inconsistent positions", seen)
         views = list(agreed.views)
         prior = None if expected is None else self._camera_from_world.compose(expected)
         first = solve_pnp(self._camera, views, prior) if views else None
@@ -183,8 +183,8 @@ class PlatformEstimator:
     def _why_nothing(self, seen: tuple[int, ...]) -> str:
         wanted = ", ".join(map(str, self._platform))
         others = [number for number in seen if number not in self._frame]
-        also = f"; seen instead: {', '.join(map(str, others))}" if others else ""
-        return f"no tag of the platform ({self._rig.tag_family} {wanted}) is to be seen{also}"
+        also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
+        return f"no platform tag ({self._rig.tag_family} {wanted}) detected{also}"
 
     def _looked_for(self, image: Image, pose: Pose, known: set[int]) -> list[TagView]:
         """Tags that the detector missed, looked for where a pose puts them.

@@ -1,4 +1,4 @@
-"""What a tracker says about one picture."""
+"""What a tracker says about one image."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class PoseMeasurement:
     """A measured pose of the platform.
 
     Attributes:
-        time: Of the picture, [s].
+        time: Of the image, [s].
         pose: ``world_from_platform``.
         covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6).
             It holds the scatter of the corners, not errors of the camera's place or of the tags'.
         tags: Numbers of the tags it rests on.
         reprojection: RMS error of their corners, [px].
-        status: ``found`` (searched in the whole picture), ``tracked`` (where it was expected) or
+        status: ``found`` (searched in the whole image), ``tracked`` (where it was expected) or
             ``guided`` (where the drives' positions put it).
     """
 
@@ -50,10 +50,10 @@ class PoseMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class NoPose:
-    """A picture that gives no pose.
+    """An image that gives no pose.
 
     Attributes:
-        time: Of the picture, [s].
+        time: Of the image, [s].
         reason: Why.
         seen: Numbers of the tags of the rig's family that were seen.
     """
@@ -103,7 +103,7 @@ def extrapolate(
         time: Of the later one, [s]; not before the measurement's own.
 
     Returns:
-        None where `predicted` knows no speed: nobody can tell where the platform is then.
+        None where `predicted` knows no speed: the pose is unknown then.
     """
     if time == last.time:
         return last

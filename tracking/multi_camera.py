@@ -28,17 +28,17 @@ GATE = 27.9
 class MultiCameraFusion:
     """The pose of all cameras, moment after moment.
 
-    Pictures of one moment are taken a little apart in time. Each pose is carried on to the newest
+    Images of one moment are taken a little apart in time. Each pose is carried on to the newest
     one's time, as the same camera saw the platform go. One whose camera saw nothing shortly
-    before is left out, as nobody knows how fast the platform went: the newest pose always counts.
+    before is left out, as the platform's speed is unknown: the newest pose always counts.
     """
 
     def __init__(self, within: float) -> None:
         """Nothing was seen yet.
 
         Args:
-            within: A picture that was taken farther than this from the median time of a moment's
-                pictures is not taken together with the others, [s].
+            within: An image that was taken farther than this from the median time of a moment's
+                images is not taken together with the others, [s].
         """
         self.apart = 0
         """In how many moments a pose was left out for that."""
@@ -77,7 +77,7 @@ def together(seen: Mapping[str, Observation]) -> Observation:
     """The mean of all poses, each by the weight of its information.
 
     Of three cameras and more one that disagrees with the others is left out; of two that disagree
-    nobody knows which is wrong.
+    it is unknown which is wrong.
 
     Args:
         seen: What each camera measured, by its name; all poses are of one time.
@@ -139,16 +139,16 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
     )
 
 
-# Which pictures of several cameras belong to one moment.
+# Which images of several cameras belong to one moment.
 
 
 def moments(
     streams: Mapping[str, Iterator[LoggedPicture]], within: float
 ) -> Iterator[dict[str, LoggedPicture]]:
-    """Puts the pictures of all cameras in order of time, those of one moment together.
+    """Puts the images of all cameras in order of time, those of one moment together.
 
-    A moment has the oldest picture that is left and, of each other camera, the one nearest to it:
-    taken no later than ``within`` after it, and nearer to the pictures of this moment than to
+    A moment has the oldest image that is left and, of each other camera, the one nearest to it:
+    taken no later than ``within`` after it, and nearer to the images of this moment than to
     those that follow them.
 
     Args:
@@ -156,12 +156,12 @@ def moments(
         within: See above, [s].
 
     Returns:
-        By the cameras' names, in their order; each picture in one moment, until all streams end.
+        By the cameras' names, in their order; each image in one moment, until all streams end.
     """
     queues: dict[str, deque[LoggedPicture]] = {name: deque() for name in streams}
     open_streams = dict(streams)
     while True:
-        # Round after round, so that live cameras are read in turn: no one's two pictures in a row.
+        # Round after round, so that live cameras are read in turn: no one's two images in a row.
         for wanted in (1, 2):
             for name in [n for n in open_streams if len(queues[n]) < wanted]:
                 picture = next(open_streams[name], None)
@@ -176,7 +176,7 @@ def moments(
 
 
 def _of_one_moment(queues: Mapping[str, deque[LoggedPicture]], within: float) -> list[str]:
-    """The cameras whose oldest pictures belong together, the oldest first."""
+    """The cameras whose oldest images belong together, the oldest first."""
     by_age = sorted((n for n, queue in queues.items() if queue), key=lambda n: _time(queues[n][0]))
     members = by_age[:1]
     for name in by_age[1:]:

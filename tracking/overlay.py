@@ -1,4 +1,4 @@
-"""A picture with what was measured in it drawn over it."""
+"""An image with what was measured in it drawn over it."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def drawn_over(
     found: Observation,
     clearance: MeasuredClearance | None = None,
 ) -> NDArray[np.uint8]:
-    """The picture in colour with the platform's box and axes, its tags, and the numbers.
+    """The image in colour with the platform's box and axes, its tags, and the numbers.
 
     Args:
-        image: Grey picture of the camera.
+        image: Grey image of the camera.
         rig: Whose platform it is.
         camera: Its place and lens.
-        found: What was measured in the picture.
+        found: What was measured in the image.
         clearance: At the measured pose, if there are obstacles.
 
     Returns:
@@ -77,7 +77,7 @@ def _draw_line(
 
 
 def _lines(found: Observation, clearance: MeasuredClearance | None) -> list[str]:
-    """What the picture says, line by line; plain ASCII, as OpenCV's letters are."""
+    """What the image says, line by line; plain ASCII, as OpenCV's letters are."""
     head = f"t {found.time:.3f} s"
     if not isinstance(found, PoseMeasurement):
         return [head, f"no pose: {found.reason}"]
@@ -100,7 +100,7 @@ def _lines(found: Observation, clearance: MeasuredClearance | None) -> list[str]
 
 
 def _draw_text(canvas: NDArray[np.uint8], lines: list[str]) -> None:
-    """White letters on a darkened corner of the picture."""
+    """White letters on a darkened corner of the image."""
     scale = max(0.4, canvas.shape[0] / 1400.0)
     step = round(34 * scale)
     ascii_only = [line.encode("ascii", "replace").decode() for line in lines]

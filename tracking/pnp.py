@@ -21,7 +21,7 @@ from tracking.edges.refine import RefinedTag
 
 #: Edge errors beyond this many deviations count linearly (Huber).
 HUBER = 3.0
-#: The edges' stated deviations weigh as much as so many residuals when the covariance is scaled by
+#: The edges' stated deviations weigh as this many residuals when the covariance is scaled by
 #: how well all edges fit: few edges fit well by chance.
 BELIEF = 20.0
 #: Two results closer than this are the same, [m] and [rad].
@@ -48,7 +48,7 @@ class BundlePose:
         edge_errors: Of each tag's edges in deviations, 0 where hidden, shape (t, 4).
         corner_errors: Of each tag's corners, RMS, shape (t,), [px]; of whole tags their corners,
             else of the edges that were measured.
-        certainties: How much each tag's edges tell, shape (t,), [1/px²].
+        certainties: Information of each tag's edges, shape (t,), [1/px²].
     """
 
     camera_from_body: Pose
@@ -61,7 +61,7 @@ class BundlePose:
 
     @property
     def reprojection(self) -> float:
-        """RMS error of all tags' corners, each tag counted for what its edges tell, [px]."""
+        """RMS error of all tags' corners, each tag weighted by its edges' information, [px]."""
         return float(np.sqrt(np.average(self.corner_errors**2, weights=self.certainties)))
 
 

@@ -51,10 +51,10 @@ CLEARANCE_COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedPicture:
-    """One picture's name and what was measured in it.
+    """One image's name and what was measured in it.
 
     Attributes:
-        name: Of the picture.
+        name: Of the image.
         observation: The pose, or why there is none.
         clearance: At the pose, where obstacles are known.
     """

@@ -22,7 +22,7 @@ class TrackerSettings:
         single_tag_margin: By how much, in variances, a single tag's pose must fit better than its
             mirror pose.
         camera_moved_px: Frame tags farther off than this mean that the camera was moved.
-        camera_check_period: Pictures between checks of the camera.
+        camera_check_period: Images between checks of the camera.
     """
 
     reprojection_px: float = 0.5

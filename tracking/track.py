@@ -1,4 +1,4 @@
-"""Measuring a whole source of pictures, as ``cdpr track`` does."""
+"""Measuring a whole source of images, as ``cdpr track`` does."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tracking.tracker import Tracker
 
 
 class Picture(Protocol):
-    """A picture of a source, such as a `drivers.cameras.live.live.Frame`."""
+    """An image of a source, such as a `drivers.cameras.live.live.Frame`."""
 
     @property
     def time(self) -> float:
@@ -31,7 +31,7 @@ class Picture(Protocol):
 
     @property
     def image(self) -> Image:
-        """Grey picture."""
+        """Grey image."""
         ...
 
     @property
@@ -41,14 +41,14 @@ class Picture(Protocol):
 
 
 class NoPlatformSeen(BadInput):
-    """Not one picture of a source gave a pose."""
+    """Not one image of a source gave a pose."""
 
     code = "no_platform_seen"
 
 
 @dataclass(slots=True)
 class TrackCount:
-    """What came of a source so far, and how long each picture took to measure, [s]."""
+    """What came of a source so far, and how long each image took to measure, [s]."""
 
     pictures: int = 0
     poses: int = 0
@@ -63,19 +63,19 @@ def track(
     model: ClearanceModel | None = None,
     on_picture: Callable[[Picture, LoggedPicture], None] | None = None,
 ) -> Iterator[LoggedPicture]:
-    """Measures picture after picture.
+    """Measures image after image.
 
     Args:
-        source: Pictures in order of time.
-        tracker: Keeps the last pose between pictures.
-        count: Kept up to date while pictures are measured.
-        give_up_after: Ends a source without an end after so many pictures without any pose.
+        source: Images in order of time.
+        tracker: Keeps the last pose between images.
+        count: Kept up to date while images are measured.
+        give_up_after: Ends a source without an end after this many images without any pose.
         model: Where obstacles are; the clearance is measured too.
-        on_picture: Told every picture with what was measured in it.
+        on_picture: Called with every image and its measurement.
 
     Raises:
-        NoPlatformSeen: At the end, when no picture gave a pose.
-        BadInput: A picture is not of the camera's size.
+        NoPlatformSeen: At the end, when no image gave a pose.
+        BadInput: An image is not of the camera's size.
         CameraMoved: The frame tags are not where they should be.
     """
     count = count or TrackCount()
@@ -114,20 +114,20 @@ def _nothing_seen(
 ) -> NoPlatformSeen:
     where = f"camera {tracker.camera.name!r}"
     if last is None:
-        return NoPlatformSeen("the source has no pictures", where=where)
+        return NoPlatformSeen("the source has no images", where=where)
     wanted = ", ".join(map(str, tracker.expected_tags))
     instead = what_else_is_seen(last.image, tracker.rig.tag_family, tracker.expected_tags)
     next_step = (
-        "check that the camera sees the platform, that the light suffices and that the rig file"
-        " names the family and numbers of the printed tags"
+        "check that the camera sees the platform, that the light suffices, and that the rig file"
+        " has the family and numbers of the printed tags"
     )
     if len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
     return NoPlatformSeen(
-        f"none of {pictures} picture{'s' if pictures != 1 else ''} gives a pose of the platform:"
+        f"none of {pictures} image{'s' if pictures != 1 else ''} gives a platform pose:"
         f" {reasons.most_common(1)[0][0]}",
         where=where,
-        why=f"expected are {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
+        why=f"expected {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
         next_step=next_step,
         values={"pictures": pictures, "family": tracker.rig.tag_family, "expected": wanted},
     )
@@ -141,8 +141,8 @@ class TogetherCount:
     """What was not taken together so far.
 
     Attributes:
-        without_partner: Pictures to which no other camera has one of about the same time.
-        apart: Moments in which a pose was left out as its picture is too far from the others.
+        without_partner: Images to which no other camera has one of about the same time.
+        apart: Moments in which a pose was left out as its image is too far from the others.
         without_speed: Moments in which one was left out as it could not be carried on.
     """
 
@@ -161,20 +161,20 @@ def track_together(
 
     Args:
         streams: What `tracking.track.track` gives for each camera, by the camera's name.
-        within: Pictures taken farther than this from the median time of a moment's pictures are
+        within: Images taken farther than this from the median time of a moment's images are
             not taken together with the others, [s].
         count: Kept up to date.
         model: Where obstacles are; the clearance is measured too.
 
     Returns:
-        What all cameras say together, and what each alone that has a picture of the moment.
+        What all cameras say together, and what each alone that has an image of the moment.
 
     Raises:
         NoPlatformSeen: At the end, when no camera gave a pose.
-        BadInput: A picture is not of its camera's size.
+        BadInput: An image is not of its camera's size.
         CameraMoved: Frame tags are not where they should be.
     """
-    poses, reason, common = 0, "the sources have no pictures", MultiCameraFusion(within)
+    poses, reason, common = 0, "the sources have no images", MultiCameraFusion(within)
     running = {name: _without_end(stream) for name, stream in streams.items()}
     for alone in moments(running, 2.0 * within):
         found = common.of({name: one.observation for name, one in alone.items()})
@@ -189,10 +189,10 @@ def track_together(
         yield LoggedPicture(next(iter(alone.values())).name, found, clearance), alone
     if not poses:
         raise NoPlatformSeen(
-            f"no camera gives a pose of the platform: {reason}",
+            f"no camera gives a platform pose: {reason}",
             where=f"cameras {', '.join(streams)}",
             next_step="check that the cameras see the platform; `cdpr track` with one source alone"
-            " tells more",
+            " gives details",
         )
 
 
@@ -204,22 +204,22 @@ def _without_end(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPicture]:
         return
 
 
-# How fast pictures are measured now.
+# How fast images are measured now.
 
 
-#: Live figures are those of so many of the newest pictures.
+#: Live figures are those of this many of the newest images.
 NEWEST = 10
 
 
 def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: int) -> str:
-    """Live figures: how fast, how long a picture takes, how many tags are seen."""
+    """Live figures: how fast, how long an image takes, how many tags are seen."""
     fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
     long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
-    return f"{fast} pictures/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
+    return f"{fast} images/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
 
 
 class FrameRate:
-    """Of the newest pictures: how many a second, and how long one takes."""
+    """Of the newest images: how many a second, and how long one takes."""
 
     def __init__(self) -> None:
         """None was measured yet."""
@@ -227,7 +227,7 @@ class FrameRate:
         self._seconds: deque[float] = deque(maxlen=NEWEST)
 
     def take(self, time: float, seconds: float) -> None:
-        """One more picture.
+        """One more image.
 
         Args:
             time: On a clock that only goes forward, [s].

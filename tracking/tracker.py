@@ -1,4 +1,4 @@
-"""From pictures to poses of the platform."""
+"""From images to poses of the platform."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tracking.settings import TrackerSettings
 
 # Where the platform should be seen, by the positions of its drives.
 #
-# Drives are off by whatever cable lengths are off, so a camera's last pose tells by how much; from
-# there on they tell how the platform went, however fast and however long no tag was to be seen.
-# This says only where to look: what is found there is judged as if nobody had said so.
+# Drives are off by whatever cable lengths are off, so a camera's last pose shows by how much; from
+# there on they show the platform's motion, however fast and however long no tag was detected.
+# This sets only where to look: what is found there is judged without it.
 
 
-#: Drives' poses farther apart in time than this do not tell how the platform goes on, [s].
+#: Drives' poses farther apart in time than this do not predict the platform's motion, [s].
 MEMORY = 0.5
 
 
@@ -56,14 +56,14 @@ class EncoderPrior:
 
 
 class DrivesAhead:
-    """The drives' pose at the time of a picture, a little after they were heard or before."""
+    """The drives' pose at the time of an image, a little after they were heard or before."""
 
     def __init__(self) -> None:
         """They were not heard yet."""
         self._last: tuple[float, Pose] | None = None
 
     def at(self, picture: float, heard: float, pose: Pose | None) -> Pose | None:
-        """The pose when the picture was taken, if the drives go as they went.
+        """The pose when the image was taken, if the drives go as they went.
 
         Args:
             picture: When it was taken, [s].
@@ -80,15 +80,15 @@ class DrivesAhead:
 
 
 class Tracker:
-    """Measures the platform's pose in one camera's pictures, one after the other.
+    """Measures the platform's pose in one camera's images, one after the other.
 
     The last pose says where to look next, then the drives' positions where they are known; without
-    these, or when that fails, the whole picture is searched. Tags on the frame show whether the
+    these, or when that fails, the whole image is searched. Tags on the frame show whether the
     camera still stands where the rig file says.
 
     Args:
         rig: Its tags and platform.
-        camera: The camera that took the pictures.
+        camera: The camera that took the images.
         settings: When a pose is believed.
 
     Raises:
@@ -98,7 +98,7 @@ class Tracker:
     def __init__(self, rig: Rig, camera: Camera, settings: TrackerSettings | None = None) -> None:
         if not rig.platform_tags:
             raise BadInput(
-                "the rig has no tags on its platform, so no camera can measure it",
+                "the rig has no platform tags, so no camera can measure it",
                 where=f"rig {rig.name}",
                 next_step="add a `tags` section to the rig file",
             )
@@ -119,20 +119,20 @@ class Tracker:
         return tuple(tag.id for tag in self.rig.platform_tags)
 
     def forget(self) -> None:
-        """Searches the whole of the next picture."""
+        """Searches the whole of the next image."""
         self._last = None
 
     def observe(self, image: Image, time: float, by_drives: Pose | None = None) -> Observation:
-        """Measures the platform in a picture.
+        """Measures the platform in an image.
 
         Args:
-            image: Grey picture of the camera's size.
+            image: Grey image of the camera's size.
             time: When it was taken, [s].
             by_drives: Where the drives' positions put the platform then; it says where to look, and
                 has no part in the pose.
 
         Raises:
-            BadInput: The picture is not a grey one of the camera's size.
+            BadInput: The image is not a grey one of the camera's size.
             CameraMoved: The frame tags are not where they should be.
         """
         require_image_format(image, self.camera, self.rig.name)
@@ -166,9 +166,9 @@ class Tracker:
         return found if self._goes_on(found, last) else None
 
     def _guided(self, image: Image, time: float, expected: Pose) -> Observation | None:
-        """As `_follow`, at a pose that nobody has seen.
+        """As `_follow`, at a pose without a camera measurement.
 
-        So it tells no pose from its mirror pose, and a tag alone is not enough: where drives are
+        So it cannot exclude the mirror pose, and a tag alone is not enough: where drives are
         wrong, that may be another print of it.
         """
         found = self._sight.measured_at(image, time, expected, "guided")
@@ -185,7 +185,7 @@ class Tracker:
         return found if self._goes_on(found, last) else None
 
     def _search(self, image: Image, time: float) -> Observation:
-        """The pose by a search of the whole picture, once more thoroughly when it finds none."""
+        """The pose by a search of the whole image, once more thoroughly when it finds none."""
         found = self._searched(image, time, thorough=False)
         return self._searched(image, time, thorough=True) if isinstance(found, NoPose) else found
 

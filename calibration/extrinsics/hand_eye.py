@@ -1,8 +1,8 @@
-"""A camera's place from the rig's own motion: the platform's tags seen at poses the rig tells.
+"""A camera's pose from the rig's own motion: the platform's tags seen at encoder poses.
 
-With Z = world_from_camera, X = the tags' frame in the platform's, P the pose that the drives tell
-and M the tags' pose in the camera's frame, Z M = P X at every picture. X is known from the rig file
-up to a small error; motion without rotation cannot tell it from Z, and then the rig file holds.
+With Z = world_from_camera, X = the tags' frame in the platform's, P the encoder pose
+and M the tags' pose in the camera's frame, Z M = P X at every image. X is known from the rig file
+up to a small error; motion without rotation cannot separate it from Z, and then the rig file holds.
 
 Source: Tsai & Lenz 1989; solved for both at once as in Zhuang & Shiu 1993, by least squares.
 """
@@ -29,22 +29,22 @@ from tracking.pnp import TagView, moved, solve_pnp
 from tracking.settings import TrackerSettings
 
 LEAST_POSES = 8
-"""Fewer poses do not show how well the rig keeps what it tells."""
+"""Fewer poses do not show how accurate the rig's poses are."""
 _LEAST_SPAN = 0.1
 """Along the axis of the largest, [m]."""
 DRAWING = (1e-3, np.radians(0.5))
 """Deviation of the tags' frame from the rig file, [m] and [rad]."""
 _FIRST = (1e-3, np.radians(0.2))
-"""Of the poses that drives tell, to begin with; then as the residuals say."""
+"""Of encoder poses, to begin with; then as the residuals say."""
 _LEAST = (2e-5, np.radians(0.002))
 _HUBER = 2.0
-"""Errors beyond so many deviations count linearly."""
+"""Errors beyond this many deviations count linearly."""
 _PRIOR = 1.0 / np.repeat(DRAWING, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CameraLook:
-    """One picture: what the drives and what the camera tell; covariance in the camera's frame."""
+    """One image: encoder pose and camera pose; covariance in the camera's frame."""
 
     world_from_platform: Pose
     camera_from_tags: Pose
@@ -114,30 +114,30 @@ class _HandEyeFit:
 def locate_by_motion(
     rig: Rig, camera: Camera, sights: TagSights, poses: Mapping[str, Pose]
 ) -> ExtrinsicCalibration:
-    """Finds a camera's place from pictures of the platform at known poses.
+    """Finds a camera's place from images of the platform at known poses.
 
     Args:
         rig: Its platform tags.
         camera: Its matrix and distortion hold; its place in the rig file does not matter.
         sights: Of platform tags.
-        poses: ``world_from_platform`` at each picture, as the rig tells it.
+        poses: ``world_from_platform`` at each image, from the rig's file of poses.
 
     Raises:
-        BadInput: Too few pictures have a pose.
+        BadInput: Too few images have a pose.
     """
     sights = sights.each_view_once()
     unknown = {name: "has no pose" for name in sights.squares if name not in poses}
     sights = sights.without(unknown)
     found = {name: _look(rig, camera, sights, name, poses[name]) for name in sights.squares}
-    unsure = {name: "allows no sure pose" for name, look in found.items() if look is None}
+    unsure = {name: "allows no unique pose" for name, look in found.items() if look is None}
     sights = sights.without(unsure)
     looks = [look for look in found.values() if look is not None]
     if len(looks) < 3:
         raise BadInput(
-            f"{len(looks)} pictures show the platform at a pose that is known, 3 are the least",
+            f"{len(looks)} images show the platform at a known pose; at least 3 are required",
             where=f"camera {camera.name}",
             why="; ".join(f"{name} {why}" for name, why in list(sights.unused.items())[:4]),
-            next_step="take pictures at more poses, and name each in the file of poses",
+            next_step="take images at more poses, and list each in the pose file",
         )
     best = _settled(looks)
     covariance: Array = np.asarray(np.linalg.inv(best.information))[:6, :6]
@@ -186,7 +186,7 @@ def _settled(looks: Sequence[_CameraLook]) -> _HandEyeFit:
 
 
 def _fit(stack: _Stack, start: Pose, noise: tuple[float, float]) -> _HandEyeFit:
-    """Both unknowns; a picture far off counts less (Huber)."""
+    """Both unknowns; an image far off counts less (Huber)."""
     whitening = stack.whitening(start, noise)
     at_drawing = Pose.level(np.zeros(3))
 
@@ -227,17 +227,17 @@ def _tag_errors(looks: Sequence[_CameraLook]) -> dict[int, float]:
 def _lacks(looks: Sequence[_CameraLook]) -> list[Issue]:
     lacks = []
     if len(looks) < LEAST_POSES:
-        what = f"{len(looks)} poses were seen, {LEAST_POSES} are needed"
-        lacks.append(Issue(what, "take pictures at more poses, far apart"))
+        what = f"{len(looks)} poses were seen; {LEAST_POSES} are required"
+        lacks.append(Issue(what, "take images at more poses, far apart"))
     places = np.array([look.world_from_platform.position for look in looks])
     span = float(np.ptp(places, axis=0).max())
     if span < _LEAST_SPAN:
-        what = f"all poses lie within {span * 1e3:.0f} mm, {_LEAST_SPAN * 1e3:.0f} mm are needed"
-        lacks.append(Issue(what, "take pictures at more poses, far apart"))
+        what = f"all poses lie within {span * 1e3:.0f} mm; {_LEAST_SPAN * 1e3:.0f} mm are required"
+        lacks.append(Issue(what, "take images at more poses, far apart"))
     return lacks
 
 
-# Poses of the platform by the names of pictures, from a CSV file with units in its columns.
+# Poses of the platform by the names of images, from a CSV file with units in its columns.
 
 
 COLUMNS = ("picture", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
@@ -245,7 +245,7 @@ COLUMNS = ("picture", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
-    """Reads ``world_from_platform`` by picture; rows without a pose are left out.
+    """Reads ``world_from_platform`` by image; rows without a pose are left out.
 
     Raises:
         BadInput: The file cannot be read.
@@ -261,13 +261,13 @@ def read_poses(path: Path) -> dict[str, Pose]:
         texts = dict(zip(header, row, strict=False))
         picture = Path(texts.get("picture", "")).name
         values = [texts.get(name, "").strip() for name in COLUMNS[1:]]
-        if not any(values):  # as of a picture that gave no pose
+        if not any(values):  # as of an image that gave no pose
             continue
         found = _pose(values)
         if isinstance(found, str):
             problems.append(Problem(picture, found, line, 1))
         elif not picture or picture in poses:
-            what = "this picture stands twice" if picture else "no picture is named"
+            what = "this image appears twice" if picture else "no image is named"
             problems.append(Problem(picture, what, line, 1))
         else:
             poses[picture] = found
@@ -286,5 +286,5 @@ def _pose(values: list[str]) -> Pose | str:
         return "a number is not finite"
     length = float(np.linalg.norm(numbers[3:]))
     if abs(length - 1.0) > 1e-3:
-        return f"qw, qx, qy, qz must have length 1, they have {length:.4g}"
+        return f"qw, qx, qy, qz must have length 1; the length is {length:.4g}"
     return Pose.from_quaternion(numbers[:3] / 1e3, numbers[3:] / length)

@@ -30,7 +30,7 @@ class ExtrinsicCalibration:
         half_widths: Of the 95 % intervals of the same, shape (6,).
         points: Places in the world that matter, shape (n, 3), [m].
         tag_errors: RMS corner error of each tag, by number, [px].
-        pictures: How many pictures it rests on.
+        pictures: How many images it rests on.
         unused: Why each of the others is not used, by name.
         lacks: What it lacks, beside precision.
         data_hash: Of what was seen.
@@ -77,15 +77,15 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
     """
     lacks, error = list(result.lacks), result.error
     if not error <= wanted:
-        more = "survey more tags, all around what the camera sees"
+        more = "survey more tags, all around the camera's view"
         if result.by == "rig motion":
-            more = "take pictures at more poses, far apart and turned up to 20° every way"
+            more = "take images at more poses, far apart and rotated up to 20° in every direction"
         what = (
-            f"points of the work space are seen within {error * 1e3:.2g} mm,"
-            f" {wanted * 1e3:.2g} mm are wanted"
+            f"points of the workspace are measured within {error * 1e3:.2g} mm;"
+            f" {wanted * 1e3:.2g} mm are required"
         )
         lacks.append(Issue(what, more))
-    return CalibrationVerdict.of(error, wanted, "in the work space", lacks)
+    return CalibrationVerdict.of(error, wanted, "in the workspace", lacks)
 
 
 def widths_of(covariance: Array, without: Sequence[Array]) -> Array:

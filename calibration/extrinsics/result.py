@@ -33,13 +33,13 @@ class ExtrinsicsResult(ResultDocument):
     by: Literal["frame tags", "rig motion"]
     world_from_camera: PoseDocument
     points_mm: Annotated[list[Vector], Field(min_length=1)] = Field(
-        description="places in the world for which error_mm is stated"
+        description="positions in the world for which error_mm is stated"
     )
     tag_errors_px: dict[str, AnyNonNegative] = Field(description="RMS corner error of each tag")
     pictures: int
 
     def in_words(self) -> list[tuple[str, str]]:
-        """As of every result; turns are from the stated rotation, so that only doubt is told."""
+        """As of every result; rotations are about the stated one: uncertainty only."""
         return pose_rows(self.stated)
 
     def changes_to(self, other: Self) -> dict[str, float]:
@@ -63,7 +63,9 @@ class ExtrinsicsResult(ResultDocument):
             BadInput: The rig has no such camera, or other tags or camera numbers.
         """
         camera = camera_named(rig, self.name)
-        self.require_basis(_basis(rig, self.name, self.by), f"numbers of the camera or {self.by}")
+        self.require_basis(
+            _basis(rig, self.name, self.by), f"parameters of the camera or {self.by}"
+        )
         return with_camera(
             rig, camera.model_copy(update={"world_from_camera": self.world_from_camera})
         )
@@ -144,21 +146,21 @@ def extrinsics_page(
         before: ``world_from_camera`` of the rig file.
     """
     pose = document.world_from_camera
-    turn = "turns are about the world's axes, from the stated rotation"
+    turn = "rotations are about the world's axes, relative to the stated one"
     quaternion = ", ".join(f"{q:.6f}" for q in pose.rotation_wxyz)
     tags = [(f"tag {k}", f"{error:.3f} px") for k, error in result.tag_errors.items()]
     return page_of(
-        f"Place of camera {document.name}",
-        f"{document.date}, by {result.by}, {result.pictures} pictures used",
+        f"Pose of camera {document.name}",
+        f"{document.date}, by {result.by}, {result.pictures} images used",
         verdict,
         [
             Section(
-                "Where the camera stands, with 95 % intervals",
+                "Camera pose, with 95 % intervals",
                 table_of(
                     [
                         *document.in_words(),
                         ("rotation_wxyz", quaternion),
-                        ("work space", f"seen within {verdict.error * 1e3:.2g} mm (95 %)"),
+                        ("workspace", f"measured within {verdict.error * 1e3:.2g} mm (95 %)"),
                         ("data", document.data_sha256[:23]),
                     ]
                 ),

@@ -1,7 +1,7 @@
 """A camera's place from surveyed tags on the frame.
 
-Each tag's mean corners are fitted with the covariance that the picture and the survey give them:
-the error of a survey is the same in every picture and does not average out.
+Each tag's mean corners are fitted with the covariance that the image and the survey give them:
+the error of a survey is the same in every image and does not average out.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Survey:
     """How well tags were surveyed, one standard deviation along or about any axis.
 
     Attributes:
-        shift: Of each corner by itself, or, where ``turn`` is told, of each tag as a whole, [m].
-        turn: Of each tag's rotation, [rad]; 0 for tags that lie as they are told to. None where
-            every corner was surveyed by itself: then the corners tell how a tag is turned.
+        shift: Of each corner by itself, or, where ``turn`` is given, of each tag as a whole, [m].
+        turn: Of each tag's rotation, [rad]; 0 for tags at their nominal rotation. None where
+            every corner was surveyed by itself: then the corners give a tag's rotation.
     """
 
     shift: float
@@ -68,14 +68,14 @@ def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Arra
 LEAST_TAGS = 3
 """Fewer cannot show that one of them was surveyed wrongly."""
 MOVED_PX = 0.5
-"""Between pictures of a camera that stands still tags do not move farther."""
+"""Between images of a camera that stands still tags do not move farther."""
 _OFF = 3.0
-"""A tag that lies so many deviations off does not agree with the survey."""
+"""A tag this many deviations off disagrees with the survey."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SeenTag:
-    """A tag over all pictures: world corners (4, 3), mean pixels (8,), whitening of them (8, 8)."""
+    """A tag over all images: world corners (4, 3), mean pixels (8,), whitening of them (8, 8)."""
 
     number: int
     corners: Array
@@ -96,17 +96,17 @@ def require_frame_tags(rig: Rig) -> None:
     """
     if not rig.frame_tags:
         raise BadInput(
-            "the rig has no frame tags to find the camera's place by",
+            "the rig has no frame tags to locate the camera",
             where=f"rig {rig.name}",
             next_step="survey tags on the frame and add them to the rig file under tags: frame, or"
-            " pass --poses to go by the rig's own motion",
+            " pass --poses to use the rig's own motion",
         )
 
 
 def locate_by_frame_tags(
     rig: Rig, camera: Camera, sights: TagSights, survey: Survey
 ) -> ExtrinsicCalibration:
-    """Finds the camera's place from pictures taken while it stood still.
+    """Finds the camera's place from images taken while it stood still.
 
     Args:
         rig: Its frame tags are the surveyed ones.
@@ -145,7 +145,7 @@ def locate_by_frame_tags(
 
 
 def _still(sights: TagSights) -> TagSights:
-    """Without pictures in which all is seen elsewhere than in most."""
+    """Without images in which all is seen elsewhere than in most."""
     middle = {
         number: np.median([s[number].corners for s in sights.squares.values() if number in s], 0)
         for number in sights.numbers
@@ -155,13 +155,13 @@ def _still(sights: TagSights) -> TagSights:
         off = [np.linalg.norm(s.corners - middle[k], axis=1).mean() for k, s in squares.items()]
         if len(sights.squares) > 2 and np.median(off) > MOVED_PX:
             unused[name] = (
-                f"shows the tags {np.median(off):.1f} px from where the others do: the camera moved"
+                f"shows the tags {np.median(off):.1f} px off the other images: the camera moved"
             )
     return sights.without(unused)
 
 
 def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
-    """``camera_from_world`` by the tags of one picture.
+    """``camera_from_world`` by the tags of one image.
 
     Raises:
         BadInput: They allow none.
@@ -172,10 +172,10 @@ def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
     found = solve_pnp(camera, views, camera.world_from_camera.inverse())
     if found is None:
         raise BadInput(
-            "the frame tags allow no place of the camera",
+            "no camera pose fits the frame tags",
             where=f"camera {camera.name}",
-            why="with the rig file's places and sizes they cannot be seen like this",
-            next_step="check the tags' places, rotations and sizes in the rig file",
+            why="the detected corners contradict their poses and sizes in the rig file",
+            next_step="check the tags' positions, rotations and sizes in the rig file",
         )
     return found.camera_from_body
 
@@ -196,7 +196,7 @@ def _seen_tags(
 
 
 def _of_picture(squares: Sequence[RefinedTag]) -> Array:
-    """Covariance of corners in one picture; more pictures of a still scene err alike."""
+    """Covariance of corners in one image; more images of a still scene err alike."""
     return np.asarray(np.mean([square.covariance for square in squares], axis=0))
 
 
@@ -244,7 +244,7 @@ def _is_off(camera: Camera, tag: _SeenTag, best: Pose) -> str:
     depth = float(best.apply(tag.corners)[:, 2].mean())
     pixels = float(np.sqrt(2.0 * np.mean(tag.errors(camera, best) ** 2)))
     away = pixels * depth / float(camera.matrix[0, 0])
-    return f"is seen {away * 1e3:.1f} mm from where the rig file puts it"
+    return f"is measured {away * 1e3:.1f} mm from its position in the rig file"
 
 
 def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
@@ -267,13 +267,13 @@ def _lacks(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> list[Issue]:
     lacks = []
     if len(tags) < LEAST_TAGS:
         seen = f"{len(tags)} frame tag{'s are' if len(tags) != 1 else ' is'} seen"
-        what = f"{seen}, {LEAST_TAGS} are needed"
-        step = "survey more tags, all around what the camera sees"
+        what = f"{seen}; {LEAST_TAGS} are required"
+        step = "survey more tags, all around the camera's view"
         lacks.append(Issue(what, step))
     for tag in tags:
         size = np.sqrt(np.mean((tag.whitening @ tag.errors(camera, best)) ** 2))
         if len(tags) >= LEAST_TAGS and size > _OFF:
             what = f"tag {tag.number} {_is_off(camera, tag, best)}"
-            step = f"survey tag {tag.number} again, or take it out of the rig file"
+            step = f"survey tag {tag.number} again, or remove it from the rig file"
             lacks.append(Issue(what, step))
     return lacks

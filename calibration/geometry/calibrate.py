@@ -31,9 +31,9 @@ from model.winches import WinchMap
 
 
 FAR_OFF = 4.0
-"""A place is left out that is so many times as far off as the median,"""
+"""A sample is left out whose error is this many times the median,"""
 OFF = 2.0
-"""and farther off than so many of the standard deviations that were stated."""
+"""and this many times the stated standard deviation."""
 
 
 def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> RigMeasurements:
@@ -58,8 +58,8 @@ def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> Rig
         apart = fit.positions[k] - measured.positions[k]
         off = float(np.linalg.norm(apart)) if by_pose else float(abs(fit.residuals[k, worst]))
         unused[measured.names[k]] = (
-            f"contradicts the others: {what} is {off * 1e3:.3g} mm off, the place"
-            f" {misfits[k] / usual:.3g} times as far as most"
+            f"contradicts the others: {what} is {off * 1e3:.3g} mm off,"
+            f" {misfits[k] / usual:.3g} times the usual error"
         )
     return replace(measured, unused=unused).part(~bad)
 
@@ -71,7 +71,7 @@ def _misfits(cables: Array, poses: Array, measured: RigMeasurements) -> Array:
     return misfits
 
 
-# How well a rig's numbers tell places that the fit has not seen, each left out once.
+# How well a rig's parameters predict held-out samples, each left out once.
 
 
 FOLDS = 5
@@ -98,7 +98,7 @@ def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation
     Args:
         parameters: The unknowns.
         measured: Places at rest.
-        length_deviation: Of a cable's length as a drive tells it, [m].
+        length_deviation: Of a cable's length from the encoder, [m].
 
     Raises:
         Fault: A part of the measurements cannot be fitted.
@@ -139,10 +139,10 @@ class RigCalibration:
         parameters: The unknowns and the rig file.
         measured: What they are from, without places that contradict the others.
         fit: The best fit that leaves what cannot be identified as in the rig file.
-        observability: What the data tell.
+        observability: What the data determine.
         uncertainty: Of the unknowns.
         held_out: Places left out of fits.
-        length_deviation: Of a cable's length as a drive tells it, its tension measured, [m].
+        length_deviation: Of a cable's length from the encoder, its tension measured, [m].
     """
 
     parameters: Parameters
@@ -155,7 +155,7 @@ class RigCalibration:
 
     @property
     def rig(self) -> Rig:
-        """As its file tells it."""
+        """As in its file."""
         return self.parameters.rig
 
     @cached_property
@@ -170,7 +170,7 @@ class RigCalibration:
 
     @cached_property
     def not_identified(self) -> list[str]:
-        """What the data do not tell, in words."""
+        """What the data do not determine, in words."""
         return sentences(self.observability, self.parameters)
 
     @cached_property
@@ -204,7 +204,7 @@ class RigCalibration:
         return Interval.between(stiffness * math.exp(-width), stiffness * math.exp(width))
 
     def position_error(self, positions: Array, rotations: Array) -> Array:
-        """How far off the platform may be where its drives are told to bring it, 95 %.
+        """How far off the platform may be from its commanded pose, 95 %.
 
         Args:
             positions: World frame, shape (k, 3), [m].
@@ -243,11 +243,11 @@ def fit_rig(
     """Finds the numbers of a rig.
 
     Args:
-        rig: As its file tells it.
+        rig: As in its file.
         measured: Places at rest.
         deviations: How far off the rig file may be by group of numbers; groups left out are taken
             as known.
-        length_deviation: Of a cable's length as a drive tells it, its tension measured, [m].
+        length_deviation: Of a cable's length from the encoder, its tension measured, [m].
 
     Raises:
         BadInput: Too few places, a pose outside the rig, or nothing to look for.
@@ -255,17 +255,17 @@ def fit_rig(
     """
     if len(measured) < FEWEST_PLACES:
         raise BadInput(
-            f"only {len(measured)} places at rest, {FEWEST_PLACES} are needed and 60 are good",
+            f"only {len(measured)} stationary samples; {FEWEST_PLACES} required, 60 recommended",
             where="calibrate rig",
-            next_step="measure in more places: `cdpr calibrate poses` plans them",
+            next_step="measure at more poses: `cdpr calibrate poses` plans them",
         )
     _require_within(rig, measured)
     parameters = Parameters.of(rig, deviations)
     if not len(parameters):
         raise BadInput(
-            "there is nothing to look for",
+            "there is nothing to calibrate",
             where="calibrate rig",
-            why="every group of numbers is taken as known",
+            why="every group of parameters is taken as known",
             next_step="leave out --known for one of them",
         )
     fit, observability = identified(parameters, measured, length_deviation)
@@ -299,7 +299,7 @@ def _require_within(rig: Rig, measured: RigMeasurements) -> None:
             f"the pose ({_mm(measured.positions[k])}) is outside the rig, whose outlets and"
             f" workspace reach from ({_mm(lower)}) to ({_mm(upper)})",
             where=measured.names[k],
-            why="another unit or frame, or a pose that was mistaken",
+            why="a wrong unit or frame, or a false pose",
             next_step="check units and axes of x_mm, y_mm, z_mm, or leave out the line",
         )
 

@@ -75,7 +75,7 @@ class NormalEquations:
 
 MOST_STEPS = 200
 SETTLED = 1e-6
-"""The fit has come to its end where a step makes the sum of squares smaller by less, as a share."""
+"""The fit has converged where a step makes the sum of squares smaller by less, as a share."""
 MOST_DAMPING = 1e9
 """No smaller step is tried: what it would gain is below round-off."""
 START_TOLERANCE = 1e-5
@@ -134,7 +134,7 @@ class RigFitter:
         Args:
             parameters: The unknowns.
             measured: Places at rest.
-            length_deviation: Of a cable's length as a drive tells it, [m].
+            length_deviation: Of a cable's length from the encoder, [m].
         """
         self._parameters, self._measured = parameters, measured
         self._model = RigModel(parameters, measured)
@@ -172,10 +172,10 @@ class RigFitter:
             if gain < SETTLED * (1.0 + cost):
                 return self._result(spread @ z, positions, rotations)
         raise Fault(
-            "the rig's numbers could not be fitted to the measurements",
+            "the rig's parameters could not be fitted to the measurements",
             where="calibrate rig",
-            why="they contradict each other, or the rig file is far off",
-            next_step="check units, the order of the cables and the reference of the drives",
+            why="the measurements contradict each other, or the rig file is far off",
+            next_step="check units, the order of the cables and the homing of the drives",
         )
 
     def _start(self) -> tuple[Array, Array]:

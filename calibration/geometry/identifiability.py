@@ -1,4 +1,4 @@
-"""Which directions of a rig's numbers the data tell, and words for those that they do not.
+"""Which directions of a rig's parameters the data determine, and words for the others.
 
 The information of the data is compared with the rig file's: along an eigenvector with a value above
 1 the data know more. The others cannot be identified; they are left as the rig file says.
@@ -19,20 +19,20 @@ from calibration.statistics import CONFIDENCE
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
-"""Of a direction, in units of what the rig file tells."""
+"""Of a direction, in units of the rig file's own information."""
 NAMED_SHARE = 0.85
-"""A direction with a name is unknown when so much of its square lies among the unknown ones."""
+"""A direction with a name is unknown when this share of its square lies among the unknown ones."""
 LARGEST_PARTS = 4
-"""So many unknowns are named for a direction without a name."""
+"""Number of unknowns named for a direction without a name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observability:
-    """What data tell about the unknowns of a rig.
+    """What data determine about the unknowns of a rig.
 
     Attributes:
         information: Eigenvalues, falling, shape (p,).
-        known: Orthonormal directions that the data tell, in standard deviations of the rig file,
+        known: Orthonormal directions the data determine, in standard deviations of the rig file,
             shape (p, r).
         unknown: The others, shape (p, p − r).
     """
@@ -51,7 +51,7 @@ class Observability:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Named:
-    """A direction with a name; several with one name and different parts are told together."""
+    """A direction with a name; several with one name and different parts are reported together."""
 
     name: str
     part: str
@@ -75,7 +75,7 @@ def sentences(observability: Observability, parameters: Parameters) -> list[str]
     told = [_sentence(name, parts, parameters.rig.cable_count) for name, parts in found.items()]
     if left.shape[1]:
         told.append(
-            f"{left.shape[1]} sums of several numbers, {_by_parts(left[:, -1], parameters)}"
+            f"{left.shape[1]} combinations of parameters, {_by_parts(left[:, -1], parameters)}"
         )
     return told
 
@@ -118,11 +118,9 @@ def _named(parameters: Parameters) -> list[_Named]:
                 what = "outlet and anchor of one cable moved together"
                 part = f"cable {cable + 1} along {name}"
                 found.append(_Named(what, part, scaled(outlets=shift, anchors=shift)))
+    found += _rigid("outlets", "a common motion of all outlets in the world", rig.outlets, scaled)
     found += _rigid(
-        "outlets", "all outlets moved or turned as one in the world", rig.outlets, scaled
-    )
-    found += _rigid(
-        "anchors", "all anchors moved or turned as one on the platform", rig.anchors, scaled
+        "anchors", "a common motion of all anchors on the platform", rig.anchors, scaled
     )
     if "drum_scale" in places:
         grown = scaled(
@@ -156,12 +154,12 @@ def _by_parts(direction: Array, parameters: Parameters) -> str:
 def identified(
     parameters: Parameters, measured: RigMeasurements, length_deviation: float
 ) -> tuple[RigFit, Observability]:
-    """The fit in the directions that the data tell, and which those are.
+    """The fit in the directions that the data determine, and which those are.
 
     Args:
         parameters: The unknowns.
         measured: Places at rest.
-        length_deviation: Of a cable's length as a drive tells it, [m].
+        length_deviation: Of a cable's length from the encoder, [m].
 
     Raises:
         Fault: The measurements cannot be fitted.
@@ -230,7 +228,7 @@ def uncertainty_of_rig(
     Args:
         parameters: The unknowns.
         measured: Places at rest.
-        fit: Of them, in the directions that they tell; where residuals tell of lengths farther off
+        fit: Of them, in the directions that they determine; where residuals show errors larger
             than they were taken to be, that holds.
         observability: Which those are.
     """

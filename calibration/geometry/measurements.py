@@ -19,7 +19,7 @@ from model.statics.gravity import PRETENSION_SHARE, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 
 SHORTEST_REST = 0.4
-"""The drives are told to stand still for longer before it counts as rest, [s]."""
+"""The drives are commanded to rest for longer before it counts as rest, [s]."""
 SETTLING = 0.2
 """What comes sooner after they stopped does not count, [s]."""
 
@@ -71,7 +71,7 @@ class RigMeasurements:
         )
 
     def with_doubt(self, deviations: Array) -> RigMeasurements:
-        """The same, poses less certain: errors that all pictures of a place have in common.
+        """The same, poses less certain: errors that all images of a place have in common.
 
         Args:
             deviations: Of camera and tags, shape (6,), [m, rad].
@@ -80,13 +80,13 @@ class RigMeasurements:
         return replace(self, covariances=read_only(more))
 
     def without_poses(self) -> RigMeasurements:
-        """The same drive positions, as if nobody had looked at the platform."""
+        """The same drive positions, as if without a camera."""
         positions, rotations = (np.full_like(a, np.nan) for a in (self.positions, self.rotations))
         return replace(self, positions=positions, rotations=rotations)
 
 
 def joined(parts: Sequence[RigMeasurements]) -> RigMeasurements:
-    """Several sources as one; a place with the numbers of an earlier one is told as unused."""
+    """Several sources as one; a sample that repeats an earlier one is listed as unused."""
     arrays = {
         key: read_only(np.concatenate([getattr(part, key) for part in parts])) for key in _ARRAYS
     }
@@ -112,7 +112,7 @@ class Recording:
         asked: Set-points, shape (n, m), [counts].
         counts: Drive positions, shape (n, m), [counts].
         tensions: Shape (n, m), [N].
-        seen: Times of the pictures that gave a pose, shape (k,), [s].
+        seen: Times of the images that gave a pose, shape (k,), [s].
         positions: Measured there, world frame, shape (k, 3), [m].
         rotations: ``world_from_platform``, shape (k, 3, 3).
         covariances: Shape (k, 6, 6), [m, rad].
@@ -131,7 +131,7 @@ class Recording:
 def at_rest(name: str, run: Recording) -> RigMeasurements:
     """The places at which the platform stood still, each with the means of what was measured.
 
-    Pictures of one place have their errors in common: their mean is no more certain than each.
+    Images of one place have their errors in common: their mean is no more certain than each.
 
     Args:
         name: Of the run, for the places' names.
@@ -143,7 +143,7 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
         cycles = (run.time >= begin) & (run.time <= end)
         pictures = (run.seen >= begin) & (run.seen <= end)
         if len(run.seen) and not pictures.any():
-            unused[place] = "no picture taken there gave a pose"
+            unused[place] = "no image taken there gave a pose"
             continue
         names.append(place)
         means = (run.counts[cycles].mean(axis=0), run.tensions[cycles].mean(axis=0))
@@ -158,7 +158,7 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
 
 
 def _rests(run: Recording) -> list[tuple[float, float]]:
-    """From when to when the drives were told to stand still, without the time of settling."""
+    """From when to when the drives were commanded to rest, without the time of settling."""
     still = np.all(np.diff(run.asked, axis=0) == 0.0, axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
     found = [(run.time[a], run.time[b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -198,7 +198,7 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     table = _Table(path)
     counts = table.of([f"actual_{i}_counts" for i in range(1, cables + 1)])
     if f"actual_{cables + 1}_counts" in table.names:
-        raise table.bad(f"the rig has {cables} cables, the file more", "name the rig's own data")
+        raise table.bad(f"the rig has {cables} cables, the file more", "pass data of this rig")
     n = len(counts)
     if "time_s" in table.names:
         _require_rising(table)
@@ -213,7 +213,7 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     if _DEVIATIONS[0] in table.names:
         deviations = table.of(_DEVIATIONS) * _TO_SI
         if (deviations <= 0.0).any():
-            raise table.bad("a standard deviation is not positive", "leave out what is not known")
+            raise table.bad("a standard deviation is not positive", "leave out what is unknown")
     return RigMeasurements(
         names=tuple(f"{path}, line {k + 2}" for k in range(n)),
         counts=read_only(counts),
@@ -233,14 +233,16 @@ class _Table:
         self.names = tuple(name.strip() for name in rows[0]) if rows else ()
         self._rows = rows[1:]
         if not self._rows:
-            raise self.bad("the file holds no measurement", "write a line of names, then the lines")
+            raise self.bad(
+                "the file holds no measurement", "write a header line, then lines of values"
+            )
         twice = {name for name in self.names if self.names.count(name) > 1}
         if twice:
-            raise self.bad(f"the column {min(twice)!r} stands twice", "name each column once")
+            raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
         for number, row in enumerate(self._rows, start=2):
             if len(row) != len(self.names):
                 what = f"line {number} has {len(row)} values for {len(self.names)} columns"
-                raise self.bad(what, "give every line as many values as there are names")
+                raise self.bad(what, "give every line one value per column")
 
     def of(self, names: list[str] | tuple[str, ...]) -> Array:
         """Columns side by side, shape (n, len(names)); all finite."""
@@ -275,7 +277,7 @@ def _require_rising(table: _Table) -> None:
     falls = np.flatnonzero(np.diff(times) <= 0.0)
     if len(falls):
         what = f"line {falls[0] + 3}: time_s does not rise"
-        raise table.bad(what, "sort the lines by time, or leave the column out")
+        raise table.bad(what, "sort the lines by time, or leave out the column")
 
 
 def _rotations(table: _Table) -> Array:
@@ -291,7 +293,7 @@ def _rotations(table: _Table) -> Array:
     )
 
 
-# The tensions of places where nobody measured them, and how far off those may be.
+# Tensions of samples without a measurement of them, and their uncertainty.
 
 
 def tension_doubt(rig: Rig) -> float:
@@ -310,7 +312,7 @@ def likely_tensions(rig: Rig, measured: RigMeasurements) -> Array:
     they are those of home: `tension_doubt` holds for both.
 
     Args:
-        rig: As its file tells it.
+        rig: As in its file.
         measured: Places at rest.
 
     Raises:

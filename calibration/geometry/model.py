@@ -1,4 +1,4 @@
-"""How far cables at estimated poses are from the lengths that the drives tell, with derivatives.
+"""How far cables at estimated poses are from the encoders' lengths, with derivatives.
 
 All derivatives are analytic: moving an anchor by d shortens its cable by u · d, u the direction
 from anchor to exit, with point exits and over pulleys alike; moving outlet and pulley lengthens it.
@@ -70,7 +70,7 @@ class Parameters:
     That of the stiffness is the logarithm of its share: near 0 the share less 1, never negative.
 
     Attributes:
-        rig: As its file tells it.
+        rig: As in its file.
         groups: Names of the groups that are looked for, in order.
         deviations: How far off each unknown may be, standard deviation, shape (p,), [m] or share.
         names: Of the unknowns, such as ``outlet_3_x``; p texts.
@@ -86,7 +86,7 @@ class Parameters:
         """The unknowns of a rig.
 
         Args:
-            rig: As its file tells it.
+            rig: As in its file.
             deviations: How far off it may be, by group; groups left out are taken as known.
         """
         groups = tuple(
@@ -147,7 +147,7 @@ def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
 
 
 class CountedLengths:
-    """Cable lengths that drive positions and tensions tell.
+    """Cable lengths from drive positions and tensions.
 
     Attributes:
         paid_out: Unstrained cable since the home counts by the rig file's drums, shape (n, m), [m].
@@ -157,7 +157,7 @@ class CountedLengths:
         """Takes the rig file's winches.
 
         Args:
-            rig: As its file tells it.
+            rig: As in its file.
             counts: Shape (n, m), [counts].
             tensions: Shape (n, m), [N].
 
@@ -207,7 +207,7 @@ class Linearised:
     """The model at given values and poses.
 
     Attributes:
-        residuals: Cable at the pose less the cable that the drive tells, shape (n, m), [m].
+        residuals: Cable at the pose less the cable from the encoder, shape (n, m), [m].
         by_values: Their derivative by the unknowns, shape (n, m, p).
         by_pose: By the pose's twist (translation, rotation in the world), shape (n, m, 6).
     """
@@ -223,7 +223,7 @@ class RigModel:
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
         """Takes the measurements; tensions that were not measured are those of `likely_tensions`.
 
-        Where some were not measured, nothing tells of the cables' stiffness.
+        Where some were not measured, nothing shows the cables' stiffness.
 
         Raises:
             TensionInfeasible: The rig cannot hold its platform at home.
@@ -235,7 +235,7 @@ class RigModel:
         self.counted = CountedLengths(parameters.rig, measured.counts, tensions)
 
     def length_deviations(self, length_deviation: float) -> Array:
-        """How far off the lengths may be that drives tell, shape (n, m), [m].
+        """Standard deviation of the lengths from the encoders, shape (n, m), [m].
 
         Args:
             length_deviation: With tensions that were measured, [m]; others add what they may

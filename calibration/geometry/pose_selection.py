@@ -1,4 +1,4 @@
-"""Chooses the poses at which measuring tells most about a rig's numbers (D-optimal, greedy)."""
+"""Chooses the most informative poses for a rig's calibration (D-optimal, greedy)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STEP_OF_TURN = float(np.radians(1.0))
 CLEARANCE_RESERVE = 1e-3
 """More clearance than the scene asks for, so that a way in and out is left, [m]."""
 TURNING_SHARE = 0.3
-"""So many of the candidates are turned about the vertical, the others tilted."""
+"""Share of the candidates rotated about the vertical; the others are tilted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +46,8 @@ class Wish:
         turn: Largest turn about the vertical, [rad].
         candidates: How many places they are chosen from.
         reserve: Kept between tensions and the rig's limits, [N]: one that is not calibrated pulls
-            otherwise than it is told.
-        length_deviation: Of a cable's length as a drive tells it, [m].
+            other than stated.
+        length_deviation: Of a cable's length from the encoder, [m].
         pose_deviations: Of measured poses, shape (6,), [m, rad].
     """
 
@@ -78,9 +78,9 @@ def chosen_poses(
     found = _candidates(rig, scene, wish, np.random.default_rng(seed))
     if len(found) < wish.count:
         raise NoSolution(
-            f"only {len(found)} of {2 * wish.candidates} poses tried can be held and are free",
+            f"only {len(found)} of {2 * wish.candidates} tried poses are feasible and free",
             where=f"rig {rig.name}, scene {scene.name}",
-            next_step="ask for fewer poses, less --reserve-n, less clearance in the scene, or more"
+            next_step="use fewer poses, less --reserve-n, less clearance in the scene, or more"
             " --candidates",
         )
     best = _most_telling(_rows(rig, found, wish, parameters), wish.count)
@@ -130,7 +130,7 @@ def _is_free(rig: Rig, scene: Scene, model: ClearanceModel, pose: Pose, room: fl
 
 
 def _rows(rig: Rig, poses: Sequence[Pose], wish: Wish, parameters: Parameters) -> Array:
-    """What each pose would tell: derivatives over deviations, with its error in them, (k, m, p)."""
+    """Information of each pose: derivatives over deviations, with its error in them, (k, m, p)."""
     winches = WinchMap(rig)
     tensions = np.array([working_tensions(rig, pose).tensions for pose in poses])
     lengths = np.array([cables_at(rig, pose).lengths for pose in poses])
@@ -236,7 +236,7 @@ def measurement_poses(
     seed: int = 0,
     listener: Listener = SILENT,
 ) -> MeasurementPlan:
-    """Chooses the poses that tell most about a rig, and plans a path through them with stops.
+    """Chooses the most informative poses, and plans a path through them with stops.
 
     Args:
         rig: The robot.

@@ -57,40 +57,40 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
     lacks = _far_numbers(result) + _other_stiffness(result) + _unknown_stretch(result)
     if missed > wanted:
-        what = "places" if out.poses else "lengths of cables at places"
+        what = "samples" if out.poses else "cable lengths of samples"
         lacks.append(
             Issue(
-                f"{what} left out of the fit are up to {missed * 1e3:.2g} mm off",
-                "calibrate the camera and its place, and look for worn guides, slack cables and"
-                " outliers in the report's list of places",
+                f"errors of held-out {what} reach {missed * 1e3:.2g} mm",
+                "calibrate the camera and its pose, and check for worn guides, slack cables and"
+                " outliers in the report's list of poses",
             )
         )
     if after > before:
         lacks.append(
             Issue(
-                f"the rig file as it is fits better ({before * 1e3:.2g} mm)",
-                "check units, the order of the cables and the reference of the drives",
+                f"the rig file without calibration fits better ({before * 1e3:.2g} mm)",
+                "check units, the order of the cables and the homing of the drives",
             )
         )
     if level > wanted:
         lacks.append(
             Issue(
-                f"the platform may be {level * 1e3:.2g} mm off where it was not measured",
-                "measure in more places all over the workspace"
+                f"the platform may be {level * 1e3:.2g} mm off between the measured poses",
+                "measure at more poses all over the workspace"
                 + ("" if out.poses else ", and with a camera"),
             )
         )
     if turned > max(wanted, level):
         lacks.append(
             Issue(
-                f"turned by {math.degrees(tilt):.3g}° it may be {turned * 1e3:.2g} mm off",
-                f"measure with the platform turned by {math.degrees(tilt):.3g}° and more both ways"
-                " (`cdpr calibrate poses` plans it), or pass --tilt-deg 0 if it is never turned",
+                f"rotated by {math.degrees(tilt):.3g}° it may be {turned * 1e3:.2g} mm off",
+                f"measure with the platform rotated by {math.degrees(tilt):.3g}° and more both ways"
+                " (`cdpr calibrate poses` plans it), or pass --tilt-deg 0 if it never rotates",
             )
         )
     error = max(missed, level, turned)
     verdict = CalibrationVerdict.of(
-        error, wanted, f"turned by up to {math.degrees(tilt):.3g}°", lacks
+        error, wanted, f"rotated by up to {math.degrees(tilt):.3g}°", lacks
     )
     return RigQuality(verdict, before, after, level, turned, tilt)
 
@@ -109,7 +109,7 @@ def _far_numbers(result: RigCalibration) -> list[Issue]:
         Issue(
             f"{parameters.names[k]} is {_far(group, float(values[k]))},"
             f" {times[k]:.3g} times {option}",
-            "check units, the order of the cables and the rig file; where it is truly that far"
+            "check units, the order of the cables and the rig file; if it is truly that far"
             f" off, pass a larger {option}",
         )
     ]
@@ -132,10 +132,10 @@ def _other_stiffness(result: RigCalibration) -> list[Issue]:
         return _cables_that_differ(result)
     return [
         Issue(
-            f"the data tell a stiffness of the cables of {compliance}, the rig file"
+            f"the data give a cable stiffness of {compliance}, the rig file"
             f" {result.rig.cable_stiffness:.6g} N",
-            "check cables: stiffness_n of the rig file, and the tensions that the drives tell;"
-            " where it is truly that far off, pass a larger --stiffness-percent",
+            "check cables: stiffness_n of the rig file, and the measured tensions;"
+            " if it is truly that far off, pass a larger --stiffness-percent",
         )
     ]
 
@@ -146,10 +146,10 @@ def _cables_that_differ(result: RigCalibration) -> list[Issue]:
         return []
     return [
         Issue(
-            f"the cables differ: the data tell stiffnesses of {differences}; the result has"
+            f"the cables differ: the data give stiffnesses of {differences}; the result has"
             f" {result.geometry.stiffness:.4g} N for all",
-            "look for a cable that is worn, loose on its drum or of another kind, and check the"
-            " tensions that its drive tells",
+            "check for a cable that is worn, loose on its drum or of another kind, and check its"
+            " measured tensions",
         )
     ]
 
@@ -163,9 +163,9 @@ def _unknown_stretch(result: RigCalibration) -> list[Issue]:
     places = int((~np.isfinite(result.measured.tensions)).any(axis=1).sum())
     return [
         Issue(
-            f"tensions were not measured in {places} places, which makes lengths of cables"
-            f" uncertain by {stretch * 1e3:.2g} mm, --length-mm is {usual * 1e3:.2g}",
-            "measure tensions too: use run folders, or tables with the columns tension_1_n …",
+            f"tensions were not measured at {places} poses, which makes cable lengths"
+            f" uncertain by {stretch * 1e3:.2g} mm; --length-mm is {usual * 1e3:.2g}",
+            "measure tensions as well: use run folders, or tables with the columns tension_1_n …",
         )
     ]
 
@@ -174,7 +174,7 @@ def judged_places(rig: Rig, tilt: float) -> tuple[Array, Array]:
     """Centre and corners of the workspace, turned about x and y both ways.
 
     Args:
-        rig: As its file tells it.
+        rig: As in its file.
         tilt: How far, [rad]; 0 for the orientation of home alone.
 
     Returns:

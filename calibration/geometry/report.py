@@ -28,7 +28,7 @@ from model.pose import Array
 from model.rig import Rig
 
 _SHARE = 0.12
-"""The longest arrow of the picture, as a share of the frame's diagonal."""
+"""The longest arrow of the image, as a share of the frame's diagonal."""
 _LAYERS = (
     ("outlets", "Outlets moved", "limit", True),
     ("anchors", "Anchors moved", "tag", True),
@@ -50,31 +50,31 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
         Section("What moved", _picture(result, scene, factor)),
         *_number_sections(result),
         Section(
-            "How well it fits poses that the fit did not see",
+            "Errors at held-out poses",
             _held_out(quality) + charts(_by_pose(result)),
-            "Every fifth pose is left out of the fit in turn.",
+            "Every fifth pose is held out of the fit in turn.",
         ),
         Section(
             "Residuals of each cable",
             _cables(result) + chart_grid(_residuals(result)),
-            "The length of a cable at the fitted pose less that of its drive, pose by pose.",
+            "Cable length at the fitted pose minus its encoder length, pose by pose.",
         ),
         Section(
             "What cannot be identified",
-            bullets(told) if told else paragraph("Everything that was looked for was found."),
-            "Left as in the rig file. It makes no difference at the poses that were measured.",
+            bullets(told) if told else paragraph("All parameters were identified."),
+            "Kept as in the rig file. It makes no difference at the measured poses.",
         ),
         Section(
             "Information of each direction",
             _falling(result.observability.information),
-            "On a logarithmic scale; below the line the rig file knows more than the data.",
+            "On a logarithmic scale; below the line the rig file is more accurate than the data.",
         ),
         Section("Poses", _poses(result)),
         Section("Not used", table_of(data.unused.items(), ("pose", "why"))),
     ]
     return page_of(
         f"Calibration of rig {result.rig.name}",
-        f"{name}, {date}, {kind} in {len(data)} places",
+        f"{name}, {date}, {kind} of {len(data)} samples",
         quality.verdict,
         sections,
         tiles=_headline(result, quality),
@@ -94,13 +94,13 @@ def _headline(result: RigCalibration, quality: RigQuality) -> str:
             tile(
                 "Error" if result.held_out.poses else "Error of lengths",
                 f"{quality.before * 1e3:.2f} → {quality.held_out * 1e3:.2f} mm",
-                f"RMS of {what} left out of the fit: by the rig file → by this calibration",
+                f"RMS of held-out {what}: with the rig file → with this calibration",
                 "headline",
             ),
             tile(
                 "In the workspace",
                 f"{quality.level * 1e3:.2g} mm",
-                f"at most, 95 %; turned by {tilt:.3g}° {quality.turned * 1e3:.2g} mm",
+                f"at most, 95 %; rotated by {tilt:.3g}° {quality.turned * 1e3:.2g} mm",
             ),
             tile(
                 "Farthest outlet",
@@ -159,12 +159,12 @@ def _number_sections(result: RigCalibration) -> list[Section]:
     kinds = (
         ("Outlets [mm]", "outlet_", "World frame."),
         ("Anchors [mm]", "anchor_", "Platform frame."),
-        ("Drums [mm per revolution]", "drum_", "Cable paid out by a revolution of the drum."),
+        ("Drums [mm per revolution]", "drum_", "Cable paid out per drum revolution."),
         (
-            "Cable at the reference [mm]",
+            "Cable length at home [mm]",
             "offset_",
-            "Cable at the home counts beyond what reaches the home pose; the rig file says none."
-            " The home counts of the result take it up.",
+            "Cable length at the home counts beyond that of the home pose; 0 in the rig file."
+            " The result's home counts include it.",
         ),
         ("Pulleys and cables", ("pulley_", "stiffness_"), ""),
     )
@@ -241,8 +241,8 @@ def _moved_labels(rig: Rig, moved: Array) -> tuple[Label, ...]:
 def _picture(result: RigCalibration, scene: SceneFigure, factor: float) -> str:
     moved = np.linalg.norm(result.geometry.outlets - result.rig.outlets, axis=1) * 1e3
     label = (
-        f"The rig of the rig file, with arrows to the {len(moved)} outlets and anchors that were"
-        f" found, {factor:g} times as long as they are; outlets moved by {moved.min():.1f} to"
+        f"The rig of the rig file, with arrows to the {len(moved)} calibrated outlets and"
+        f" anchors, {factor:g} times as long as the change; outlets moved by {moved.min():.1f} to"
         f" {moved.max():.1f} mm."
     )
     hint = f"Arrows are {factor:g} times as long as the change from the rig file."
@@ -271,12 +271,12 @@ def _chart(title: str, text: str, quantity: str, lines: Iterable[ChartLine], cou
 def _by_pose(result: RigCalibration) -> Chart:
     out, number = result.held_out, np.arange(1.0, len(result.measured) + 1.0)
     text = (
-        f"Line chart of the error of {len(number)} poses: up to {out.before.max() * 1e3:.2f} mm by"
-        f" the rig file, up to {out.after.max() * 1e3:.2f} mm left out of the fit."
+        f"Line chart of the error of {len(number)} poses: {out.before.max() * 1e3:.2f} mm with"
+        f" the rig file, up to {out.after.max() * 1e3:.2f} mm held out of the fit."
     )
     lines = (
-        ChartLine("by the rig file", number, out.before * 1e3, "limit", dash=DOTTED),
-        ChartLine("left out of the fit", number, out.after * 1e3, "encoder"),
+        ChartLine("with the rig file", number, out.before * 1e3, "limit", dash=DOTTED),
+        ChartLine("held out of the fit", number, out.after * 1e3, "encoder"),
     )
     return _chart("Error at each pose", text, "error", lines, len(number))
 
@@ -321,10 +321,10 @@ def _cables(result: RigCalibration) -> str:
 
 def _held_out(quality: RigQuality) -> str:
     rows = [
-        ("by the rig file as it is", f"{quality.before * 1e3:.3f} mm RMS"),
-        ("each left out of the fit once", f"{quality.held_out * 1e3:.3f} mm RMS"),
-        ("anywhere in the workspace, turned as at home", f"within {quality.level * 1e3:.2g} mm"),
-        (f"turned by {np.degrees(quality.tilt):.3g}°", f"within {quality.turned * 1e3:.2g} mm"),
+        ("with the rig file as it is", f"{quality.before * 1e3:.3f} mm RMS"),
+        ("held out of the fit", f"{quality.held_out * 1e3:.3f} mm RMS"),
+        ("anywhere in the workspace, home orientation", f"within {quality.level * 1e3:.2g} mm"),
+        (f"rotated by {np.degrees(quality.tilt):.3g}°", f"within {quality.turned * 1e3:.2g} mm"),
     ]
     return table_of(rows)
 
@@ -344,7 +344,7 @@ def _poses(result: RigCalibration) -> str:
         )
         for k, (name, before, after, worst) in enumerate(each, start=1)
     ]
-    head = ("", "pose", "rig file [mm]", "left out [mm]", "largest residual [mm]", "of cable")
+    head = ("", "pose", "rig file [mm]", "held out [mm]", "largest residual [mm]", "of cable")
     return (
         f"<details><summary>All {len(rows)} poses</summary>"
         f"{list_table(head, rows, 'numbers')}</details>"
@@ -366,6 +366,6 @@ def _falling(information: Array) -> str:
     known = int((information > 1.0).sum())
     label = (
         f"Bars of the information of {len(information)} directions; of {known} of them the data"
-        " know more than the rig file."
+        " are more accurate than the rig file."
     )
     return drawing(bars + line, (width, height), label)

@@ -34,23 +34,23 @@ class RigResult(ResultDocument):
     drums_mm_per_rev: list[Positive]
     stiffness_n: Positive = Field(description="E·A of a cable")
     home_counts: list[AnyNumber] = Field(description="drive positions with the platform at home")
-    groups: list[str] = Field(description="of numbers that were looked for")
-    not_identified: list[str] = Field(description="left as in the rig file, in words")
+    groups: list[str] = Field(description="of parameters that were calibrated")
+    not_identified: list[str] = Field(description="kept as in the rig file, in words")
     information: list[AnyNumber] = Field(
-        description="of each direction, falling; below 1 the rig file knows more than the data"
+        description="of each direction, descending; below 1 the rig file is better"
     )
     places: int
     with_poses: bool = Field(description="false: from lengths alone")
-    held_out_mm: AnyNonNegative = Field(description="RMS of places left out of the fit")
-    before_mm: AnyNonNegative = Field(description="the same by the rig file as it is")
-    level_mm: AnyNonNegative = Field(description="of the platform turned as at home, 95 %")
-    turned_mm: AnyNonNegative = Field(description="turned by tilt_deg, 95 %")
+    held_out_mm: AnyNonNegative = Field(description="RMS of held-out samples")
+    before_mm: AnyNonNegative = Field(description="the same with the rig file as it is")
+    level_mm: AnyNonNegative = Field(description="of the platform at its home orientation, 95 %")
+    turned_mm: AnyNonNegative = Field(description="rotated by tilt_deg, 95 %")
     tilt_deg: AnyNonNegative
     reached_mm: list[Vector] = Field(
-        description="where the platform goes when the rig file as it is would bring it to the"
+        description="true positions of the platform when the uncalibrated rig file puts it at the"
         " centre of the workspace and near its corners"
     )
-    cable_residuals_mm: list[AnyNonNegative] = Field(description="RMS, one a cable")
+    cable_residuals_mm: list[AnyNonNegative] = Field(description="RMS, one per cable")
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Those of every result, and one entry a cable."""
@@ -68,7 +68,7 @@ class RigResult(ResultDocument):
     def apart_mm(self, other: Self) -> float:
         """How far apart both say that the platform goes, RMS over the workspace, [mm].
 
-        Outlets and anchors may differ by more where they cannot be told from each other.
+        Outlets and anchors may differ by more where they cannot be separated.
 
         Raises:
             BadInput: The results rest on different rig files.
@@ -77,7 +77,7 @@ class RigResult(ResultDocument):
             raise BadInput(
                 "the results rest on different rig files",
                 where=f"rig {self.name}, {self.date} and {other.date}",
-                next_step="compare results that were made with one rig file",
+                next_step="compare results made with the same rig file",
             )
         apart = np.array(other.reached_mm) - np.array(self.reached_mm)
         return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
@@ -93,7 +93,7 @@ class RigResult(ResultDocument):
             raise BadInput(
                 f"this result is of {len(self.outlets_mm)} cables, the rig has {len(rig.winches)}",
                 where=f"calibration {self.kind} {self.name}, {self.date}",
-                next_step="run `cdpr calibrate rig` again; the file was changed after it was made",
+                next_step="run `cdpr calibrate rig` again; the rig file was changed since",
             )
         return _with_numbers(
             rig,
@@ -204,18 +204,18 @@ def require_one_drawing(rig: Rig, others: Sequence[tuple[str, Rig]]) -> Rig:
     for name, other in others:
         if drawing_of(other.document) != drawing_of(rig.document):
             raise BadInput(
-                f"this run was made with other {_WHAT} than those of {rig.name!r}",
+                f"this run was made with {_WHAT} that differ from those of {rig.name!r}",
                 where=name,
-                why="it is of another rig, the rig file was changed since, or it was run with a"
+                why="it is from another rig, the rig file was changed since, or it was run with a"
                 " calibration of the rig",
-                next_step="name the rig file that it was run with, without --calibration",
+                next_step="pass the rig file that it was run with, without --calibration",
             )
         homes = [[w.home_counts for w in r.winches] for r in (other, others[0][1])]
         if homes[0] != homes[1]:
             raise BadInput(
-                "the drives were referenced again between these runs",
+                "the drives were homed again between these runs",
                 where=f"{others[0][0]}, {name}",
-                next_step="use runs made after one and the same `cdpr home`",
+                next_step="use runs made after the same `cdpr home`",
             )
     return others[0][1] if others else rig
 

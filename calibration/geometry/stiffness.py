@@ -1,7 +1,7 @@
-"""Whether the data tell of another stiffness than the rig file, or of cables that differ.
+"""Whether the data show another stiffness than the rig file, or cables that differ.
 
 One step of the fit with the compliance (1 / stiffness) as one more number that the rig file does
-not tell, all others and the poses eliminated: a wrong stiffness makes residuals grow with tension
+not give, all others and the poses eliminated: a wrong stiffness makes residuals grow with tension
 and length alike, and nothing else does. The other numbers would hide a part of it, and their
 intervals would be false. Where the stiffness is among them, the doubt that was stated counts too.
 """
@@ -19,47 +19,47 @@ from calibration.geometry.model import RigModel
 from model.pose import Array
 
 CONTRADICTION = 4.0
-"""So many standard deviations from the rig file are no chance."""
+"""This many standard deviations from the rig file are significant."""
 LEAST_CHANCE = 1e-3
 """Cables differ where chance explains it less often."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """What the data tell of the cables' compliance, 1 / stiffness.
+    """Estimate of the cables' compliance, 1 / stiffness.
 
     Attributes:
         drawn: By the rig file, to first order about the fit, [1/N].
-        told: By the data, [1/N].
+        estimated: From the data, [1/N].
         deviation: Standard deviation of the difference, [1/N].
     """
 
     drawn: float
-    told: float
+    estimated: float
     deviation: float
 
     @property
     def contradicts(self) -> bool:
-        """Whether the data tell another one than the rig file."""
-        return abs(self.told - self.drawn) > CONTRADICTION * self.deviation
+        """Whether the data contradict the rig file."""
+        return abs(self.estimated - self.drawn) > CONTRADICTION * self.deviation
 
     def __str__(self) -> str:
-        """The stiffness that the data tell, in words."""
-        if self.told > 0.0:
-            return f"about {1.0 / self.told:.2g} N"
-        return "more than can be told"
+        """The estimated stiffness, in words."""
+        if self.estimated > 0.0:
+            return f"about {1.0 / self.estimated:.2g} N"
+        return "too high to determine"
 
 
 @dataclass(frozen=True, slots=True)
 class Differences:
-    """What the data tell of each cable's compliance by itself.
+    """Estimate of each cable's own compliance.
 
     Attributes:
-        told: Shape (m,), [1/N].
+        estimated: Shape (m,), [1/N].
         chance: How likely differences from the rig file as large as these are by chance.
     """
 
-    told: Array
+    estimated: Array
     chance: float
 
     @property
@@ -68,13 +68,15 @@ class Differences:
         return self.chance < LEAST_CHANCE
 
     def __str__(self) -> str:
-        """The stiffnesses that the data tell, in words."""
-        told = (f"{1.0 / c:.2g} N" if c > 0.0 else "more than can be told" for c in self.told)
-        return ", ".join(told)
+        """The estimated stiffnesses, in words."""
+        estimated = (
+            f"{1.0 / c:.2g} N" if c > 0.0 else "too high to determine" for c in self.estimated
+        )
+        return ", ".join(estimated)
 
 
 def compliance_told(result: RigCalibration) -> Compliance | None:
-    """What the data tell; None where the tensions were not measured in all places.
+    """The estimate; None where the tensions were not measured in all samples.
 
     Args:
         result: The fit with the rig file's stiffness.
@@ -88,7 +90,7 @@ def compliance_told(result: RigCalibration) -> Compliance | None:
 
 
 def differences_told(result: RigCalibration) -> Differences | None:
-    """What the data tell of each cable; None where tensions were not measured in all places.
+    """The estimate of each cable; None where tensions were not measured in all samples.
 
     Args:
         result: The fit with one stiffness for all cables.
@@ -99,8 +101,8 @@ def differences_told(result: RigCalibration) -> Differences | None:
     information, pull = _told(result, np.eye(cables))
     change = -np.asarray(np.linalg.solve(information, pull))
     chance = float(chi2.sf(-pull @ change, cables))
-    told: Array = _drawn(result) + change
-    return Differences(told, chance)
+    estimated: Array = _drawn(result) + change
+    return Differences(estimated, chance)
 
 
 def _drawn(result: RigCalibration) -> float:
@@ -114,7 +116,7 @@ def _drawn(result: RigCalibration) -> float:
 
 
 def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
-    """What the data tell of compliances beside all other numbers and the poses, per variance.
+    """Information on compliances beside all other parameters and the poses, per variance.
 
     Args:
         result: The fit.
@@ -135,10 +137,12 @@ def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
     poses[data.posed] += np.linalg.inv(data.covariances[data.posed])
     mixed = np.swapaxes(by_all, 1, 2) @ weighted
     gained = np.linalg.solve(poses, np.swapaxes(mixed, 1, 2))
-    told = np.einsum("nmp,nm,nmq->pq", by_all, weights, by_all)
-    told -= np.einsum("npi,niq->pq", mixed, gained)
+    information = np.einsum("nmp,nm,nmq->pq", by_all, weights, by_all)
+    information -= np.einsum("npi,niq->pq", mixed, gained)
     r = free.shape[1]
-    told[:r, :r] += np.eye(r)
-    own = told[r:, r:] - told[r:, :r] @ np.linalg.solve(told[:r, :r], told[:r, r:])
+    information[:r, :r] += np.eye(r)
+    own = information[r:, r:] - information[r:, :r] @ np.linalg.solve(
+        information[:r, :r], information[:r, r:]
+    )
     pull = np.einsum("nmq,nm,nm->q", by_compliance, weights, fit.residuals)
     return own / result.uncertainty.scatter, pull / result.uncertainty.scatter

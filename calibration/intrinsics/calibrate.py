@@ -1,4 +1,4 @@
-"""Camera matrix and lens distortion from pictures of a board."""
+"""Camera matrix and lens distortion from images of a board."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from tracking.camera_model import Image
 
 LEAST_VIEWS = 4
-"""Fewer pictures cannot be calibrated from; forty and more, tilted up to 40°, are good."""
+"""Fewer images cannot be calibrated from; forty and more, tilted up to 40°, are good."""
 _FAR_OFF, _OFF = 4.0, 0.5
-"""A view is left out whose error is so many times the median, and so many pixels at least."""
+"""A view is left out whose error is this many times the median, and this many pixels at least."""
 _LOOKED_AT = 5
-"""So many pictures without the board, spread over all, are looked at for what they show instead."""
-_MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
+"""Number of images without the board, spread over all, that are examined for what they show."""
+_MIRRORED = "its mirror image, so the images or the board's print are mirrored"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,14 +31,14 @@ class CameraCalibration:
     """A camera's matrix and distortion, and what they rest on.
 
     Attributes:
-        size: Width and height of the pictures, [px].
+        size: Width and height of the images, [px].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: k1, k2, p1, p2, k3; shape (5,).
         uncertainty: What is known about their errors.
-        views: What was seen of the board in each picture used, by name.
+        views: What was seen of the board in each image used, by name.
         boards: Where the board was in the camera's frame, by name.
-        view_errors: RMS distance of each used picture's corners, by name, [px].
-        unused: Why each of the other pictures is not used, by name.
+        view_errors: RMS distance of each used image's corners, by name, [px].
+        unused: Why each of the other images is not used, by name.
         data_hash: Of the corners it rests on.
     """
 
@@ -87,12 +87,12 @@ def fit_camera(
     """Fits a pinhole with five distortion coefficients.
 
     Args:
-        pictures: Names and grey pictures of one size.
+        pictures: Names and grey images of one size.
         board: What they show.
-        unused: Pictures that were left out before, with the reasons.
+        unused: Images that were left out before, with the reasons.
 
     Raises:
-        BadInput: Pictures of different sizes, or too few that show the board.
+        BadInput: Images of different sizes, or too few that show the board.
     """
     views: dict[str, Seen] = {}
     left_out = dict(unused or {})
@@ -103,9 +103,9 @@ def fit_camera(
         size = size or own
         if own != size:
             raise BadInput(
-                f"the picture has {own[0]} x {own[1]} px, the ones before {size[0]} x {size[1]} px",
+                f"the image has {own[0]} x {own[1]} px, others {size[0]} x {size[1]} px",
                 where=name,
-                next_step="use pictures of one camera in one size",
+                next_step="use images of one camera at one size",
             )
         seen = board.find(image)
         if seen is None:
@@ -115,7 +115,7 @@ def fit_camera(
             left_out[name] = as_in(first)
         else:
             views[name] = seen
-            left_out |= {f"{name}, {k}": "is seen more than once" for k in seen.twice}
+            left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
     return calibrate_from_views(views, size, left_out)
@@ -129,12 +129,12 @@ def _same(seen: Seen, before: Seen) -> bool:
 def calibrate_from_views(
     views: Mapping[str, Seen], size: tuple[int, int], unused: Mapping[str, str] | None = None
 ) -> CameraCalibration:
-    """Fits the camera to the board's corners in each picture.
+    """Fits the camera to the board's corners in each image.
 
-    A picture whose corners are far off, as of a board that moved or was mistaken, is left out.
+    An image whose corners are far off, as of a board that moved or was mistaken, is left out.
 
     Raises:
-        BadInput: Too few pictures are left, or they determine nothing.
+        BadInput: Too few images are left, or they determine nothing.
     """
     left_out, used = dict(unused or {}), dict(views)
     fit = _fit(used, size)
@@ -142,7 +142,7 @@ def calibrate_from_views(
     bad = {name: error for name, error in fit.errors.items() if error > limit}
     if bad and len(used) - len(bad) >= LEAST_VIEWS:
         for name, error in bad.items():
-            left_out[name] = f"has corners that are {error:.2f} px off, far more than the others"
+            left_out[name] = f"has a corner error of {error:.2f} px, far more than the others"
             del used[name]
         fit = _fit(used, size)
     return CameraCalibration(
@@ -191,14 +191,14 @@ def _fit(views: Mapping[str, Seen], size: tuple[int, int]) -> _Fit:
 
 def _undetermined() -> BadInput:
     return BadInput(
-        "these pictures do not determine a camera",
-        why="the fit found no finite answer, as when the board stands the same way in all of them",
-        next_step="take more pictures, with the board tilted up to 40° every way",
+        "these images do not determine a camera",
+        why="the fit has no finite solution, as when the board has the same tilt in all of them",
+        next_step="take more images, with the board tilted up to 40° in every direction",
     )
 
 
 def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
-    """What most of the pictures without the board show, if anything is known."""
+    """What most of the images without the board show, if anything is known."""
     shown: dict[str, list[str]] = {}
     for name, image in without:
         flipped = mirrored(board, image)
@@ -209,7 +209,7 @@ def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
     what, names = max(shown.items(), key=lambda item: len(item[1]))
     verb = "shows"
     if len(names) > 1:
-        verb = f"and {len(names) - 1} of {len(without) - 1} others that were looked at show"
+        verb = f"and {len(names) - 1} of {len(without) - 1} others that were examined show"
     return f"; {names[0]} {verb} {what}"
 
 
@@ -220,14 +220,14 @@ def _too_few(
     without: Sequence[tuple[str, Image]],
 ) -> BadInput:
     count = len(views) + len(unused)
-    why = f"{board} was looked for{_instead(board, without)}"
+    why = f"expected {board}{_instead(board, without)}"
     told = [f"{name} {reason}" for name, reason in unused.items()]
     if told:
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""
         why += "; " + "; ".join(told[: 4 if more else 5]) + more
     return BadInput(
-        f"the board is to be seen in {len(views)} of {count} pictures; {LEAST_VIEWS} are the least",
+        f"the board is detected in {len(views)} of {count} images; {LEAST_VIEWS} are required",
         why=why,
-        next_step="check the board's kind and numbers, or take more pictures of it, tilted up to"
-        " 40°; 40 are good",
+        next_step="check the board's kind and dimensions, or take more images of it, tilted up to"
+        " 40°; 40 are recommended",
     )

@@ -1,7 +1,7 @@
-"""Which pictures to take of a board that is moved before a live camera, and what is still missing.
+"""Which images to take of a board that is moved before a live camera, and what is still missing.
 
-A picture is taken when the board stands still and shows something new: a part of the picture or a
-tilt that no picture shows yet, or a place far from all others.
+An image is taken when the board stands still and shows something new: a part of the image or a
+tilt that no image shows yet, or a place far from all others.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from model.pose import Array
 from tracking.camera_model import Image
 
 STILL_PX = 0.7
-"""RMS motion of the corners from one picture to the next, for pictures of 1000 px."""
+"""RMS motion of the corners from one image to the next, for images of 1000 px."""
 ENOUGH_TILT = 18.0
 """Degrees to each side that must be seen."""
 _FAR, _FAR_TILT = 0.12, 12.0
-"""So far from all others, as part of the picture's width, or turned so much [deg], it is new."""
+"""It is new at this distance from all others, as share of the image width, or rotation [deg]."""
 _PARTS = (("left", "middle", "right"), ("top", "middle", "bottom"))
 _AWAY = ("lower", "upper", "right", "left")
-"""Edges of the board, as seen in the picture, that are away from the camera by tilt: − and + about
-the picture's x axis, then about its y axis."""
+"""Edges of the board, as seen in the image, that are away from the camera by tilt: − and + about
+the image's x axis, then about its y axis."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,9 +35,9 @@ class View:
     Attributes:
         seen: Its corners.
         middle: Mean of the corners, shape (2,), [px].
-        tilt: Roughly, of the board's normal, away from the camera, towards the picture's y and x
+        tilt: Roughly, of the board's normal, away from the camera, towards the image's y and x
             axes, shape (2,), [deg].
-        parts: Parts of the picture that it covers, (column, row) of 3 x 3.
+        parts: Parts of the image that it covers, (column, row) of 3 x 3.
     """
 
     seen: Seen
@@ -51,7 +51,7 @@ class Advice:
     """What to do next.
 
     Attributes:
-        taken: Whether this picture is to be kept.
+        taken: Whether this image is to be kept.
         text: One sentence for the person who moves the board.
         done: Whether enough was taken.
     """
@@ -63,11 +63,11 @@ class Advice:
 
 @dataclass(slots=True)
 class CaptureGuide:
-    """Judges one picture after the other.
+    """Judges one image after the other.
 
     Attributes:
         board: What is shown.
-        wanted: How many pictures at least.
+        wanted: How many images at least.
         views: Those that were taken.
     """
 
@@ -77,7 +77,7 @@ class CaptureGuide:
     _last: Seen | None = None
 
     def look(self, image: Image) -> Advice:
-        """Judges the next picture.
+        """Judges the next image.
 
         Args:
             image: Grey, all of one size.
@@ -90,16 +90,16 @@ class CaptureGuide:
             return self._advice(False, "hold it still")
         view = _view(self._last, size)
         if not self._is_new(view, size):
-            return self._advice(False, self.missing() or "move it to another place and tilt")
+            return self._advice(False, self.missing() or "move it to another position and tilt it")
         self.views.append(view)
-        return self._advice(True, self.missing() or "move it to another place and tilt")
+        return self._advice(True, self.missing() or "move it to another position and tilt it")
 
     def missing(self) -> str:
-        """The first thing that no picture shows yet; empty when all is there."""
+        """The first thing that no image shows yet; empty when all is there."""
         covered = {part for view in self.views for part in view.parts}
         for part in sorted(product(range(3), range(3)), key=lambda p: (p == (1, 1), p[1], p[0])):
             if part not in covered:
-                return f"bring the board to the {_name(part)} of the picture"
+                return f"bring the board to the {_name(part)} of the image"
         for which, name in enumerate(_AWAY):
             axis, sign = which // 2, (-1.0, 1.0)[which % 2]
             if not any(sign * view.tilt[axis] > ENOUGH_TILT for view in self.views):
@@ -118,7 +118,7 @@ class CaptureGuide:
 
     def _advice(self, taken: bool, text: str) -> Advice:
         done = len(self.views) >= self.wanted and not self.missing()
-        count = f"{len(self.views)} of {self.wanted} pictures"
+        count = f"{len(self.views)} of {self.wanted} images"
         return Advice(taken, f"{count}: {'enough' if done else text}", done)
 
 
@@ -130,7 +130,7 @@ def _name(part: tuple[int, int]) -> str:
 
 
 def _still(before: Seen, now: Seen, size: tuple[int, int]) -> bool:
-    """Whether corners that both pictures show have not moved."""
+    """Whether corners that both images show have not moved."""
     earlier = {tuple(p): c for p, c in zip(before.points.tolist(), before.corners, strict=True)}
     pairs = [
         corner - earlier[tuple(point)]

@@ -37,8 +37,10 @@ class CameraResult(ResultDocument):
     distortion: list[AnyNumber]
     rms_px: AnyNonNegative
     distance_m: Positive = Field(description="for which error_mm is stated")
-    halves_apart_mm: AnyNonNegative = Field(description="as two halves of the pictures see a point")
-    covered: AnyNonNegative = Field(description="share of the picture in which the board was seen")
+    halves_apart_mm: AnyNonNegative = Field(
+        description="difference between two halves of the images"
+    )
+    covered: AnyNonNegative = Field(description="share of the image covered by the board")
     pictures_used: int
     view_errors_px: dict[str, AnyNonNegative]
 
@@ -48,17 +50,17 @@ class CameraResult(ResultDocument):
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart points at the distance are seen, RMS over the picture, [mm].
+        """How far apart points at the distance are seen, RMS over the image, [mm].
 
         Raises:
-            BadInput: The pictures are of different sizes.
+            BadInput: The images are of different sizes.
         """
         size = (self.width_px, self.height_px)
         if size != (other.width_px, other.height_px):
             raise BadInput(
-                f"one camera's pictures have {size[0]} x {size[1]} px, the other's"
+                f"one camera's images have {size[0]} x {size[1]} px, the other's"
                 f" {other.width_px} x {other.height_px} px",
-                next_step="compare results for one size of pictures",
+                next_step="compare results for one image size",
             )
         flat = [
             cv2.undistortPoints(
@@ -78,10 +80,10 @@ class CameraResult(ResultDocument):
         camera = camera_named(rig, self.name)
         if (camera.width_px, camera.height_px) != (self.width_px, self.height_px):
             raise BadInput(
-                f"this result is for pictures of {self.width_px} x {self.height_px} px, camera"
+                f"this result is for images of {self.width_px} x {self.height_px} px, camera"
                 f" {self.name!r} takes {camera.width_px} x {camera.height_px} px",
                 where=f"calibration {self.kind} {self.name}, {self.date}",
-                next_step="calibrate the camera in the size that it is used in",
+                next_step="calibrate the camera at the image size in use",
             )
         keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
@@ -150,22 +152,22 @@ _WIDTH = 560.0
 def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, date: str) -> str:
     """The whole page."""
     lead = (
-        f"{date}, {result.size[0]} × {result.size[1]} px, {len(result.views)} pictures used,"
+        f"{date}, {result.size[0]} × {result.size[1]} px, {len(result.views)} images used,"
         f" {len(result.unused)} not"
     )
-    covered = f"{quality.covered:.0%} of the picture's cells have seen corners"
-    tilted = "A dot for each picture: forward and backward up and down, left and right across."
-    used = "Error, corners, and how fx changes without the picture."
+    covered = f"{quality.covered:.0%} of the image's cells contain corners"
+    tilted = "A dot per image: vertical for forward and backward, horizontal for left and right."
+    used = "Error, corners, and change of fx without the image."
     return page_of(
         f"Calibration of camera {name}",
         lead,
         quality.verdict,
         [
-            Section("Numbers, with 95 % intervals", _numbers(result, quality)),
+            Section("Parameters, with 95 % intervals", _numbers(result, quality)),
             Section("Where the board was seen", _map(result, quality), covered),
             Section("How the board was tilted", _tilts(quality), tilted),
-            Section("Pictures used", _pictures(result), used),
-            Section("Pictures not used", table_of(result.unused.items())),
+            Section("Images used", _pictures(result), used),
+            Section("Images not used", table_of(result.unused.items())),
         ],
     )
 
@@ -175,10 +177,10 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
     return table_of(
         [
             *interval_rows(result.intervals),
-            ("corners off, RMS", f"{result.error:.3f} px"),
+            ("reprojection error, RMS", f"{result.error:.3f} px"),
             (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
             ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
-            ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
+            ("two halves of the images", f"differ by {quality.halves * 1e3:.2g} mm there"),
             ("data", result.data_hash[:23]),
         ]
     )
@@ -203,12 +205,12 @@ def _map(result: CameraCalibration, quality: CameraQuality) -> str:
             f'<circle cx="{x * scale:.1f}" cy="{y * scale:.1f}" r="1.4" fill="var(--ink)"/>'
             for x, y in seen.corners
         ]
-    label = f"Corners seen in the camera's picture, in {quality.covered:.0%} of its cells."
+    label = f"Corners in the camera's image, in {quality.covered:.0%} of its cells."
     return drawing("".join(shapes), (_WIDTH, height * scale), label)
 
 
 def _tilts(quality: CameraQuality) -> str:
-    """Tilt of each picture's board, about both axes, ± 50°."""
+    """Tilt of each image's board, about both axes, ± 50°."""
     dots = "".join(
         f'<circle cx="{140 + 2.4 * np.clip(y, -50, 50):.1f}"'
         f' cy="{140 - 2.4 * np.clip(x, -50, 50):.1f}" r="4" fill="var(--ink)"/>'
@@ -219,12 +221,12 @@ def _tilts(quality: CameraQuality) -> str:
         f'<text x="{144 + 2.4 * ring}" y="137">{ring}°</text>'
         for ring in (20, 40)
     )
-    label = f"Tilt of the board in {len(quality.tilts)} pictures; rings at 20° and 40°."
+    label = f"Tilt of the board in {len(quality.tilts)} images; rings at 20° and 40°."
     return drawing(rings + dots, (280, 280), label, "small")
 
 
 def _pictures(result: CameraCalibration) -> str:
-    """Error of each picture, and how much of the focal length hangs on it."""
+    """Error of each image, and how much of the focal length hangs on it."""
     change = result.uncertainty.without[:, NAMES.index("fx_px")]
     rows = [
         (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+.2f} px")
@@ -232,4 +234,4 @@ def _pictures(result: CameraCalibration) -> str:
             result.view_errors.items(), result.views.values(), change, strict=True
         )
     ]
-    return table_of(rows, ("picture", "error, RMS", "corners", "fx without it"))
+    return table_of(rows, ("image", "error, RMS", "corners", "fx without it"))

@@ -1,12 +1,12 @@
-"""How well pictures determine a camera: the fit linearised, picture by picture.
+"""How well images determine a camera: the fit linearised, image by image.
 
-With r the errors of a picture's corners and A, B their derivatives by the camera's nine numbers and
-by the board's pose, what the picture says of the nine is H = AᵀPA and s = AᵀPr, P projecting the
+With r the errors of an image's corners and A, B their derivatives by the camera's nine numbers and
+by the board's pose, what the image says of the nine is H = AᵀPA and s = AᵀPr, P projecting the
 pose out. From these follow the covariance by the scatter of the corners, the fit without any one
-picture, and the fits of two halves of the pictures, each to first order.
+image, and the fits of two halves of the images, each to first order.
 
-The scatter alone promises too much: corners of one picture err together (a bent board, blur, the
-lens model). The spread of the fits without one picture (the jackknife over pictures) feels that,
+The scatter alone promises too much: corners of one image err together (a bent board, blur, the
+lens model). The spread of the fits without one image (the jackknife over images) feels that,
 and the larger of both is stated.
 
 Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
@@ -37,8 +37,8 @@ class Uncertainty:
     Attributes:
         covariance: Shape (9, 9).
         half_widths: Of the 95 % intervals, shape (9,).
-        without: How the numbers change when a picture is left out, shape (pictures, 9).
-        halves: How the even pictures' numbers differ from the odd ones', shape (9,).
+        without: How the numbers change when an image is left out, shape (pictures, 9).
+        halves: How the even images' numbers differ from the odd ones', shape (9,).
     """
 
     covariance: Array
@@ -57,14 +57,14 @@ def uncertainty_of(
     """The uncertainty of a fit.
 
     Args:
-        views: The board in each picture.
+        views: The board in each image.
         turns: Rotation vectors of the board in the camera's frame, shape (3,) each, [rad].
         places: Its origin there, shape (3,) each, [m].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: k1, k2, p1, p2, k3; shape (5,).
 
     Raises:
-        BadInput: The pictures leave some of the nine numbers open.
+        BadInput: The images leave some of the nine numbers open.
     """
     parts, scores, squares, residuals = [], [], 0.0, 0
     for seen, turn, place in zip(views, turns, places, strict=True):
@@ -81,9 +81,9 @@ def uncertainty_of(
     scale = np.sqrt(np.diag(information))
     if not (scale > 0.0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
         raise BadInput(
-            "these pictures do not determine a camera",
-            why="other numbers would explain them as well",
-            next_step="take more pictures, with the board tilted up to 40° every way",
+            "these images do not determine a camera",
+            why="other parameters would explain them as well",
+            next_step="take more images, with the board tilted up to 40° in every direction",
         )
     by_scatter = np.linalg.inv(information) * squares / max(residuals - 9, 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
@@ -100,12 +100,12 @@ def uncertainty_of(
 
 
 def _without(information: Array, part: Array, score: Array) -> Array:
-    """The change of the numbers when one picture is left out."""
+    """The change of the numbers when one image is left out."""
     return np.asarray(-np.linalg.pinv(information - part, hermitian=True) @ score)
 
 
 def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
-    """The change of the numbers when every other picture is used, from the first or the second."""
+    """The change of the numbers when every other image is used, from the first or the second."""
     information = np.sum(parts[which::2], axis=0)
     return np.asarray(
         np.linalg.pinv(information, hermitian=True) @ np.sum(scores[which::2], axis=0)
@@ -113,5 +113,5 @@ def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
 
 
 def _quantile(count: int) -> float:
-    """Of Student's distribution, for so many pictures."""
+    """Of Student's distribution, for a number of images."""
     return float(student.ppf(0.5 + CONFIDENCE / 2.0, max(count - 1, 1)))

@@ -32,20 +32,20 @@ class EvenSample(Generic[T]):
             self._kept, self._every = self._kept[::2], 2 * self._every
 
     def chosen(self) -> list[T]:
-        """So many as were wanted, in their order; all where there were no more."""
+        """The wanted number, in their order; all where there were no more."""
         last, wanted = len(self._kept) - 1, min(self._wanted, len(self._kept))
         places = [round(k * last / max(wanted - 1, 1)) for k in range(wanted)]
         return [self._kept[place] for place in places]
 
 
-# Pictures between which nothing moved: copies, or pictures of what stood still.
+# Images between which nothing moved: copies, or images of what stood still.
 #
-# They err alike, and together they tell no more than one. A copy that was saved anew as JPEG has
-# its corners elsewhere by as much as noise moves them, so both are told by one limit.
+# They err alike, and together they show no more than one. A copy that was saved again as JPEG has
+# its corners elsewhere by as much as noise moves them, so one limit finds both.
 
 
 SAME_VIEW = 0.1
-"""Corners that nothing moved are nearer than that to each other in two pictures, RMS, [px]."""
+"""Corners that nothing moved are nearer than that to each other in two images, RMS, [px]."""
 
 
 def is_duplicate_view(corners: Array, before: Array) -> bool:
@@ -54,5 +54,5 @@ def is_duplicate_view(corners: Array, before: Array) -> bool:
 
 
 def as_in(first: str) -> str:
-    """Why a picture is not used that shows the same as another, named ``first``."""
-    return f"shows the same as {first}: nothing moved in between"
+    """Why an image is not used that shows the same as another, named ``first``."""
+    return f"duplicates {first}: nothing moved in between"

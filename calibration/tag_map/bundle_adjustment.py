@@ -1,8 +1,8 @@
-"""Where the tags are on the platform: all of them and all pictures fitted together.
+"""Where the tags are on the platform: all of them and all images fitted together.
 
-Every picture may be taken from anywhere; its camera pose is an unknown as well (bundle adjustment).
-Pictures tell the layout only up to a rigid motion of the platform's frame; it is put where the
-layout fits the rig file best, or where one tag is as there. What a picture says of the layout, its
+Every image may be taken from anywhere; its camera pose is an unknown as well (bundle adjustment).
+Images give the layout only up to a rigid motion of the platform's frame; it is put where the
+layout fits the rig file best, or where one tag is as there. What an image says of the layout, its
 camera pose projected out, is added up as in `calibration.intrinsics.uncertainty`.
 """
 
@@ -26,31 +26,31 @@ from tracking.pnp import TagView, moved, solve_pnp
 
 
 HUBER = 3.0
-"""Errors of edges beyond so many deviations count linearly."""
+"""Errors of edges beyond this many deviations count linearly."""
 _NARROWING = (1e4, 1e2, 2e1, HUBER)
 _FAR_OFF_PX = 2.0
-"""A picture whose corners are farther off does not show this platform as it is."""
+"""An image whose corners are farther off does not show this platform as it is."""
 
 
 def far_off(sights: TagSights, errors: Sequence[float]) -> dict[str, str]:
-    """The picture that fits the others least, and why, where it is far off: it smears the fit."""
+    """The image that fits the others least, and why, where it is far off: it smears the fit."""
     name, error = max(zip(sights.squares, errors, strict=True), key=lambda item: item[1])
     if error <= max(_FAR_OFF_PX, 4.0 * float(np.median(errors))):
         return {}
-    return {name: f"has corners that are {error:.2f} px off, far more than the others"}
+    return {name: f"has a corner error of {error:.2f} px, far more than the others"}
 
 
 def starts_of(
     camera: Camera, drawn: Mapping[int, Tag], sights: TagSights
 ) -> tuple[dict[str, Pose], TagSights]:
-    """``camera_from_platform`` of each picture by the rig file; pictures without one are named."""
+    """``camera_from_platform`` of each image by the rig file; images without one are named."""
     starts = {}
     for name, squares in sights.squares.items():
         found = solve_pnp(camera, [TagView(drawn[k], s) for k, s in squares.items()])
         if found is not None:
             starts[name] = found.camera_from_body
     strange = {
-        name: "allows no pose of the platform as in the rig file"
+        name: "fits no platform pose with the rig file's tags"
         for name in sights.squares
         if name not in starts
     }
@@ -76,7 +76,7 @@ def fitted(
         return np.delete(whole, np.s_[count : count + 6], axis=1)
 
     # The rig file may be many deviations off, where Huber's loss hardly pulls: so it narrows.
-    # Each round starts anew from what was found: steps are small turns about the present poses.
+    # Each round starts again from the last result: steps are small turns about the present poses.
     for scale in _NARROWING:
         found = least_squares(
             lambda x: views.errors(*at(x)).ravel(),
@@ -91,7 +91,7 @@ def fitted(
     return list(cameras), tags
 
 
-# Where the platform's frame is in a layout: pictures cannot tell, the rig file does.
+# Where the platform's frame is in a layout: images do not determine it, the rig file does.
 
 
 def corner_slopes(tags: Sequence[Tag]) -> Array:
@@ -136,11 +136,11 @@ def fix_gauge(tags: Sequence[Tag], fixed: int | None) -> Array:
     return np.concatenate([slopes.sum(axis=0), turns / 0.05])
 
 
-# Which tags can be located: those that pictures tie to each other.
+# Which tags can be located: those that images tie to each other.
 
 
 def connected_tags(pictures: Sequence[Iterable[int]], fixed: int | None = None) -> list[int]:
-    """The largest group of tags that are tied by pictures that show two or more of them.
+    """The largest group of tags that are tied by images that show two or more of them.
 
     Args:
         pictures: Numbers of the tags in each.
@@ -175,12 +175,12 @@ class TagLayout:
             shape (6 t, 6 t).
         half_widths: Of the 95 % intervals of the same, shape (6 t,).
         fixed: Number of the tag that is as in the rig file; None where all fit the rig file best.
-        errors: RMS corner error of each picture, by name, [px].
-        seen: In how many pictures each tag was, by number.
+        errors: RMS corner error of each image, by name, [px].
+        seen: In how many images each tag was, by number.
         unseen: Why each of the other tags is as in the rig file, by number.
-        sides: Largest angle between directions from which pictures were taken, [rad].
+        sides: Largest angle between directions from which images were taken, [rad].
         scale: Size of the layout by that of the rig file.
-        unused: Why pictures are not used, by name.
+        unused: Why images are not used, by name.
         data_hash: Of what was seen.
     """
 
@@ -208,7 +208,7 @@ class TagLayout:
 
     @property
     def reprojection(self) -> float:
-        """RMS corner error over the pictures, [px]."""
+        """RMS corner error over the images, [px]."""
         return float(np.sqrt(np.mean(np.square(list(self.errors.values())))))
 
 
@@ -222,7 +222,7 @@ def require_tags(rig: Rig, fixed: int | None) -> None:
     told = f"tags of the platform: {', '.join(map(str, numbers)) or 'none'}"
     if len(numbers) < 2:
         raise BadInput(
-            "the platform has no two tags whose places could be compared",
+            "the platform has fewer than two tags, so their poses cannot be compared",
             where=f"rig {rig.name}",
             why=told,
             next_step="add the platform's tags to the rig file under tags: platform",
@@ -248,11 +248,11 @@ def measure_layout(
         fixed: Number of the tag that is as in the rig file; left out, all fit the rig file best.
 
     Raises:
-        BadInput: Too few pictures show two tags or more, or none shows the fixed tag with others.
+        BadInput: Too few images show two tags or more, or none shows the fixed tag with others.
     """
     drawn = {tag.id: tag for tag in rig.platform_tags}
     single = {
-        name: "shows one tag only, which says nothing of the others"
+        name: "shows only one tag, which does not locate the others"
         for name, squares in sights.squares.items()
         if len(squares) < 2
     }
@@ -262,7 +262,7 @@ def measure_layout(
     among = fixed if fixed is not None else next(iter(located), None)
     sights = sights.without(
         {
-            name: f"shows only tags that no picture shows with tag {among}"
+            name: f"shows only tags that no image shows together with tag {among}"
             for name, squares in sights.squares.items()
             if not set(squares) <= set(located)
         }
@@ -312,7 +312,7 @@ def _result(
         errors=dict(zip(sights.squares, views.picture_errors(cameras, tags), strict=True)),
         seen={tag.id: numbers.count(tag.id) for tag in tags},
         unseen={
-            number: "was not seen together with the others"
+            number: "was not detected together with the others"
             for number in drawn
             if number not in {tag.id for tag in tags}
         },
@@ -332,10 +332,10 @@ def _sides(cameras: Sequence[Pose]) -> float:
 
 def _too_few(sights: TagSights, fixed: int | None) -> BadInput:
     told = "; ".join(f"{name} {why}" for name, why in list(sights.unused.items())[:5])
-    together = f", tied to tag {fixed}" if fixed is not None else ""
+    together = f", linked to tag {fixed}" if fixed is not None else ""
     return BadInput(
-        f"{len(sights.squares)} pictures show two tags of the platform or more{together};"
-        f" {LEAST_PICTURES} are the least",
+        f"{len(sights.squares)} images show two platform tags or more{together};"
+        f" {LEAST_PICTURES} are required",
         why=told,
-        next_step="take 20 pictures from all sides, two or three tags in each",
+        next_step="take 20 images from all sides, two or three tags in each",
     )

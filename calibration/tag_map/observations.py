@@ -1,4 +1,4 @@
-"""The tags of a rig in many pictures of one camera, and why others are of no use."""
+"""The tags of a rig in many images of one camera, and why others are of no use."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class TagSights:
     """Whole tags that were seen.
 
     Attributes:
-        squares: Of every picture that shows some, by its name: the tags' squares by number.
-        unused: Why a picture, or a tag in it, is not used, by name.
+        squares: Of every image that shows some, by its name: the tags' squares by number.
+        unused: Why an image, or a tag in it, is not used, by name.
     """
 
     squares: Mapping[str, Mapping[int, RefinedTag]]
@@ -42,12 +42,12 @@ class TagSights:
         return tuple(sorted({number for squares in self.squares.values() for number in squares}))
 
     def without(self, unused: Mapping[str, str]) -> TagSights:
-        """The sights without some more pictures, and why."""
+        """The sights without some more images, and why."""
         left = {name: squares for name, squares in self.squares.items() if name not in unused}
         return TagSights(left, {**self.unused, **unused})
 
     def each_view_once(self) -> TagSights:
-        """Without pictures in which all tags are where another, which shows no fewer, has them."""
+        """Without images in which all tags are where another, which shows no fewer, has them."""
         kept: dict[str, Mapping[int, RefinedTag]] = {}
         unused = {}
         for name, squares in sorted(self.squares.items(), key=lambda sight: -len(sight[1])):
@@ -76,19 +76,19 @@ def sights_of(
 ) -> TagSights:
     """Looks for tags.
 
-    A number that is seen twice in a picture is left out there: nobody knows which is the rig's.
-    A copy of a picture is left out: it tells nothing more. Pictures of a camera that stands still
+    A number that is seen twice in an image is left out there: it is unknown which is the rig's.
+    A copy of an image is left out: it adds no information. Images of a camera that stands still
     differ by their noise at least.
 
     Args:
-        pictures: Names and grey pictures of the camera's size.
+        pictures: Names and grey images of the camera's size.
         rig: Its family of tags, and what finds them.
         camera: Its matrix and distortion hold.
         wanted: Their numbers.
-        unused: Pictures that were left out before, with the reasons.
+        unused: Images that were left out before, with the reasons.
 
     Raises:
-        BadInput: No picture shows any of them whole.
+        BadInput: No image shows any of them whole.
     """
     family = rig.tag_family
     detector, modules = make_detector(rig.tag_detector, family), modules_across(family)
@@ -99,16 +99,16 @@ def sights_of(
     for name, image in pictures:
         first = names.setdefault(hashlib.sha256(image.tobytes()).digest(), name)
         if first != name:
-            left_out[name] = f"is the same picture as {first}"
+            left_out[name] = f"is the same image as {first}"
             continue
         mine = [d for d in detector.detect_all(image) if d.id in wanted]
         twice = [number for number, count in Counter(d.id for d in mine).items() if count > 1]
-        left_out |= {f"{name}, tag {number}": "is seen more than once" for number in twice}
+        left_out |= {f"{name}, tag {number}": "is detected more than once" for number in twice}
         squares = _whole(image, camera, [d for d in mine if d.id not in twice], modules)
         if squares:
             found[name] = squares
         elif not twice:
-            left_out[name] = "shows none of the tags whole"
+            left_out[name] = "shows no complete tag"
             example = example or (name, image)
     if not found:
         raise _nothing_seen(camera, family, wanted, left_out, example)
@@ -144,15 +144,15 @@ def _nothing_seen(
         name, image = example
         why += f"; {name} shows {what_else_is_seen(image, family, list(wanted))}"
     return BadInput(
-        f"none of the {family} tags {', '.join(map(str, wanted))} is to be seen whole",
+        f"none of the {family} tags {', '.join(map(str, wanted))} is completely visible",
         where=f"camera {camera.name}",
         why=why,
         next_step="check that the camera sees them, that the light suffices, and that the rig file"
-        " names the family and numbers of the printed tags",
+        " has the family and numbers of the printed tags",
     )
 
 
-# All tags in all pictures as arrays: errors of their edges, and what these say of the layout.
+# All tags in all images as arrays: errors of their edges, and what these say of the layout.
 
 
 def moved_tags(tags: Sequence[Tag], steps: Array) -> tuple[Tag, ...]:
@@ -165,11 +165,11 @@ def moved_tags(tags: Sequence[Tag], steps: Array) -> tuple[Tag, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagViews:
-    """v views of t tags in p pictures.
+    """v views of t tags in p images.
 
     Attributes:
         camera: That took them.
-        picture: Which picture each view is in, shape (v,).
+        picture: Which image each view is in, shape (v,).
         tag: Which tag it shows, shape (v,).
         whitening: Shape (v, 8, 8), [1/px].
         target: Shape (v, 8).
@@ -210,7 +210,7 @@ class TagViews:
         return np.asarray(np.einsum("vij,vj->vi", self.whitening, pixels) - self.target)
 
     def slopes(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array]:
-        """Of the errors, by the picture's camera pose and by the tag's pose, shape (v, 8, 6)."""
+        """Of the errors, by the image's camera pose and by the tag's pose, shape (v, 8, 6)."""
         points, arms_camera, arms_tag = self._points(cameras, tags)
         depth = points[..., 2]
         by_point = np.zeros((*points.shape[:2], 2, 3))
@@ -242,10 +242,10 @@ class TagViews:
     def about_tags(
         self, cameras: Sequence[Pose], tags: Sequence[Tag], huber: float
     ) -> tuple[list[Array], list[Array], float]:
-        """What each picture says of the tags' poses, its camera pose projected out.
+        """What each image says of the tags' poses, its camera pose projected out.
 
         Returns:
-            Information, shape (6 t, 6 t), and score, shape (6 t,), of each picture; and the squares
+            Information, shape (6 t, 6 t), and score, shape (6 t,), of each image; and the squares
             of the errors, in variances, for each that is free.
         """
         errors = self.errors(cameras, tags)
@@ -268,7 +268,7 @@ class TagViews:
         return informations, scores, float(np.sum(errors**2)) / max(freedom, 1)
 
     def picture_errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> list[float]:
-        """RMS corner error of each picture, [px]."""
+        """RMS corner error of each image, [px]."""
         points, _, _ = self._points(cameras, tags)
         pixels = project_undistorted(self.camera, points).reshape(-1, 8)
         measured = np.linalg.solve(self.whitening, self.target[..., None])[..., 0]

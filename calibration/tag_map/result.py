@@ -30,14 +30,14 @@ class TagsResult(ResultDocument):
 
     kind: Literal["tags"] = "tags"
     platform: Annotated[list[TagDocument], Field(min_length=2)]
-    fixed_tag: int | None = Field(description="that is as in the rig file; null: all fit it best")
-    scale: Positive = Field(description="size of the layout by that of the rig file")
+    fixed_tag: int | None = Field(description="kept as in the rig file; null: best fit of all")
+    scale: Positive = Field(description="size of the layout relative to the rig file")
     rms_px: AnyNonNegative
     picture_errors_px: dict[str, AnyNonNegative]
-    seen: dict[str, int] = Field(description="in how many pictures each tag was")
+    seen: dict[str, int] = Field(description="number of images that show each tag")
 
     def in_words(self) -> list[tuple[str, str]]:
-        """As of every result; turns are from the stated rotation, so that only doubt is told."""
+        """As of every result; rotations are about the stated one: uncertainty only."""
         return pose_rows(self.stated)
 
     def changes_to(self, other: Self) -> dict[str, float]:
@@ -63,7 +63,7 @@ class TagsResult(ResultDocument):
             raise BadInput(
                 "the results have no tag in common",
                 where=f"calibration {self.kind} {self.name}, {self.date}",
-                next_step="compare results for one platform",
+                next_step="compare results for the same platform",
             )
         return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1)))) * 1e3
 
@@ -163,12 +163,12 @@ def _basis(rig: RigDocument) -> dict[str, Any]:
 
 def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdict) -> str:
     """The whole page."""
-    gauge = "The platform's frame is put where all tags fit the rig file best."
+    gauge = "The platform frame is the best fit of all tags to the rig file."
     if result.fixed is not None:
-        gauge = f"Tag {result.fixed} is taken to be as in the rig file."
+        gauge = f"Tag {result.fixed} is kept as in the rig file."
     return page_of(
         f"Tags on the platform of {document.name}",
-        f"{document.date}, {len(result.errors)} pictures used",
+        f"{document.date}, {len(result.errors)} images used",
         verdict,
         [
             Section(
@@ -180,23 +180,23 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdi
                 gauge,
             ),
             Section(
-                "Places, with 95 % intervals",
+                "Poses, with 95 % intervals",
                 table_of(_places(document), ("tag", *AXES)),
-                "Turns are about the platform's axes, from the stated rotation.",
+                "Rotations are about the platform's axes, relative to the stated one.",
             ),
             Section(
                 "Quality",
                 table_of(
                     [
-                        ("corners off, RMS", f"{result.reprojection:.3f} px"),
+                        ("reprojection error, RMS", f"{result.reprojection:.3f} px"),
                         ("tags located", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
-                        ("size by the rig file", f"{result.scale:.5f}"),
+                        ("size relative to the rig file", f"{result.scale:.5f}"),
                         ("data", document.data_sha256[:23]),
                     ]
                 ),
             ),
             Section(
-                "Pictures used",
+                "Images used",
                 table_of((name, f"{error:.3f} px") for name, error in result.errors.items()),
             ),
             Section("Not used", table_of(document.unused.items())),
@@ -215,7 +215,7 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
                 f"{np.linalg.norm(shift):.3f}",
                 f"{np.degrees(tag.pose.angle_to(drawn.pose)):.3f}",
                 ", ".join(f"{value:+.3f}" for value in shift),
-                f"{result.seen[tag.id]} pictures",
+                f"{result.seen[tag.id]} images",
             )
         )
     return rows
@@ -233,7 +233,7 @@ def _places(document: TagsResult) -> list[tuple[str, ...]]:
 
 
 GOOD_PICTURES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
-"""Pictures in all, pictures of each tag, pixels."""
+"""Images in all, images of each tag, pixels."""
 GOOD_SIDES_DEG = 40.0
 GOOD_SCALE = 0.02
 """Share by which a layout may be larger or smaller than in the rig file."""
@@ -251,25 +251,27 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
     lacks = [*_about_pictures(result), *_about_tags(result)]
     error = result.error
     if not error <= wanted:
-        what = f"tags are located within {error * 1e3:.2g} mm, {wanted * 1e3:.2g} mm are wanted"
-        lacks.append(Issue(what, "take more pictures, closer, sharp and from all sides"))
-    return CalibrationVerdict.of(error, wanted, "in the tags' places", lacks)
+        what = f"tags are located within {error * 1e3:.2g} mm; {wanted * 1e3:.2g} mm are required"
+        lacks.append(Issue(what, "take more images, closer, sharp and from all sides"))
+    return CalibrationVerdict.of(error, wanted, "in the tags' positions", lacks)
 
 
 def _about_pictures(result: TagLayout) -> list[Issue]:
     lacks = []
     if len(result.errors) < GOOD_PICTURES:
-        what = f"{len(result.errors)} pictures show two tags or more, {GOOD_PICTURES} are needed"
-        lacks.append(Issue(what, "take 20 pictures from all sides, two or three tags in each"))
+        what = f"{len(result.errors)} images show two tags or more; {GOOD_PICTURES} are required"
+        lacks.append(Issue(what, "take 20 images from all sides, two or three tags in each"))
     if np.degrees(result.sides) < GOOD_SIDES_DEG:
         what = (
-            f"all pictures are taken from within {np.degrees(result.sides):.0f}°,"
-            f" {GOOD_SIDES_DEG:.0f}° are needed"
+            f"all images are taken from within {np.degrees(result.sides):.0f}°;"
+            f" {GOOD_SIDES_DEG:.0f}° is required"
         )
-        lacks.append(Issue(what, "take pictures from all sides, not alike"))
+        lacks.append(Issue(what, "take images from all sides, all different"))
     if result.reprojection > GOOD_ERROR:
-        what = f"corners are {result.reprojection:.2f} px off"
-        step = "check sizes and numbers of the tags, that they lie flat, and the camera's numbers"
+        what = f"the reprojection error is {result.reprojection:.2f} px"
+        step = (
+            "check sizes and numbers of the tags, that they lie flat, and the camera's parameters"
+        )
         lacks.append(Issue(what, step))
     if abs(result.scale - 1.0) > GOOD_SCALE:
         way = "larger" if result.scale > 1.0 else "smaller"
@@ -281,16 +283,16 @@ def _about_pictures(result: TagLayout) -> list[Issue]:
 def _about_tags(result: TagLayout) -> list[Issue]:
     lacks = []
     for number, why in result.unseen.items():
-        step = f"take pictures that show tag {number} together with others"
+        step = f"take images that show tag {number} together with others"
         lacks.append(Issue(f"tag {number} {why}", step))
     for number, count in result.seen.items():
         if count < GOOD_VIEWS:
-            what = f"tag {number} is in {count} pictures, {GOOD_VIEWS} are needed"
-            lacks.append(Issue(what, f"take more pictures of tag {number} with its neighbours"))
+            what = f"tag {number} is in {count} images; {GOOD_VIEWS} are required"
+            lacks.append(Issue(what, f"take more images of tag {number} with its neighbours"))
     for tag, drawn in zip(result.tags, result.drawn, strict=True):
         shift, turn = drawn.pose.distance_to(tag.pose) * 1e3, drawn.pose.angle_to(tag.pose)
         if shift > FAR_MM or np.degrees(turn) > FAR_DEG:
             what = f"tag {tag.id} is {shift:.1f} mm and {np.degrees(turn):.1f}° from the rig file"
-            step = f"check that tag {tag.id} is where, and turned as, the rig file says"
+            step = f"check the position and rotation of tag {tag.id} in the rig file"
             lacks.append(Issue(what, step))
     return lacks

@@ -13,18 +13,18 @@ from model.rig import Camera
 from tracking.camera_model import Image
 
 LEAST_POINTS = 8
-"""Of a board in a picture: fewer say too little about its pose."""
+"""Of a board in an image: fewer say too little about its pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """A board in a picture.
+    """A board in an image.
 
     Attributes:
         points: In the board's plane, shape (n, 3), [m].
-        corners: Where they are in the picture, shape (n, 2), [px].
-        twice: Numbers of markers or tags that were seen more than once and are left out: nobody
-            knows which of them is the board's.
+        corners: Where they are in the image, shape (n, 2), [px].
+        twice: Numbers of markers or tags that were detected more than once and are left out: it is
+            unknown which of them is the board's.
     """
 
     points: Array
@@ -36,11 +36,11 @@ class Board(Protocol):
     """What `calibration.intrinsics.calibrate` needs of a board."""
 
     def find(self, image: Image) -> Seen | None:
-        """The board in a grey picture; None where too little of it is to be seen."""
+        """The board in a grey image; None where too little of it is to be seen."""
         ...
 
     def instead(self, image: Image) -> str:
-        """What a picture without the board shows, for messages; empty where that is unknown."""
+        """What an image without the board shows, for messages; empty where that is unknown."""
         ...
 
     def __str__(self) -> str:
@@ -49,12 +49,12 @@ class Board(Protocol):
 
 
 def mirrored(board: Board, image: Image) -> bool:
-    """Whether a picture shows the board only when it is flipped over."""
+    """Whether an image shows the board only when it is flipped over."""
     return board.find(np.ascontiguousarray(image[:, ::-1])) is not None
 
 
 def require_board(
-    holds: bool, what: str, next_step: str = "check the numbers of the board"
+    holds: bool, what: str, next_step: str = "check the dimensions of the board"
 ) -> None:
     """Refuses boards that cannot be.
 
@@ -65,14 +65,14 @@ def require_board(
         raise BadInput(what, next_step=next_step)
 
 
-# A camera of which nothing is known but the size of its pictures.
+# A camera of which nothing is known but the size of its images.
 
 
 def plain_camera(size: tuple[int, int], name: str = "camera") -> Camera:
     """A camera as most are: no distortion, and a view of about 53° across.
 
     Args:
-        size: Width and height of its pictures, [px].
+        size: Width and height of its images, [px].
         name: For messages.
     """
     width, height = size

@@ -1,4 +1,4 @@
-"""ChArUco boards: the corners between markers, in a picture that may show a part only."""
+"""ChArUco boards: the corners between markers, in an image that may show a part only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import what_else_is_seen
 
 _LEAST_FOURS = 4
-"""Markers of 16 modules are found by chance: so many are not."""
+"""Markers of 16 modules are found by chance: this many are not."""
 _ARUCO = {
     name.removeprefix("DICT_"): getattr(cv2.aruco, name)
     for name in dir(cv2.aruco)
@@ -55,7 +55,7 @@ class Charuco:
             BadInput: Too few squares, a marker that does not fit its square, or a dictionary that
                 is not known or has too few markers.
         """
-        require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares a side")
+        require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares per side")
         require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")
         require_board(
             self.dictionary in _ARUCO,
@@ -66,7 +66,7 @@ class Charuco:
         wanted = self.columns * self.rows // 2
         require_board(
             markers >= wanted,
-            f"dictionary {self.dictionary} has {markers} markers, the board needs {wanted}",
+            f"dictionary {self.dictionary} has {markers} markers; the board needs {wanted}",
             "check the dictionary's name",
         )
 
@@ -91,7 +91,7 @@ class Charuco:
         return Seen(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
 
     def instead(self, image: Image) -> str:
-        """Tags and markers that the picture shows."""
+        """Tags and markers that the image shows."""
         family = self.dictionary if self.dictionary in FAMILIES else FAMILIES[-1]
         told = what_else_is_seen(image, family, [])
         fours = TagDetector("4X4_1000").detect(image)

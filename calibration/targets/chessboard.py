@@ -1,4 +1,4 @@
-"""Chessboards: their inner corners in a picture."""
+"""Chessboards: their inner corners in an image."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from tracking.camera_model import Image
 _WINDOW = 0.3
 """Half of the window a corner is refined in, as part of the way to the next."""
 _SEARCHED = 1600
-"""Longer side of the picture in which the board is looked for, [px]."""
+"""Longer side of the image in which the board is looked for, [px]."""
 _LARGEST, _SHARE = 11, 120
-"""It is at most so many pixels, or that share of the picture's width: large pictures are softer."""
+"""At most this many pixels, or this share of the image width: large images are softer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chessboard:
-    """A printed chessboard; all of it must be in the picture.
+    """A printed chessboard; all of it must be in the image.
 
     Attributes:
         columns: Inner corners along a row of squares.
@@ -40,7 +40,8 @@ class Chessboard:
             BadInput: Fewer than three inner corners a side, or a square without a size.
         """
         require_board(
-            min(self.columns, self.rows) >= 3, "a chessboard needs at least 3 inner corners a side"
+            min(self.columns, self.rows) >= 3,
+            "a chessboard needs at least 3 inner corners per side",
         )
         require_board(self.square > 0.0, "the side of a square must be above 0 mm")
 
@@ -54,7 +55,7 @@ class Chessboard:
         return np.asarray(grid * self.square)
 
     def find(self, image: Image) -> Seen | None:
-        """Its inner corners; in large pictures they are looked for in a smaller copy first."""
+        """Its inner corners; in large images they are looked for in a smaller copy first."""
         rough = None
         if (times := max(image.shape) / _SEARCHED) > 1.0:
             size = (round(image.shape[1] / times), round(image.shape[0] / times))
@@ -71,21 +72,21 @@ class Chessboard:
         try:
             size = (self.columns, self.rows)
             found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
-        except cv2.error:  # as for pictures too small to hold the board
+        except cv2.error:  # as for images too small to hold the board
             return None
         return np.asarray(corners, dtype=np.float64).reshape(-1, 2) if found else None
 
     def instead(self, image: Image) -> str:
-        """Inner corners of another chessboard that the picture shows."""
+        """Inner corners of another chessboard that the image shows."""
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
         try:
             found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags=flags)
-        except cv2.error:  # as for pictures too small to hold a board
+        except cv2.error:  # as for images too small to hold a board
             return ""
         if not found:
             return ""
-        columns, rows = max(meta.shape), min(meta.shape)  # which way round, a board does not tell
-        return f"a chessboard of {columns} x {rows} inner corners, or a part of one"
+        columns, rows = max(meta.shape), min(meta.shape)  # a board does not show its orientation
+        return f"a chessboard of {columns} x {rows} inner corners, or part of one"
 
     def _refined(self, image: Image, corners: Array) -> Array:
         """Corners at the saddles of brightness, which halves the error; shape (n, 2), [px].

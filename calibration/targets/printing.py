@@ -92,10 +92,10 @@ def _tag_grid(board: TagGrid) -> Print:
     module = board.tag / modules_across(board.family)
     if board.gap < module:
         raise BadInput(
-            f"the gap between tags is {board.gap * 1e3:g} mm, less than a module of them"
+            f"the gap between tags is {board.gap * 1e3:g} mm, less than one module"
             f" ({module * 1e3:.3g} mm)",
             where="--gap-mm",
-            why="a tag is found by the white around it",
+            why="a tag needs a white border to be detected",
             next_step=f"use {2.0 * module * 1e3:.3g} mm or more",
         )
     step = board.tag + board.gap
@@ -110,7 +110,7 @@ def _tag_grid(board: TagGrid) -> Print:
 
 
 def _quiet(square: float) -> float:
-    """White around a chessboard, [m]: enough to tell its outermost squares from the table."""
+    """White around a chessboard, [m]: enough to separate its outermost squares from the table."""
     return min(square / 3.0, 0.008)
 
 
@@ -369,7 +369,7 @@ def _ruler(width: float, height: float) -> tuple[Array, list[Text]]:
     for millimetre in range(int(RULER_MM) + 1):
         deep = 4.0 if millimetre % 10 == 0 else 2.5 if millimetre % 5 == 0 else 1.5
         ticks.append([left + millimetre - 0.05, top, 0.1, deep])
-    say = f"{RULER_MM:g} mm: measure it. Print at 100 %, not fitted to the page."
+    say = f"{RULER_MM:g} mm: measure it. Print at 100 %, not scaled to the page."
     return np.array(ticks), [Text(left + RULER_MM + 3.0, top + 3.0, _LETTERS_MM, say)]
 
 
@@ -381,6 +381,8 @@ def _too_large(print_: Print, paper: str) -> BadInput:
         f"{print_.caption} needs paper of {needed[0]:.0f} x {needed[1]:.0f} mm with its white"
         f" border and the ruler; {paper} has {width:g} x {height:g} mm",
         where="--paper",
-        why="a board in several parts would not be flat or exact, so it is not cut into tiles",
-        next_step=f"use --paper {others[0]}" if others else "make it smaller, or order it printed",
+        why="a board in several parts would be neither flat nor exact, so it is not split",
+        next_step=f"use --paper {others[0]}"
+        if others
+        else "make it smaller, or have it printed professionally",
     )

@@ -1,4 +1,4 @@
-"""Grids of tags: their corners, in a picture that may show a part only."""
+"""Grids of tags: their corners, in an image that may show a part only."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class TagGrid:
         last = self.first + self.columns * self.rows - 1
         require_board(
             self.first >= 0 and last < tags_in(self.family),
-            f"{self.family} has the tags 0 to {tags_in(self.family) - 1}, the grid needs"
+            f"{self.family} has the tags 0 to {tags_in(self.family) - 1}; the grid needs"
             f" {self.first} to {last}",
             "choose a smaller first number, fewer tags or a larger family",
         )
@@ -88,7 +88,7 @@ class TagGrid:
         return Seen(points, np.concatenate([square.corners for _, square in whole]), twice)
 
     def instead(self, image: Image) -> str:
-        """Tags that the picture shows."""
+        """Tags that the image shows."""
         return what_else_is_seen(image, self.family, [])
 
     def _corners_of(self, number: int) -> Array:

@@ -15,7 +15,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from cdpr.cli.verbs import LazyGroup
-from model.errors import BadInput, CdprError, Fault
+from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.reading import shown
 
 EPILOG = (
@@ -24,7 +24,7 @@ EPILOG = (
 )
 
 
-def _tell_version(wanted: bool) -> None:
+def _show_version(wanted: bool) -> None:
     if wanted:
         # Takes longer to import than all else here, and only this option needs it.
         from importlib.metadata import version
@@ -52,7 +52,7 @@ def _options(
     _version: Annotated[
         bool,
         typer.Option(
-            "--version", help="Show the version and exit.", callback=_tell_version, is_eager=True
+            "--version", help="Show the version and exit.", callback=_show_version, is_eager=True
         ),
     ] = False,
 ) -> None:
@@ -78,9 +78,14 @@ def main() -> None:
     except OSError as error:
         _end(_of_the_system(error))
     except MemoryError:
-        _end(Fault("not enough memory", next_step="take less of it at once, or a larger computer"))
+        _end(
+            Fault(
+                "not enough memory",
+                next_step="reduce the problem size, or use a computer with more memory",
+            )
+        )
     except Exception as error:
-        _tell_bug(error)
+        _print_defect(error)
         sys.exit(1)
     finally:
         # Nor is there rubbish to be found in them at the end, which took another fifth.
@@ -96,7 +101,7 @@ def _print_anything() -> None:
 
 def _end(error: CdprError) -> NoReturn:
     with suppress(OSError):  # the cause may be that nothing can be written
-        _tell(error)
+        _print_error(error)
     with suppress(OSError):
         sys.stdout.flush()
     _forget_output()
@@ -123,29 +128,31 @@ def _of_the_system(error: OSError) -> CdprError:
     """The operating system refused a file that a verb did not expect it to, or its output."""
     why = error.strerror or str(error)
     if error.filename is not None:
-        hint = "check the path, who may use it, and the space on its disk"
+        hint = "check the path, its permissions and the free space"
         return BadInput(
             "the path cannot be used", where=shown(str(error.filename)), why=why, next_step=hint
         )
-    hint = "check where its output goes, and the space there"
+    hint = "check the output's destination and its free space"
     return Fault("the command could not write all its output", why=why, next_step=hint)
 
 
-def _tell(error: CdprError) -> None:
+def _print_error(error: CdprError) -> None:
+    if isinstance(error, AlreadyExists):  # the library knows no options
+        error.next_step += ", or pass --force to replace it"
     if "--json" in sys.argv:
         print(json.dumps(error.as_dict(), indent=1))
     print(f"error: {error}", file=sys.stderr)
 
 
-def _tell_bug(error: Exception) -> None:
-    """An error nobody foresaw: one line for the user, the trace for us in a file."""
+def _print_defect(error: Exception) -> None:
+    """An unexpected error: one line for the user, the trace in a file."""
     with tempfile.NamedTemporaryFile(
         "w", prefix="cdpr-error-", suffix=".txt", delete=False, encoding="utf-8"
     ) as file:
         file.write("".join(traceback.format_exception(error)))
     print(
         f"error: {type(error).__name__}: {error}\n"
-        "  why: this is a defect of cdpr, not of your input\n"
+        "  why: this is a defect in cdpr, not in your input\n"
         f"  next: please report it with the file {file.name}",
         file=sys.stderr,
     )

@@ -70,15 +70,15 @@ def refuse_overwriting(outputs: Mapping[str, Path], inputs: Iterable[Path]) -> N
                 f"{other} and {name} name the same file",
                 where=shown(path),
                 why="one would overwrite the other",
-                next_step="give each output a name of its own",
+                next_step="give each output its own name",
             )
     for source in inputs:
         for identity in _identities(source):
             if identity in taken:
                 raise BadInput(
-                    f"{taken[identity]} would overwrite what the command reads",
+                    f"{taken[identity]} would overwrite an input of this command",
                     where=shown(outputs[taken[identity]]),
-                    why=f"it is the same as {shown(source)}, or in it",
+                    why=f"it is the same as {shown(source)}, or inside it",
                     next_step="choose another name for the output; --force does not help here",
                 )
 
@@ -111,19 +111,19 @@ def _check(name: str, value: object) -> None:
 def _check_whole(name: str, value: int) -> None:
     most = MOST_OF.get(name, MOST_WHOLE)
     if abs(value) > most:
-        what = f"{_option(name)} is {str(value)[:40]}; {most} is the most"
+        what = f"{_option(name)} is {str(value)[:40]}; the limit is {most}"
         raise BadInput(what, where="command line", next_step="give a smaller number")
 
 
 def _check_number(name: str, value: float) -> None:
     if not math.isfinite(value) or abs(value) > MOST:
-        what = f"{_option(name)} is {value:g}; it must be a finite number of {MOST:g} at most"
+        what = f"{_option(name)} is {value:g}; it must be a finite number, at most {MOST:g}"
         raise BadInput(what, where="command line", next_step="give a smaller number, in that unit")
 
 
 def _check_text(name: str, text: str) -> None:
     if "\0" in text or (name in NAMES and len(os.fsencode(text)) > LONGEST_TEXT):
-        what = f"{_option(name)} is a text of {len(text)} characters that can be no name"
+        what = f"{_option(name)} is a text of {len(text)} characters, not a valid name"
         hint = f"give a name of {LONGEST_TEXT} bytes at most"
         raise BadInput(what, where=shown(text), next_step=hint)
     if "://" not in text:
@@ -157,9 +157,9 @@ def _require_writable_kind(path: Path, name: str) -> None:
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise BadInput(
-            f"{name} is no plain file but a device, a pipe or a socket",
+            f"{name} is not a regular file but a device, a pipe or a socket",
             where=shown(path),
-            why="writing would replace it by a file",
+            why="writing would replace it with a file",
             next_step="name a file or a folder",
         )
 

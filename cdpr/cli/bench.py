@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from cdpr.cli.demo import RIG, configs
+from cdpr.cli.demo import RIG
+from cdpr.cli.examples import configs
 from cdpr.cli.options import DaskOption, WorkersOption
 from cdpr.cli.output import Terminal, out, show_json
 from model.files.output import make_folder
@@ -33,16 +34,16 @@ def paper(
     workers: WorkersOption = None,
     dask: DaskOption = None,
     check: Annotated[
-        bool, typer.Option("--check", help="put every path of Fig. 9 to `cdpr check` as well")
+        bool, typer.Option("--check", help="also run `cdpr check` on every path of Fig. 9")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="replace what the folder holds")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace the folder's content")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the findings as JSON")] = False,
 ) -> None:
-    """Repeat the paper's evaluation (section 5.3, Fig. 9) and tell which claims hold.
+    """Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.
 
     Adaptive sampling against the goal bias, kinematic cost against length, in three environments,
     with the scene's ends and with random ones, in the rig's workspace box and in larger ones, and
-    for every reading of the text. Writes index.html, pictures, trials.csv, summary.csv and
+    for every reading of the text. Writes index.html, images, trials.csv, summary.csv and
     findings.json. The numbers depend on the seeds alone, the times aside.
 
     [dim]Example:[/dim]
@@ -68,7 +69,7 @@ def paper(
             for name in ("paths checked", "paths that failed their check"):
                 out.print(f"{name}: {described[name]}")
         else:
-            out.print("paths were not checked; give --check to check each of them")
+            out.print("paths were not checked; pass --check to check them")
         out.print(f"larger boxes, every reading, figures: open {output / 'index.html'}")
     if described["paths that failed their check"]:
         raise typer.Exit(1)

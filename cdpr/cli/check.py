@@ -10,7 +10,7 @@ import typer
 
 from cdpr.cli.options import JsonOption
 from cdpr.cli.output import Terminal, out, show_facts, show_json
-from cdpr.cli.stop_facts import stop_facts
+from cdpr.cli.plan_facts import stop_facts
 from model.plan import load_plan, require_same_rig
 from model.rig import load_rig
 from planner.check import check_path
@@ -21,11 +21,11 @@ def check(
     plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
     rig: Annotated[
         Path | None,
-        typer.Option(help="check for this rig file as it is now"),
+        typer.Option(help="check against this rig file as it is now"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Prove a plan by an independent route: distances on dense poses, with a stated bound.
+    """Check a plan with an independent method: distances at dense poses, with bounds.
 
     Exits with 3 when anything is below what the scene asks.
 
@@ -56,7 +56,7 @@ def sentences_of(report: CheckReport) -> list[tuple[str, str]]:
     """What the check found, for people."""
     own = report.self_clearance
     facts = [
-        ("length", f"{report.length * 1000:.1f} mm, {report.samples} poses looked at"),
+        ("length", f"{report.length * 1000:.1f} mm, {report.samples} poses checked"),
         (
             "self clearance",
             _distance(own, report.proved_self_clearance, report.required_self_clearance),
@@ -77,7 +77,7 @@ def sentences_of(report: CheckReport) -> list[tuple[str, str]]:
 
 def _tensions(report: CheckReport) -> str:
     if math.isnan(report.min_tension):
-        return "none within the limits hold the weight"
+        return "no tensions within the limits hold the weight"
     return f"{report.min_tension:.1f} to {report.max_tension:.1f} N at these poses"
 
 
@@ -87,5 +87,5 @@ def _distance(closest: Closest, proved: float, required: float) -> str:
     return (
         f"{near.distance * 1000:.2f} mm, {near.first} to {near.second}, with the platform at"
         f" {x:z.1f}, {y:z.1f}, {z:z.1f} mm; proved {proved * 1000:.2f} mm,"
-        f" asked {required * 1000:g} mm"
+        f" required {required * 1000:g} mm"
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-import cdpr
+from cdpr.cli.examples import configs
 from cdpr.cli.output import Terminal, out, show_facts
 from cdpr.cli.plan_facts import sentences_of
 from cdpr.cli.run import agreement, show, show_files
@@ -26,10 +26,10 @@ RIG = "gachon_8_6.yaml"
 
 def demo(
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder to make", metavar="DIR")
+        Path | None, typer.Option("-o", "--output", help="folder to create", metavar="DIR")
     ] = None,
     environment: Annotated[
-        int, typer.Option(min=1, max=3, help="which of the paper's environments")
+        int, typer.Option(min=1, max=3, help="number of the paper's environment")
     ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
 ) -> None:
@@ -58,14 +58,3 @@ def demo(
         show_files(result, False)
     out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
     raise typer.Exit(result.exit_code)
-
-
-def configs(name: str = "configs") -> Path:
-    """The folder of the ready rigs and scenes: in the package, or in the repository.
-
-    Args:
-        name: ``examples`` for the recorded sessions instead.
-    """
-    package = Path(cdpr.__file__).resolve().parent
-    inside = package / name
-    return inside if inside.is_dir() else package.parent / name

@@ -22,17 +22,17 @@ if TYPE_CHECKING:  # needs canopen, which may be missing
 def doctor(
     rig: Annotated[
         Path | None,
-        typer.Argument(help="also look at this rig's bus and cameras", metavar="[RIG]"),
+        typer.Argument(help="also check this rig's bus and cameras", metavar="[RIG]"),
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="also take a picture with the camera of this index")
+        str | None, typer.Option(help="also capture an image with the camera of this index")
     ] = None,
     drives: Annotated[
         bool, typer.Option("--drives", help="also read every object of every CANopen drive")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look whether this machine has what a run needs; with a rig file, whether its bus opens.
+    """Check that this machine can run a rig; with a rig file, also its bus and cameras.
 
     Each thing that is missing comes with the command that mends it. Nothing is sent on the bus;
     with --drives only questions are, and no drive is changed.
@@ -47,15 +47,15 @@ def doctor(
     """
     if camera is not None and rig is None:
         raise BadInput(
-            "a camera is looked at with the rig file that describes it",
+            "checking a camera needs the rig file that describes it",
             where="--camera",
-            next_step="name the rig file too: cdpr doctor RIG --camera INDEX",
+            next_step="pass the rig file as well: cdpr doctor RIG --camera INDEX",
         )
     if drives and rig is None:
         raise BadInput(
-            "drives are read with the rig file that names them",
+            "reading drives needs the rig file that lists them",
             where="--drives",
-            next_step="name the rig file too: cdpr doctor RIG --drives",
+            next_step="pass the rig file as well: cdpr doctor RIG --drives",
         )
     checks = check_machine()
     the_rig = None if rig is None else load_rig(rig)
@@ -104,7 +104,7 @@ def _plain(found: Examined) -> dict[str, Any]:
 
 def _show_table(found: Examined, rig: Rig) -> None:
     """What needs a change first, then the rest, then the sum."""
-    table = Table("", "object", "needed", "found", "what it means", "what to change")
+    table = Table("", "object", "needed", "found", "meaning", "change")
     marks = {"ok": "[green]ok[/]", "remark": "[yellow]note[/]", "wrong": "[red]wrong[/]"}
     for verdict in ("wrong", "remark", "ok"):
         for row in found.rows:

@@ -7,19 +7,25 @@ from typing import Annotated
 
 import typer
 
+import cdpr
+from cdpr.cli.output import out, show_json
+from model.errors import BadInput
+from model.files.examples import copy_examples, find_examples, select_examples
+
 
 def examples(
     names: Annotated[
-        list[str] | None, typer.Argument(help="which to copy; all are listed without one")
+        list[str] | None, typer.Argument(help="examples to copy; without a name, all are listed")
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help="folder to copy to; the present one without it", metavar="DIR"
+            "-o", "--output", help="folder to copy to (default: the current one)", metavar="DIR"
         ),
     ] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="copy all, into configs/ and examples/ as in a clone")
+        bool,
+        typer.Option("--all", help="copy all, into configs/ and examples/ as in the repository"),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the list as JSON")] = False,
@@ -34,13 +40,8 @@ def examples(
 
       cdpr examples --all
     """
-    from cdpr.cli.demo import configs
-    from cdpr.cli.output import out, show_json
-    from model.errors import BadInput
-    from model.files.examples import copy_examples, find_examples, select_examples
-
     if names and everything:
-        raise BadInput("--all copies every example already", next_step="leave the names out")
+        raise BadInput("--all copies every example already", next_step="leave out the names")
     if output is not None and not (names or everything):
         raise BadInput("-o needs something to copy", next_step="name an example, or pass --all")
     known = find_examples(configs(), configs("examples"))
@@ -60,3 +61,14 @@ def examples(
         return
     for path in copies:
         out.print(f"copied {path}", markup=False, soft_wrap=True)
+
+
+def configs(name: str = "configs") -> Path:
+    """The folder of the ready rigs and scenes: in the package, or in the repository.
+
+    Args:
+        name: ``examples`` for the recorded sessions instead.
+    """
+    package = Path(cdpr.__file__).resolve().parent
+    inside = package / name
+    return inside if inside.is_dir() else package.parent / name

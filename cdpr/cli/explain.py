@@ -32,8 +32,8 @@ def explain(
         return
     if code not in codes:
         raise BadInput(
-            f"no fault has the code {code!r}",
+            f"there is no fault code {code!r}",
             where="cdpr explain",
-            next_step=f"give one of these: {', '.join(codes)}",
+            next_step=f"use one of: {', '.join(codes)}",
         )
     out.print(page_text(code).rstrip(), markup=False, soft_wrap=True)

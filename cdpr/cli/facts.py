@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from cdpr.cli.output import err, out, show_facts, show_json
-from cdpr.cli.stop_facts import stop_facts
+from cdpr.cli.plan_facts import stop_facts
 from drivers.can_bus import IN_PROCESS
 from executor.cameras.sources import looked_with
 from executor.homing import ForgetProposal, HomeResult, HomingProposal
@@ -46,7 +46,7 @@ def clearance_fact(proposal: MotionProposal) -> str:
         return "off (no camera)"
     if not scene.obstacles:
         return "off (no obstacles in the scene)"
-    return f"below {scene.obstacle_clearance * 1000:g} mm, as the cameras see it"
+    return f"below {scene.obstacle_clearance * 1000:g} mm, measured by the cameras"
 
 
 def show_prepared(proposal: MotionProposal, on: Console) -> None:
@@ -108,17 +108,17 @@ def show_summary(summary: dict[str, Any], folder: Path, as_json: bool) -> None:
         out.print(f"  {reason}", markup=False, soft_wrap=True)
     if summary["verdict"] == "FAILED":
         for code in faults_among(event["code"] for event in summary["events"]):
-            out.print(f"  more about it: cdpr explain {code}", markup=False, soft_wrap=True)
+            out.print(f"  details: cdpr explain {code}", markup=False, soft_wrap=True)
         out.print(f"  next: {_step_after(summary)}", markup=False, soft_wrap=True)
 
 
 def _step_after(summary: dict[str, Any]) -> str:
     """What to do after a run that failed."""
     if summary["final_state"] in ("finished", "stopped"):
-        return "see in the report what was out of its limits, before the next run"
+        return "check the report for exceeded limits before the next run"
     if summary.get("interface") == IN_PROCESS:
         return "find the cause, then run again into a new folder"
-    return "find the cause and look at the platform, then `cdpr reset RIG`"
+    return "find the cause and check the platform, then run `cdpr reset RIG`"
 
 
 def show_missing(result: RunResult) -> None:
@@ -126,12 +126,12 @@ def show_missing(result: RunResult) -> None:
     missing, folder = result.missing, result.folder
     if not missing:
         return
-    lines = [f"error: {folder}: not every file of the run could be written"]
+    lines = [f"error: {folder}: some files of the run could not be written"]
     for why in dict.fromkeys(missing.values()):
         names = [name for name, reason in missing.items() if reason == why]
         lines.append(f"  why: {', '.join(names)}: {why}")
-    lines.append("  next: the verdict and the exit code stand; free some space where the disk is")
-    lines[-1] += f" full, then `cdpr report {folder}` makes what is missing from what is there"
+    lines.append("  next: the verdict and the exit code are valid; free some disk space if it is")
+    lines[-1] += f" full, then `cdpr report {folder}` to write the missing files"
     for line in lines:
         err.print(line, markup=False, soft_wrap=True)
 
@@ -146,10 +146,12 @@ def resumed_facts(end: RunEnd, folder: Path, done: int, left: int) -> list[tuple
         left: How many are left.
     """
     how = "finished" if end.finished else "stopped"
-    text = f"where {folder} {how}, {_millimetres(end.pose, 3)}, carrying {end.payload.mass_kg:g} kg"
+    text = (
+        f"pose where {folder} {how}: {_millimetres(end.pose, 3)}, with {end.payload.mass_kg:g} kg"
+    )
     text += f"; {done} stops done, {left} left"
     if end.waiting_at:
-        text += f"; the dwell at {end.waiting_at!r} was cut short and is done again"
+        text += f"; the dwell at {end.waiting_at!r} was interrupted and is repeated"
     return [("from", text)]
 
 
@@ -167,10 +169,10 @@ def show_homing(proposal: HomingProposal, on: Console) -> None:
     bus = rig.document.bus
     measured = f"measured, camera {eye[0].name} ({eye[1]})" if eye else "stated, held by a jig"
     show_facts(
-        "ready to wind in",
+        "ready to pretension",
         [
             ("rig", rig.name),
-            ("pretension", f"{proposal.target:g} N a cable, at most {proposal.limit:g} N"),
+            ("pretension", f"{proposal.target:g} N per cable, at most {proposal.limit:g} N"),
             ("winches", f"all together, at most {fastest:.2f} mm/s and {reach:g} mm each"),
             ("pose", measured),
             ("bus", f"{bus.interface} {bus.channel}".strip()),
@@ -184,9 +186,9 @@ def show_home(result: HomeResult) -> None:
     reference = result.reference
     x, y, z = reference.pose.position_mm
     tensions = reference.tensions_n
-    kept = result.file or "not kept: simulated drives end with this process"
+    kept = result.file or "not saved: simulated drives end with this process"
     show_facts(
-        "drives referenced; they hold",
+        "drives homed; they hold",
         [
             ("platform", f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm, {reference.how}"),
             ("uncertainty", _uncertainty(reference)),
@@ -203,14 +205,14 @@ def show_home(result: HomeResult) -> None:
 def _uncertainty(reference: HomingReference) -> str:
     """How well the pose is known; it is not measured how well a jig holds it."""
     if reference.uncertainty_mm == 0.0:
-        return "that of the jig, which was not measured"
+        return "that of the jig (not measured)"
     return f"{reference.uncertainty_mm:.3f} mm (one standard deviation)"
 
 
 def show_forgotten(proposal: ForgetProposal, on: Console) -> None:
     """The reference that is about to be given up."""
     text = reference_text(reference_status(proposal.interlock))
-    line = f"the reference that is given up: {text}"
+    line = f"the present homing reference, which is discarded: {text}"
     on.print(line, soft_wrap=True, markup=False)
 
 
@@ -218,13 +220,13 @@ def show_cable(proposal: CableProposal, on: Console) -> None:
     """The cable that is about to move."""
     rig, mm = proposal.rig, proposal.length * 1000.0
     winch, speed = rig.winches[proposal.cable - 1], proposal.speed * 1000.0
-    limit = f"at most {proposal.limit:g} N in any cable; none that is taut may go slack"
+    limit = f"at most {proposal.limit:g} N in any cable; no taut cable may go slack"
     show_facts(
         "ready to move one cable",
         [
             ("rig", rig.name),
             ("cable", rig.drive_names[winch.node_id]),
-            ("way", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed:g} mm/s"),
+            ("motion", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed:g} mm/s"),
             ("tension", limit),
         ],
         on,
@@ -249,8 +251,8 @@ def reference_text(reference: ReferenceStatus) -> str:
     """The same in a sentence."""
     made = f"made {reference.made} ({reference.how})" if reference.made else ""
     if not reference.counts:
-        return f"does not count: {reference.why_not}"
-    return f"counts, {made}" if made else "none kept: absolute encoders count as the rig file says"
+        return f"not valid: {reference.why_not}"
+    return f"valid, {made}" if made else "none: absolute encoders match the rig file"
 
 
 def show_reset(proposal: ResetProposal, on: Console) -> None:
@@ -264,12 +266,12 @@ def show_release(proposal: ReleaseProposal, on: Console) -> None:
     """The drives that are about to lose their torque."""
     braked, kept = proposal.braked, reference_text(proposal.reference)
     show_facts(
-        "ready to take the torque off",
+        "ready to release the drives",
         [
             ("rig", proposal.rig.name),
             ("bus", proposal.bus),
             ("afterwards", "the brakes hold the drums" if braked else "nothing holds the cables"),
-            ("reference", kept if braked else "given up: `cdpr home` before the next motion"),
+            ("reference", kept if braked else "discarded: run `cdpr home` before the next motion"),
         ],
         on,
     )
@@ -308,7 +310,7 @@ def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
     """The state of a rig, for people."""
     latched = status.latched or "none"
     if status.run is not None:
-        latched = f"none; process {status.run} moves or resets it, see `cdpr monitor`"
+        latched = f"none; process {status.run} is moving or resetting the rig, see `cdpr monitor`"
     facts = [
         ("rig", rig.name),
         ("bus", status.bus),
@@ -316,17 +318,17 @@ def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
         ("reference", reference_text(status.reference)),
     ]
     if status.being_set_up:
-        facts.append(("drives", "not asked: a motion is being prepared, or somebody else asks"))
+        facts.append(("drives", "not read: another program is preparing a motion or reading them"))
     if status.pose is not None:
-        place = f"{_millimetres(status.pose, 2)} by the drives, without a load"
+        place = f"{_millimetres(status.pose, 2)} from the encoders, without a load"
         facts.append(("platform", place))
     elif status.why_no_pose is not None:
         facts.append(("platform", status.why_no_pose))
     if next_step:
         facts.append(("next", next_step))
-    show_facts("how the rig stands", facts)
+    show_facts("state of the rig", facts)
     for drive in status.drives or ():
-        new = "" if drive.set_up else "  not set up since it was switched on"
+        new = "" if drive.set_up else "  not configured since power-up"
         out.print(
             f"  {rig.drive_names[drive.node]:<19} {drive.state:<24}"
             f" {drive.position:>11} counts {drive.tension:8.2f} N{new}",
@@ -336,7 +338,7 @@ def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
 
 
 def camera_line(camera: Mapping[str, Any]) -> str:
-    """One camera while pictures are measured.
+    """One camera while images are measured.
 
     Args:
         camera: As `executor.remote.status` has it.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import show_forgotten, show_home, show_homing
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     FastOption,
     InterfaceOption,
@@ -17,6 +18,7 @@ from cdpr.cli.options import (
     YesOption,
     require_unused,
     rig_on_bus,
+    with_option_groups,
 )
 from cdpr.cli.output import Terminal, out, show_json
 from cdpr.cli.supervision import SignalSupervisor, confirmation
@@ -40,6 +42,47 @@ FURTHEST_MM, FASTEST_MM_S = 1000.0 * FURTHEST, 1000.0 * FASTEST
 REACH_MM, SPEED_MM_S, SLACK_MM = 1000.0 * REACH, 1000.0 * SPEED, 1000.0 * SLACK
 
 
+@dataclass(frozen=True, slots=True)
+class WindingOptions:
+    """How the cables are pretensioned and the pose is measured; every field is an option."""
+
+    tension_n: Annotated[
+        float | None, typer.Option(help="pretension (default: twice the rig's smallest tension)")
+    ] = None
+    limit_n: Annotated[
+        float | None, typer.Option(help="tension limit of any cable (default: 60 % of the range)")
+    ] = None
+    reach_mm: Annotated[
+        float,
+        typer.Option(min=0.1, max=1000.0 * FURTHEST, help="largest length to take up per cable"),
+    ] = REACH_MM
+    speed_mm_s: Annotated[
+        float, typer.Option(min=0.01, max=FASTEST_MM_S, help="largest winch speed")
+    ] = SPEED_MM_S
+    pictures: Annotated[
+        int,
+        typer.Option(min=FEWEST_PICTURES, max=MOST_PICTURES, help="number of images for the pose"),
+    ] = PICTURES
+    simulated_slack_mm: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="largest slack of simulated cables")
+    ] = SLACK_MM
+
+    def given(self) -> dict[str, object]:
+        """Each option by name with its value, false where it is the default."""
+        return {
+            "--tension-n": self.tension_n,
+            "--limit-n": self.limit_n,
+            "--reach-mm": self.reach_mm != REACH_MM,
+            "--speed-mm-s": self.speed_mm_s != SPEED_MM_S,
+            "--pictures": self.pictures != PICTURES,
+            "--simulated-slack-mm": self.simulated_slack_mm != SLACK_MM,
+        }
+
+
+DEFAULT_WINDING = WindingOptions()
+
+
+@with_option_groups
 def home(
     rig: RigArgument,
     at_home: Annotated[
@@ -47,50 +90,30 @@ def home(
     ] = False,
     pose_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--pose-mm", help="a jig holds it level at x y z"),
+        typer.Option("--pose-mm", help="a jig holds the platform level at x y z"),
     ] = None,
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="it hangs free, and this camera measures it: 'synthetic', an index, or of another"
-            " camera than the rig file's first NAME=SOURCE",
+            help="the platform hangs freely and a camera measures it: 'synthetic', an index, or for"
+            " a camera other than the rig file's first, NAME=SOURCE",
             metavar="SOURCE",
         ),
     ] = None,
     calibration: CalibrationOption = None,
     as_rig_file: Annotated[
         bool,
-        typer.Option(
-            "--as-rig-file", help="move nothing: absolute encoders count what the rig file says"
-        ),
+        typer.Option("--as-rig-file", help="move nothing: absolute encoders match the rig file"),
     ] = False,
-    tension_n: Annotated[
-        float | None, typer.Option(help="pretension (default: twice the rig's smallest tension)")
-    ] = None,
-    limit_n: Annotated[
-        float | None, typer.Option(help="no cable may carry more (default: 60 % of the range)")
-    ] = None,
-    reach_mm: Annotated[
-        float,
-        typer.Option(min=0.1, max=1000.0 * FURTHEST, help="take up at most so much of a cable"),
-    ] = REACH_MM,
-    speed_mm_s: Annotated[
-        float, typer.Option(min=0.01, max=FASTEST_MM_S, help="no winch is faster")
-    ] = SPEED_MM_S,
-    pictures: Annotated[
-        int, typer.Option(min=FEWEST_PICTURES, max=MOST_PICTURES, help="to measure the pose in")
-    ] = PICTURES,
+    winding: WindingOptions = DEFAULT_WINDING,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
-    simulated_slack_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="how slack simulated cables hang at most")
-    ] = SLACK_MM,
     fast: FastOption = False,
     yes: YesOption = False,
     without_real_time: WithoutRealTimeOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the reference as JSON")] = False,
 ) -> None:
-    """Wind slack cables in until all are taut, then reference the drives at a pose that is known.
+    """Pretension all cables, then set the encoder reference at a known pose.
 
     All winches together, slowly, each until its cable carries the pretension; a cable that carries
     too much, or none after the whole reach, stops all. The reference is a file of its own, which
@@ -110,17 +133,8 @@ def home(
             homing.require_one_pose(False, None, [])
         require_unused(
             "cdpr home",
-            {
-                "--tension-n": tension_n,
-                "--limit-n": limit_n,
-                "--reach-mm": reach_mm != REACH_MM,
-                "--speed-mm-s": speed_mm_s != SPEED_MM_S,
-                "--pictures": pictures != PICTURES,
-                "--simulated-slack-mm": simulated_slack_mm != SLACK_MM,
-                "--fast": fast,
-                "--without-real-time": without_real_time,
-            },
-            "--as-rig-file moves nothing and measures nothing",
+            winding.given() | {"--fast": fast, "--without-real-time": without_real_time},
+            "--as-rig-file neither moves nor measures",
         )
         _use_rig_file_counts(the_rig, asks, as_json)
         return
@@ -129,12 +143,12 @@ def home(
         at_home=at_home,
         pose=None if pose_mm is None else Pose.level(millimetres(list(pose_mm))),
         camera=camera,
-        tension=tension_n,
-        limit=limit_n,
-        reach=reach_mm / 1000.0,
-        speed=speed_mm_s / 1000.0,
-        pictures=pictures,
-        simulated_slack=simulated_slack_mm / 1000.0,
+        tension=winding.tension_n,
+        limit=winding.limit_n,
+        reach=winding.reach_mm / 1000.0,
+        speed=winding.speed_mm_s / 1000.0,
+        pictures=winding.pictures,
+        simulated_slack=winding.simulated_slack_mm / 1000.0,
         realtime=not fast,
         need_real_time_rights=not without_real_time,
         listener=Terminal(quiet=as_json),
@@ -155,4 +169,4 @@ def _use_rig_file_counts(rig: Rig, asks: bool, as_json: bool) -> None:
     if as_json:
         show_json({"file": None})
     else:
-        out.print("no reference is kept; drives count what the rig file says at home")
+        out.print("no reference is stored; drives match the rig file at home")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import show_cable
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     FastOption,
     InterfaceOption,
@@ -19,6 +20,7 @@ from cdpr.cli.options import (
     YesOption,
     require_unused,
     rig_on_bus,
+    with_option_groups,
 )
 from cdpr.cli.output import Terminal, out, show_json
 from cdpr.cli.run import agreement, show, show_files
@@ -32,40 +34,62 @@ from model.rig import Rig
 from model.scene import Scene, load_scene
 
 
-def jog(
-    rig: RigArgument,
+@dataclass(frozen=True, slots=True)
+class PathOptions:
+    """How far the platform is moved, among what; every field is an option of `cdpr jog`."""
+
     by_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--by-mm", help="how far: x y z, at most 50 mm"),
-    ] = None,
+        typer.Option("--by-mm", help="distance x y z, at most 50 mm"),
+    ] = None
     to_home: Annotated[
-        bool, typer.Option("--to-home", help="instead: to the rig's home pose, and turned as there")
-    ] = False,
+        bool, typer.Option("--to-home", help="move to the rig's home pose and orientation")
+    ] = False
+    scene: Annotated[Path | None, typer.Option(help="scene file: obstacles and payload")] = None
+    no_scene: Annotated[
+        bool, typer.Option("--no-scene", help="jog without a description of obstacles")
+    ] = False
+    clearance_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
+    ] = None
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="run folder to create (default: runs/jog, runs/jog-2 …)"
+        ),
+    ] = None
+
+    def given(self) -> dict[str, object]:
+        """Each option by name with its value."""
+        return {
+            "--by-mm": self.by_mm,
+            "--to-home": self.to_home,
+            "--scene": self.scene,
+            "--no-scene": self.no_scene,
+            "--clearance-mm": self.clearance_mm,
+            "--output": self.output,
+        }
+
+
+DEFAULT_PATH = PathOptions()
+
+
+@with_option_groups
+def jog(
+    rig: RigArgument,
+    path: PathOptions = DEFAULT_PATH,
     cable: Annotated[
         int | None, typer.Option("--cable", min=1, help="move one winch alone, with --mm")
     ] = None,
     mm: Annotated[
-        float | None, typer.Option("--mm", help="pay out so much; negative winds in; at most 50")
+        float | None, typer.Option("--mm", help="length to pay out, at most 50; negative winds in")
     ] = None,
     limit_n: Annotated[
-        float | None, typer.Option(help="with --cable: no cable may carry more (default: 60 %)")
-    ] = None,
-    scene: Annotated[
-        Path | None, typer.Option(help="what is in the way, and what the platform carries")
-    ] = None,
-    no_scene: Annotated[
-        bool, typer.Option("--no-scene", help="jog although nobody says what is in the way")
-    ] = False,
-    clearance_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
+        float | None, typer.Option(help="with --cable: tension limit of any cable (default: 60 %)")
     ] = None,
     speed_mm_s: Annotated[
-        float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="at most the rig's own speed")
+        float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
     ] = 1000.0 * SPEED,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help="run folder to make (default: runs/jog, runs/jog-2 …)"),
-    ] = None,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     calibration: CalibrationOption = None,
@@ -74,7 +98,7 @@ def jog(
     without_real_time: WithoutRealTimeOption = False,
     as_json: SummaryJsonOption = False,
 ) -> None:
-    """Move the platform straight by a few millimetres, slowly, from where it stands.
+    """Move the platform straight slowly by a few millimetres from its present pose.
 
     A jog is a run: planned, proved, checked and gated like any other, and it can be stopped, held
     and watched. With the interface 'virtual' the simulated platform hangs at home. With --cable one
@@ -92,32 +116,25 @@ def jog(
     if cable is not None or mm is not None:
         require_unused(
             "cdpr jog",
-            {
-                "--by-mm": by_mm,
-                "--to-home": to_home,
-                "--scene": scene,
-                "--no-scene": no_scene,
-                "--clearance-mm": clearance_mm,
-                "--output": output,
-            },
-            "one cable alone is moved without a path, and nothing in its way is looked at",
+            path.given(),
+            "a single cable is moved without a path, and obstacles are not checked",
         )
         _one_cable(the_rig, cable, mm, limit_n, speed, fast, yes, without_real_time, as_json)
         return
     require_unused(
-        "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path has the rig's own limits"
+        "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
-    by = None if by_mm is None else millimetres(list(by_mm))
-    jogging.require_distance(by, to_home=to_home)
-    the_scene = _scene(scene, no_scene, clearance_mm)
+    by = None if path.by_mm is None else millimetres(list(path.by_mm))
+    jogging.require_distance(by, to_home=path.to_home)
+    the_scene = _scene(path.scene, path.no_scene, path.clearance_mm)
     with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
         result = jogging.jog(
             the_rig,
             the_scene,
             by=by,
-            to_home=to_home,
+            to_home=path.to_home,
             speed=speed,
-            folder=output,
+            folder=path.output,
             realtime=not fast,
             need_real_time_rights=not without_real_time,
             listener=Terminal(quiet=as_json),
@@ -141,7 +158,7 @@ def _one_cable(
 ) -> None:
     if cable is None or mm is None:
         raise BadInput(
-            "one cable is moved with --cable N and --mm X together",
+            "a single cable needs both --cable N and --mm X",
             where="cdpr jog",
             next_step="pass both, or --by-mm X Y Z to move the platform",
         )
@@ -170,9 +187,9 @@ def _scene(path: Path | None, without: bool, clearance_mm: float | None) -> Scen
     """What is around; nothing only when somebody says so."""
     if (path is None) != without:
         raise BadInput(
-            "say what is in the way: either --scene SCENE or --no-scene",
+            "obstacles are not given: pass either --scene SCENE or --no-scene",
             where="--scene",
-            next_step="pass --scene with the file, or --no-scene if there is nothing to hit",
+            next_step="pass --scene with the file, or --no-scene if there are no obstacles",
         )
     if path is None:
         return None

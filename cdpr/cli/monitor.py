@@ -23,21 +23,25 @@ _STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latche
 
 
 def monitor(
-    once: Annotated[bool, typer.Option("--once", help="look once instead of all the time")] = False,
+    once: Annotated[bool, typer.Option("--once", help="show the state once and exit")] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="JSON: one document with --once, otherwise a line a look")
+        bool,
+        typer.Option(
+            "--json", help="print JSON: one document with --once, otherwise one line per update"
+        ),
     ] = False,
     rate: Annotated[
-        float, typer.Option("--rate-hz", min=0.1, max=50.0, help="looks a second")
+        float, typer.Option("--rate-hz", min=0.1, max=50.0, help="updates per second")
     ] = 5.0,
     process: Annotated[
-        int | None, typer.Option("--process", help="which run, where several are under way")
+        int | None,
+        typer.Option("--process", help="process number, if several runs are in progress"),
     ] = None,
 ) -> None:
-    """Watch a run: its state, every drive, tension, lateness, progress and events, to its end.
+    """Show a run live: state, drives, tensions, lateness, progress and events.
 
     It only looks; `cdpr stop`, `hold`, `resume` and `speed` act. Ctrl-C ends the monitor, not the
-    run. Exit code: 0 when the motion came to its end, 130 when it was stopped, 1 otherwise.
+    run. Exit code: 0 when the motion finished, 130 when it was stopped, 1 otherwise.
 
     [dim]Examples:[/dim]
 
@@ -95,7 +99,7 @@ def _tell_end(status: dict[str, Any], as_json: bool) -> None:
     state, cause = status["state"], status.get("cause")
     if not as_json:
         if state not in _EXIT_CODES:
-            typer.echo(f"the run ended without a last word; last seen {state}")
+            typer.echo(f"the run ended without a final status; last state {state}")
         else:
             typer.echo(f"the run ended: {state}{f', {cause}' if cause else ''}")
     raise typer.Exit(_EXIT_CODES.get(state, 1))
@@ -148,7 +152,7 @@ def _plain(status: dict[str, Any]) -> str:
 
 
 def _view(status: dict[str, Any]) -> Group:
-    """The live picture."""
+    """The live image."""
     title = Text.assemble(
         (status["state"].upper(), _STATES.get(status["state"], "bold")),
         f"  {status['rig']} on {status['bus']}  process {status['process']}  {status['folder']}",

@@ -5,12 +5,15 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from model.files.new_rig import RigQuestion
+from cdpr.cli.output import out
+from model.errors import AlreadyExists, BadInput
+from model.files.documents import write_atomic
+from model.files.new_rig import OPTIONS, RigQuestion, collect_answers, read_coordinates
+from model.files.rig_template import rig_text
 
 _Point = tuple[float, float, float]
 
@@ -21,7 +24,7 @@ def new(
     coordinates: Annotated[
         Path | None,
         typer.Option(
-            "--from", help="CSV with a line a cable; asks nothing, defaults for all that is left"
+            "--from", help="CSV with one line per cable; no questions, defaults for the rest"
         ),
     ] = None,
     platform_mm: Annotated[_Point | None, typer.Option(metavar="X Y Z", help="its size")] = None,
@@ -38,17 +41,21 @@ def new(
     min_tension_n: Annotated[float | None, typer.Option(help="least tension of a cable")] = None,
     max_tension_n: Annotated[float | None, typer.Option(help="largest tension of a cable")] = None,
     drum_radius_mm: Annotated[float | None, typer.Option(help="radius of the drums")] = None,
-    gear_ratio: Annotated[float | None, typer.Option(help="motor turns a drum turn")] = None,
-    counts_per_rev: Annotated[int | None, typer.Option(help="encoder counts a motor turn")] = None,
+    gear_ratio: Annotated[float | None, typer.Option(help="motor turns per drum turn")] = None,
+    counts_per_rev: Annotated[
+        int | None, typer.Option(help="encoder counts per motor turn")
+    ] = None,
     encoder: Annotated[str | None, typer.Option(help="absolute or incremental")] = None,
     max_speed_mm_s: Annotated[float | None, typer.Option(help="largest cable speed")] = None,
-    torque_constant_n: Annotated[float | None, typer.Option(help="tension at rated torque")] = None,
-    interface: Annotated[str | None, typer.Option(help="python-can's name of the bus")] = None,
+    torque_constant_n: Annotated[
+        float | None, typer.Option(help="cable tension at rated torque")
+    ] = None,
+    interface: Annotated[str | None, typer.Option(help="python-can interface of the bus")] = None,
     channel: Annotated[str | None, typer.Option(help="channel of the bus")] = None,
-    bitrate: Annotated[int | None, typer.Option(help="of the bus, bit/s")] = None,
+    bitrate: Annotated[int | None, typer.Option(help="bit rate of the bus, bit/s")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Ask for the least that a rig file needs, and write a commented one.
+    """Ask for the essentials of a rig, and write a commented rig file.
 
     Each question has a unit and a default, which Enter takes; what an option gives is not asked.
 
@@ -58,18 +65,8 @@ def new(
 
       cdpr new my_rig.yaml --from cables.csv --mass-kg 2.5 --interface socketcan --channel can0
     """
-    from cdpr.cli.output import out
-    from model.errors import BadInput
-    from model.files.documents import write_atomic
-    from model.files.new_rig import OPTIONS, collect_answers, read_coordinates
-    from model.files.rig_template import rig_text
-
     if rig.exists() and not force:
-        raise BadInput(
-            "the file exists already",
-            where=str(rig),
-            next_step="choose another name, or pass --force to replace it",
-        )
+        raise AlreadyExists("the file exists already", str(rig))
     given = {key: context.params[key] for key in OPTIONS if context.params[key] is not None}
     if coordinates is None:
         answers = collect_answers(rig.stem, given, _ask, _refuse)
@@ -79,7 +76,7 @@ def new(
     name = shlex.quote(str(rig))
     out.print(f"wrote {rig}: {answers['cables']} cables", markup=False, soft_wrap=True)
     out.print(
-        f"next: read it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE",
+        f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE",
         markup=False,
         soft_wrap=True,
     )
@@ -87,21 +84,19 @@ def new(
 
 def _ask(question: RigQuestion, default: str) -> str:
     """The typed answer; standard error has the question, so that output can go to a file."""
-    from model.errors import BadInput
-
     unit = f" {question.unit}" if question.unit else ""
     print(f"{question.text} [{default}]{unit}: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line.endswith("\n"):
         print(file=sys.stderr)
         raise BadInput(
-            f"the answers ended at the question about {question.text!r}",
+            f"no answer to the question about {question.text!r}",
             where="cdpr new",
-            why="standard input is at its end; nothing was written",
+            why="standard input ended; nothing was written",
             next_step="answer every question, or give the cables with --from FILE.csv",
         )
     return line.strip()
 
 
 def _refuse(reason: str) -> None:
-    print(f"  {reason}; once more", file=sys.stderr)
+    print(f"  {reason}; try again", file=sys.stderr)

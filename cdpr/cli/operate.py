@@ -10,13 +10,13 @@ from cdpr.cli.output import out, show_json
 from executor.remote.client import request_run
 
 _Process = Annotated[
-    int | None, typer.Option("--process", help="which run, where several are under way")
+    int | None, typer.Option("--process", help="process number, if several runs are in progress")
 ]
-_Json = Annotated[bool, typer.Option("--json", help="print how the run stands, as JSON")]
+_Json = Annotated[bool, typer.Option("--json", help="print the run's status as JSON")]
 
 
 def hold(process: _Process = None, as_json: _Json = False) -> None:
-    """Feed hold: the platform slows down along the path, waits there, and keeps its tension.
+    """Feed hold: the platform slows down along the path and waits there under tension.
 
     [dim]Example:[/dim]
 
@@ -26,7 +26,7 @@ def hold(process: _Process = None, as_json: _Json = False) -> None:
 
 
 def resume(process: _Process = None, as_json: _Json = False) -> None:
-    """Go on after `cdpr hold`, at the speed that was asked for last.
+    """Continue after `cdpr hold`, at the last requested speed.
 
     [dim]Example:[/dim]
 
@@ -37,12 +37,13 @@ def resume(process: _Process = None, as_json: _Json = False) -> None:
 
 def speed(
     percent: Annotated[
-        int, typer.Argument(min=1, max=100, help="of the planned speed", metavar="PERCENT")
+        int,
+        typer.Argument(min=1, max=100, help="percentage of the planned speed", metavar="PERCENT"),
     ],
     process: _Process = None,
     as_json: _Json = False,
 ) -> None:
-    """Go at a share of the planned speed along the path, from the next cycle on.
+    """Scale the speed along the path to a percentage of the planned one.
 
     [dim]Example:[/dim]
 
@@ -56,9 +57,9 @@ def _tell(verb: str, process: int | None, as_json: bool, percent: int | None = N
     if as_json:
         show_json(status)
         return
-    wish = {"hold": "hold", "resume": "go on", "speed": f"go at {percent} %"}[verb]
+    wish = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
     out.print(
-        f"process {status['process']} was told to {wish}; it is {status['state']}", soft_wrap=True
+        f"asked process {status['process']} to {wish}; it is {status['state']}", soft_wrap=True
     )
     if verb == "speed" and status["wished"]["hold"]:
-        out.print("it holds: the speed counts from `cdpr resume` on")
+        out.print("it is on hold: the speed applies after `cdpr resume`")

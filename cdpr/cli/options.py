@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from cdpr.cli.calibrations import calibrated_rig
+from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.rig import Rig, load_rig
 
@@ -22,10 +22,10 @@ PlanFileOption = Annotated[Path, typer.Option("-o", "--output", help="plan file 
 ReplacePlanOption = Annotated[bool, typer.Option("--force", help="replace an existing plan file")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
 WorkersOption = Annotated[
-    int | None, typer.Option(min=1, help="processes; else one a core", metavar="N")
+    int | None, typer.Option(min=1, help="number of processes (default: one per core)", metavar="N")
 ]
 DaskOption = Annotated[
-    str | None, typer.Option(help="do the work on this Dask cluster", metavar="ADDRESS")
+    str | None, typer.Option(help="compute on this Dask cluster", metavar="ADDRESS")
 ]
 Triple = tuple[float, float, float]
 
@@ -74,17 +74,43 @@ def _parameters(group: Any) -> list[inspect.Parameter]:
     ]
 
 
+# Calibration results in place of the rig file's values.
+
+CalibrationOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--calibration",
+        help="result file of `cdpr calibrate`, used instead of the rig file's values; repeatable",
+        metavar="FILE",
+    ),
+]
+
+
+def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
+    """See `calibration.load.with_calibrations`.
+
+    Raises:
+        BadInput: A file cannot be used, or is not about this rig.
+    """
+    if not files:
+        return rig
+    # Scientific libraries, of which `cdpr stop` and others without this option must not wait.
+    from calibration.load import with_calibrations
+
+    return with_calibrations(rig, files, Terminal())
+
+
 # Verbs that reach drives: the rig, its bus, and how its drives are moved.
 
 InterfaceOption = Annotated[
     str | None,
-    typer.Option("--interface", help="python-can interface instead of the rig file's"),
+    typer.Option("--interface", help="python-can interface, overriding the rig file's"),
 ]
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="its channel")]
-FastOption = Annotated[
-    bool, typer.Option("--fast", help="simulated time: as fast as the computer can")
+FastOption = Annotated[bool, typer.Option("--fast", help="simulated time, as fast as possible")]
+YesOption = Annotated[
+    bool, typer.Option("--yes", help="do not ask before moving drives on a real bus")
 ]
-YesOption = Annotated[bool, typer.Option("--yes", help="do not ask before a real bus moves")]
 NoQuestionOption = Annotated[bool, typer.Option("--yes", help="do not ask")]
 WithoutRealTimeOption = Annotated[
     bool,
@@ -104,7 +130,7 @@ def rig_on_bus(
 
 
 def require_unused(verb: str, options: Mapping[str, object], why: str) -> None:
-    """Refuses options that would have no effect: whoever gave one expects something else.
+    """Refuses options that would have no effect, as they show a misunderstanding.
 
     Args:
         verb: As it is called, ``cdpr jog``.

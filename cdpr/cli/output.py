@@ -20,7 +20,7 @@ out = Console(highlight=False)
 
 
 class _Remarks:
-    """Standard error; that nobody reads it any more must not end a run that moves."""
+    """Standard error; a closed pipe must not end a run in motion."""
 
     def write(self, text: str) -> int:
         """Writes, if anybody is there."""

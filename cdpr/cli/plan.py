@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
@@ -9,21 +10,21 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
 from cdpr.cli.facts import resumed_facts
 from cdpr.cli.options import (
+    CalibrationOption,
     JsonOption,
     PlanFileOption,
     ReplacePlanOption,
     RigArgument,
     SceneArgument,
     Triple,
+    calibrated_rig,
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
 from cdpr.cli.plan_facts import facts_of, sentences_of
 from cdpr.cli.plan_options import DEFAULT_SEARCH, SearchOptions
-from cdpr.cli.stop_facts import by_way_of
 from executor.recording.resume import require_room, scene_after
 from model.errors import BadInput
 from model.files.documents import millimetres
@@ -44,28 +45,28 @@ def plan(
     output: PlanFileOption,
     seed: Annotated[
         int,
-        typer.Option(min=0, help="of the random numbers; with --rounds the same plan again"),
+        typer.Option(min=0, help="random seed; with --rounds the plan is reproducible"),
     ] = 0,
     calibration: CalibrationOption = None,
     clearance_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
+        float | None, typer.Option(min=0.0, help="obstacle clearance, overriding the scene's")
     ] = None,
     search: SearchOptions = DEFAULT_SEARCH,
     start_mm: Annotated[
-        Triple | None, typer.Option(help="start instead of the scene's: x y z")
+        Triple | None, typer.Option(help="start position x y z, overriding the scene's")
     ] = None,
     goal_mm: Annotated[
-        Triple | None, typer.Option(help="goal instead of the scene's: x y z")
+        Triple | None, typer.Option(help="goal position x y z, overriding the scene's")
     ] = None,
     via_mm: Annotated[
         list[str] | None,
         typer.Option(
-            help="way-pose before the scene's stops: x y z; again for more", metavar="X Y Z"
+            help="position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
         ),
     ] = None,
     from_run: Annotated[
         Path | None,
-        typer.Option(help="begin where this run ended, with the stops left", metavar="RUNDIR"),
+        typer.Option(help="start where this run ended, with the remaining stops", metavar="RUNDIR"),
     ] = None,
     force: ReplacePlanOption = False,
     as_json: JsonOption = False,
@@ -87,7 +88,9 @@ def plan(
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
     if from_run is not None and start_mm is not None:
-        raise BadInput("--from-run and --start-mm both say where to begin", next_step="give one")
+        raise BadInput(
+            "--from-run and --start-mm contradict each other", next_step="leave out one of them"
+        )
     the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
     done: Sequence[StopDocument] = ()
     begun: list[tuple[str, str]] = []
@@ -95,7 +98,7 @@ def plan(
         the_scene, done, end = scene_after(the_scene, the_rig, from_run)
         require_room(the_scene, the_rig)
         begun = resumed_facts(end, from_run, len(done), len(the_scene.stops))
-    the_scene = by_way_of(the_scene, via_mm or [])
+    the_scene = _by_way_of(the_scene, via_mm or [])
     require_new_file(output, force)
     settings = settings_from_options(search.with_seed(seed))
     of_legs = search.rounds if search.rounds and len(search.rounds) > 1 else []
@@ -119,3 +122,25 @@ def _changed(
     goal = None if goal_mm is None else Pose.level(millimetres(list(goal_mm)))
     clearance = None if clearance_mm is None else clearance_mm / 1000.0
     return scene.changed(start=start, goal=goal, clearance=clearance)
+
+
+def _by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
+    """The scene with level way-poses before its own stops, given as ``x y z`` (`joined_points`).
+
+    Raises:
+        BadInput: A way-pose cannot be read.
+    """
+    ways = []
+    for number, text in enumerate(via_mm, start=1):
+        try:
+            x, y, z = map(float, text.split())
+        except ValueError:
+            raise BadInput(
+                f"--via-mm {text}: three numbers are required", next_step="write --via-mm 0 40 430"
+            ) from None
+        if not all(map(math.isfinite, (x, y, z))):
+            raise BadInput(
+                f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
+            )
+        ways.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
+    return scene.changed(stops=[*ways, *scene.document.stops]) if ways else scene

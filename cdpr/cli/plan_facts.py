@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cdpr.cli.stop_facts import stop_facts
 from model.files.plan_file import OptimalPlannerDocument, PlanDocument, PlannerDocument
 from model.rotation_limits import largest_rotations
-from model.scene import scene_from_document
+from model.scene import Scene, legs_of, scene_from_document
 from model.statics.dexterity import rms_anchor_radius
 
 
@@ -57,7 +56,7 @@ def sentences_of(document: PlanDocument) -> list[tuple[str, str]]:
 
 def _before(document: PlanDocument) -> str:
     is_paper = isinstance(document.planner, PlannerDocument)
-    return "before post-processing" if is_paper else "when first found"
+    return "before post-processing" if is_paper else "first path found"
 
 
 def _rotation(document: PlanDocument) -> list[tuple[str, str]]:
@@ -71,7 +70,7 @@ def _rotation(document: PlanDocument) -> list[tuple[str, str]]:
     way = sum(
         math.hypot(a.distance_to(b) * 1e3, radius * a.angle_to(b)) for a, b in pairwise(poses)
     )
-    text = f"tilted up to {tilt:.2f}°, turned up to {turn:.2f}°; {way:.1f} mm long with turning"
+    text = f"tilted up to {tilt:.2f}°, rotated up to {turn:.2f}°; {way:.1f} mm with rotation"
     return [("rotation", text)]
 
 
@@ -79,7 +78,18 @@ def _search_sentence(document: PlanDocument) -> str:
     statistics, planner = document.statistics, document.planner
     rest = f"{statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s"
     if isinstance(planner, OptimalPlannerDocument):
-        search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of it searching"
+        search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of search"
         again = " ".join(f"--rounds {rounds}" for rounds in planner.rounds)
-        return f"{sum(planner.rounds)} rounds (again: {again}), {rest}{search}"
+        return f"{sum(planner.rounds)} rounds (to repeat: {again}), {rest}{search}"
     return f"{statistics.nodes} nodes, {statistics.iterations} samples, {rest}"
+
+
+def stop_facts(scene: Scene) -> list[tuple[str, str]]:
+    """Stops with what happens there and what is carried on; nothing for a scene without."""
+    carried = [leg.scene.load.payload_mass for leg in legs_of(scene)]
+    shown = []
+    for stop, before, after in zip(scene.stops, carried[:-1], carried[1:], strict=True):
+        load = f", then {after:g} kg" if after != before else ""
+        dwell = f" {stop.dwell:g} s" if stop.dwell > 0.0 else ""
+        shown.append(f"{stop.name} ({stop.kind}{dwell}{load})")
+    return [("via", ", ".join(shown))] if shown else []

@@ -10,7 +10,7 @@ import typer
 
 from planner.options import PlanningOptions
 
-_PANEL = "The paper's text where it is open (docs/paper.md)"
+_PANEL = "Open readings of the paper's text (docs/paper.md)"
 
 
 class PlannerName(StrEnum):
@@ -74,33 +74,37 @@ class SearchOptions:
 
     planner: Annotated[
         PlannerName,
-        typer.Option(help="the one we recommend; the paper's; or half of all samples at the goal"),
+        typer.Option(help="optimal (recommended), the paper's, or half of all samples at the goal"),
     ] = PlannerName.optimal
     cost: Annotated[
         CostName | None,
-        typer.Option(help="what to optimise (optimal: length; the paper's planners: kinematic)"),
+        typer.Option(help="objective (default: length; the paper's planners: kinematic)"),
     ] = None
     weight: Annotated[
         list[str] | None,
-        typer.Option("--weight", help="NAME=NUMBER, again for a sum: length, kinematic, …"),
+        typer.Option(
+            "--weight", help="NAME=NUMBER, repeatable for a weighted sum: length, kinematic, …"
+        ),
     ] = None
     longest_mm: Annotated[
-        float | None, typer.Option(min=0.001, help="optimal: the best path that is no longer")
+        float | None, typer.Option(min=0.001, help="optimal: upper limit of the path length")
     ] = None
     budget_ms: Annotated[
         float | None,
         typer.Option(
             min=0.001,
-            help="optimal: how long it goes on improving; 50 ms, or 500 with --free-rotation",
+            help="optimal: time for improvement (default: 50 ms; 500 with --free-rotation)",
         ),
     ] = None
     rounds: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="optimal: so many rounds instead, the same path again"),
+        typer.Option(min=1, help="optimal: fixed number of improvement rounds (reproducible)"),
     ] = None
     free_rotation: Annotated[
         bool,
-        typer.Option("--free-rotation", help="optimal: turn as well, within the scene's limits"),
+        typer.Option(
+            "--free-rotation", help="optimal: also rotate the platform, within the scene's limits"
+        ),
     ] = False
     mode: Annotated[
         ModeName | None,
@@ -108,9 +112,7 @@ class SearchOptions:
     ] = None
     max_iterations: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=1_000_000, help="the paper's planners: give up after so many samples"
-        ),
+        typer.Option(min=1, max=1_000_000, help="the paper's planners: largest number of samples"),
     ] = None
     failure_rate: Annotated[
         FailureRateName | None,
@@ -130,7 +132,7 @@ class SearchOptions:
     spacing_mm: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="reject nodes nearer than this to another", rich_help_panel=_PANEL
+            min=0.0, help="reject nodes closer than this to another", rich_help_panel=_PANEL
         ),
     ] = None
     goal_sight: Annotated[

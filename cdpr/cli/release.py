@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import reference_dict, reference_text, show_release
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     InterfaceOption,
     JsonOption,
@@ -27,7 +27,7 @@ def release(
     without_real_time: WithoutRealTimeOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """End the day: with the platform on a support, close the brakes and take the torque off.
+    """Release the drives with the platform on a support: close brakes, remove torque.
 
     All drives together; set-points move nothing. Winches without brakes let their cables go, so
     that the drives have to be referenced again.
@@ -47,5 +47,5 @@ def release(
         reference = reference_dict(result.reference)
         show_json({"drives": list(result.drives), "reference": reference})
         return
-    out.print(f"no drive has torque any more: {', '.join(sorted(set(result.drives)))}")
+    out.print(f"all drives are without torque: {', '.join(sorted(set(result.drives)))}")
     out.print(f"reference: {reference_text(result.reference)}", soft_wrap=True, markup=False)

@@ -16,7 +16,7 @@ def report(
     run: Annotated[Path, typer.Argument(help="run folder", metavar="RUNDIR")],
     as_json: Annotated[bool, typer.Option("--json", help="print the run's summary")] = False,
 ) -> None:
-    """Write the report of a run folder again, from its files alone.
+    """Write the report of a run folder again from its files.
 
     Of a run whose program was killed, or whose disk was full, it writes what is missing from what
     is there.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import reference_dict, reference_text, show_reset
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     InterfaceOption,
     JsonOption,
@@ -25,7 +25,7 @@ def reset(
     yes: NoQuestionOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Take a latched fault off, after its cause is gone: resets drives in fault; moves nothing.
+    """Release a latched fault once its cause is removed: resets drives in fault, moves nothing.
 
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
     Afterwards a run starts only from where the platform stands.
@@ -54,7 +54,7 @@ def reset(
     out.print(f"drives: {', '.join(sorted(set(result.drives)))}", soft_wrap=True)
     if result.restarted:
         names = ", ".join(the_rig.drive_names[node] for node in result.restarted)
-        out.print(f"switched on since they were last set up: {names}", soft_wrap=True)
+        out.print(f"power-cycled since their last configuration: {names}", soft_wrap=True)
     out.print(f"reference: {reference_text(result.reference)}", soft_wrap=True, markup=False)
-    latch_now = "the latch is off" if result.was_latched else "nothing was latched"
-    out.print(f"{latch_now}; the next run starts only from where the platform stands now")
+    latch_now = "the fault latch is released" if result.was_latched else "no fault was latched"
+    out.print(f"{latch_now}; the next run must start from the platform's present pose")

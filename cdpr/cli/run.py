@@ -8,15 +8,16 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
 from cdpr.cli.facts import show_missing, show_prepared, show_summary
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     FastOption,
     InterfaceOption,
     SummaryJsonOption,
     WithoutRealTimeOption,
     YesOption,
+    calibrated_rig,
     require_unused,
     rig_on_bus,
 )
@@ -47,7 +48,7 @@ def run(
         typer.Option(
             "-o",
             "--output",
-            help="run folder to make, with its parents (default: runs/ and the time)",
+            help="run folder to create, with its parents (default: runs/ and the time)",
             metavar="RUNDIR",
         ),
     ] = None,
@@ -56,7 +57,7 @@ def run(
         list[str] | None,
         typer.Option(
             help="a camera's index, or 'synthetic': all of the rig file's (the default with the"
-            " interface 'virtual'); for each of several cameras NAME=SOURCE, again and again",
+            " interface 'virtual'); for several cameras NAME=SOURCE, repeated",
             metavar="SOURCE",
         ),
     ] = None,
@@ -66,17 +67,19 @@ def run(
     channel: ChannelOption = None,
     simulated_start_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="where the simulated platform stands: x y z (default: at the start)"),
+        typer.Option(help="initial position of the simulated platform x y z (default: the start)"),
     ] = None,
     yes: YesOption = False,
     without_real_time: WithoutRealTimeOption = False,
     no_clearance_stop: Annotated[
         bool,
-        typer.Option("--no-clearance-stop", help="go on when the camera sees too little clearance"),
+        typer.Option(
+            "--no-clearance-stop", help="do not stop when the measured clearance is too small"
+        ),
     ] = False,
     as_json: SummaryJsonOption = False,
 ) -> None:
-    """Run a plan: prove it, make its set-points, arm the drives, move, measure, report.
+    """Run a plan: check it, compute set-points, arm the drives, move, measure, report.
 
     With the interface 'virtual' the drives, the platform and the camera are simulated in this
     process. Ctrl-C and `cdpr stop` slow all drives down together along the path; they then hold.
@@ -154,7 +157,7 @@ def _simulated(rig: Rig, interface: str | None, channel: str | None) -> Rig:
             "a run on a bus needs the rig file",
             where="--rig",
             why="without it the plan's own rig runs on simulated drives",
-            next_step="name the rig file with --rig, or leave out --interface and --channel",
+            next_step="pass the rig file with --rig, or leave out --interface and --channel",
         )
     return rig.with_bus(IN_PROCESS)
 
@@ -162,9 +165,9 @@ def _simulated(rig: Rig, interface: str | None, channel: str | None) -> Rig:
 def _refuse_camera_options(camera: list[str] | None, no_clearance_stop: bool) -> None:
     if camera:
         raise BadInput(
-            "--camera and --no-camera contradict each other", next_step="leave one of them out"
+            "--camera and --no-camera contradict each other", next_step="leave out one of them"
         )
-    why = "without a camera no clearance is measured, and nothing stops the run for it"
+    why = "without a camera no clearance is measured, so it cannot stop the run"
     require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
 
 

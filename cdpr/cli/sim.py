@@ -7,8 +7,15 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import ChannelOption, InterfaceOption, RigArgument, Triple, rig_on_bus
+from cdpr.cli.options import (
+    CalibrationOption,
+    ChannelOption,
+    InterfaceOption,
+    RigArgument,
+    Triple,
+    calibrated_rig,
+    rig_on_bus,
+)
 from cdpr.cli.output import Terminal, out
 from cdpr.cli.supervision import stop_requests
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
@@ -32,23 +39,28 @@ def sim(
     channel: ChannelOption = None,
     start_mm: Annotated[
         Triple | None,
-        typer.Option("--at-mm", help="where the platform stands: x y z (default: home)"),
+        typer.Option("--at-mm", help="initial position of the platform x y z (default: home)"),
     ] = None,
     power_lost: Annotated[
         int | None,
         typer.Option(
-            "--power-lost", help="drives count from anywhere, cables hang slack: a seed", min=0
+            "--power-lost",
+            help="simulate a power loss (lost counts, slack cables) with this random seed",
+            min=0,
         ),
     ] = None,
     slack_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="with --power-lost: at most so slack")
+        float, typer.Option(min=0.0, max=100.0, help="with --power-lost: largest slack")
     ] = 5.0,
     on_a_stand: Annotated[
         bool,
-        typer.Option("--on-a-stand", help="with --power-lost: held until all cables are taut"),
+        typer.Option(
+            "--on-a-stand", help="with --power-lost: platform supported until all cables are taut"
+        ),
     ] = False,
     plan: Annotated[
-        Path | None, typer.Option(help="put the platform at the start of this plan, with its load")
+        Path | None,
+        typer.Option(help="place the platform at the start of this plan, with its load"),
     ] = None,
     eds: Annotated[
         Path | None,
@@ -62,7 +74,7 @@ def sim(
         typer.Option(
             "--drive-behaviour",
             metavar="NAME[=VALUE]",
-            help="what the drives do beyond strict CiA 402, again for more; 'list' shows them",
+            help="deviation of the drives from strict CiA 402, repeatable; 'list' shows all",
         ),
     ] = None,
     calibration: CalibrationOption = None,
@@ -82,7 +94,7 @@ def sim(
     the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
     if the_rig.document.bus.interface == IN_PROCESS:
         raise BadInput(
-            "the interface 'virtual' reaches no other process",
+            "the interface 'virtual' cannot reach another process",
             where="bus",
             why="`cdpr run` simulates the drives itself on that interface",
             next_step="pass --interface udp_multicast, or socketcan with a vcan channel",
@@ -111,7 +123,7 @@ def sim(
             rehearsal.serve(lambda: board.read().stop)
     finally:
         bus.shutdown()
-    out.print("the simulated drives are gone")
+    out.print("the simulated drives have ended")
 
 
 def _behaviour(names: list[str]) -> DriveBehaviour:
@@ -128,7 +140,7 @@ def _start(rig: Rig, start_mm: Triple | None, plan: Path | None) -> tuple[Pose, 
     """Where the platform stands, and what it carries."""
     if start_mm is not None and plan is not None:
         raise BadInput(
-            "--at-mm and --plan contradict each other", next_step="leave one of them out"
+            "--at-mm and --plan contradict each other", next_step="leave out one of them"
         )
     if plan is not None:
         the_plan = load_plan(plan)

@@ -6,9 +6,9 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from cdpr.cli.calibrations import CalibrationOption
 from cdpr.cli.facts import show_status, status_dict
 from cdpr.cli.options import (
+    CalibrationOption,
     ChannelOption,
     InterfaceOption,
     JsonOption,
@@ -26,7 +26,7 @@ def status(
     calibration: CalibrationOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Tell how a rig stands: faults, reference, drives, tensions, pose. Moves and writes nothing.
+    """Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.
 
     While a run is under way, or being prepared, the drives are not asked; `cdpr monitor` shows
     them.
@@ -52,7 +52,9 @@ def _next_step(rig: Path, told: dict[str, Any]) -> str:
         return ""
     steps = []
     if told["latched"] is not None:
-        steps.append(f"find the cause and look at the platform, then cdpr reset {quote(str(rig))}")
+        steps.append(
+            f"find the cause and check the platform, then run cdpr reset {quote(str(rig))}"
+        )
     if not told["reference"]["counts"]:
         ways = "--at-home, --pose-mm X Y Z or --camera SOURCE"
         steps.append(f"cdpr home {quote(str(rig))} with {ways}")

@@ -28,7 +28,7 @@ _GIVING_UP = b"\nleaving out what is not written yet; press Ctrl-C again to leav
 def confirmation(
     show: Callable[[_P, Console], None], *, asks: bool, as_json: bool
 ) -> Callable[[_P], bool]:
-    """A `confirm` callback: shows what is about to happen to whoever is asked, or reads; then asks.
+    """A `confirm` callback: shows what is about to happen, then asks.
 
     Args:
         show: Shows it, on standard error where a program reads the other.
@@ -55,18 +55,18 @@ def has_agreed(question: str, otherwise: str) -> bool:
     """Whether the answer is yes; silence is none.
 
     Args:
-        question: Shown to whoever sits there.
+        question: Shown to the operator.
         otherwise: What a no leaves, such as ``nothing was moved``.
 
     Raises:
-        BadInput: There is nobody to ask.
+        BadInput: There is no terminal to ask on.
     """
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     answer = sys.stdin.readline()
     if not answer:
         print(file=sys.stderr)
         raise BadInput(
-            f"nobody answered: {question}",
+            f"no answer to: {question}",
             where="standard input",
             next_step=f"run it in a terminal, or pass --yes; {otherwise}",
         )
@@ -177,7 +177,7 @@ def say(write: Callable[[], None], result: Any) -> None:
     try:
         write()
         sys.stdout.flush()
-    except (Exception, SystemExit):  # rich ends the program when nobody reads it any more
+    except (Exception, SystemExit):  # rich ends the program when its pipe is closed
         with suppress(OSError, ValueError):
             output = sys.stdout.fileno()
             nothing = os.open(os.devnull, os.O_WRONLY)

@@ -1,4 +1,4 @@
-"""`cdpr track`: measures the platform in pictures."""
+"""`cdpr track`: measures the platform in images."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 import typer
 
 from cdpr.cli.arguments import refuse_overwriting
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import JsonOption, RigArgument
+from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import Terminal, show_facts, show_json
 from cdpr.cli.supervision import stop_requests
 from executor.cameras.sources import parse_camera_sources
@@ -29,8 +28,8 @@ def track(
     source: Annotated[
         list[str],
         typer.Argument(
-            help="folder of pictures, video file, camera index, or 'synthetic' with --plan;"
-            " for each of several cameras NAME=SOURCE",
+            help="folder of images, video file, camera index, or 'synthetic' with --plan;"
+            " for several cameras NAME=SOURCE, repeated",
             metavar="SOURCE...",
         ),
     ],
@@ -45,14 +44,14 @@ def track(
         Path | None, typer.Option(help="also measure the clearance to this scene's obstacles")
     ] = None,
     plan: Annotated[
-        Path | None, typer.Option(help="with 'synthetic': the path the platform follows")
+        Path | None, typer.Option(help="with 'synthetic': the path of the platform")
     ] = None,
     pictures: Annotated[
-        int | None, typer.Option(min=1, help="stop after so many; Ctrl-C also stops")
+        int | None, typer.Option(min=1, help="largest number of images; Ctrl-C also stops")
     ] = None,
     detector: Annotated[
         str | None,
-        typer.Option(help="opencv or apriltag, instead of the rig file's tags: detector"),
+        typer.Option(help="opencv or apriltag, overriding tags.detector of the rig file"),
     ] = None,
     mcap: Annotated[
         Path | None, typer.Option(help="also write the poses as MCAP", metavar="MCAP")
@@ -60,14 +59,14 @@ def track(
     overlay: Annotated[
         Path | None,
         typer.Option(
-            help="also draw what is measured into the pictures: a folder, or a video (.mp4, .avi)",
+            help="also write images with the measurements: a folder or a video (.mp4, .avi)",
             metavar="DIR|VIDEO",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace what exists already")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace existing output")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the platform's pose from its tags, picture by picture.
+    """Measure the platform's pose from its tags, image by image.
 
     [dim]Examples:[/dim]
 

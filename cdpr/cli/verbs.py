@@ -36,32 +36,32 @@ class Verb:
 CALIBRATE = (
     Verb(
         "camera",
-        "Find a camera's matrix and lens distortion, and say whether they are good enough.",
+        "Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.",
         "calibrate.camera:camera",
     ),
     Verb(
         "extrinsics",
-        "Find where a camera stands, by surveyed tags on the frame or by the rig's own motion.",
+        "Find a camera's pose, from surveyed tags on the frame or from the rig's motion.",
         "calibrate.extrinsics:extrinsics",
     ),
     Verb(
         "tags",
-        "Find where the tags are on the platform, from pictures that show two or more at once.",
+        "Find the tags' poses on the platform, from images that show two or more at once.",
         "calibrate.tags:tags",
     ),
     Verb(
         "poses",
-        "Choose the poses that tell most about the rig, and plan a way through them with stops.",
+        "Choose the most informative poses for calibration, and plan a path with stops at them.",
         "calibrate.poses:poses",
     ),
     Verb(
         "rig",
-        "Find outlets, anchors, pulleys, drum scales, references and the cables' stiffness.",
+        "Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.",
         "calibrate.rig:rig",
     ),
     Verb(
         "print",
-        "Make a board, or the tags of a rig, as PDF in exact size, with the white that they need.",
+        "Make a calibration board, or the tags of a rig, as a PDF in exact size.",
         "calibrate.targets:print_",
     ),
     Verb(
@@ -71,14 +71,14 @@ CALIBRATE = (
     ),
     Verb(
         "apply",
-        "Write a new rig file with calibration results in place of the rig file's numbers.",
+        "Write a new rig file with calibration results in place of its own values.",
         "calibrate.apply:apply",
     ),
 )
 BENCH = (
     Verb(
         "paper",
-        "Repeat the paper's evaluation (section 5.3, Fig. 9) and tell which claims hold.",
+        "Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.",
         "bench:paper",
     ),
 )
@@ -88,17 +88,17 @@ PLAN = (
         "Plan, check, run on simulated drives, track with a synthetic camera, and report.",
     ),
     Verb("examples", "List the ready rigs, scenes and recorded sessions, or copy some of them."),
-    Verb("new", "Ask for the least that a rig file needs, and write a commented one."),
+    Verb("new", "Ask for the essentials of a rig, and write a commented rig file."),
     Verb("plan", "Plan a collision-free path and write it to a file."),
     Verb(
         "check",
-        "Prove a plan by an independent route: distances on dense poses, with a stated bound.",
+        "Check a plan with an independent method: distances at dense poses, with bounds.",
     ),
 )
 OPERATE = (
     Verb(
         "run",
-        "Run a plan: prove it, make its set-points, arm the drives, move, measure, report.",
+        "Run a plan: check it, compute set-points, arm the drives, move, measure, report.",
     ),
     Verb(
         "stop",
@@ -106,47 +106,45 @@ OPERATE = (
     ),
     Verb(
         "hold",
-        "Feed hold: the platform slows down along the path, waits there, and keeps its tension.",
+        "Feed hold: the platform slows down along the path and waits there under tension.",
         "operate:hold",
     ),
     Verb(
         "resume",
-        "Go on after `cdpr hold`, at the speed that was asked for last.",
+        "Continue after `cdpr hold`, at the last requested speed.",
         "operate:resume",
     ),
     Verb(
         "speed",
-        "Go at a share of the planned speed along the path, from the next cycle on.",
+        "Scale the speed along the path to a percentage of the planned one.",
         "operate:speed",
     ),
     Verb(
         "monitor",
-        "Watch a run: its state, every drive, tension, lateness, progress and events, to its end.",
+        "Show a run live: state, drives, tensions, lateness, progress and events.",
     ),
     Verb(
         "status",
-        "Tell how a rig stands: faults, reference, drives, tensions, pose. Moves and"
-        " writes nothing.",
+        "Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.",
     ),
     Verb(
         "reset",
-        "Take a latched fault off, after its cause is gone: resets drives in fault; moves nothing.",
+        "Release a latched fault once its cause is removed: resets drives in fault, moves nothing.",
     ),
     Verb(
         "home",
-        "Wind slack cables in until all are taut, then reference the drives at a pose"
-        " that is known.",
+        "Pretension all cables, then set the encoder reference at a known pose.",
     ),
-    Verb("jog", "Move the platform straight by a few millimetres, slowly, from where it stands."),
+    Verb("jog", "Move the platform straight slowly by a few millimetres from its present pose."),
     Verb(
         "release",
-        "End the day: with the platform on a support, close the brakes and take the torque off.",
+        "Release the drives with the platform on a support: close brakes, remove torque.",
     ),
 )
 SET_UP = (
     Verb(
         "doctor",
-        "Look whether this machine has what a run needs; with a rig file, whether its bus opens.",
+        "Check that this machine can run a rig; with a rig file, also its bus and cameras.",
     ),
     Verb(
         "sim",
@@ -154,15 +152,18 @@ SET_UP = (
     ),
     Verb("calibrate", "Calibrate and compare.", verbs=CALIBRATE),
 )
-MEASURE = (Verb("track", "Measure the platform's pose from its tags, picture by picture."),)
+MEASURE = (Verb("track", "Measure the platform's pose from its tags, image by image."),)
 ANALYSE = (
-    Verb("report", "Write the report of a run folder again, from its files alone."),
+    Verb("report", "Write the report of a run folder again from its files."),
     Verb(
         "explain",
         "Explain a fault that a run reported: meaning, likely cause, state of the"
         " machine, next step.",
     ),
-    Verb("workspace", "Map where the robot can be and how well it can work there."),
+    Verb(
+        "workspace",
+        "Map the workspace: feasibility, wrench closure, capacity margin and dexterity.",
+    ),
     Verb("bench", "Measure the planner.", verbs=BENCH),
 )
 PANELS: dict[str, tuple[Verb, ...]] = {

@@ -30,28 +30,34 @@ def workspace(
     ] = None,
     slices: Annotated[
         list[str] | None,
-        typer.Option("--slice", help="plane to map; several are possible", metavar="z=MM"),
+        typer.Option("--slice", help="plane to map; repeatable", metavar="z=MM"),
     ] = None,
     volume: Annotated[
         bool | None,
-        typer.Option("--volume/--no-volume", help="map the whole box too (default: no --slice)"),
+        typer.Option(
+            "--volume/--no-volume", help="also map the whole box (default: without --slice)"
+        ),
     ] = None,
     step_mm: Annotated[
-        float | None, typer.Option(help="distance of points; else a fiftieth of the longest side")
+        float | None, typer.Option(help="grid spacing (default: a fiftieth of the longest side)")
     ] = None,
     lower_mm: Annotated[
-        Triple | None, typer.Option(help="corner of the region instead of the workspace's: x y z")
+        Triple | None,
+        typer.Option(help="lower corner of the region x y z (default: the workspace's)"),
     ] = None,
-    upper_mm: Annotated[Triple | None, typer.Option(help="its opposite corner: x y z")] = None,
+    upper_mm: Annotated[
+        Triple | None,
+        typer.Option(help="upper corner of the region x y z (default: the workspace's)"),
+    ] = None,
     rotation_wxyz: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(help="orientation of the platform; else the scene's start, else home"),
+        typer.Option(help="platform orientation (default: the scene's start, else home)"),
     ] = None,
     length_mm: Annotated[
         float | None,
         typer.Option(
             "--characteristic-length-mm",
-            help="divides moments in the condition number; else the anchors' mean radius",
+            help="characteristic length for moments (default: the anchors' mean radius)",
         ),
     ] = None,
     workers: WorkersOption = None,
@@ -59,7 +65,7 @@ def workspace(
     force: Annotated[bool, typer.Option("--force", help="replace the maps in the folder")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> None:
-    """Map where the robot can be and how well it can work there.
+    """Map the workspace: feasibility, wrench closure, capacity margin and dexterity.
 
     Wrench closure and feasibility, dexterity, forces and clearances, as one page.
 
@@ -100,7 +106,7 @@ def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array 
         return None
     norm = float(np.linalg.norm(rotation_wxyz))
     if not 1e-6 < norm < np.inf:
-        raise BadInput("the rotation is not a quaternion w x y z of a length above 0")
+        raise BadInput("the rotation is not a quaternion w x y z of non-zero length")
     return matrix_from_quaternion(np.array(rotation_wxyz) / norm)
 
 

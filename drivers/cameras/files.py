@@ -1,4 +1,4 @@
-"""The picture files of a folder."""
+"""The image files of a folder."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import Frame, Image, is_too_large
-from model.errors import BadInput, Fault
+from model.errors import AlreadyExists, BadInput, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, read_bytes
 from model.rig import Camera
 
-#: Endings of picture files, in lower case.
+#: Endings of image files, in lower case.
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
-_NO_PICTURE, _CAMERA = "is no picture that can be read", "the camera has"
+_NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
 
 
 class ImageFolder:
-    """The pictures of a folder in the order of their names, numbers counted as numbers.
+    """The images of a folder in the order of their names, numbers counted as numbers.
 
     Args:
         folder: Where they are.
         camera: The camera that took them.
-        rate: Pictures a second; the camera's when left out.
-        on_unused: Told the name of each file that cannot be used, and why; the others are used.
+        rate: Images a second; the camera's when left out.
+        on_unused: Called with the name of each unusable file and the reason; the others are used.
 
     Attributes:
-        files: All that end like pictures.
+        files: All that end like images.
         unused: Why files were not used, by name.
 
     Raises:
-        BadInput: The folder is missing or has no pictures.
+        BadInput: The folder is missing or has no images.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class ImageFolder:
         return len(self.files)
 
     def __iter__(self) -> Iterator[Frame]:
-        """The pictures of the camera's size.
+        """The images of the camera's size.
 
         Raises:
             BadInput: None can be read, or none is of the camera's size.
@@ -83,9 +83,9 @@ class ImageFolder:
 
 
 class OneCamerasPictures:
-    """The pictures of a folder that are of one size, upright as their files say (EXIF).
+    """The images of a folder that are of one size, upright as their files say (EXIF).
 
-    A camera that was turned by hand stores how; where the pictures are of one size only as the
+    A camera that was turned by hand stores how; where the images are of one size only as the
     sensor gave them, they are taken so. Files that cannot be used are named, the others are used.
 
     Args:
@@ -94,12 +94,12 @@ class OneCamerasPictures:
 
     Attributes:
         size: Width and height, [px].
-        names: Of the pictures used, in order.
+        names: Of the images used, in order.
         unused: Why each of the other files is not used, by name.
-        upright: Whether pictures are turned as their files say.
+        upright: Whether images are turned as their files say.
 
     Raises:
-        BadInput: The folder is missing, has no pictures, or none that can be read or is of the
+        BadInput: The folder is missing, has no images, or none that can be read or is of the
             wanted size.
     """
 
@@ -132,7 +132,7 @@ class OneCamerasPictures:
         self.names = tuple(path.name for path in self._files)
 
     def __iter__(self) -> Iterator[tuple[str, Image]]:
-        """Name and grey picture."""
+        """Name and grey image."""
         for path in self._files:
             image = read_picture(path, self.upright)
             if image is not None and _size(image) == self.size:
@@ -140,7 +140,7 @@ class OneCamerasPictures:
 
 
 def picture_files(folder: Path) -> tuple[Path, ...]:
-    """The files of a folder that end like pictures, in order of their names.
+    """The files of a folder that end like images, in order of their names.
 
     Numbers in names are counted as numbers.
 
@@ -152,15 +152,15 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
     found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS]
     if not found:
         raise BadInput(
-            "the folder has no pictures",
+            "the folder has no images",
             where=str(folder),
-            next_step=f"name a folder with files that end in {', '.join(PICTURE_ENDINGS)}",
+            next_step=f"name a folder with files ending in {', '.join(PICTURE_ENDINGS)}",
         )
     return tuple(sorted(found, key=lambda path: _natural(path.name)))
 
 
 def read_picture(path: Path, upright: bool = True) -> Image | None:
-    """A grey picture, or None when the file holds none; also for names that OpenCV cannot open.
+    """A grey image, or None when the file holds none; also for names that OpenCV cannot open.
 
     Args:
         path: The file.
@@ -190,18 +190,18 @@ def _size(image: Image | None) -> tuple[int, int]:
 
 def _no_picture(folder: Path, count: int) -> BadInput:
     return BadInput(
-        f"none of the {count} files is a picture that can be read",
+        f"none of the {count} files is a readable image",
         where=str(folder),
-        next_step="check that the files were copied whole",
+        next_step="check that the files were copied completely",
     )
 
 
 def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) -> BadInput:
     return BadInput(
-        f"none of the {len(unused)} pictures has the camera's {wanted[0]} x {wanted[1]} px",
+        f"none of the {len(unused)} images has the camera's {wanted[0]} x {wanted[1]} px",
         where=str(folder),
         why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4]),
-        next_step="use full pictures of this camera, or calibrate it in this size",
+        next_step="use full-size images of this camera, or calibrate it at this size",
     )
 
 
@@ -211,19 +211,19 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts]
 
 
-# Pictures written to a folder or into a video.
+# Images written to a folder or into a video.
 
 
-#: Endings of videos that are written, and how their pictures are coded.
+#: Endings of videos that are written, and how their images are coded.
 VIDEO_CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 class PictureOutput:
-    """Writes colour pictures one after the other, as a context manager.
+    """Writes colour images one after the other, as a context manager.
 
     Args:
         path: A folder to make, or a video file by its ending.
-        rate: Pictures a second of a video.
+        rate: Images a second of a video.
         force: Whether something that is there may be replaced (a video) or added to (a folder).
 
     Raises:
@@ -239,19 +239,17 @@ class PictureOutput:
         self._is_video = path.suffix.lower() in VIDEO_CODES
         if not self._is_video and path.suffix and not path.is_dir():
             raise BadInput(
-                "neither a folder nor a video that can be written",
+                "neither a folder nor a supported video file",
                 where=str(path),
-                next_step=f"name a folder, or a file that ends in {', '.join(VIDEO_CODES)}",
+                next_step=f"name a folder, or a file ending in {', '.join(VIDEO_CODES)}",
             )
         if path.exists() and not force:
-            raise BadInput(
-                "it exists already", where=str(path), next_step="name another one, or pass --force"
-            )
+            raise AlreadyExists("the file exists already", str(path))
         try:
             (path.parent if self._is_video else path).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BadInput(
-                "the folder cannot be made", where=str(path), why=error.strerror or str(error)
+                "the folder cannot be created", where=str(path), why=error.strerror or str(error)
             ) from None
 
     def __enter__(self) -> PictureOutput:
@@ -278,7 +276,7 @@ class PictureOutput:
         count = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
         reader.release()
         if count < self._count:
-            why = f"only {count} of {self._count} pictures are in it: the disk may be full"
+            why = f"it holds only {count} of {self._count} images; the disk may be full"
             raise _unwritable(self._path, why)
         try:
             self._unfinished.replace(self._path)
@@ -286,11 +284,11 @@ class PictureOutput:
             raise _unwritable(self._path, error.strerror or str(error)) from None
 
     def write(self, picture: NDArray[np.uint8], name: str) -> None:
-        """Writes the next picture.
+        """Writes the next image.
 
         Args:
             picture: Shape (height, width, 3), blue green red; all of one size.
-            name: Of the picture; a folder's file is called after it.
+            name: Of the image; a folder's file is called after it.
 
         Raises:
             Fault: It cannot be written.
@@ -300,14 +298,14 @@ class PictureOutput:
             return
         good, data = cv2.imencode(".png", picture)
         if not good:
-            raise ValueError(f"no picture: shape {picture.shape}, type {picture.dtype}")
+            raise ValueError(f"no image: shape {picture.shape}, type {picture.dtype}")
         try:
             write_bytes_atomic(self._path / self._file_name(name), data.tobytes())
         except BadInput as error:
             raise _unwritable(Path(error.where), error.why) from None
 
     def _file_name(self, name: str) -> str:
-        """Of a picture: ``a.png``; ``a.jpg.png`` where ``a.png`` is another picture's."""
+        """Of a picture: ``a.png``; ``a.jpg.png`` where ``a.png`` is another image's."""
         whole = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in name)
         short = Path(whole).stem + ".png"
         owner = self._names.setdefault(short, name)
@@ -319,15 +317,15 @@ class PictureOutput:
             size = (picture.shape[1], picture.shape[0])
             self._video = cv2.VideoWriter(str(self._unfinished), code, self._rate, size)
             if not self._video.isOpened():
-                raise _unwritable(self._path, "OpenCV cannot write such a video here")
+                raise _unwritable(self._path, "OpenCV has no encoder for this kind of video here")
         self._video.write(picture)
         self._count += 1
 
 
 def _unwritable(path: Path, why: str) -> Fault:
     return Fault(
-        "the picture cannot be written",
+        "the image cannot be written",
         where=str(path),
         why=why,
-        next_step="free some space, or name another place",
+        next_step="free some space, or name another folder",
     )

@@ -1,4 +1,4 @@
-"""Pictures of a video and of a camera."""
+"""Images of a video and of a camera."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from numpy.typing import NDArray
 from model.errors import BadInput, Fault, HardwareMissing
 from model.rig import Camera
 
-# The newest picture of a camera that takes them faster than anybody asks for them.
+# The newest image of a camera that takes them faster than anybody asks for them.
 #
-# A camera's pictures wait in queues: of the network, of its driver, of the decoder. Whoever takes
+# A camera's images wait in queues: of the network, of its driver, of the decoder. Who takes
 # one of three falls behind by the other two, and measures an ever older platform. So a thread takes
 # them all, as they come, and keeps the last.
 
 
-#: Pictures a camera may fail to give in a row before it counts as gone.
+#: Images a camera may fail to give in a row before it counts as gone.
 LOST_PICTURES = 5
 #: A camera that is being read is waited for no longer than this when it is let go of, [s].
 END_TIMEOUT = 2.0
 
 
 class Capture(Protocol):
-    """What gives pictures, such as `cv2.VideoCapture`."""
+    """What gives images, such as `cv2.VideoCapture`."""
 
     def read(self) -> tuple[bool, Any]:
-        """The next picture in the queue, waited for; False and nothing where there is none."""
+        """The next image in the queue, waited for; False and nothing where there is none."""
         ...
 
     def release(self) -> None:
@@ -46,10 +46,10 @@ class Capture(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrived:
-    """A picture as it came.
+    """An image as it came.
 
     Attributes:
-        number: Of the camera's pictures, from 0; those that nobody asked for count.
+        number: Of the camera's images, from 0; those not requested count.
         time: When it arrived, on the reader's clock, [s].
         picture: As the camera gave it.
     """
@@ -60,7 +60,7 @@ class Arrived:
 
 
 class PictureReader:
-    """Takes all pictures of a camera in a thread of its own."""
+    """Takes all images of a camera in a thread of its own."""
 
     def __init__(self, capture: Capture, clock: Callable[[], float]) -> None:
         """Begins to read.
@@ -77,7 +77,7 @@ class PictureReader:
         self._thread.start()
 
     def newest(self) -> Arrived | None:
-        """The newest picture, each only once; waited for.
+        """The newest image, each only once; waited for.
 
         Returns:
             None when the camera gives no more.
@@ -115,14 +115,14 @@ class PictureReader:
             self._changed.notify_all()
 
 
-# The size that a picture file states, read before anything is decoded.
+# The size that an image file states, read before anything is decoded.
 #
 # Source: PNG specification (W3C), 11.2.1; JPEG, ITU-T T.81, annex B; BMP,
 # Microsoft's BITMAPINFOHEADER.
 
 
 MOST_PIXELS = 2**28
-"""Of a picture; more than any camera of this field has, and a quarter of a gigabyte in grey."""
+"""Of an image; more than any camera of this field has, and a quarter of a gigabyte in grey."""
 
 _NO_SIZE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -145,7 +145,7 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
 
 
 def is_too_large(data: bytes) -> bool:
-    """Whether a picture states more pixels than are decoded; other kinds OpenCV limits itself."""
+    """Whether an image states more pixels than are decoded; other kinds OpenCV limits itself."""
     size = stated_size(data)
     return size is not None and size[0] * size[1] > MOST_PIXELS
 
@@ -174,10 +174,10 @@ LAST_CAMERA = 255
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One picture.
+    """One image.
 
     Attributes:
-        time: When it was taken, [s]; since the first picture for files.
+        time: When it was taken, [s]; since the first image for files.
         image: Grey, shape (height, width).
         name: File name, or number in the video or of the camera.
     """
@@ -188,7 +188,7 @@ class Frame:
 
 
 class VideoFile:
-    """The pictures of a video.
+    """The images of a video.
 
     Args:
         path: The file.
@@ -205,7 +205,7 @@ class VideoFile:
         capture = _opened(str(path))
         if not capture.isOpened():
             raise BadInput(
-                "the file is no video that can be read",
+                "the file is not a readable video",
                 where=str(path),
                 next_step="convert it, for example with ffmpeg to MJPEG or H.264",
             )
@@ -218,18 +218,18 @@ class VideoFile:
         capture.release()
         if width * height > MOST_PIXELS:
             raise BadInput(
-                f"the video states pictures of {width:.0f} x {height:.0f} px",
+                f"the video states images of {width:.0f} x {height:.0f} px",
                 where=str(path),
                 why="the file is damaged",
-                next_step="take another one",
+                next_step="use another file",
             )
 
     def __len__(self) -> int:
-        """Number of pictures as the file states it, for progress."""
+        """Number of images as the file states it, for progress."""
         return self._count
 
     def __iter__(self) -> Iterator[Frame]:
-        """Every picture.
+        """Every image.
 
         Raises:
             BadInput: They are not of the camera's size, or none can be read.
@@ -246,16 +246,16 @@ class VideoFile:
                 image = _grey(np.asarray(picture))
                 if number == 0:
                     refuse_wrong_size(image, self._camera, str(self._path))
-                yield Frame(number / rate, image, f"picture {number}")
+                yield Frame(number / rate, image, f"image {number}")
                 number += 1
         finally:
             capture.release()
         if number == 0:
-            raise BadInput("the video has no picture that can be read", where=str(self._path))
+            raise BadInput("the video has no readable image", where=str(self._path))
 
 
 class LiveCamera:
-    """A camera on this machine or on the network; it answers with its newest picture.
+    """A camera on this machine or on the network; it answers with its newest image.
 
     Args:
         source: Its index, such as ``0``, its device file or its address.
@@ -263,8 +263,8 @@ class LiveCamera:
         clock: Monotonic time, [s].
 
     Raises:
-        HardwareMissing: It does not open or gives no picture.
-        BadInput: It gives pictures of another size.
+        HardwareMissing: It does not open or gives no image.
+        BadInput: It gives images of another size.
     """
 
     def __init__(
@@ -275,7 +275,7 @@ class LiveCamera:
         numbered = isinstance(source, int) or source.isdecimal()
         if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
             raise BadInput(
-                f"no camera has the index {str(source)[:40]}",
+                f"there is no camera with index {str(source)[:40]}",
                 where=self.name[:100],
                 next_step=f"give an index from 0 to {LAST_CAMERA}; `ls /dev/video*` lists them",
             )
@@ -286,13 +286,13 @@ class LiveCamera:
                 "the camera cannot be opened",
                 where=self.name,
                 why="it is not connected, another program uses it, or you may not read it",
-                next_step="check the cable and `ls -l /dev/video*`, close other programs, or pass"
+                next_step="check the cable and `ls -l /dev/video*`, close other programs, or name"
                 " another camera",
             )
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
         self._reader = PictureReader(capture, clock)
-        # Whoever only iterates over it closes nothing, and its thread must not outlive it.
+        # A caller that only iterates closes nothing, and the thread must not outlive it.
         self._let_go = weakref.finalize(self, self._reader.close)
         try:
             refuse_wrong_size(self.read().image, camera, self.name)
@@ -307,32 +307,32 @@ class LiveCamera:
         self.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Pictures without end; those that came while one was looked at are left out.
+        """Images without end; those that came while one was looked at are left out.
 
         Raises:
-            Fault: The camera stopped giving pictures.
+            Fault: The camera stopped giving images.
         """
         while True:
             yield self.read()
 
     def read(self) -> Frame:
-        """The newest picture that was not read before, with the time at which it arrived.
+        """The newest image that was not read before, with the time at which it arrived.
 
         It may have arrived before this was called.
 
         Raises:
-            HardwareMissing: It never gave a picture.
-            Fault: It stopped giving pictures.
+            HardwareMissing: It never gave an image.
+            Fault: It stopped giving images.
         """
         arrived = self._reader.newest()
         if arrived is not None:
             self._seen = True
-            return Frame(arrived.time, _grey(arrived.picture), f"picture {arrived.number}")
+            return Frame(arrived.time, _grey(arrived.picture), f"image {arrived.number}")
         kind = Fault if self._seen else HardwareMissing
         raise kind(
-            f"the camera gave no picture {LOST_PICTURES} times in a row",
+            f"the camera delivered no image {LOST_PICTURES} times in a row",
             where=self.name,
-            why="it was unplugged, or the bus it hangs on is too slow for its pictures",
+            why="it was unplugged, or its USB bus is too slow for its images",
             next_step="check the cable, then start again",
         )
 
@@ -342,12 +342,12 @@ class LiveCamera:
 
 
 def live_name(camera: str, source: str) -> str:
-    """A camera of the rig file and where its pictures come from, such as ``side (0)``."""
+    """A camera of the rig file and where its images come from, such as ``side (0)``."""
     return source if camera == source else f"{camera} ({source})"
 
 
 def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
-    """Pictures of another size than the camera was calibrated for would measure wrongly.
+    """Images of another size than the camera was calibrated for would measure wrongly.
 
     Raises:
         BadInput: The size is another one.
@@ -355,16 +355,16 @@ def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
     height, width = image.shape
     if (width, height) != (camera.width, camera.height):
         raise BadInput(
-            f"the picture has {width} x {height} px, camera {camera.name!r} has {camera.width} x"
+            f"the image has {width} x {height} px, camera {camera.name!r} has {camera.width} x"
             f" {camera.height} px",
             where=where,
-            why="it is of another camera, or was cut or scaled",
-            next_step="use full pictures of this camera, or calibrate it in this size",
+            why="it is from another camera, or was cropped or scaled",
+            next_step="use full-size images of this camera, or calibrate it at this size",
         )
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Width and height of a video's pictures, [px]; nought of a file that is none."""
+    """Width and height of a video's images, [px]; nought of a file that is none."""
     capture = _opened(str(path))
     try:
         width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT

@@ -24,7 +24,7 @@ def commanding_ids(nodes: Iterable[int]) -> frozenset[int]:
 
 
 def set_up_ids(nodes: Sequence[int]) -> frozenset[int]:
-    """The same while drives are set up: nobody else may read or write their objects then."""
+    """The same while drives are set up: no other master may access their objects then."""
     return commanding_ids(nodes) | {SDO_REQUEST_BASE + node for node in nodes}
 
 

@@ -131,7 +131,7 @@ def configure_drives(
 
 
 class WrongObjects:
-    """Gathers what drives refuse, so that one look at them tells everything."""
+    """Collects what drives refuse, so that one message reports everything."""
 
     def __init__(self) -> None:
         """Begins with nothing."""
@@ -193,8 +193,8 @@ def _unwatched_peers(
         drives = ", ".join(str(n) for n, own in zip(nodes, entries, strict=True) if own == count)
         yield (
             f"drive {drives}: 1016h has {count} heartbeat {'entry' if count == 1 else 'entries'},"
-            f" so the master and {count - 1} of {len(nodes) - 1} other drives are watched; when"
-            f" another one falls silent together with the master, {instead} instead"
+            f" so the master and {count - 1} of {len(nodes) - 1} other drives are monitored; if"
+            f" another one is lost together with the master, {instead} instead"
         )
 
 
@@ -230,7 +230,7 @@ def _expect(network: SetupNetwork, node: int, expected: Expectation) -> None:
 
 
 def _require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
-    """Objects that are not there are all told before any is written; what else is wrong shows then.
+    """Missing objects are all reported before any is written; other errors show then.
 
     Raises:
         Refused: A drive does not have an object that it needs.
@@ -263,7 +263,7 @@ def _check_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
     data = network.client(node).read(0x6041, 0, "status word")
     state = state_of(int.from_bytes(data, "little"))
     if state in FAULTED and not to_reset:
-        why = "it stopped itself; its own display or tool tells the cause"
+        why = "it stopped itself; see its display or maker's tool for the cause"
         raise in_fault(node, "", _STATUS_WORD, why)
     if state is DriveState.OPERATION_ENABLED:
         raise moved_by_another(node, "enabled already", _STATUS_WORD)
@@ -360,7 +360,7 @@ def _switch_off_used(network: SetupNetwork, node: int) -> None:
 
 
 def _switch_off_unused(network: SetupNetwork, node: int) -> None:
-    """Process data that nobody asked for would only fill the bus."""
+    """Process data that is not used would only fill the bus."""
     for index in UNUSED_PDOS:
         data = network.client(node).read_if_there(index, 1, "PDO identifier")
         if data is not None and not int.from_bytes(data, "little") & PDO_INVALID:

@@ -106,7 +106,7 @@ class Cia402Group(CyclicGroup):
         self._faults = []
         self._cycle = 0
         self._cycles_to_goal = 0
-        self._left_stop = False  # told "enable operation" since the last release began
+        self._left_stop = False  # commanded "enable operation" since the last release began
         self._known = False
         self._unwatching: SdoJobs | None = None
         self._modes: ModeCheck | None = None
@@ -173,7 +173,7 @@ class Cia402Group(CyclicGroup):
         return remarks
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
-        """Sends SYNC until every drive has told its position; see `DriveGroup.read_positions`."""
+        """Sends SYNC until every drive has reported a position; as `DriveGroup.read_positions`."""
         self._watch.forget_positions()
         agreed = 0
         for _ in range(FIRST_READING_ATTEMPTS):
@@ -192,7 +192,7 @@ class Cia402Group(CyclicGroup):
         raise HardwareMissing(
             f"no position from drive{'s' if len(silent) > 1 else ''} {names}",
             where="reading the drives' positions",
-            why="the drive lost power or the bus since it was set up",
+            why="the drive lost power or the bus after it was configured",
             next_step="check power and wiring, then start again",
             values={"nodes": names},
         )
@@ -281,7 +281,7 @@ class Cia402Group(CyclicGroup):
     def _begin_unwatching(self) -> None:
         """Heartbeat first and SYNC last: what is still watched is still sent."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
-            raise Refused("enabled drives must watch this program", where="drive group")
+            raise Refused("enabled drives must monitor this program", where="drive group")
         self._unwatching = SdoJobs(dict.fromkeys(self._nodes, MONITORING_OFF), self._again_after)
         self._modes = None
         self._watch.on_answer = self._unwatching.take
@@ -322,7 +322,7 @@ class Cia402Group(CyclicGroup):
             self._latch(found)
 
     def _stopped_by_themselves(self) -> list[tuple[int, str]]:
-        """Drives that left OPERATION ENABLED although they were not told to; not those in fault.
+        """Drives that left OPERATION ENABLED without being commanded to; not those in fault.
 
         On the way to a release they leave it for SWITCHED ON; one that is back in quick stop after
         it was enabled must not be enabled again.

@@ -32,7 +32,7 @@ Verdict = Literal["ok", "remark", "wrong"]
 
 WRITE_ONLY = 0x06010001
 MOST_VALUES = 3
-"""Of an object that are listed; more are told as different ones."""
+"""Of an object that are listed; more are reported as different ones."""
 
 _WORST: tuple[Verdict, ...] = ("ok", "remark", "wrong")
 
@@ -65,7 +65,7 @@ class ObjectRow:
     found: dict[str, list[int]] = field(default_factory=dict)
 
     def note(self, node: int, text: str, verdict: Verdict = "ok", change: str = "") -> None:
-        """Adds what one drive told."""
+        """Adds what one drive reported."""
         self.found.setdefault(text, []).append(node)
         if _WORST.index(verdict) > _WORST.index(self.verdict):
             self.verdict, self.change = verdict, change
@@ -73,7 +73,7 @@ class ObjectRow:
     def found_text(self, nodes: Sequence[int]) -> str:
         """``all: 8``, or each value with its drives."""
         if len(self.found) > MOST_VALUES and self.verdict == "ok":
-            return "there; each drive has its own"
+            return "present; differs between drives"
         if [sorted(nodes)] == [sorted(each) for each in self.found.values()]:
             return f"all: {next(iter(self.found))}"
         return "; ".join(
@@ -97,7 +97,7 @@ class Examined:
 
     @property
     def good(self) -> bool:
-        """Every drive can be set up, as far as reading tells."""
+        """Every drive can be set up, as far as reading shows."""
         return not self.silent and all(row.verdict != "wrong" for row in self.rows)
 
 
@@ -170,13 +170,15 @@ class _Look:
     def at_state(self) -> None:
         """Where the drive is in the state machine."""
         row = self._row(0x6041, 0, "6041h:00 statusword", "not enabled, no fault")
-        row.meaning = "drives that nobody moves are set up"
+        row.meaning = "only drives at rest are configured"
         data = self._read(0x6041, 0, row, optional=False)
         if data is None:
             return
         state = state_of(int.from_bytes(data, "little"))
         if state in FAULTED:
-            row.note(self._node, state.value, "wrong", "remove the cause, then `cdpr reset RIG`")
+            row.note(
+                self._node, state.value, "wrong", "remove the cause, then run `cdpr reset RIG`"
+            )
         elif state is DriveState.OPERATION_ENABLED:
             row.note(self._node, state.value, "remark", "another program moves it; end it first")
         else:
@@ -185,16 +187,21 @@ class _Look:
     def at_heartbeats(self, most: int | None, drives: int) -> None:
         """How many producers the drive can watch."""
         name = "1016h:00 consumer heartbeat entries"
-        row = self._row(HEARTBEAT_CONSUMERS, 0, name, f"1; {drives} to watch every peer too")
-        row.meaning = "stop when the master, or a peer, is gone"
+        row = self._row(HEARTBEAT_CONSUMERS, 0, name, f"1; {drives} to monitor every peer as well")
+        row.meaning = "stop when the master or a peer is lost"
         data = self._read(HEARTBEAT_CONSUMERS, 0, row, optional=False)
         if data is None:
             return
         count = int.from_bytes(data, "little")
         if count < 1:
-            row.note(self._node, "0", "wrong", "no run is safe with a drive that cannot watch")
+            row.note(
+                self._node,
+                "0",
+                "wrong",
+                "a drive that cannot monitor its master is not safe to run",
+            )
         elif min(count, most or count) < drives:
-            row.note(self._node, str(count), "remark", "nothing: not every peer is watched")
+            row.note(self._node, str(count), "remark", "none required: not every peer is monitored")
         else:
             row.note(self._node, str(count))
 
@@ -217,7 +224,7 @@ class _Look:
             found = self._read(*setting.per_mille_of, rated, optional=False)
             if found is not None:
                 value = int.from_bytes(found, "little")
-                change = "" if value else "enter the motor's data with the maker's tool"
+                change = "" if value else "enter the motor data with the maker's tool"
                 rated.note(self._node, str(value), "ok" if value else "wrong", change)
 
     def _row(self, index: int, sub: int, name: str, needed: str) -> ObjectRow:
@@ -235,7 +242,7 @@ class _Look:
             if code is None:
                 raise
         if code == WRITE_ONLY:
-            row.note(self._node, "there, write-only")
+            row.note(self._node, "present, write-only")
             return None
         absent = code in OBJECT_DOES_NOT_EXIST
         text = "absent" if absent else f"refused: {abort_text(int(code))}"
@@ -249,7 +256,7 @@ class _Look:
 def _how_to_set(expected: Expectation) -> str:
     if expected.index == 0x6502:
         return (
-            "none: without cyclic synchronous position (CSP) a drive cannot be used; Technosoft"
+            "none: a drive without cyclic synchronous position (CSP) cannot be used; Technosoft"
             " iPOS and Pilz PRBT do not have it"
         )
     if expected.index in (0x1000, 0x1018):
@@ -263,4 +270,4 @@ def _how_without(index: int, sub: int) -> str:
     fitting = [each for each in profile_names() if name in load_profile(each).absent]
     if fitting:
         return f"name the drives in the rig file: drives.profile: {' or '.join(fitting)}"
-    return "another drive, or another firmware of it: see its manual"
+    return "use another drive or firmware: see its manual"

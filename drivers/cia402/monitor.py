@@ -1,4 +1,4 @@
-"""What the drives told, and what of it is a fault of the group. No bus, no clock."""
+"""What the drives reported, and which of it is a group fault. No bus, no clock."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class DriveMonitor:
         if before is DriveState.OPERATION_ENABLED and state is not before:
             node = self.nodes[drive]
             cause = self._emergencies.get(node)
-            text = f"{self._names[node]} stopped by itself: {state.value}"
+            text = f"{self._names[node]} stopped on its own: {state.value}"
             self._dropped.append((node, f"{text}; {cause}" if cause else text))
 
     def _judge(self, node: int, state: DriveState) -> None:
@@ -167,13 +167,13 @@ class DriveMonitor:
         dropped, self._dropped = self._dropped, []
         return dropped
 
-    def state_faults(self, told: Container[str], *, powered: bool) -> list[tuple[int, str]]:
+    def state_faults(self, known: Container[str], *, powered: bool) -> list[tuple[int, str]]:
         """What is wrong with the drives as they stand, by node.
 
         How often a drive may be silent is the executor's to say (`executor.safety.monitor`).
 
         Args:
-            told: Faults known already; a drive whose emergency is among them is not told again.
+            known: Faults known already; a drive whose emergency is among them is left out.
             powered: The group is under power or on its way there; replies that cannot be believed
                 are a fault then.
         """
@@ -181,8 +181,11 @@ class DriveMonitor:
         for node, state in zip(self.nodes, self.states, strict=True):
             if state not in FAULTED:
                 continue
-            name, cause = self._names[node], self._emergencies.get(node, "it sent no reason")
-            if f"{name}: {cause}" not in told:
+            name, cause = (
+                self._names[node],
+                self._emergencies.get(node, "no emergency message received"),
+            )
+            if f"{name}: {cause}" not in known:
                 found.append((node, f"{name} is in {state.value}: {cause}"))
         return found + (self._check.faults() if powered else [])
 
@@ -194,10 +197,10 @@ class DriveMonitor:
         """
         if self.restarted:
             raise Refused(
-                f"{self._names[min(self.restarted)]} restarted: its set-up and its position are"
+                f"{self._names[min(self.restarted)]} restarted: its configuration and position are"
                 " lost",
                 where="drive group",
-                next_step="set the drives up again and check the reference (home) positions",
+                next_step="configure the drives again and check the homing reference",
             )
         faulted = [n for n, s in zip(self.nodes, self.states, strict=True) if s in FAULTED]
         if faulted and any(state in TORQUE_ON for state in self.states):
@@ -205,7 +208,7 @@ class DriveMonitor:
                 f"{self._names[faulted[0]]} cannot be reset while other drives hold the platform",
                 where="drive group",
                 why="resetting one drive of a platform under tension moves it",
-                next_step="support the platform, press the emergency stop so that no drive holds,"
+                next_step="support the platform, press the emergency stop to disable all drives,"
                 " release it, then reset the fault",
             )
         return faulted
@@ -246,7 +249,7 @@ class DriveMonitor:
         elif state == NmtState.BOOT_UP:
             self.restarted.add(node)
             self._news.append(
-                (node, f"{self._names[node]} restarted: its set-up and its position are lost")
+                (node, f"{self._names[node]} restarted: its configuration and position are lost")
             )
         elif state != NmtState.OPERATIONAL:
             self._news.append((node, f"{self._names[node]} left the NMT state operational"))

@@ -71,7 +71,7 @@ class Setting:
         except struct.error:
             raise BadInput(
                 f"{self} cannot hold {self.value}",
-                where="setting the drives up",
+                where="configuring the drives",
                 why=self.why,
                 next_step="check the winches, the cycle and the drive profile of the rig file",
             ) from None
@@ -109,7 +109,7 @@ class Expectation:
 
 #: What a drive must be before anything is written to it.
 BEFORE = (
-    Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are commanded here"),
+    Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
     Expectation(
         *(0x6502, 0, 0x80, 0x80, "supported drive modes"),
         "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
@@ -123,7 +123,7 @@ def identity(rig: Rig) -> tuple[Expectation, ...]:
     if not isinstance(drives, Cia402Document):
         return ()
     named = ((1, drives.vendor_id, "vendor id"), (2, drives.product_code, "product code"))
-    why = "the rig file names these drives"
+    why = "the rig file requires this drive"
     return tuple(
         Expectation(0x1018, sub, 0xFFFFFFFF, value, name, why)
         for sub, value, name in named
@@ -132,7 +132,7 @@ def identity(rig: Rig) -> tuple[Expectation, ...]:
 
 
 MODE_DISPLAY = Expectation(
-    0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode was taken"
+    0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode must be active"
 )
 """What it must show after the set-up, or once enabled (`ProfileDocument`)."""
 
@@ -208,7 +208,7 @@ def _within(setting: Setting, profile: ProfileDocument) -> Setting:
         f"{setting} must hold {setting.value}; {profile.name} takes {allowed.low} to"
         f" {allowed.high}",
         where="drives.profile",
-        why=f"needed because: {setting.why}",
+        why=f"required because: {setting.why}",
         next_step="change the cycle, the limits or the drives of the rig file",
     )
 
@@ -230,7 +230,7 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
             "<I",
             node << 16 | time_ms,
             "consumer heartbeat time",
-            "stop when the master is gone" if node == MASTER_NODE else "stop when a peer is gone",
+            "stop when the master is lost" if node == MASTER_NODE else "stop when a peer is lost",
         )
         for sub, node in enumerate([MASTER_NODE, *peers][:entries], start=1)
     )
@@ -256,7 +256,7 @@ def interpolation_time(
         if taken and 0 < round(value) <= most and abs(value - round(value)) < 1e-6:
             return round(value), exponent
     raise BadInput(
-        f"drives cannot interpolate over a cycle of {1000 * cycle:g} ms",
+        f"the drives cannot interpolate over a cycle of {1000 * cycle:g} ms",
         where="bus.cycle_ms",
         why=f"object 60C2h holds a whole number up to {most} times a power of ten"
         + ("" if exponents is None else f" from {exponents.low} to {exponents.high}"),
@@ -270,16 +270,21 @@ def _process_data(node: int) -> tuple[Setting, ...]:
     return (
         *_mapped(0x1400, 0x1600, RPDO1_BASE + node, received),
         # Off: a drive that stops by itself because frames to it alone were lost would be enabled
-        # again by the next one (transition 16 acts by level), before its reply tells that.
+        # again by the next one (transition 16 acts by level), before its reply shows that.
         Setting(
-            *(0x1400, 5, "<H", 0, "RPDO1 deadline", "the program sees lost set-points, and stops"),
+            *(
+                0x1400,
+                5,
+                "<H",
+                0,
+                "RPDO1 deadline",
+                "the program detects lost set-points and stops",
+            ),
             optional=True,
         ),
         _switched_on(0x1400, RPDO1_BASE + node, "RPDO1 identifier"),
         *_mapped(0x1800, 0x1A00, PDO_NO_RTR | TPDO1_BASE + node, sent),
-        Setting(
-            *(0x1800, 3, "<H", 0, "TPDO1 inhibit time", "no reply is held back"), optional=True
-        ),
+        Setting(*(0x1800, 3, "<H", 0, "TPDO1 inhibit time", "no reply is delayed"), optional=True),
         _switched_on(0x1800, PDO_NO_RTR | TPDO1_BASE + node, "TPDO1 identifier"),
     )
 
@@ -300,7 +305,7 @@ def _mapped(
             Setting(mapping, sub, "<I", entry, "PDO mapping", "word, position, and torque back")
             for sub, entry in enumerate(objects, start=1)
         ),
-        Setting(mapping, 0, "<B", len(objects), "PDO mapping", "all of them"),
+        Setting(mapping, 0, "<B", len(objects), "PDO mapping", "all objects"),
         Setting(parameters, 2, "<B", 1, "PDO transmission type", "one SYNC for all drives"),
     )
 
@@ -313,13 +318,15 @@ def _supervision(cycle: float) -> tuple[Setting, ...]:
         Setting(
             *(0x1007, 0, "<I", period_us, "synchronous window length", "the whole cycle"),
             optional=True,
-            instead="without it the window has no end",
+            instead="without it the window is unlimited",
         ),
-        Setting(0x1017, 0, "<H", produced_ms, "producer heartbeat time", "peers watch each other"),
+        Setting(
+            0x1017, 0, "<H", produced_ms, "producer heartbeat time", "peers monitor each other"
+        ),
         Setting(
             *(0x1029, 1, "<B", 1, "communication error behaviour", "keep reporting"),
             optional=True,
-            instead="a drive may leave the NMT state operational, which is a fault",
+            instead="a drive may leave NMT operational, which is a fault",
         ),
     )
 
@@ -345,7 +352,7 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
         Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
         Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
         *_options(),
-        _capped(0x6085, "quick stop deceleration", ramp, "stands within one cycle"),
+        _capped(0x6085, "quick stop deceleration", ramp, "at rest within one cycle"),
         _capped(0x6065, "following error window", window, "motion.following_error_mm"),
         Setting(0x6066, 0, "<H", math.ceil(1000 * cycle), "following error time out", "one cycle"),
     )
@@ -359,7 +366,7 @@ def _ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float
 
 
 def lost_master_times(rig: Rig) -> tuple[str, float, float]:
-    """What tells drives that the master is lost, when the last one notices, and its ramp, [s].
+    """How drives notice that the master is lost, when the last one does, and its ramp, [s].
 
     Raises:
         BadInput: There is no such profile, or its file is wrong.
@@ -378,13 +385,13 @@ def _options() -> tuple[Setting, ...]:
         Setting(
             *(0x605C, 0, "<h", 1, "disable operation option code", "ramp down before torque off"),
             optional=True,
-            instead="what a drive does when operation is disabled is its maker's choice: read its"
+            instead="the reaction to disabling operation is the maker's choice: read the"
             " manual before `cdpr release`",
         ),
         Setting(
             *(0x605E, 0, "<h", 2, "fault reaction option code", "ramp down before torque off"),
             optional=True,
-            instead="what a drive does in a fault is its maker's choice: read its manual",
+            instead="the reaction to a fault is the maker's choice: read the manual",
         ),
     )
 
@@ -399,7 +406,7 @@ def _limits(
             f"max_tension_n is {max_tension / winch.torque_constant:.0f} times the tension at"
             " rated torque",
             where=f"rig {rig.name}: winches[{drive}].torque_constant_n",
-            next_step="give the cable tension at rated motor torque",
+            next_step="set the cable tension at rated motor torque",
         )
     low, high = position_limits(rig, drive, winch_map)
     why = "longest and shortest cable of the workspace"
@@ -412,7 +419,7 @@ def _limits(
 
 def _torque_limit(per_mille: int, profile: ProfileDocument) -> Setting:
     """6072h, or the object of the maker that limits the current; [per mille of rated torque]."""
-    why = "largest allowed tension and a reserve"
+    why = "largest allowed tension plus a reserve"
     limit = profile.torque_limit
     if limit is None:
         return Setting(0x6072, 0, "<H", per_mille, "max torque", why)

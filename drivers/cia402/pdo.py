@@ -44,7 +44,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """What a heartbeat tells."""
+    """Content of a heartbeat."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04

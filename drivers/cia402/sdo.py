@@ -221,10 +221,10 @@ class Client:
         if not self._strange:
             return silent(self.node, where)
         return Refused(
-            f"drive {self.node} answers something else than it was asked",
+            f"drive {self.node} answered a different request",
             where=where,
             why="two devices have this node id, or another program talks to the drive",
-            next_step="give every device on the bus its own node id; end other programs",
+            next_step="give each device on the bus a unique node id; end other programs",
             values={"node": self.node},
         )
 
@@ -324,7 +324,7 @@ class Client:
         return answer
 
     def _attempt(self, transfer: Callable[[], bytes], place: str) -> bytes:
-        """Runs a transfer; what goes wrong is told with node and object."""
+        """Runs a transfer; errors name node and object."""
         where = f"drive {self.node}, object {place}"
         for attempt in range(1, ATTEMPTS + 1):
             try:
@@ -342,7 +342,7 @@ class Client:
                     raise self.no_answer(where) from None
             except can.CanError as error:
                 raise Fault(
-                    f"the bus did not take a frame: {error}",
+                    f"a frame could not be sent: {error}",
                     where=where,
                     next_step="check cable, termination and bit rate",
                 ) from error
@@ -356,7 +356,7 @@ def _upload(index: int, sub: int) -> bytes:
 def _answers(wanted: Key, command: int, index: int, sub: int) -> bool:
     """Whether a frame is an answer of the kind and to the object that are waited for.
 
-    A segment names no object; its toggle bit tells it from the one before.
+    A segment names no object; its toggle bit distinguishes it from the one before.
     """
     kind, wanted_index, wanted_sub = wanted
     if command == _ABORT:
@@ -371,7 +371,7 @@ def silent(node: int, where: str) -> HardwareMissing:
     return HardwareMissing(
         f"drive {node} does not answer",
         where=where,
-        why="it has no power, another node id or another bit rate, or it is not on this bus",
-        next_step="check power, wiring and node id; for simulated drives start `cdpr sim`",
+        why="no power, a wrong node id or bit rate, or the drive is on another bus",
+        next_step="check power, wiring and node id; for simulated drives, start `cdpr sim`",
         values={"node": node},
     )

@@ -161,7 +161,7 @@ class AnswerListener:
 def mode_text(name: str, mode: int | None) -> str:
     """What is wrong with the mode that an enabled drive shows; None where it shows none."""
     if mode is None:
-        return f"{name} does not say once enabled which mode it is in (6061h)"
+        return f"{name} does not report its mode once enabled (6061h)"
     return f"{name} is in mode {mode} (6061h) once enabled, not in 8 (CSP)"
 
 

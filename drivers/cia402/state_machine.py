@@ -78,7 +78,7 @@ _STATES = tuple(_decoded(low_bits) for low_bits in range(0x80))
 
 
 def state_of(status_word: int) -> DriveState:
-    """The state a status word (6041h) tells; a code the standard has not is NOT_READY."""
+    """The state a status word (6041h) reports; a code the standard has not is NOT_READY."""
     return _STATES[status_word & 0x7F]
 
 
@@ -86,7 +86,7 @@ class Goal(Enum):
     """Where the group is going."""
 
     IDLE = auto()
-    """No power; a drive found under torque is told to stop and hold."""
+    """No power; a drive found under torque is commanded to stop and hold."""
     ENABLE = auto()
     STOP = auto()
     RELEASE = auto()
@@ -148,8 +148,8 @@ def _enable(states: Sequence[DriveState], told_to_stop: Sequence[bool]) -> tuple
     if any(state in FAULTED for state in states):
         return (ControlWord.QUICK_STOP,) * len(states)
     lowest = min(_RANKS[state] for state in states)
-    # Out of quick stop only by a fresh edge: a drive that stopped by itself while it was told to
-    # run must first be told to stop.
+    # Out of quick stop only by a fresh edge: a drive that stopped by itself while commanded to
+    # run must first be commanded to stop.
     fresh = all(
         state is not DriveState.QUICK_STOP_ACTIVE or told
         for state, told in zip(states, told_to_stop, strict=True)

@@ -89,7 +89,7 @@ class SetupLink:
         self._send(node, self._layouts.rxsdo.command, data[:4])
 
     def write(self, node: int, endpoint: int, raw: int, size: int) -> None:
-        """Sets the value of an endpoint, of so many bytes."""
+        """Sets the value of an endpoint, of ``size`` bytes."""
         data = self._layouts.rxsdo.pack(OPCODE_WRITE, endpoint, raw)
         self._send(node, self._layouts.rxsdo.command, data[: 4 + size])
 
@@ -179,7 +179,7 @@ def configure_drives(
 
     The torque limit comes from ``max_tension``, [N].
 
-    A watchdog that expired while nothing was enabled only tells that a master went away; it is
+    A watchdog that expired while nothing was enabled only shows that a master was lost; it is
     cleared, on drives that all hold by their brakes.
     """
     nodes = tuple(winch.node_id for winch in rig.winches)
@@ -209,7 +209,7 @@ def configure_drives(
 
 
 def check_resolution(rig: Rig) -> None:
-    """A set-point is a 32-bit float of turns: it must tell every count of the travel apart.
+    """A set-point is a 32-bit float of turns: it must resolve every count of the travel.
 
     Raises:
         BadInput: It does not.
@@ -219,9 +219,9 @@ def check_resolution(rig: Rig) -> None:
         farthest = max(map(abs, position_limits(rig, drive, winch_map)))
         if farthest > WHOLE_IN_FLOAT:
             raise BadInput(
-                f"positions up to {farthest} counts are finer than an ODrive's set-point",
+                f"an ODrive's set-point does not resolve positions up to {farthest} counts",
                 where=f"rig {rig.name}: winches[{drive}]",
-                next_step="choose a smaller counts_per_rev (for ODrives it is a unit of your own"
+                next_step="choose a smaller counts_per_rev (for ODrives this unit is your own"
                 " choice), or home_counts nearer to 0",
             )
 
@@ -247,7 +247,7 @@ def _answers(
     raise HardwareMissing(
         f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",
         where=SETTING_UP,
-        why="no power, a broken cable, a wrong bit rate or node id, or the message is switched off",
+        why="no power, a broken cable, a wrong bit rate or node id, or the message is disabled",
         next_step="check power and wiring, and node id, bit rate and message periods with"
         " odrivetool",
         values={"nodes": silent},
@@ -280,8 +280,8 @@ def _check_versions(
             raise Refused(
                 f"its firmware is {text}, drives.endpoints is for {wanted}",
                 where=f"drive {node}",
-                why="the same number is another setting in another firmware",
-                next_step="take flat_endpoints.json of the drive's firmware",
+                why="endpoint numbers differ between firmware versions",
+                next_step="use the flat_endpoints.json of the drive's firmware",
                 values={"node": node, "firmware": text},
             )
 
@@ -295,7 +295,7 @@ def _check_idle(
     for node, (_, state, _) in told.items():
         if state != AxisState.IDLE:
             enabled = state == AxisState.CLOSED_LOOP_CONTROL
-            what = "enabled already" if enabled else f"in axis state {state}"
+            what = "already enabled" if enabled else f"in axis state {state}"
             raise moved_by_another(node, what, "Heartbeat")
     for node, (errors, _, _) in told.items():
         if int(errors) & ~AxisError.WATCHDOG_TIMER_EXPIRED and not reset:
@@ -314,9 +314,9 @@ def _check_supply(link: SetupLink, layouts: Layouts, nodes: Sequence[int]) -> No
     for node, (voltage, _) in told.items():
         if not voltage > NO_SUPPLY:  # also when it is no number
             raise Refused(
-                f"drive {node} has no supply: {voltage:.1f} V",
+                f"drive {node} has no motor supply: {voltage:.1f} V",
                 where=f"drive {node}, Get_Bus_Voltage_Current",
-                next_step="switch the supply of the motors on",
+                next_step="switch on the motor supply",
                 values={"node": node, "voltage": voltage},
             )
 
@@ -325,7 +325,7 @@ def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wante
     """Writes a setting and reads it back.
 
     Raises:
-        HardwareMissing: The drive does not tell it.
+        HardwareMissing: The drive does not report it.
         Refused: It does not keep it.
     """
     raw = endpoint.to_raw(wanted.value)
@@ -348,8 +348,8 @@ def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wante
             "ODrive's API reference",
         )
     raise HardwareMissing(
-        f"drive {node} does not tell {endpoint.name}",
+        f"drive {node} does not report {endpoint.name}",
         where=SETTING_UP,
-        next_step="check that drives.endpoints is of the drive's firmware and board",
+        next_step="check that drives.endpoints matches the drive's firmware and board",
         values={"node": node, "endpoint": endpoint.name},
     )

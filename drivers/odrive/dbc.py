@@ -114,7 +114,7 @@ def _database(path: Path) -> Any:
         import cantools.database.errors
     except ImportError as error:
         raise BadInput(
-            "the package cantools is not installed; ODrives need it",
+            "the package cantools, needed for ODrives, is not installed",
             where="drives.type: odrive",
             next_step="pip install 'cdpr[odrive]'",
         ) from error
@@ -137,7 +137,7 @@ def _database(path: Path) -> Any:
         raise BadInput(
             f"the DBC file cannot be read: {error}",
             where=str(path),
-            next_step="take ODrive's own of the drives' firmware (its page 'CAN Protocol'), or"
+            next_step="use ODrive's DBC file for the firmware (its page 'CAN Protocol'), or"
             " leave drives.dbc out",
         ) from error
 
@@ -154,14 +154,14 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
         size = "f" if signal.is_float else _INTEGERS.get((signal.length, signal.is_signed))
         gap, odd = divmod(signal.start - end, 8)
         if size is None or odd or gap < 0 or signal.byte_order != "little_endian":
-            raise _unfit(path, f"{name}.{signal.name} is no number of whole bytes in order")
+            raise _unfit(path, f"{name}.{signal.name} is not a whole number of bytes in order")
         codes += f"{gap}x{size}"
         scales.append(_scale(signal.conversion.scale, f"{name}.{signal.name}", path))
         end = signal.start + signal.length
     if not end <= message.length * 8 <= 64:
         raise _unfit(
             path,
-            f"{name} has {message.length} bytes; its signals need {end // 8}, and 8 is the most",
+            f"{name} has {message.length} bytes; its signals need {end // 8}, the limit is 8",
         )
     form = struct.Struct(f"{codes}{message.length - end // 8}x")
     return Layout(name, message.frame_id, form, tuple(scales))
@@ -170,7 +170,7 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
 def _scale(given: float, name: str, path: Path) -> float | None:
     """Value of one step of a signal; None where it is not scaled."""
     if not 1e-9 <= abs(given) <= 1e9:
-        raise _unfit(path, f"{name} has steps of {str(given)[:40]}")
+        raise _unfit(path, f"{name} has a scale of {str(given)[:40]}")
     return None if given == 1 else float(given)
 
 
@@ -178,5 +178,5 @@ def _unfit(path: Path, what: str) -> BadInput:
     return BadInput(
         f"the DBC file does not describe CANSimple of firmware 0.6: {what}",
         where=str(path),
-        next_step="take ODrive's own of the drives' firmware, or leave drives.dbc out",
+        next_step="use ODrive's DBC file for the firmware, or leave out drives.dbc",
     )

@@ -1,6 +1,6 @@
 """The settings of an ODrive by name: the flat endpoints of its firmware, and what cdpr wants there.
 
-ODrive publishes a `flat_endpoints.json` for each firmware and board; it tells the number and the
+ODrive publishes a `flat_endpoints.json` for each firmware and board; it gives the number and the
 type behind each name of the API reference.
 """
 
@@ -30,8 +30,7 @@ _FORMS = {
 
 
 _OTHER_FILE = (
-    "take flat_endpoints.json of the drives' firmware and board from ODrive, or leave"
-    " drives.endpoints out"
+    "use ODrive's flat_endpoints.json for the firmware and board, or leave out drives.endpoints"
 )
 
 
@@ -116,14 +115,14 @@ def wanted_settings(document: OdriveDocument) -> tuple[Wanted, ...]:
     watchdog = (document.watchdog_ms or 0.0) / 1000.0
     return (
         Wanted(f"{config}.watchdog_timeout", watchdog, "drives.watchdog_ms"),
-        Wanted(f"{config}.enable_watchdog", watchdog > 0.0, "it stops when its master is gone"),
+        Wanted(f"{config}.enable_watchdog", watchdog > 0.0, "it stops when its master is lost"),
         Wanted(f"{can}.heartbeat_msg_rate_ms", document.heartbeat_ms, "drives.heartbeat_ms"),
         Wanted(f"{can}.encoder_msg_rate_ms", document.estimates_ms, "drives.estimates_ms"),
         Wanted(f"{can}.torques_msg_rate_ms", document.torques_ms, "drives.torques_ms"),
         Wanted(f"{can}.input_vel_scale", 1000, "feed-forward comes in steps of 0.001 turns/s"),
         Wanted(f"{can}.input_torque_scale", 1000, "feed-forward comes in steps of 0.001 N·m"),
         Wanted(
-            "axis0.controller.config.circular_setpoints", False, "a cable is no circle of turns"
+            "axis0.controller.config.circular_setpoints", False, "cable travel does not wrap around"
         ),
     )
 
@@ -146,7 +145,7 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
             first = error.errors(include_url=False)[0]
             why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise BadInput(
-            f"these are not the endpoints that are needed: {why}",
+            f"the file lacks required endpoints: {why}",
             where=str(path),
             next_step=_OTHER_FILE,
         ) from error

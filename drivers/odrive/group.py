@@ -150,7 +150,7 @@ class OdriveGroup(CyclicGroup):
         return remarks
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
-        """Listens until every drive has told position and state; see `DriveGroup`.
+        """Listens until every drive has reported position and state; see `DriveGroup`.
 
         Its drives report by themselves, so that nothing is sent and no pace is kept.
         """
@@ -171,7 +171,7 @@ class OdriveGroup(CyclicGroup):
         raise HardwareMissing(
             f"no {'position' if silent else 'heartbeat'} from drives {names}",
             where="reading the drives' positions",
-            why="a drive lost power or the bus, or sends its messages more seldom than the rig file"
+            why="a drive lost power or the bus, or sends its messages less often than the rig file"
             " says",
             next_step="check power, wiring and the message periods, then start again",
             values={"nodes": names},
@@ -212,7 +212,7 @@ class OdriveGroup(CyclicGroup):
             self._begin_enabling()
         elif command is GroupCommand.RESET_FAULT:
             self._reset_fault()
-        elif command is not GroupCommand.END_MONITORING:  # axes that are idle watch nobody
+        elif command is not GroupCommand.END_MONITORING:  # idle axes monitor no master
             if command is GroupCommand.RELEASE:
                 self.require_releasable()
             # Every stop of ODrives ends with closed brakes and without torque.
@@ -255,7 +255,7 @@ class OdriveGroup(CyclicGroup):
             self._begin_stop(GroupState.FAULT)
 
     def _begin_stop(self, state: GroupState) -> None:
-        """Targets stay where they are; a stop that has begun is not begun anew."""
+        """Targets stay where they are; a stop that has begun is not restarted."""
         powered = self._state in (GroupState.ENABLING, GroupState.ENABLED)
         self._all_hold = self._all_hold or self._state is GroupState.ENABLED
         if self._state is not GroupState.FAULT:
@@ -265,7 +265,7 @@ class OdriveGroup(CyclicGroup):
             self._stop, self._waited = _Stop.HOLDING if powered else idle, 0
 
     def _advance(self) -> None:
-        """Sees whether the way under way has come to its end, or was not in time."""
+        """Checks whether the transition in progress has finished or timed out."""
         if self._stop is _Stop.HOLDING and self._waited >= self._settling:
             self._stop, self._waited = _Stop.DISARMING, 0
             self._watch.forget_heartbeats()
@@ -298,7 +298,7 @@ class OdriveGroup(CyclicGroup):
         watch = self._watch
         positions = np.array(watch.positions, dtype=np.int64)
         told = np.array(self._recent or [watch.positions], dtype=np.int64)
-        # A drive tells its position when it is its time: somewhere between the last set-points.
+        # A drive reports its position at its own time: somewhere between the last set-points.
         demands = np.clip(positions, told.min(axis=0), told.max(axis=0))
         torques = np.rint(np.array(watch.torques) * self._per_mille).astype(np.int64)
         words = np.array(watch.status_words, dtype=np.int64)
@@ -326,7 +326,7 @@ class OdriveGroup(CyclicGroup):
         self._refuse_latched("enable the drives")
         if self.stopping:
             raise Refused("cannot enable the drives: they are being stopped", where="drive group")
-        self._cyclic.forget_waiting()  # the drives went on telling while nobody listened
+        self._cyclic.forget_waiting()  # the drives kept sending meanwhile
         self._state, self._stop, self._waited = GroupState.ENABLING, _Stop.NONE, 0
         self._all_hold = False
         self._recent.clear()

@@ -44,26 +44,26 @@ class AxisError(IntEnum):
 
 
 ERROR_TEXTS: dict[int, str] = {
-    0x0000_0001: "it is still starting",
-    0x0000_0002: "the drive's own electronics",
-    0x0000_0004: "its control loop ran late",
-    0x0000_0008: "no position of the encoder",
-    0x0000_0010: "its configuration is not valid",
+    0x0000_0001: "still starting",
+    0x0000_0002: "drive electronics",
+    0x0000_0004: "control loop late",
+    0x0000_0008: "no position from the encoder",
+    0x0000_0010: "invalid configuration",
     0x0000_0020: "gate driver",
-    0x0000_0040: "no set-point came",
+    0x0000_0040: "no set-point received",
     0x0000_0100: "supply over-voltage",
     0x0000_0200: "supply under-voltage",
     0x0000_0400: "supply over-current",
-    0x0000_0800: "too much current fed back into the supply",
+    0x0000_0800: "regenerated current above its limit",
     0x0000_1000: "motor current above its limit",
-    0x0000_2000: "motor too hot",
-    0x0000_4000: "drive too hot",
+    0x0000_2000: "motor over-temperature",
+    0x0000_4000: "drive over-temperature",
     0x0000_8000: "speed above its limit",
     0x0001_0000: "position outside its limits",
-    0x0002_0000: "more current wanted than allowed",
+    0x0002_0000: "current demand above its limit",
     AxisError.WATCHDOG_TIMER_EXPIRED: "watchdog: no set-point in time",
     AxisError.ESTOP_REQUESTED: "emergency stop",
-    0x0400_0000: "the motor spins although it is held; the encoder slipped?",
+    0x0400_0000: "motor spinning out; has the encoder slipped?",
     0x0800_0000: "brake resistor",
     0x1000_0000: "temperature sensor",
     0x4000_0000: "calibration",
@@ -78,7 +78,7 @@ RESULT_TEXTS: dict[int, str] = {
     13: "not possible in this state",
     14: "not calibrated",
 }
-"""Why an axis did not reach a state that it was told to go to."""
+"""Why an axis did not reach a state that was requested."""
 
 
 def can_id(node: int, command: int) -> int:
@@ -144,7 +144,7 @@ class OdriveFrames:
         ]
 
     def axis_states(self, state: AxisState) -> list[can.Message]:
-        """Tells every drive to go to a state."""
+        """Requests a state of every drive."""
         return [self._frame(node, self._layouts.set_axis_state, state) for node in self._nodes]
 
     def clear_errors(self) -> list[can.Message]:

@@ -1,4 +1,4 @@
-"""What ODrives told, how long ago, and what of it is a fault of the group. No bus, no clock."""
+"""What ODrives reported, how long ago, and which of it is a group fault. No bus, no clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class OdriveWatch:
         errors: Axis errors.
         results: Procedure results.
         positions: [counts].
-        torques: As the drives tell them, [N·m].
+        torques: As the drives report them, [N·m].
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class OdriveWatch:
 
     @property
     def complete(self) -> bool:
-        """Every drive has told a position in this cycle."""
+        """Every drive has reported a position in this cycle."""
         return all(self._fresh)
 
     @property
@@ -149,7 +149,7 @@ class OdriveWatch:
             found += [
                 (
                     node,
-                    f"{self._names[node]} was disarmed; its brake holds (axis state {state})",
+                    f"{self._names[node]} disarmed itself; its brake holds (axis state {state})",
                 )
                 for node, state in zip(self.nodes, self.states, strict=True)
                 if state != AxisState.CLOSED_LOOP_CONTROL
@@ -161,9 +161,9 @@ class OdriveWatch:
         for drive, node in enumerate(self.nodes):
             late = {kind: self._ages[kind][drive] - self._most[kind] for kind in self._most}
             if late["heartbeat"] > 0:
-                found.append((node, f"{self._names[node]}: its heartbeat is missing"))
+                found.append((node, f"{self._names[node]}: heartbeat missing"))
             if late["torque"] > MISSED_TORQUES:
-                found.append((node, f"{self._names[node]} does not tell its torque"))
+                found.append((node, f"{self._names[node]} does not report its torque"))
         return found
 
     def _heartbeat(self, drive: int, values: tuple[float, ...]) -> None:

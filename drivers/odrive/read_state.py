@@ -1,4 +1,4 @@
-"""Looks at ODrives without changing anything: listens to what they tell by themselves."""
+"""Reads the state of ODrives without changing anything, from their cyclic messages."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def look(rig: Rig, document: OdriveDocument, bus: can.BusABC, pump: Pump | None)
             f"no {'position' if silent else 'heartbeat'} from drives"
             f" {', '.join(map(str, silent or nodes))}",
             where="listening to the drives",
-            why="a drive has no power or is not on the bus, or it sends its messages more seldom"
+            why="a drive has no power, is not on the bus, or sends its messages less often"
             " than the rig file says",
             next_step="check power, wiring and the message periods",
         )
@@ -55,6 +55,6 @@ def look(rig: Rig, document: OdriveDocument, bus: can.BusABC, pump: Pump | None)
         positions=np.array(watch.positions, dtype=np.int64),
         torques=np.rint(np.array(watch.torques) * per_mille).astype(np.int64),
         status_words=np.array(watch.status_words, dtype=np.int64),
-        # Their settings outlive their power, so nothing tells whether it was gone.
+        # Their settings outlive their power, so a loss of power leaves no trace.
         restarted=tuple(winch.node_id for winch in rig.winches if not winch.absolute),
     )

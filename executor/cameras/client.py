@@ -18,7 +18,7 @@ from tracking.track import FrameRate
 # Whether a camera measures the platform now, or has lost it.
 
 
-#: So many pictures in a row without a pose mean that the camera looks elsewhere or the light is
+#: This many images in a row without a pose mean that the camera looks elsewhere or the light is
 #: gone.
 BLIND_PICTURES = 10
 #: A camera that answers nothing for so long hangs, [s].
@@ -34,11 +34,11 @@ class CameraHealth:
         self._blind = 0
 
     def ask(self, at: float) -> None:
-        """A picture was asked for, at this time, [s]."""
+        """An image was asked for, at this time, [s]."""
         self._asked = at
 
     def answer(self, seen: bool) -> None:
-        """That picture is measured.
+        """That image is measured.
 
         Args:
             seen: It gave a pose.
@@ -52,10 +52,10 @@ class CameraHealth:
             now: On the clock of `ask`, [s].
         """
         if self._asked is not None and now - self._asked > SILENCE:
-            return f"gave no answer for {SILENCE:g} s"
+            return f"did not answer for {SILENCE:g} s"
         if self._blind >= BLIND_PICTURES:
             return (
-                f"gave no pose in {BLIND_PICTURES} pictures in a row (is it where the rig file"
+                f"gave no pose in {BLIND_PICTURES} images in a row (is it where the rig file"
                 " says, are tags in view and lit?)"
             )
         return ""
@@ -63,16 +63,16 @@ class CameraHealth:
 
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
-    """What became of one camera's pictures in a run.
+    """What became of one camera's images in a run.
 
     Attributes:
         name: Of the camera in the rig file.
-        source: Where its pictures came from.
+        source: Where its images came from.
         pictures: How many it was asked for.
         poses: How many of them gave a pose.
         dropped: How many were due while it was busy, and not asked for.
         measuring_ms: Median time that measuring one took; None where none was measured.
-        failed: Why it gave no pictures any more, or nothing.
+        failed: Why it gave no images any more, or nothing.
     """
 
     name: str
@@ -85,14 +85,14 @@ class CameraRecord:
 
 
 class CameraClient:
-    """Asks one camera for pictures and keeps its answers."""
+    """Asks one camera for images and keeps its answers."""
 
     def __init__(self, process: CameraProcess, source: str) -> None:
         """Nothing was asked for yet.
 
         Args:
-            process: Takes and measures the pictures.
-            source: Where they come from, to be told.
+            process: Takes and measures the images.
+            source: Where they come from, for messages.
         """
         self.name, self.source = process.name, source
         self.looks: list[CameraSample] = []
@@ -100,13 +100,13 @@ class CameraClient:
         self.failed: CdprError | None = None
         """Why there will be no more of them."""
         self.dropped = 0
-        """Pictures that were due while it was busy."""
+        """Images that were due while it was busy."""
         self._poses = 0
         self._process = process
         self._sight, self._pace = CameraHealth(), FrameRate()
 
     def ask(self, trigger: FrameRequest) -> bool:
-        """Asks for a picture unless it is busy or gone; returns whether it did."""
+        """Asks for an image unless it is busy or gone; returns whether it did."""
         if self.failed is not None:
             return False
         if self._process.unanswered is not None:
@@ -137,7 +137,7 @@ class CameraClient:
         if unanswered is None:
             return None
         if self.failed is None:
-            self.failed = CdprError(f"no answer any more from {unanswered.time:.2f} s on")
+            self.failed = CdprError(f"no answer since {unanswered.time:.2f} s")
         look = unseen(unanswered.frame, unanswered.time, self.failed.what)
         self.looks.append(look)
         return look
@@ -149,7 +149,7 @@ class CameraClient:
         return self._sight.trouble(now)
 
     def record(self) -> CameraRecord:
-        """What became of its pictures."""
+        """What became of its images."""
         return CameraRecord(
             self.name,
             self.source,
@@ -204,7 +204,7 @@ def _median_ms(looks: list[CameraSample]) -> float | None:
     return round(float(np.median(seconds)) * 1e3, 2) if seconds else None
 
 
-# Waiting until cameras are open, which takes a while, and may be told to end meanwhile.
+# Waiting until cameras are open, which takes a while, and may be stopped meanwhile.
 
 
 #: How long processes may take to import their libraries, to compile what finds tags' edges (once on
@@ -224,7 +224,7 @@ def wait_until_ready(
         unless_stopped: Asked again and again; what it raises ends the waiting.
 
     Raises:
-        CdprError: A camera cannot be used, for the reason told.
+        CdprError: A camera cannot be used, for the reason given.
     """
     waiting, latest = list(processes), time.monotonic() + START_TIMEOUT
     while waiting:
@@ -236,6 +236,6 @@ def wait_until_ready(
             raise Fault(
                 f"camera {names} did not open within {START_TIMEOUT:.0f} s",
                 where="cameras",
-                why="the device or the network that it is on does not answer",
+                why="the device or its network does not answer",
                 next_step="check the camera with `cdpr doctor RIG --camera SOURCE`",
             )

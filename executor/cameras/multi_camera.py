@@ -18,21 +18,21 @@ from tracking.measurement import PoseMeasurement
 from tracking.multi_camera import MultiCameraFusion
 from tracking.track import rates
 
-# Watches measured clearance, picture by picture, for one whose upper bound is below the limit.
+# Watches measured clearance, image by image, for one whose upper bound is below the limit.
 
 
-#: So many pictures in a row must show too little clearance before the run is stopped for it.
+#: This many images in a row must show too little clearance before the run is stopped for it.
 NEAR_PICTURES = 2
 
 
 class ClearanceMonitor:
-    """Tells when clearance was below a limit in the last pictures, whatever they are off by.
+    """Detects clearance below a limit in the last images, beyond their uncertainty.
 
-    One picture alone may be wrong for a reason that its covariance does not know.
+    One image alone may be wrong for a reason that its covariance does not know.
     """
 
     def __init__(self, limit: float) -> None:
-        """Begins without a picture.
+        """Begins without an image.
 
         Args:
             limit: Clearance that the scene asks for, [m].
@@ -40,10 +40,10 @@ class ClearanceMonitor:
         self._limit, self._pictures = limit, 0
 
     def take(self, clearance: MeasuredClearance | None) -> str:
-        """What is too near, with numbers, when the last pictures say so; else nothing.
+        """What is too near, with numbers, when the last images say so; else nothing.
 
         Args:
-            clearance: Of the newest picture with a pose; None in a scene without obstacles.
+            clearance: Of the newest image with a pose; None in a scene without obstacles.
         """
         if clearance is None or clearance.at_most >= self._limit:
             self._pictures = 0
@@ -55,7 +55,7 @@ class ClearanceMonitor:
         near, spread = clearance.nearest[at], float(clearance.uncertainties[at])
         return (
             f"{near.first} to {near.second}: {near.distance * 1e3:.1f} ± {spread * 1e3:.1f} mm;"
-            f" the scene asks for {self._limit * 1e3:g} mm"
+            f" the scene requires {self._limit * 1e3:g} mm"
         )
 
 
@@ -92,9 +92,9 @@ class MultiCameraMonitor:
         self.near = ""
         """Between what the measured clearance fell below the limit, with numbers; else nothing."""
         self.news: list[CameraNews] = []
-        """What began since whoever reads this cleared it."""
+        """Conditions that began since the reader cleared this."""
         self._model, self._several = model, len(names) > 1
-        # Each camera has its own: where they disagree, nobody knows which one is right.
+        # Each camera has its own: where they disagree, the right one is unknown.
         self._watches = {name: ClearanceMonitor(limit) for name in names}
         self._within = 0.5 / rate
         self._common = MultiCameraFusion(self._within)
@@ -120,15 +120,15 @@ class MultiCameraMonitor:
         poses = {name: one for name, one in each.items() if isinstance(one, PoseMeasurement)}
         self._count_disagreement(found.reason if poses else "")
         for name, one in poses.items():
-            self._watch(name, clearance_of(self._model, one), f", as camera {name} alone sees it")
+            self._watch(name, clearance_of(self._model, one), f", measured by camera {name} alone")
         return CameraSample(frame, found, picture)
 
     def finish(self) -> None:
-        """Tells in how many moments a camera was left out as its picture was too far apart."""
+        """Reports how often a camera was left out because its image was too far apart in time."""
         if self._common.apart:
             text = (
-                f"in {self._common.apart} of {self._moments} moments not all cameras were taken"
-                f" together: pictures were taken more than {self._within * 1e3:.0f} ms apart from"
+                f"at {self._common.apart} of {self._moments} times not all cameras were used"
+                f": images were taken more than {self._within * 1e3:.0f} ms from"
                 " the others"
             )
             self.news.append(CameraNews("pictures_dropped", text))
@@ -142,13 +142,13 @@ class MultiCameraMonitor:
         self._disagree = self._disagree + 1 if reason else 0
         if self._disagree == BLIND_PICTURES:
             text = (
-                f"{reason}, {BLIND_PICTURES} times in a row; clearance is not measured together,"
-                " only watched by each alone"
+                f"{reason}, {BLIND_PICTURES} times in a row; fused clearance is not measured,"
+                " each camera monitors it alone"
             )
             self.news.append(CameraNews("camera_sees_nothing", text))
 
 
-#: At the end of a run the last pictures are waited for no longer than this, [s],
+#: At the end of a run the last images are waited for no longer than this, [s],
 PATIENCE = 20.0
 #: and after a stop no longer than this, [s]; whether there is one is asked every so often, [s].
 HURRY, ROUND = 2.0, 0.05
@@ -220,13 +220,13 @@ class RunCameras:
     def trigger(
         self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
     ) -> None:
-        """Takes in what the cameras have seen, and asks for a picture of this moment.
+        """Takes in what the cameras have seen, and asks for an image of this moment.
 
         Args:
             time: Since the start of the run, [s].
             asked: The same moment on the monotonic clock, [s].
             true_pose: Where the simulated platform is; None with real cameras.
-            by_drives: Where the drives' positions put it; None when they do not tell.
+            by_drives: Where the drives' positions put it; None when they are unknown.
         """
         self._now = asked
         for eye in self._eyes:
@@ -251,7 +251,7 @@ class RunCameras:
         return [eye.as_dict(self._now) for eye in self._eyes]
 
     def finish(self, stopped: Callable[[], bool]) -> CameraRecords:
-        """Waits for the last pictures of all cameras; what is missing then is told.
+        """Waits for the last images of all cameras; what is missing then is reported.
 
         Args:
             stopped: Whether a stop is wished; the wait is a short one then.
@@ -327,14 +327,14 @@ Tell = Callable[[str, str, float], None]
 
 
 class RunWatch:
-    """Asks the cameras for pictures, and stops the run when they see too little clearance."""
+    """Asks the cameras for images, and stops the run when they see too little clearance."""
 
     def __init__(
         self,
         cameras: RunCameras,
         status: RunStatus,
         board: RequestBoard,
-        tell: Tell,
+        report: Tell,
         *,
         clearance_stop: bool,
         listener: Listener = SILENT,
@@ -345,19 +345,19 @@ class RunWatch:
             cameras: Those of the run.
             status: Kept up to date for those who ask.
             board: Where a stop is asked for.
-            tell: Takes in what happens.
+            report: Called with each event.
             clearance_stop: Ask for a stop when clearance is too small.
             listener: Receives the same.
         """
         self.rates = ""
         """How fast each camera is and how many tags it sees, for the progress bar."""
         self._cameras, self._status, self._board = cameras, status, board
-        self._tell, self._clearance_stop, self._listener = tell, clearance_stop, listener
+        self._tell, self._clearance_stop, self._listener = report, clearance_stop, listener
 
     def trigger(
         self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
     ) -> None:
-        """A picture is due; arguments as for `RunCameras.trigger`."""
+        """An image is due; arguments as for `RunCameras.trigger`."""
         self._cameras.trigger(time, asked, true_pose, by_drives)
         self._tell_news(asked)
         each = self._cameras.as_dict()
@@ -369,24 +369,24 @@ class RunWatch:
         near, all_failed = self._cameras.near, self._cameras.all_failed
         if near and self._clearance_stop:
             who = "the cameras" if len(each) > 1 else "the camera"
-            less = f"{who} measured less clearance than the scene asks for: {near}"
+            less = f"{who} measured less clearance than the scene requires: {near}"
             self._stop("too near", near, "clearance_low", less)
         if all_failed:
             self._stop("stopping", all_failed, "camera", all_failed)
 
     def finish(self, at: float) -> CameraRecords:
-        """Waits for the last pictures.
+        """Waits for the last images.
 
         Args:
             at: The end of the run, on the loop's clock, [s].
         """
-        with self._listener.waiting("waiting for the last pictures"):
+        with self._listener.waiting("waiting for the last images"):
             seen = self._cameras.finish(lambda: self._board.read().stop)
         self._tell_news(at)
         for camera in seen.cameras:
             if camera.dropped:
-                what = f"{camera.dropped} of {camera.dropped + camera.pictures} pictures left out"
-                text = f"camera {camera.name}: {what}, the one before was not done"
+                what = f"{camera.dropped} of {camera.dropped + camera.pictures} images skipped"
+                text = f"camera {camera.name}: {what}; the previous one was still being processed"
                 self._tell("pictures_dropped", text, at)
         return seen
 

@@ -34,7 +34,7 @@ from tracking.measurement import Observation
 if TYPE_CHECKING:  # a real camera loads no simulator
     from simulation.camera.camera import Film
 
-#: About so many pictures of a run are kept for its report.
+#: Approximate number of a run's images kept for its report.
 KEPT_PICTURES = 12
 
 
@@ -59,12 +59,12 @@ def open_cameras(
         folder: The run folder.
         pictures: How many are expected of each; some of them are kept.
         board: A stop that is wished here ends the opening.
-        simulated_time: A late picture holds the run up instead of being dropped.
+        simulated_time: A late image holds the run up instead of being dropped.
         listener: Receives that it waits.
 
     Raises:
         StoppedByOperator: A stop was wished before all were open.
-        CdprError: A camera cannot be used, for the reason told.
+        CdprError: A camera cannot be used, for the reason given.
     """
     if not eyes:
         yield None
@@ -91,7 +91,7 @@ def open_cameras(
 
 
 def asked_rate(eyes: Mapping[Camera, str]) -> float:
-    """How often all cameras are asked for a picture: as often as the slowest takes one, [Hz]."""
+    """How often all cameras are asked for an image: as often as the slowest takes one, [Hz]."""
     return min(camera.rate for camera in eyes)
 
 
@@ -103,7 +103,7 @@ def require_no_stop(board: RequestBoard) -> None:
     """
     if board.read().stop:
         raise StoppedByOperator(
-            "stopped before anything moved", next_step="run it again when all is well"
+            "stopped before anything moved", next_step="run it again when ready"
         )
 
 
@@ -136,7 +136,7 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
 
 
 class RenderedPictures:
-    """The synthetic camera as the run's source of pictures."""
+    """The synthetic camera as the run's source of images."""
 
     def __init__(self, film: Film) -> None:
         self._film = film
@@ -144,7 +144,7 @@ class RenderedPictures:
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """Renders the platform where it truly is."""
         if trigger.true_pose is None:
-            raise Fault("the synthetic camera was not told where the platform is")
+            raise Fault("the synthetic camera has no platform pose")
         return self._film.picture(trigger.time, trigger.true_pose, trigger.frame), 0.0
 
     def close(self) -> None:
@@ -152,13 +152,13 @@ class RenderedPictures:
 
 
 class LivePictures:
-    """A real camera as the run's source of pictures."""
+    """A real camera as the run's source of images."""
 
     def __init__(self, camera: LiveCamera) -> None:
         self._camera = camera
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """The next picture, and how long after the trigger it arrived."""
+        """The next image, and how long after the trigger it arrived."""
         frame = self._camera.read()
         return frame.image, frame.time - trigger.asked
 
@@ -175,7 +175,7 @@ def look_at_rest(
     unless_stopped: Callable[[], None],
     listener: Listener,
 ) -> list[Observation]:
-    """Opens the camera, takes pictures of a platform that stands still, measures each.
+    """Opens the camera, takes images of a platform that stands still, measures each.
 
     Args:
         rig: The robot.

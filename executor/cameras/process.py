@@ -1,7 +1,7 @@
-"""A camera's own process, so that pictures never delay the loop, nor one camera another.
+"""A camera's own process, so that images never delay the loop, nor one camera another.
 
-It takes (or renders) a picture when it is asked, measures the pose, and says so at once. In real
-time it is not asked again before it has answered, and a picture that was due is counted as dropped.
+It takes (or renders) an image when it is asked, measures the pose, and says so at once. In real
+time it is not asked again before it has answered, and an image that was due is counted as dropped.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class _Failure:
 
 
 class CameraProcess:
-    """Takes pictures with one camera when told to, and measures the platform in them."""
+    """Takes images with one camera on request, and measures the platform in them."""
 
     def __init__(self, name: str, make_observer: MakeObserver, *, may_wait: bool) -> None:
-        """Starts the process; `is_ready` tells when its camera is.
+        """Starts the process; `is_ready` is true once its camera is.
 
         Args:
             name: Of the camera.
@@ -65,7 +65,7 @@ class CameraProcess:
             within: How long it is waited for, [s].
 
         Raises:
-            CdprError: It cannot be used, for the reason told.
+            CdprError: It cannot be used, for the reason given.
         """
         if not self._link.poll(within):
             return False
@@ -78,16 +78,16 @@ class CameraProcess:
         return self._asked
 
     def ask(self, trigger: FrameRequest) -> None:
-        """Asks for a picture; the one before must have been answered.
+        """Asks for an image; the one before must have been answered.
 
         Raises:
-            CdprError: The process is gone, for the reason told.
+            CdprError: The process is gone, for the reason given.
         """
         if self._asked is not None:
             raise ValueError(f"camera {self.name} has not answered yet")
         try:
             self._link.send(trigger)
-        except OSError:  # the process is gone; why, it may have told before
+        except OSError:  # the process is gone; it may have reported why
             while True:
                 self._receive()
         self._asked = trigger
@@ -98,7 +98,7 @@ class CameraProcess:
         One that does not come is waited for only once: the others must go on.
 
         Raises:
-            CdprError: The process failed, for the reason told.
+            CdprError: The process failed, for the reason given.
         """
         return self.answer_within(PATIENCE if self._waits else 0.0)
 
@@ -106,7 +106,7 @@ class CameraProcess:
         """The answer to what was asked, if it comes within so long, [s].
 
         Raises:
-            CdprError: The process failed, for the reason told.
+            CdprError: The process failed, for the reason given.
         """
         if not self._link.poll(patience if self._asked is not None else 0.0):
             self._waits = self._waits and self._asked is None
@@ -153,12 +153,12 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
         except CdprError as error:
             _say(link, _Failure(error))
         except Exception as error:
-            what = f"the camera's process failed: {type(error).__name__}: {error}"
+            what = f"the camera process failed: {type(error).__name__}: {error}"
             _say(link, _Failure(what))
 
 
 class _NobodyThere(BaseException):
-    """The parent is gone; there is nothing left to do, and nobody to tell."""
+    """The parent is gone; nothing is left to do or to report."""
 
 
 def _say(link: Connection, what: CameraSample | _Ready | _Failure) -> None:

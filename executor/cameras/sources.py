@@ -1,4 +1,4 @@
-"""Which of the rig's cameras look at it, and where the pictures of each come from."""
+"""Which of the rig's cameras look at it, and where the images of each come from."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ the drives are simulated in this process, an error on a bus."""
 
 
 def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool) -> str | None:
-    """Where pictures come from: ``synthetic``, a camera's index or address, or None.
+    """Where images come from: ``synthetic``, a camera's index or address, or None.
 
     Raises:
         BadInput: The wish cannot be met; nothing is left out silently.
@@ -25,7 +25,7 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
     if without:
         if wanted is not None:
             raise BadInput(
-                "--camera and --no-camera contradict each other", next_step="leave one of them out"
+                "--camera and --no-camera contradict each other", next_step="leave out one of them"
             )
         return None
     if not rig.cameras or not rig.platform_tags:
@@ -39,13 +39,13 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
             raise BadInput(
                 "no camera was named",
                 where="--camera",
-                why="the drives are not simulated in this process, so no picture can be rendered",
+                why="the drives are not simulated in this process, so no image can be rendered",
                 next_step="pass --camera INDEX for a real camera, or --no-camera",
             )
         return SYNTHETIC
     if wanted == SYNTHETIC and not in_process:
         raise BadInput(
-            "the synthetic camera needs drives that are simulated in this process",
+            "the synthetic camera needs drives simulated in this process",
             where="--camera",
             next_step="use the interface 'virtual', a real camera, or --no-camera",
         )
@@ -58,9 +58,9 @@ def _require_live(source: str) -> None:
     """What was recorded shows nothing of a platform that moves now."""
     if not is_camera(source):
         raise BadInput(
-            f"{source!r} is no camera",
+            f"{source!r} is not a live camera source",
             where="--camera",
-            why="pictures must be taken while the platform moves; a file or a folder has others",
+            why="images must be taken during the motion, not read from a file or folder",
             next_step="name an index such as 0, a device such as /dev/video0, or an address",
         )
 
@@ -68,7 +68,7 @@ def _require_live(source: str) -> None:
 def choose_cameras(
     rig: Rig, wanted: list[str], without: bool, in_process: bool
 ) -> dict[Camera, str]:
-    """Which of the rig's cameras look at a run, and where the pictures of each come from.
+    """Which of the rig's cameras look at a run, and where the images of each come from.
 
     Args:
         rig: Its cameras.
@@ -116,7 +116,7 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
 
 
 def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:
-    """The one camera that measures a platform at rest, and where its pictures come from.
+    """The one camera that measures a platform at rest, and where its images come from.
 
     Args:
         rig: Its cameras.
@@ -128,9 +128,9 @@ def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Ca
     """
     if len(wanted) != 1:
         raise BadInput(
-            f"{len(wanted)} cameras are named, and one measures",
+            f"{len(wanted)} cameras are given; only one can be used",
             where="--camera",
-            next_step="name the one that sees the most tags, from the nearest",
+            next_step="name the one that sees the most tags from the shortest distance",
         )
     ((camera, source),) = parse_camera_sources(rig, wanted, None, "--camera").items()
     choose_camera(rig, source, False, in_process)
@@ -140,7 +140,7 @@ def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Ca
 def parse_camera_sources(
     rig: Rig, sources: list[str], wanted: str | None, where: str = "track"
 ) -> dict[Camera, str]:
-    """Which camera's pictures come from where.
+    """Which camera's images come from where.
 
     Args:
         rig: Its cameras.
@@ -167,11 +167,11 @@ def parse_camera_sources(
             raise BadInput(
                 f"camera {name!r} has no source",
                 where=where,
-                next_step=f"write {name}=0, or what its pictures come from",
+                next_step=f"write {name}=0, or its image source",
             )
         if not sign or "://" in name:
             raise BadInput(
-                f"the source {source!r} does not say which camera it is of",
+                f"the source {source!r} does not name its camera",
                 where=where,
                 next_step=f"write NAME={source}, NAME one of: {', '.join(names)}",
             )
@@ -194,13 +194,13 @@ def _is_unnamed(source: str, names: list[str]) -> bool:
 
 
 def _require_own(place: str, eyes: Mapping[Camera, str], name: str, where: str) -> None:
-    """Two cameras cannot take the same pictures."""
+    """Two cameras cannot take the same images."""
     for camera, other in eyes.items():
         if place != SYNTHETIC and _device(place) == _device(other):
             raise BadInput(
                 f"cameras {camera.name!r} and {name!r} have the same source {place!r}",
                 where=where,
-                next_step="give each camera its own",
+                next_step="give each camera its own source",
             )
 
 
@@ -217,7 +217,7 @@ def require_camera_source(source: str) -> None:
     """
     if not is_camera(source):
         raise BadInput(
-            "neither a folder of pictures, nor a video file, nor a camera",
+            "not a folder of images, a video file or a camera",
             where=source,
             next_step="check the path; a camera is an index such as 0, /dev/video0 or an address",
         )
@@ -231,7 +231,7 @@ def is_camera(source: str) -> bool:
 
 
 def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
-    """In simulated time a real camera's pictures would be stamped with times that mean nothing.
+    """In simulated time a real camera's images would be stamped with times that mean nothing.
 
     Raises:
         BadInput: ``--fast`` is given, and a source is a real camera.
@@ -241,8 +241,8 @@ def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
         raise BadInput(
             "--fast needs synthetic cameras",
             where=f"--camera {real[0]}",
-            why="a real camera takes its pictures in real time, and the run would be over before",
-            next_step="leave --fast out, or pass --camera synthetic",
+            why="a real camera takes images in real time; a fast run would end before",
+            next_step="leave out --fast, or pass --camera synthetic",
         )
 
 

@@ -1,4 +1,4 @@
-"""Where a platform at rest is, from several pictures of it."""
+"""Where a platform at rest is, from several images of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_m
 from model.rig import Rig
 from tracking.measurement import Observation, PoseMeasurement
 
-#: At least this share of the pictures must give a pose.
+#: At least this share of the images must give a pose.
 SEEN_SHARE = 0.8
 #: The platform moves, or the light flickers, when poses scatter by more, [m].
 MOST_SCATTER = 0.5e-3
@@ -30,7 +30,7 @@ class RestPose:
     Attributes:
         pose: ``world_from_platform``.
         uncertainty: Of the position along its worst direction, standard deviation, [m].
-        length_uncertainty: Of the cable length that it tells worst, [m].
+        length_uncertainty: Of the cable length known worst, [m].
         pictures: How many gave a pose.
     """
 
@@ -41,19 +41,19 @@ class RestPose:
 
 
 def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
-    """The pose in which the platform stood still in all pictures.
+    """The pose in which the platform stood still in all images.
 
-    What is wrong with one picture is wrong with all, so the mean is not more certain than each.
+    What is wrong with one image is wrong with all, so the mean is not more certain than each.
 
     Raises:
-        Refused: Too few pictures show it, it did not stand still, or it is not known well enough
+        Refused: Too few images show it, it did not stand still, or it is not known well enough
             for a run to start: to half the rig's start tolerance, in cable length.
     """
     found = [look for look in looks if isinstance(look, PoseMeasurement)]
     if not found or len(found) < SEEN_SHARE * len(looks):
         reasons = {getattr(look, "reason", "") for look in looks} - {""}
         raise _refusal(
-            f"{len(found)} of {len(looks)} pictures show where the platform is",
+            f"{len(found)} of {len(looks)} images give a platform pose",
             "; ".join(sorted(reasons)),
         )
     first = found[0].pose
@@ -64,8 +64,8 @@ def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
     scatter = float(np.max(np.std(positions, axis=0)))
     if not scatter <= MOST_SCATTER:
         raise _refusal(
-            f"the platform does not stand still: its poses scatter by {scatter * 1000:.2f} mm,"
-            f" allowed {MOST_SCATTER * 1000:g} mm",
+            f"the platform is not at rest: its poses scatter by {scatter * 1000:.2f} mm,"
+            f" limit {MOST_SCATTER * 1000:g} mm",
             "it swings, or the light flickers",
         )
     turned = matrix_from_rotation_vector(turns.mean(axis=0))
@@ -76,9 +76,9 @@ def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
     allowed = rig.motion.start_tolerance / 2.0
     if not lengths <= allowed:
         raise _refusal(
-            f"a cable's length is known to {lengths * 1000:.2f} mm only, allowed"
+            f"the uncertainty of a cable's length is {lengths * 1000:.2f} mm, limit"
             f" {allowed * 1000:.2f} mm",
-            "few tags are seen, far away or aslant",
+            "few tags are visible, from far away or at a steep angle",
         )
     worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance[:3, :3]))))
     return RestPose(pose, worst, lengths, len(found))
@@ -89,15 +89,15 @@ def _refusal(what: str, why: str) -> Refused:
         what,
         where="tracked pose",
         why=why,
-        next_step="see to camera, light and tags (`cdpr track RIG SOURCE`), then home again; the"
+        next_step="check camera, light and tags (`cdpr track RIG SOURCE`), then home again; the"
         " cables are taut and held",
     )
 
 
-# Pictures of a platform that stands still, and an operator who may end the looking at any time.
+# Images of a platform that stands still, and an operator who may end the looking at any time.
 
 
-#: A picture that has not come after so long will not come, [s].
+#: An image that has not come after so long will not come, [s].
 PATIENCE = 20.0
 
 
@@ -108,18 +108,18 @@ def looks_at_rest(
     true_pose: Pose | None,
     unless_stopped: Callable[[], None],
 ) -> list[Observation]:
-    """What a camera measures in some pictures, one after another.
+    """What a camera measures in some images, one after another.
 
     Args:
         process: Of the camera, which is open.
         pictures: How many.
-        period: Between pictures in simulated time, [s]; None where a real camera takes them.
+        period: Between images in simulated time, [s]; None where a real camera takes them.
         true_pose: Where the simulated platform is.
-        unless_stopped: Called before each picture and while one is waited for; what it raises ends
+        unless_stopped: Called before each image and while one is waited for; what it raises ends
             the looking.
 
     Raises:
-        CdprError: The camera failed, for the reason told.
+        CdprError: The camera failed, for the reason given.
     """
     began, looks = time.monotonic(), []
     for frame in range(pictures):
@@ -141,8 +141,8 @@ def _answer(
         unless_stopped()
         if time.monotonic() > latest:
             raise Fault(
-                f"the camera gave no picture for {PATIENCE:g} s",
+                f"the camera delivered no image for {PATIENCE:g} s",
                 where=f"camera {process.name}",
-                why="it hangs, or what connects it",
-                next_step="check its cable, then begin again",
+                why="the camera or its connection hangs",
+                next_step="check its cable, then start again",
             )

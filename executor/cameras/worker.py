@@ -1,4 +1,4 @@
-"""What a camera's process does with a trigger: a picture, and the pose in it."""
+"""What a camera's process does with a trigger: an image, and the pose in it."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tracking.tracker import DrivesAhead, Tracker
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRequest:
-    """Asks for one picture.
+    """Asks for one image.
 
     Attributes:
         frame: Number of the moment, the same for all cameras.
         time: Since the start of the run, [s].
         asked: When, monotonic, [s].
         true_pose: Where the simulated platform is; None with a real camera.
-        by_drives: Where the drives' positions put the platform; None when they do not tell.
+        by_drives: Where the drives' positions put the platform; None when they are unknown.
     """
 
     frame: int
@@ -40,12 +40,12 @@ class FrameRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSample:
-    """What came of one picture, or of the pictures that several cameras took at one moment.
+    """What came of one image, or of the images that several cameras took at one moment.
 
     Attributes:
         frame: Number of the moment.
         found: The pose, or why there is none; its time is since the start of the run, [s].
-        picture: Name of the kept picture in the run folder, or nothing.
+        picture: Name of the kept image in the run folder, or nothing.
         seconds: How long measuring took, [s]; NaN where nothing was measured.
         clearance: Distances at the measured pose, or None.
     """
@@ -58,15 +58,15 @@ class CameraSample:
 
 
 def unseen(frame: int, time: float, reason: str) -> CameraSample:
-    """What is known of a picture that was asked for and never measured."""
+    """What is known of an image that was asked for and never measured."""
     return CameraSample(frame, NoPose(time, reason))
 
 
 class PictureSource(Protocol):
-    """A camera, real or rendered, that gives a picture when asked."""
+    """A camera, real or rendered, that gives an image when asked."""
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """A grey picture, and how much later than asked for it was taken, [s]."""
+        """A grey image, and how much later than asked for it was taken, [s]."""
         ...
 
     def close(self) -> None:
@@ -75,7 +75,7 @@ class PictureSource(Protocol):
 
 
 class CameraWorker:
-    """Takes pictures with one camera and measures them, as a context manager."""
+    """Takes images with one camera and measures them, as a context manager."""
 
     def __init__(
         self,
@@ -92,10 +92,10 @@ class CameraWorker:
         Args:
             rig: The robot with its tags.
             camera: The camera that the source is.
-            source: Where pictures come from.
+            source: Where images come from.
             folder: Where some of them are kept; None to keep none.
-            keep_every: Every how many pictures one is kept.
-            named: Kept pictures are in a folder of the camera's name: there are others.
+            keep_every: Every how many images one is kept.
+            named: Kept images are in a folder of the camera's name: there are others.
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._name = camera.name if named else ""
@@ -113,7 +113,7 @@ class CameraWorker:
         self._source.close()
 
     def look(self, trigger: FrameRequest) -> CameraSample:
-        """Takes a picture and measures the platform in it."""
+        """Takes an image and measures the platform in it."""
         image, delay = self._source.picture(trigger)
         kept = ""
         if self._folder is not None and trigger.frame % self._keep_every == 0:

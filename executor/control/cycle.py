@@ -22,7 +22,7 @@ class CycleResult:
 
     Attributes:
         verdict: Of the gate; when it denied, nothing was sent and there is nothing else.
-        status: What the drives told; None also when it was too late to send anything.
+        status: What the drives reported; None also when it was too late to send anything.
         following_error: Largest over the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
         findings: What the watch saw.
@@ -103,7 +103,7 @@ class Cycle:
             targets: One position a drive, [counts].
             at_rest: Nothing moves, so that only a cycle that would enable a drive can be late.
         """
-        # The cycle that was not sent has no record: the one in its place tells how late it is.
+        # The cycle that was not sent has no record: the next one records how late it is.
         lateness, self._unsent = max(self._master.begin(), self._unsent), 0.0
         too_late = () if at_rest else self._too_late(lateness)
         if too_late:

@@ -33,7 +33,7 @@ from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused
 
-#: Within which all drives must hold by themselves after they were told to, [s].
+#: Within which all drives must hold after the command to, [s].
 HOLD_TIMEOUT = 3.0
 #: Cycles of holding still before and after the motion.
 SETTLING = 10
@@ -78,7 +78,7 @@ class Loop:
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = ""
         self.error: CdprError | None = None
-        """None: what ends a run is told by its cause."""
+        """None: the end of a run is reported by its cause."""
         self.holding = True
         """Every cable was held when the drives were last heard."""
 
@@ -134,10 +134,10 @@ class Loop:
         except CdprError as error:
             self._fault(error.code, error.what)
         except Exception as error:
-            self._fault("broken", f"the loop broke: {type(error).__name__}: {error}")
+            self._fault("broken", f"the control loop failed: {type(error).__name__}: {error}")
             self._tell("traceback", traceback.format_exc())
         except BaseException:
-            self._fault("broken", "the program was ended")
+            self._fault("broken", "the program was terminated")
             raise
         return self.machine.state
 
@@ -164,7 +164,7 @@ class Loop:
     def _take_over(self) -> None:
         verdict = self._exchange.take_over()
         if not verdict.allowed:
-            self._fault("gate_denied", f"the drives hold elsewhere: {verdict.reason}")
+            self._fault("gate_denied", f"the drives hold at other positions: {verdict.reason}")
             return
         self._taken_over = True
         self.machine.on(Event.ENABLED)
@@ -211,7 +211,7 @@ class Loop:
             if status is not None and status.stopped and (status.holding or not was_enabled):
                 self._leave(status)
                 return
-        self._fault("hold_timeout", f"the drives did not go over to hold in {HOLD_TIMEOUT:g} s")
+        self._fault("hold_timeout", f"the drives did not hold within {HOLD_TIMEOUT:g} s")
 
     def _leave(self, held: CycleStatus) -> None:
         """Leaves drives alone that hold by themselves, and asks them once more afterwards."""
@@ -275,7 +275,7 @@ class Loop:
         try:
             tell()
         except Exception as error:
-            self._listener_error = self._listener_error or f"what records the run failed: {error}"
+            self._listener_error = self._listener_error or f"recording failed: {error}"
 
     def _judge(self, findings: tuple[Alarm, ...], lost: str) -> None:
         """Reacts to what the watch saw, and to the loss of those who watch over this loop."""
@@ -306,13 +306,15 @@ class Loop:
         elif state is State.HOLDING and not wishes.hold:
             self._feed.go_to(wishes.speed)
             self.machine.on(Event.RESUME)
-            self._tell("resume", f"going on {self.way} at {wishes.speed:.0%} of the planned speed")
+            self._tell(
+                "resume", f"continuing {self.way} at {wishes.speed:.0%} of the planned speed"
+            )
         elif state is State.MOVING and self._feed.wanted != wishes.speed:
             self._feed.go_to(wishes.speed)
-            self._tell("speed", f"speed {self.way}: {wishes.speed:.0%} of the planned")
+            self._tell("speed", f"speed {self.way}: {wishes.speed:.0%} of the planned speed")
 
     def _tell_once(self, finding: Alarm) -> None:
-        """What is wrong in every cycle is told in the first."""
+        """A condition that persists is reported in its first cycle."""
         # A drive may report several faults, each once; what the watch measures changes its text.
         named = finding.code in ("drive_fault", "drive_warning")
         what = finding.text if named else str(finding.drive)
@@ -341,7 +343,7 @@ class Loop:
         try:
             self._master.stop_now()
         except Exception as error:
-            text = f"{_in_one_line(error)}; the drives stop when they miss the master"
+            text = f"{_in_one_line(error)}; the drives stop on loss of the master"
             self._tell("stop_not_sent", text)
 
     def _drain(self) -> None:
@@ -354,8 +356,8 @@ class Loop:
                     return
             before = self._master.status
             left = self._master.leave(self._one_more_latched)
-        except Exception as error:  # the drives have been told to stop; nothing more is owed
-            text = f"{_in_one_line(error)}; the drives stop when they miss the master"
+        except Exception as error:  # the drives have been commanded to stop; nothing more is needed
+            text = f"{_in_one_line(error)}; the drives stop on loss of the master"
             self._tell("bus_lost", text)
             return
         if before is not None and before.holding and not left.holding:
@@ -378,7 +380,7 @@ class Loop:
                 self._tell_once(finding)
 
     def _tell_cause(self, code: str, text: str) -> None:
-        """Tells why the run does not finish; the first cause is kept."""
+        """Reports why the run does not finish; the first cause is kept."""
         self.cause = self.cause or text
         self._tell(code, text)
 
@@ -397,6 +399,6 @@ _ACTIVE = ON_PATH | {State.ENABLING, State.APPROACHING, State.SECURING}
 _WITHOUT_QUICK_STOP = ON_PATH | {State.SECURING}
 _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.HOLDING})
 
-_HELD = "at rest; the drives hold by themselves under torque"
+_HELD = "at rest; the drives hold under torque"
 _BRAKED = "at rest; the brakes of the winches hold"
-_NEVER_ENABLED = "stopped before all drives were enabled; none of them follows set-points"
+_NEVER_ENABLED = "stopped before all drives were enabled; none follows set-points"

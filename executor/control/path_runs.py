@@ -124,7 +124,7 @@ def run_in_real_time(
         listener: Receives what the drives cannot do.
 
     Raises:
-        CdprError: The bus is latched, or the process could not arm the drives, for the reason told;
+        CdprError: The bus is latched, or the process could not arm the drives, as stated;
             nothing was enabled.
         StoppedByOperator: The operator wanted to stop before anything moved.
     """

@@ -32,7 +32,7 @@ def require_capabilities(drives: Capabilities, cycle: float) -> None:
     braked = drives.has_brake and watchdog > 0.0
     missing = []
     if not (drives.sync or braked):
-        missing.append("take their set-points at one SYNC")
+        missing.append("apply set-points at a common SYNC")
     if not (drives.holds_on_comm_loss or braked):
         missing.append("hold when the master is lost")
     if not (drives.holds_on_quick_stop or drives.has_brake):
@@ -45,7 +45,7 @@ def require_capabilities(drives: Capabilities, cycle: float) -> None:
         raise Refused(
             f"these drives do not {', nor '.join(missing)}",
             where="arming",
-            why="a cable robot whose drives do not stop together and hold drops its platform",
+            why="if the drives do not stop together and hold, the platform drops",
             next_step=f"use drives that do, or winches with brakes{_declared(drives)};"
             " nothing was enabled",
         )
@@ -64,9 +64,9 @@ def require_unchanged(course: CheckedSetpoints) -> None:
     """
     if not course.unchanged:
         raise Refused(
-            "the set-points are not those that were checked",
+            "the set-points differ from those that were checked",
             where="arming",
-            why="memory was written to after the check: a defect of the program or the computer",
+            why="memory changed after the check: a defect of the program or the computer",
             next_step="run it again, and test the computer's memory; nothing was enabled",
         )
 
@@ -88,11 +88,11 @@ def require_at_start(course: CheckedSetpoints, actual: Array) -> None:
     if not off[worst] <= rig.motion.start_tolerance:
         raise Refused(
             f"the platform is not at the start of the plan: cable {worst + 1} is"
-            f" {off[worst] * 1000:.1f} mm off, allowed {rig.motion.start_tolerance * 1000:.1f} mm",
+            f" {off[worst] * 1000:.1f} mm off, limit {rig.motion.start_tolerance * 1000:.1f} mm",
             where="arming",
-            why="the rig stands elsewhere, or its drives were not referenced at home",
-            next_step="move the platform to the plan's start (plan a path from where it is"
-            " with `cdpr plan --start-mm`), or reference the drives; nothing was enabled",
+            why="the platform was moved, or the drives were not homed",
+            next_step="move the platform to the plan's start (plan a path from its pose"
+            " with `cdpr plan --start-mm`), or home the drives; nothing was enabled",
             values={"off_mm": float(off[worst] * 1000), "cable": float(worst + 1)},
         )
 
@@ -105,7 +105,7 @@ def require_still_referenced(
 ) -> None:
     """Drives without absolute encoders still count from where they were referenced.
 
-    Such a drive forgets its set-up and its position when its power goes, and nobody tells. So it
+    Such a drive silently loses its configuration and position with its power. So it
     must hold the set-up of before, and stand where it was left.
 
     Args:
@@ -122,20 +122,20 @@ def require_still_referenced(
     moved = moved_since(rig, reference, positions)
     for drive, (winch, off) in enumerate(zip(rig.winches, moved, strict=True)):
         if not winch.absolute and winch.node_id in restarted:
-            raise _lost(rig, drive, "it was switched on since it was referenced")
+            raise _lost(rig, drive, "it was power-cycled after homing")
         if not off <= rig.motion.start_tolerance:
             raise _lost(
-                rig, drive, f"it stands {off * 1000:.1f} mm of cable away from where it was left"
+                rig, drive, f"it is {off * 1000:.1f} mm of cable from its last known position"
             )
 
 
 def _lost(rig: Rig, drive: int, how: str) -> Refused:
     node = rig.winches[drive].node_id
     return Refused(
-        f"the reference of {rig.drive_names[node]} is lost: {how}",
+        f"the homing reference of {rig.drive_names[node]} is lost: {how}",
         where="arming",
-        why="its encoder is not absolute: after its power was gone it counts from anywhere",
-        next_step="reference the drives again with `cdpr home RIG`; nothing was enabled",
+        why="its encoder is not absolute: its position is arbitrary after power-up",
+        next_step="home the drives again with `cdpr home RIG`; nothing was enabled",
         values={"cable": drive + 1, "drive": node},
     )
 
@@ -164,7 +164,7 @@ def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"winches": winches_here}))
 
 
-def set_up_here(rig: Rig, told: DriveSnapshot) -> tuple[Rig, float]:
+def set_up_here(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
     """What drives are set up for that move nothing: their limits lie about where they stand.
 
     The rig file's counts are no guide: a drive that is enabled beyond its own position limits runs
@@ -172,12 +172,12 @@ def set_up_here(rig: Rig, told: DriveSnapshot) -> tuple[Rig, float]:
 
     Args:
         rig: The robot.
-        told: Where its drives stand.
+        snapshot: Positions of its drives.
 
     Returns:
         The rig, see `counted_here`, and the largest tension, [N].
     """
-    return counted_here(rig, told.positions.tolist(), rig.home), rig.max_tension
+    return counted_here(rig, snapshot.positions.tolist(), rig.home), rig.max_tension
 
 
 def careful(rig: Rig, *, limit: float, speed: float) -> Rig:
@@ -206,7 +206,7 @@ def require_below(rig: Rig, held: DriveSnapshot, limit: float) -> None:
 
     Args:
         rig: The robot.
-        held: What its drives tell.
+        held: State of its drives.
         limit: Largest tension, [N].
 
     Raises:
@@ -222,7 +222,6 @@ def require_below(rig: Rig, held: DriveSnapshot, limit: float) -> None:
         raise Refused(
             f"{', '.join(over)}, more than the limit of {limit:g} N",
             where="setting the drives' torque limit",
-            why="a drive whose torque is limited to less than it holds lets its cable slip",
-            next_step="name a higher --limit-n, or take the load off these cables; the drives hold"
-            " as before",
+            why="a drive with a torque limit below its holding torque lets its cable slip",
+            next_step="set a higher limit, or unload these cables; the drives hold as before",
         )

@@ -1,7 +1,7 @@
 """What is done to drives that follow no path: torque off (`cdpr release`) and `cdpr reset`.
 
 Each is done in the real-time process, with the cycle kept from the first reading to the ordered
-end; whatever stops it, all drives are told to stop.
+end; whatever stops it, all drives are commanded to stop.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from model.errors import CdprError, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import Rig
 
-#: All drives must be without torque, or have come to a stop, within so many seconds.
+#: All drives must be without torque, or have come to a stop, within this time, [s].
 WITHIN_S = 3.0
 #: Cycles in which a drive leaves its fault, and the others are seen to hold.
 SETTLING_CYCLES = 30
@@ -31,7 +31,7 @@ class Standstill(ABC):
     """One procedure on drives that stay where they are; a `Procedure` of the real-time process.
 
     Attributes:
-        cause: Why it did not come to its end.
+        cause: Why it did not finish.
         error: The same, to be raised where the operator is.
         holding: Every cable was held in every cycle.
     """
@@ -74,7 +74,7 @@ class Standstill(ABC):
         return () if status is None else tuple(int(position) for position in status.positions)
 
     def run(self) -> State:
-        """Does it; drives that hold are told to stop when anything is wrong.
+        """Does it; drives that hold are commanded to stop when anything is wrong.
 
         Returns:
             FINISHED, or LATCHED with `cause` and `error`.
@@ -86,8 +86,8 @@ class Standstill(ABC):
                 raise Fault(
                     otherwise,
                     where=self.where,
-                    why="a drive takes the loss of its master as a fault, or lost its power",
-                    next_step="look at the platform and the drives, then `cdpr reset RIG`",
+                    why="a drive treats loss of its master as a fault, or lost power",
+                    next_step="check the platform and the drives, then run `cdpr reset RIG`",
                 )
         except CdprError as error:
             self.cause, self.error = error.what, error
@@ -102,7 +102,7 @@ class Standstill(ABC):
         """The procedure itself; how it leaves the drives.
 
         Raises:
-            CdprError: It did not come to its end.
+            CdprError: It did not finish.
         """
 
     def _cycle(self) -> CycleStatus:
@@ -153,7 +153,7 @@ class Standstill(ABC):
         return True
 
     def _stop(self) -> None:
-        """All are told to stop until every one reports that it follows nothing, or time is over.
+        """Commands all to stop until every one reports that it follows nothing, or time is over.
 
         A bus that does not take the stop is no reason to leave off: the next cycle repeats it.
         """
@@ -184,23 +184,23 @@ class Release(Standstill):
         for _ in range(self._longest):
             if self._wishes().stop:
                 raise StoppedByOperator(
-                    "stopped while the torque was being taken off; drives under torque hold, a"
-                    " fault is latched, and the drives have to be referenced again",
-                    next_step="look at the drives (`cdpr status RIG`), then `cdpr reset RIG`",
+                    "stopped while releasing the drives; those under torque hold, a"
+                    " fault is latched, and the drives must be homed again",
+                    next_step="check the drives (`cdpr status RIG`), then run `cdpr reset RIG`",
                 )
             status = self._cycle()
             if status.state is GroupState.RELEASED:
                 return status
             if status.state is GroupState.FAULT:
                 raise _not_released("; ".join(text for _, text in status.faults))
-        raise _not_released(f"the drives were not without torque within {WITHIN_S:g} s")
+        raise _not_released(f"the drives still had torque after {WITHIN_S:g} s")
 
     def _require_heard(self, silence: ReplyTimeout) -> None:
         silence.require_none(
-            "while the torque was being taken off",
+            "while releasing the drives",
             where="release",
             why="it lost power or the bus; the others were stopped and hold",
-            next_step="check power and wiring, then `cdpr reset RIG`",
+            next_step="check power and wiring, then run `cdpr reset RIG`",
         )
 
 
@@ -208,9 +208,9 @@ def _not_released(what: str) -> Fault:
     return Fault(
         what,
         where="release",
-        why="a drive did not go the way of all; those under torque hold",
-        next_step="look at the drives, then `cdpr reset RIG`; where none can be released, cut the"
-        " motor power with the emergency stop once the platform is supported",
+        why="a drive did not follow the release sequence; those under torque hold",
+        next_step="check the drives, then run `cdpr reset RIG`; if none can be released, cut the"
+        " motor power by the emergency stop once the platform is supported",
     )
 
 
@@ -228,7 +228,7 @@ class FaultReset(Standstill):
             raise Fault(
                 "; ".join(text for _, text in status.faults),
                 where="reset",
-                why="the cause is still there",
+                why="the cause persists",
                 next_step="remove it, then reset again; the latch stays engaged",
             )
         return status
@@ -237,7 +237,7 @@ class FaultReset(Standstill):
         silence.require_none(
             "while the drives settled",
             where="reset",
-            why="it lost power or the bus since it was set up",
+            why="it lost power or the bus after it was configured",
             next_step="check power and wiring, then reset again; the latch stays engaged",
         )
 

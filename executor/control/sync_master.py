@@ -1,7 +1,7 @@
 """The one sender of SYNC: it keeps the cycle from the first reading of positions to the last SYNC.
 
 Whatever else is waited for (the operator's word, a file on disk, a camera), the cycle goes on, so
-that no drive finds its master gone. No drive is told to follow set-points when the SYNC before is
+that no drive loses its master. No drive is commanded to follow set-points when the SYNC before is
 too old (`executor.safety.sync_age`): that is decided when a cycle begins and once more between its
 set-points and its SYNC, since this process may be suspended in between.
 """
@@ -55,7 +55,7 @@ class ReplyTimeout:
             name for name, n in zip(self._names, self._cycles, strict=True) if n >= MISSING_CYCLES
         ]
         if gone:
-            what = f"{', '.join(gone)} fell silent {doing}"
+            what = f"{', '.join(gone)} stopped answering {doing}"
             raise HardwareMissing(what, where=where, why=why, next_step=next_step)
 
 
@@ -183,7 +183,7 @@ class SyncMaster:
         return word
 
     def leave(self, cycle: Callable[[], bool]) -> CycleStatus:
-        """The ordered end, with drives that hold by themselves or were told to.
+        """The ordered end, with drives that hold on their own or by command.
 
         Their monitoring of this master is switched off while SYNC goes on, heartbeat first and SYNC
         last. Then SYNC and heartbeat cease, and every drive is asked for its state once more; where
@@ -254,7 +254,7 @@ def left_otherwise(rig: Rig, before: CycleStatus, after: CycleStatus) -> str:
         for name, old, new, silent in rows
         if silent or old != new
     ]
-    return f"drives did not stay as they were left: {', '.join(changed)}" if changed else ""
+    return f"drives left the state they held in: {', '.join(changed)}" if changed else ""
 
 
 def late_fault(age: float) -> Fault:
@@ -262,6 +262,6 @@ def late_fault(age: float) -> Fault:
     return Fault(
         f"a cycle began {age - 1.0:.1f} cycles late",
         where="executor",
-        why="another program held the processor; the drives may have stopped by themselves",
+        why="another program held the processor; the drives may have stopped on their own",
         next_step="run `cdpr doctor RIG` for real-time scheduling, then `cdpr reset RIG`",
     )

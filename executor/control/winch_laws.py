@@ -1,4 +1,4 @@
-"""How winches go on by themselves, without a path: what each is told next. Pure.
+"""Laws of winch motion without a path: the next set-point of each winch. Pure.
 
 Drives stay in their position mode: a tension is reached by winding cable in by less, each cycle,
 than could overstretch it before its tension is seen. No law pays cable out to cure a tension.
@@ -69,7 +69,7 @@ STAYS_TAUT = 0.8
 #: Cycles in which all cables must be taut, and in which one that was taut must not be slack.
 TAUT_CYCLES, SLACK_CYCLES = 20, 5
 #: A step may raise a tension by this share of what is left to the limit: its effect is seen only
-#: two cycles later, three where a torque is told a cycle late, and the cables opposite may be wound
+#: two cycles later, three where torques are a cycle late, and the cables opposite may be wound
 #: in meanwhile, too.
 SHARE_OF_ROOM = 0.125
 
@@ -77,7 +77,7 @@ Targets = tuple[int, ...]
 
 
 class WinchLaw(Protocol):
-    """Says what each winch is told next."""
+    """Computes the next set-point of each winch."""
 
     @property
     def reach(self) -> tuple[Targets, Targets]:
@@ -171,7 +171,7 @@ class PretensionLaw:
     def _still_slack(self, cable: int, tension: float) -> Alarm:
         text = (
             f"cable {cable + 1} carries {tension:.1f} N after {self._reach * 1000:g} mm were wound"
-            f" in, {self._target:.1f} N are wanted: it may be off its drum or pulley, or broken"
+            f" in; the target is {self._target:.1f} N. It may be off its drum or pulley, or broken"
         )
         return Alarm(StopReaction.PATH_STOP, "not_taut", text, cable + 1)
 
@@ -244,7 +244,7 @@ class CableStep:
             if self._slack[cable] >= SLACK_CYCLES:
                 text = (
                     f"cable {cable + 1} went slack ({tension:.1f} N, less than {self._least:.1f})"
-                    f" while cable {self._cable + 1} alone was moved"
+                    f" while only cable {self._cable + 1} was moved"
                 )
                 found.append(Alarm(StopReaction.PATH_STOP, "went_slack", text, cable + 1))
         return found

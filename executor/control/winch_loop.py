@@ -89,7 +89,7 @@ class WinchMover(Protocol):
     """Arms the drives, moves them, and can be asked afterwards where they stand."""
 
     def arm(self, records: Records) -> Armed:
-        """Makes all ready; what happens from now on is told to the records.
+        """Prepares the motion; events from now on go to the records.
 
         Raises:
             CdprError: It cannot be; nothing was enabled.
@@ -101,7 +101,7 @@ class WinchMover(Protocol):
         ...
 
     def stands_now(self) -> CycleStatus:
-        """What the drives tell after the motion."""
+        """State of the drives after the motion."""
         ...
 
 
@@ -112,7 +112,7 @@ class LawMotion:
     Attributes:
         cables: How many.
         cycle: [s].
-        make_law: Makes what the winches are told; it can be sent to a process.
+        make_law: Makes the winches' law; it can be sent to a process.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
     """
@@ -141,7 +141,7 @@ class LawMotion:
         """See `Motion`; winches move by a law from wherever they are."""
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `Motion`; nobody asks for a pose while winches move without a path."""
+        """See `Motion`; no pose is needed while winches move without a path."""
         return None
 
     def close(self) -> None:

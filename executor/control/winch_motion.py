@@ -29,7 +29,7 @@ from model.rig import Rig
 #: Drives that hold move by no more than this share of the rig's start tolerance.
 HELD_SHARE = 0.1
 
-_CUT_SHORT = Ended(State.LATCHED, "the program was ended", holding=True, true_pose=None)
+_CUT_SHORT = Ended(State.LATCHED, "the program was terminated", holding=True, true_pose=None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,8 +40,8 @@ class WinchesStand:
         state: How it ended.
         cause: Why it did not finish, if it did not.
         began: Positions of the drives before it, shape (m,), [counts].
-        counts: Positions of the drives, at rest, shape (m,), [counts]; NaN when none was told.
-        tensions: By their torques, at rest, shape (m,), [N]; NaN when none was told.
+        counts: Positions of the drives, at rest, shape (m,), [counts]; NaN when unknown.
+        tensions: By their torques, at rest, shape (m,), [N]; NaN when unknown.
     """
 
     state: State
@@ -51,37 +51,37 @@ class WinchesStand:
     tensions: Array
 
 
-def require_held(rig: Rig, stand: WinchesStand, told: CycleStatus) -> None:
-    """The drives stand where the motion left them, and hold: nobody commanded them meanwhile.
+def require_held(rig: Rig, stand: WinchesStand, found: CycleStatus) -> None:
+    """The drives hold at the positions where the motion ended, without new commands.
 
     Args:
         rig: The robot.
         stand: Where the motion ended.
-        told: What the drives tell now.
+        found: Present state of the drives.
 
     Raises:
         Fault: One moved, or does not hold.
     """
     per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
-    moved = np.abs((told.positions - stand.counts) / per_metre)
+    moved = np.abs((found.positions - stand.counts) / per_metre)
     worst = int(moved.argmax())
     name = list(rig.drive_names.values())[worst]
     if not moved[worst] <= HELD_SHARE * rig.motion.start_tolerance:
         what = f"{name} moved by {moved[worst] * 1000:.2f} mm after all winches were at rest"
-    elif told.faults:
-        what = "; ".join(text for _, text in told.faults)
-    elif told.missing.any():
-        silent = compress(rig.drive_names.values(), told.missing.tolist())
+    elif found.faults:
+        what = "; ".join(text for _, text in found.faults)
+    elif found.missing.any():
+        silent = compress(rig.drive_names.values(), found.missing.tolist())
         what = f"{', '.join(silent)}: no answer after all winches were at rest"
-    elif not told.holding:
-        what = "not all drives hold any more"
+    elif not found.holding:
+        what = "not all drives still hold"
     else:
         return
     raise Fault(
         what,
         where="winches",
-        why="a drive let go, slipped or was moved by hand; counts and pose do not belong together",
-        next_step="look at the platform and the drives, then `cdpr reset RIG`",
+        why="a drive released, slipped or was moved by hand; counts and pose do not match",
+        next_step="check the platform and the drives, then run `cdpr reset RIG`",
     )
 
 
@@ -114,7 +114,7 @@ def move_winches(
     records: Records,
     *,
     record: Path,
-    anew: bool,
+    rehome: bool,
     at_rest: Callable[[WinchesStand, Pose | None], HomingReference | None],
 ) -> WinchesStand:
     """Moves by a law and ends with the drives holding by themselves, whatever happens.
@@ -124,9 +124,9 @@ def move_winches(
         rig: The robot as its file is.
         custody: Of that rig.
         records: Takes in what happens.
-        record: What the latch names, should this not come to its end.
-        anew: The drives are to be referenced again afterwards.
-        at_rest: Called after a motion that came to its end, while nobody else may move the drives,
+        record: What the latch names, should this not finish.
+        rehome: The drives are to be homed again afterwards.
+        at_rest: Called after a motion that finished, while the drives are locked,
             with where the simulated platform is; the reference that it makes is kept if the drives
             held all the while.
 
@@ -135,31 +135,31 @@ def move_winches(
             enabled.
         HardwareMissing: A drive does not answer.
         StoppedByOperator: The operator wanted to stop before anything moved.
-        CdprError: The drives did not hold after the motion, or did not tell; it is latched.
+        CdprError: The drives did not hold after the motion, or did not answer; it is latched.
     """
     custody.require_free()
     last = _LastCycles(records)
     armed = mover.arm(last)
     if armed.denied:
         last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
-    custody.begin(record, custody.still_counts(armed.stands_at), anew=anew)
-    ended, told = _CUT_SHORT, None
+    custody.begin(record, custody.still_counts(armed.stands_at), rehome=rehome)
+    ended, found = _CUT_SHORT, None
     try:
         ended = mover.run()
         stand = _stand(rig, armed.stands_at, ended, last.cycles)
         if stand.state is State.FINISHED:
             reference = at_rest(stand, ended.true_pose)
             try:
-                told = mover.stands_now()
-                require_held(rig, stand, told)
+                found = mover.stands_now()
+                require_held(rig, stand, found)
             except CdprError as error:
-                ended = _not_held(ended, told, error.what)
+                ended = _not_held(ended, found, error.what)
                 last.tell("not_held", error.what)
                 raise
             if reference is not None:
                 custody.take(reference)
     finally:
-        not_kept = _kept(custody, ended, record, _stands_at(last.cycles, told))
+        not_kept = _kept(custody, ended, record, _stands_at(last.cycles, found))
     if not_kept:
         last.tell("recorder", not_kept)
         stand = replace(stand, state=State.LATCHED, cause=stand.cause or not_kept)
@@ -177,24 +177,24 @@ def _stand(
     return WinchesStand(ended.state, ended.cause, before, counts.mean(axis=0), tensions)
 
 
-def _not_held(ended: Ended, told: CycleStatus | None, cause: str) -> Ended:
-    """A motion that came to its end, with what was found wrong with the drives afterwards."""
-    # Drives that tell nothing held when they were last heard.
-    holding = ended.holding if told is None else told.holding
+def _not_held(ended: Ended, found: CycleStatus | None, cause: str) -> Ended:
+    """A motion that finished, with what was found wrong with the drives afterwards."""
+    # Drives that are silent held when they last answered.
+    holding = ended.holding if found is None else found.holding
     return replace(ended, state=State.LATCHED, cause=cause, holding=holding)
 
 
-def _stands_at(last: Sequence[CycleRecord], told: CycleStatus | None) -> Sequence[int] | None:
-    """Where the drives stood when they were last heard, [counts]; None when nobody heard them."""
-    if told is not None:
-        return [int(position) for position in told.positions]
+def _stands_at(last: Sequence[CycleRecord], found: CycleStatus | None) -> Sequence[int] | None:
+    """Last known positions of the drives, [counts]; None when there are none."""
+    if found is not None:
+        return [int(position) for position in found.positions]
     return last[-1].actual if last else None
 
 
 def _kept(
     custody: MotionInterlock, ended: Ended, record: Path, stands_at: Sequence[int] | None
 ) -> str:
-    """Keeps how it ended; why it could not, if so: the motion is over, and is told all the same."""
+    """Keeps how it ended; an error of keeping is reported as well."""
     try:
         custody.end(ended.state, ended.cause, record, holding=ended.holding, stands_at=stands_at)
     except CdprError as error:
@@ -267,10 +267,10 @@ def recording(folder: Path) -> Iterator[WinchRecord]:
             )
         except OSError as error:
             raise BadInput(
-                "the record of the motion cannot be made",
+                "the record of the motion cannot be written",
                 where=str(folder),
                 why=error.strerror or str(error),
-                next_step="change to a folder that you may write to; nothing was moved",
+                next_step="change to a writable folder; nothing was moved",
             ) from None
         record = WinchRecord(folder, events, winches)
         try:

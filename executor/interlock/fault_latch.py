@@ -5,8 +5,8 @@ anything moves and disengaged when the motion ended well; a fault leaves it enga
 and a program that died or a computer that lost power leaves it engaged too. Only `cdpr reset`
 disengages it then.
 
-Whoever moves the drives, or resets them, holds a lock on a file beside it. The system gives it
-back when that program ends, however it ends; so every user can tell a run from what a run left.
+A program that moves or resets the drives holds a lock on a file beside it. The system frees it
+when that program ends, however it ends; so a run differs from what a run left behind.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from model.files.documents import write_atomic
 #: Who looks at the lock lets it go within this, [s].
 LOOKS_WITHIN = 0.5
 
-_CUT_SHORT = "a run did not come to its end: its program was killed, or the computer stopped"
+_CUT_SHORT = "a run did not finish: its program was killed, or the computer stopped"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,16 +109,16 @@ class FaultLatch:
             Refused: It is not what is latched now.
         """
         if shown is None:
-            self.engage(rig, self.path.parent, "a reset did not come to its end")
+            self.engage(rig, self.path.parent, "a reset did not finish")
         else:
             self._hold()
         try:
             if shown is not None and self.read() != shown:
                 raise Refused(
-                    "what is latched changed since it was shown",
+                    "the latched fault changed since it was shown",
                     where=f"bus {self._bus}",
-                    why="somebody else reset this bus, or ran it",
-                    next_step="look at it again: `cdpr reset RIG`; nothing was reset",
+                    why="another user reset this bus, or moved it",
+                    next_step="run `cdpr reset RIG` again; nothing was reset",
                 )
             yield
         except BaseException:
@@ -129,12 +129,12 @@ class FaultLatch:
         self.disengage()
 
     def engage(self, rig: str, folder: Path, cause: str = _CUT_SHORT) -> None:
-        """A run is about to move; if it does not come to its end, this is what tells of it.
+        """A run is about to move; if it does not finish, this is the only trace of it.
 
         Args:
             rig: Name of the rig.
             folder: Where the record of the run is.
-            cause: What is told then.
+            cause: The cause reported then.
 
         Raises:
             Refused: It is engaged already, or cannot be.
@@ -146,7 +146,7 @@ class FaultLatch:
             raise self._not_kept(error.strerror or str(error)) from None
         self._hold()
         try:
-            self.require_disengaged()  # nobody else engages it from here on
+            self.require_disengaged()  # no other program engages it from here on
             self._write(self._latched(rig, cause, folder))
         except BaseException:
             self._let_go()
@@ -222,23 +222,23 @@ class FaultLatch:
         if latched is None or self.held_by_another():
             who = "" if latched is None else f" (process {latched.process})"
             return Refused(
-                f"a motion or a reset{who} is under way on this bus",
+                f"a motion or a reset{who} is in progress on this bus",
                 where=f"bus {self._bus}",
-                next_step="wait for its end, or stop it with `cdpr stop` (`sudo cdpr stop` where it"
-                " is another user's)",
+                next_step="wait until it ends, or stop it with `cdpr stop` (`sudo cdpr stop` if it"
+                " belongs to another user)",
             )
         return Refused(
             f"a fault is latched since {latched.since}: {latched.cause}",
             where=f"bus {self._bus}",
             why=f"on record in {latched.folder}",
-            next_step="find the cause and look at the platform, then `cdpr reset RIG`;"
+            next_step="find the cause and check the platform, then run `cdpr reset RIG`;"
             " nothing was moved",
         )
 
     def _not_kept(self, why: str) -> Refused:
         return Refused(
-            "the latch cannot be written, so a fault would be forgotten",
+            "the fault latch cannot be written",
             where=str(self.path),
             why=why,
-            next_step="make the folder writable for those who run the rig",
+            next_step="make the folder writable for the operators of the rig",
         )

@@ -56,11 +56,11 @@ class MotionInterlock:
             self._require_absolute()
             return None
         if reference.lost:
-            why = f"{reference.lost}; it was made {reference.made}"
-            raise self._refusal("the drives are no more referenced", why)
+            why = f"{reference.lost}; homed {reference.made}"
+            raise self._refusal("the homing reference is lost", why)
         if reference.rig_hash != counting_hash(self._rig):
-            why = f"it was made {reference.made} for {reference.rig}; geometry or winches differ"
-            raise self._refusal("the drives were referenced for another rig file", why)
+            why = f"homed {reference.made} for {reference.rig}; geometry or winches differ"
+            raise self._refusal("the drives were homed for another rig file", why)
         return reference
 
     def why_unreferenced(self, stands: Sequence[int] | None = None) -> str:
@@ -80,7 +80,7 @@ class MotionInterlock:
         if moved[worst] <= self._rig.motion.start_tolerance:
             return ""
         name = list(self._rig.drive_names.values())[worst]
-        return f"{name} stands {moved[worst] * 1000:.1f} mm of cable away from where it was left"
+        return f"{name} is {moved[worst] * 1000:.1f} mm of cable from its last known position"
 
     def kept_reference(self) -> HomingReference | None:
         """What is on file for this bus, whatever it says; None where nothing is."""
@@ -102,10 +102,10 @@ class MotionInterlock:
         if reference is None:
             self._require_absolute()
         elif reference.lost:
-            raise self._refusal("the drives are no more referenced", reference.lost)
+            raise self._refusal("the homing reference is lost", reference.lost)
         elif reference.home_counts != [winch.home_counts for winch in self._rig.winches]:
-            what = "the run was prepared with another reference than that of its drives"
-            raise self._refusal(what, f"the drives were referenced {reference.made}")
+            what = "the run was prepared with a different homing reference"
+            raise self._refusal(what, f"the drives were homed {reference.made}")
         return reference
 
     def still_counts(self, stands: Sequence[int]) -> HomingReference | None:
@@ -119,7 +119,7 @@ class MotionInterlock:
     def found_restarted(self, nodes: Iterable[int]) -> None:
         """Drives were switched on since they were set up: their reference is lost for good.
 
-        It is kept at once, whatever becomes of what was about to be done: nothing else tells of it
+        It is kept at once, whatever happens next: nothing else records it
         once they are set up again.
 
         Raises:
@@ -128,7 +128,7 @@ class MotionInterlock:
         forgot = {winch.node_id for winch in self._rig.winches if not winch.absolute} & {*nodes}
         if forgot:
             names = [name for node, name in self._rig.drive_names.items() if node in forgot]
-            self._lose(f"{', '.join(names)}: switched on since the reference was made")
+            self._lose(f"{', '.join(names)}: power-cycled after homing")
 
     def found_held(self, stands: Sequence[int]) -> None:
         """All drives held since they were last heard: they still count, and stand there [counts].
@@ -140,13 +140,15 @@ class MotionInterlock:
         if reference is not None and not reference.lost and len(reference.stands_at) == len(stands):
             self.file.write(reference.model_copy(update={"stands_at": list(stands)}))
 
-    def begin(self, record: Path, reference: HomingReference | None, *, anew: bool = False) -> None:
-        """The drives are about to move; if that does not come to its end, the latch tells of it.
+    def begin(
+        self, record: Path, reference: HomingReference | None, *, rehome: bool = False
+    ) -> None:
+        """The drives are about to move; if that does not finish, the latch records it.
 
         Args:
             record: Where the motion is on record.
             reference: From which the drives count, found to do so; None where it is not known.
-            anew: They are to be referenced again; what they counted from is given up.
+            rehome: They are to be homed again; the present reference is given up.
 
         Raises:
             Refused: The bus is latched, or cannot be.
@@ -154,10 +156,10 @@ class MotionInterlock:
         if not self._is_kept:
             return
         self._latch.engage(self._rig.name, record)
-        self._counted_from = None if anew else reference
+        self._counted_from = None if rehome else reference
         try:
-            if anew:
-                self._lose("the drives were being referenced again, which did not come to its end")
+            if rehome:
+                self._lose("homing did not finish")
         except BaseException:
             self._latch.disengage()
             raise
@@ -193,7 +195,7 @@ class MotionInterlock:
             cause: Why it did not end well.
             record: Where it is on record.
             holding: Every cable was held to the end.
-            stands_at: Where the drives stand, [counts]; None when nobody heard it.
+            stands_at: Positions of the drives, [counts]; None when unknown.
             let_go: Why cables are not held any more where that was wished; what the reference was
                 lost by.
 
@@ -203,7 +205,7 @@ class MotionInterlock:
         if not self._is_kept:
             return
         try:
-            lost = let_go or f"drives let go of cables under tension ({cause})"
+            lost = let_go or f"drives released cables under tension ({cause})"
             self._note_end(lost, holding, stands_at)
         except Refused as error:
             self._latch.settle(self._rig.name, State.LATCHED, cause or error.what, record)
@@ -249,9 +251,9 @@ class MotionInterlock:
         relative = [names[w.node_id] for w in self._rig.winches if not w.absolute]
         if relative:
             raise self._refusal(
-                f"never referenced: {', '.join(relative)}",
-                "an encoder that is not absolute (winches[].encoder in the rig file) counts from"
-                " anywhere once its power was gone",
+                f"never homed: {', '.join(relative)}",
+                "the position of an encoder that is not absolute (winches[].encoder in the"
+                " rig file) is arbitrary after power-up",
             )
 
     def _refusal(self, what: str, why: str) -> Refused:

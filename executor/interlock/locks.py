@@ -50,7 +50,7 @@ def state_file(kind: str, settings: BusSettings) -> Path:
 def open_state_file(path: Path, *, create: bool = False) -> int:
     """Opens a file of the state folder for reading; the caller closes it.
 
-    The folder may be shared: whoever can write to it could put a link to a file elsewhere there, or
+    The folder may be shared: any user with write access could put a link to another file there, or
     a FIFO, which would keep a program waiting for ever. Neither is followed or waited for.
 
     Args:
@@ -88,7 +88,7 @@ def read_state_file(path: Path) -> str:
     with os.fdopen(open_state_file(path), "rb") as stream:
         data = stream.read(LARGEST_FILE + 1)
     if len(data) > LARGEST_FILE:
-        raise _refusal(path, f"it has more than {LARGEST_FILE} bytes")
+        raise _refusal(path, f"it is larger than {LARGEST_FILE} bytes")
     return data.decode("utf-8")
 
 
@@ -102,8 +102,8 @@ def _refusal(path: Path, what: str) -> Refused:
     return Refused(
         f"{what}, and is not used",
         where=str(path),
-        why="it was not made by this program: whoever can write to this folder put it there",
-        next_step=f"find out who made it (`ls -l {path}`), then remove it; nothing was moved",
+        why="this program did not create it; another user of the folder did",
+        next_step=f"find its owner (`ls -l {path}`), then remove it; nothing was moved",
     )
 
 
@@ -131,7 +131,7 @@ def locked_within(handle: int, seconds: float) -> bool:
 # Who sets the drives of a bus up, or asks them for objects, does so alone.
 #
 # A drive answers one such request at a time and does not say to whom: the answer to somebody else's
-# would be taken for one's own. On a bus of this process alone (``virtual``) there is nobody else.
+# would be taken for one's own. A bus of this process alone (``virtual``) has no other user.
 
 
 #: Who only asks how the drives stand is done within this, unless one does not answer, [s].
@@ -161,17 +161,17 @@ class SetUpLock:
             lock = open_state_file(self._path, create=True)
         except OSError as error:
             raise Refused(
-                "it cannot be made sure that nobody else sets these drives up",
+                "exclusive access to the drives cannot be ensured",
                 where=str(self._path),
                 why=error.strerror or str(error),
-                next_step="make the folder writable for those who run the rig",
+                next_step="make the folder writable for the operators of the rig",
             ) from None
         try:
             if not locked_within(lock, ASKED_WITHIN):
                 raise Refused(
-                    "another program sets these drives up or asks them how they stand",
+                    "another program is configuring or reading these drives",
                     where=f"bus {self._bus}",
-                    next_step="wait until it is done; `cdpr monitor` shows motions."
+                    next_step="wait until it is done (`cdpr monitor` shows motions)."
                     " Nothing was moved",
                 )
             yield
@@ -180,14 +180,14 @@ class SetUpLock:
 
     @contextmanager
     def tried(self) -> Iterator[bool]:
-        """For who only asks: whether nobody else has it; then it is held. Makes no file.
+        """For readers: takes it if it is free, and returns whether it was. Makes no file.
 
         Raises:
             Refused: The lock is no regular file.
         """
         try:
             lock = open_state_file(self._path)
-        except OSError:  # nobody set these drives up from here so far
+        except OSError:  # no program on this computer has used these drives
             yield True
             return
         try:

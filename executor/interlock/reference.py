@@ -25,7 +25,7 @@ from model.rig import Rig, rig_from_document
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
-AGAIN = "reference the drives with `cdpr home RIG`; nothing was moved"
+AGAIN = "home the drives with `cdpr home RIG`; nothing was moved"
 
 
 class HomingReference(Document):
@@ -33,15 +33,15 @@ class HomingReference(Document):
 
     schema_version: Literal[1]
     rig: str
-    rig_hash: str = Field(description="of what the counts depend on")
-    made: str = Field(description="when, ISO 8601, UTC")
+    rig_hash: str = Field(description="of the rig data that the counts depend on")
+    made: str = Field(description="time of homing, ISO 8601, UTC")
     how: str
-    pose: PoseDocument = Field(description="of the platform then")
+    pose: PoseDocument = Field(description="of the platform at that time")
     uncertainty_mm: float = Field(description="of the pose, one standard deviation; 0 if stated")
     home_counts: Annotated[list[int], Field(min_length=1)]
     tensions_n: list[float]
     stands_at: list[int] = Field(description="drive positions at the end of the last motion")
-    lost: str = Field(default="", description="why it counts no more")
+    lost: str = Field(default="", description="why it is no longer valid")
 
 
 def reference_at(
@@ -99,7 +99,7 @@ def referenced(rig: Rig, reference: HomingReference) -> Rig:
 def moved_since(rig: Rig, reference: HomingReference, stands: Sequence[int]) -> list[float]:
     """How far drives were moved since the last motion, of cable, [m], one a drive.
 
-    None of those with absolute encoders, which count on whoever moves them.
+    None of those with absolute encoders, which keep counting when moved.
 
     Args:
         rig: The robot.
@@ -132,7 +132,7 @@ class ReferenceFile:
             return None
         except (OSError, ValidationError, ValueError) as error:
             raise Refused(
-                "the reference of the drives cannot be read",
+                "the homing reference cannot be read",
                 where=str(self.path),
                 why=str(error).splitlines()[0],
                 next_step=AGAIN,
@@ -148,10 +148,10 @@ class ReferenceFile:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             raise Refused(
-                "the reference of the drives cannot be removed",
+                "the homing reference cannot be removed",
                 where=str(self.path),
                 why=error.strerror or str(error),
-                next_step="make the folder writable for those who run the rig",
+                next_step="make the folder writable for the operators of the rig",
             ) from None
 
     def write(self, reference: HomingReference) -> None:
@@ -166,8 +166,8 @@ class ReferenceFile:
             write_atomic(self.path, text)
         except (OSError, CdprError) as error:
             raise Refused(
-                "the reference of the drives cannot be kept",
+                "the homing reference cannot be written",
                 where=str(self.path),
                 why=error.why if isinstance(error, CdprError) else error.strerror or str(error),
-                next_step="make the folder writable for those who run the rig, then `cdpr home`",
+                next_step="make the folder writable for the rig's operators, then run `cdpr home`",
             ) from None

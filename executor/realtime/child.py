@@ -41,7 +41,7 @@ def serve(job: Job, link: Connection, supervisor: int) -> None:
         supervisor: Number of its process.
     """
     supervised = Supervised(job.board, supervisor)
-    # What a terminal sends is the supervisor's to decide on; it tells by the board, and where it is
+    # What a terminal sends is the supervisor's to decide on; it uses the board, and where it is
     # suspended or killed its silence does.
     for number in _FROM_A_TERMINAL:
         signal.signal(number, signal.SIG_IGN)
@@ -52,7 +52,7 @@ def serve(job: Job, link: Connection, supervisor: int) -> None:
     except CdprError as error:
         _say(link, Failed(error))
     except Exception as error:
-        _say(link, Failed(Fault(f"the real-time process broke: {type(error).__name__}: {error}")))
+        _say(link, Failed(Fault(f"the real-time process failed: {type(error).__name__}: {error}")))
 
 
 def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Supervised) -> None:
@@ -77,7 +77,7 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             )
             loop.arm(partial(motion.require, drives))
             if drives.group.capabilities.simulated and drives.true_pose is None:  # on a real bus
-                on_event(LoopEvent(0, 0.0, SIMULATED, "the drives say that they are simulated"))
+                on_event(LoopEvent(0, 0.0, SIMULATED, "the drives report that they are simulated"))
             _say(link, Armed(denied, loop.stands_at, drives.restarted, drives.remarks))
             said = master.keep_until(lambda: _word(link))
         except Exception:
@@ -89,7 +89,7 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
         state = loop.run()
     true_pose = drives.true_pose_now()
     _say(link, Ended(state, loop.cause, loop.holding, true_pose, loop.error))
-    # After any other end the supervisor may hang, and nobody asks.
+    # After any other end the supervisor may hang, and nothing is requested.
     while state is State.FINISHED and isinstance(_heard(link), ReadDrives):
         _say(link, master.look())
 
@@ -108,5 +108,5 @@ def _heard(link: Connection) -> object:
 
 
 def _say(link: Connection, what: Armed | Ended | Failed | CycleStatus) -> None:
-    with suppress(OSError):  # nobody is there to hear it; the drives hold all the same
+    with suppress(OSError):  # the supervisor is gone; the drives hold all the same
         link.send(what)

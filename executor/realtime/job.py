@@ -56,7 +56,7 @@ class Procedure(Protocol):
     """What is done with the drives of a motion, cycle by cycle.
 
     Attributes:
-        cause: Why it did not come to its end.
+        cause: Why it did not finish.
         error: The same where the operator is to see it as an error of its own; else None.
         holding: Every cable was held when the drives were last heard.
     """
@@ -241,4 +241,4 @@ class Gone:
 
 
 class ReadDrives:
-    """The supervisor asks what the drives tell after the motion; a `CycleStatus` answers it."""
+    """The supervisor asks for the drives' state after the motion; a `CycleStatus` answers it."""

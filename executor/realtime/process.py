@@ -1,4 +1,4 @@
-"""The supervisor's side of the real-time process: starts it, takes in what it tells, is told."""
+"""The supervisor's side of the real-time process: starts it, reads its records, sends requests."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LOOK = 0.01
 #: Looks are counted, not time, so that a supervisor that was suspended itself first reads what it
 #: missed.
 SILENT_LOOKS = 300
-#: A process that was not told to move ends within this, [s]; drives may still be asked for a time.
+#: A process without a command to move ends within this, [s]; drives may still be asked for a time.
 END_TIMEOUT = 10.0
 
 
@@ -120,7 +120,7 @@ class RealTimeProcess:
         if self._records is None:
             raise Refused("the motion was not armed", where="executor")
         self._board.beat()
-        with suppress(OSError):  # it died since it was armed, which is told below
+        with suppress(OSError):  # it died since it was armed, which is reported below
             self._link.send(Go())
         said: object = None
         over, silent, cycles = False, 0, 0
@@ -142,12 +142,12 @@ class RealTimeProcess:
         return Ended(State.LATCHED, error.what, holding=True, true_pose=None)
 
     def stands_now(self) -> CycleStatus:
-        """What the drives tell after the motion.
+        """State of the drives after the motion.
 
         Raises:
             CdprError: One does not answer, or the process is gone.
         """
-        with suppress(OSError):  # told below
+        with suppress(OSError):  # reported below
             self._link.send(ReadDrives())
         if not self._link.poll(END_TIMEOUT):
             raise self._hung()
@@ -185,11 +185,11 @@ class RealTimeProcess:
         code = self._process.exitcode
         how = f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
         return Fault(
-            f"the real-time process ended without a word ({how}); the drives stop and hold by"
-            " themselves as set-points stay away",
+            f"the real-time process died ({how}); the drives stop and hold on their own"
+            " without set-points",
             where="real-time process",
             why="it was killed, or the system ran out of memory",
-            next_step="look at the platform first; then start again from where it is",
+            next_step="check the platform first, then start again from its pose",
         )
 
     def _hung(self) -> Fault:
@@ -197,15 +197,15 @@ class RealTimeProcess:
         self._process.kill()  # a process that is suspended hears no milder signal
         self._process.join()
         return Fault(
-            "the real-time process hung and was ended; the drives stop and hold by themselves as"
-            " set-points stay away",
+            "the real-time process hung and was killed; the drives stop and hold on their own"
+            " without set-points",
             where="real-time process",
-            why="it was suspended, or waits for a device that does not answer",
-            next_step="look at the platform first; then start again from where it is",
+            why="it was suspended, or is waiting for a device that does not answer",
+            next_step="check the platform first, then start again from its pose",
         )
 
     def _take_in(self, records: Records) -> None:
-        """Everything told since the last time; cycles first, they tell the time."""
+        """Everything received since the last call; cycles first, as they carry the time."""
         for content in self._cycles.take():
             self._last, true_pose = self._wire.unpack(content)
             self._record(partial(records.take_cycle, self._last, true_pose))
@@ -213,13 +213,13 @@ class RealTimeProcess:
             self._record(partial(records.take_event, unpack_event(content)))
         lost = self._cycles.lost + self._events.lost
         if lost:
-            self._board.complain(f"{lost} records of the run were lost: they came too fast")
+            self._board.complain(f"{lost} records of the run were lost: they arrived too fast")
 
     def _record(self, take: Callable[[], None]) -> None:
         """A record that cannot be kept leads to a stop along the path, not to an end of care."""
         try:
             take()
         except CdprError as error:
-            self._board.complain(f"what records the run failed: {error.what}")
+            self._board.complain(f"recording failed: {error.what}")
         except Exception as error:
-            self._board.complain(f"what records the run failed: {type(error).__name__}: {error}")
+            self._board.complain(f"recording failed: {type(error).__name__}: {error}")

@@ -85,8 +85,8 @@ def require_real_time(denied: str, *, needed: bool) -> None:
         raise Refused(
             f"no real-time scheduling: {denied}",
             where="arming",
-            why="without it other programs make cycles late, and late cycles stop the motion",
-            next_step="allow it as named above, or pass --without-real-time if you accept that;"
+            why="without it other programs delay cycles, and late cycles stop the motion",
+            next_step="allow it as stated above, or pass --without-real-time to accept that;"
             " nothing was enabled",
         )
 

@@ -1,4 +1,4 @@
-"""Memory that two processes share. It has no name, so nothing is left of it whoever is killed."""
+"""Memory that two processes share. It has no name, so nothing is left when a process is killed."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class SharedMemory:
 
     @classmethod
     def sealed(cls, content: bytes) -> SharedMemory:
-        """Memory that nobody can write to any more, in no process."""
+        """Memory that no process can write to any longer."""
         descriptor = os.memfd_create("cdpr", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         left = memoryview(content)
         while left:
@@ -100,7 +100,7 @@ class Ring:
 
     @staticmethod
     def size(content: int, slots: int) -> int:
-        """Memory for slots of so much content, [bytes]."""
+        """Memory for slots of a content size, [bytes]."""
         return slots * (content + _HEAD.size)
 
     @property
@@ -162,7 +162,7 @@ class CycleRecordCodec:
     """
 
     def __init__(self, cables: int) -> None:
-        """For so many cables."""
+        """For a number of cables."""
         self._cables = cables
         self._layout = struct.Struct(f"<Qd B dd HQQ dd {4 * cables}i 7d")
         self.size = self._layout.size
@@ -218,7 +218,7 @@ class CycleRecordCodec:
 
 
 def pack_event(event: LoopEvent, most: int) -> bytes:
-    """An event in at most so many bytes; a text that is too long loses its middle."""
+    """An event within a number of bytes; a text that is too long loses its middle."""
     text = event.text
     while len(content := json.dumps({**asdict(event), "text": text}).encode()) > most:
         keep = len(text) * 2 // 5
@@ -256,7 +256,7 @@ class SharedRequests:
     def ask_stop(self, for_what: StopReason | None = None) -> None:
         """See `RequestBoard`."""
         if for_what is not None and not self.memory.view[_STOP]:
-            # Before the stop: whoever reads that knows why.
+            # Before the stop: its reader then knows why.
             _write(self.memory, _REASON, f"{for_what.code} {for_what.text}")
         self.memory.view[_STOP] = 1
 
@@ -321,9 +321,9 @@ class Supervised:
         if beats != self._beats:
             self._beats, self._heard = beats, now
         if os.getppid() != self._supervisor:
-            return "the process that supervises the run is gone"
+            return "the supervising process has ended"
         if now - self._heard > SILENCE:
-            return f"the process that supervises the run was silent for {SILENCE:g} s"
+            return f"the supervising process was silent for {SILENCE:g} s"
         return _text(self._memory, _TROUBLE)
 
 

@@ -149,7 +149,7 @@ def no_clearance(obstacles: tuple[str, ...] = ()) -> ClearanceTable:
     )
 
 
-# How exactly the drives tell where the platform is: whole counts, and stretch by noisy torques.
+# How accurate the encoder pose is: whole counts, and stretch by noisy torques.
 
 
 #: Standard deviation of a normal distribution by the median of its absolute values.
@@ -157,18 +157,18 @@ _BY_MEDIAN = 1.4826
 
 
 def tension_noise(rig: Rig, tensions: Array) -> Array:
-    """Standard deviation of the tensions that torques tell, by what changes between two cycles.
+    """Standard deviation of tensions computed from torques, by what changes between two cycles.
 
     What the platform's motion changes in a cycle counts as noise, too: a torque may be a cycle old.
 
     Args:
         rig: The robot.
-        tensions: Of every cycle, shape (n, m), [N]; NaN where none was told.
+        tensions: Of every cycle, shape (n, m), [N]; NaN where unknown.
 
     Returns:
         Shape (m,), [N].
     """
-    # One is the smallest step of a torque: drives tell whole per mille of the rated one.
+    # One is the smallest step of a torque: drives report whole per mille of the rated one.
     rounding: Array = np.abs(rig.tensions_by(np.ones(rig.cable_count))) / np.sqrt(12.0)
     steps = np.abs(np.diff(tensions, axis=0))
     known = np.isfinite(steps).all(axis=1)
@@ -180,7 +180,7 @@ def tension_noise(rig: Rig, tensions: Array) -> Array:
 
 
 def covariance_by_drives(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) -> Array:
-    """Covariance of a pose that fits the cable lengths which the drives tell.
+    """Covariance of a pose that fits the cable lengths from the encoders.
 
     Args:
         winches: Of the robot.
@@ -252,7 +252,7 @@ def encoder_rows(
         times: Of n poses, shape (n,), [s].
         measured: By the drives, ``world_from_platform``.
         planned: At the same times.
-        noise: Of the tensions that the drives tell, shape (m,), [N].
+        noise: Of the tensions that the drives report, shape (m,), [N].
     """
     rows = []
     for time, at, due in zip(times.tolist(), measured, planned, strict=True):

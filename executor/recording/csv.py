@@ -95,7 +95,7 @@ class TableFile:
         self._path = path
         rows = CsvFile(path, text).rows
         if not rows:
-            raise self._bad("the file is empty; its first line must name the columns")
+            raise self._bad("the file is empty; the first line must name the columns")
         self.names = tuple(rows[0])
         for number, row in enumerate(rows[1:], start=2):
             if len(row) != len(self.names):
@@ -137,7 +137,9 @@ class TableFile:
         try:
             return np.fromiter(map(int, values), np.int64, len(values))
         except (ValueError, OverflowError) as error:
-            raise self._bad(f"the column {name!r} holds no whole number: {error}") from None
+            raise self._bad(
+                f"the column {name!r} has a value that is not a whole number: {error}"
+            ) from None
 
     def matrix(self, names: Sequence[str], scale: float = 1.0) -> Array:
         """Columns side by side, shape (n, len(names)), divided by ``scale``.
@@ -150,7 +152,7 @@ class TableFile:
         return np.column_stack([self.floats(name, scale) for name in names])
 
     def matrix_at(self, places: range, scale: float = 1.0) -> Array:
-        """As `matrix`, with columns chosen by their place, for names that may stand twice.
+        """As `matrix`, with columns chosen by their place, for names that may appear twice.
 
         Raises:
             BadInput: A column holds something that is no number.
@@ -182,13 +184,15 @@ class TableFile:
         try:
             return np.fromiter(map(float, values), np.float64, len(values))
         except ValueError as error:
-            raise self._bad(f"the column {name!r} holds a text: {error}") from None
+            raise self._bad(
+                f"the column {name!r} has a value that is not a number: {error}"
+            ) from None
 
     def _bad(self, what: str) -> BadInput:
         return BadInput(
             what,
             where=str(self._path),
-            why="the file was edited or cut short after the run",
+            why="the file was edited or truncated after the run",
             next_step="restore the file, or run the plan again into a new folder",
         )
 

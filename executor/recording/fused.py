@@ -1,4 +1,4 @@
-"""The platform's pose from drives and camera together: a row a cycle, from the first picture on."""
+"""The platform's pose from drives and camera together: a row a cycle, from the first image on."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class FusedTable:
         position: Of the platform in the world, shape (n, 3), [m].
         rotation: ``world_from_platform`` as unit quaternions (w, x, y, z), shape (n, 4).
         std: Standard deviations of position and rotation vector, shape (n, 6), [m] and [rad].
-        age: Time since the last picture that was used, shape (n,), [s].
+        age: Time since the last image that was used, shape (n,), [s].
     """
 
     time: Array
@@ -58,7 +58,7 @@ class FusedTable:
 
 
 def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
-    """The drives' poses of a run, moved to where its pictures show the platform."""
+    """The drives' poses of a run, moved to where its images show the platform."""
     known = np.isfinite(cycles.encoder).all(axis=1) & np.isfinite(cycles.encoder_rotation).all(
         axis=1
     )

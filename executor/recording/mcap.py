@@ -35,7 +35,7 @@ from tracking.clearance import MeasuredClearance
 from tracking.measurement import NoPose
 from tracking.pose_log import LoggedPicture
 
-# What cameras saw, as messages of ``run.mcap``: poses, why there is none, kept pictures.
+# What cameras saw, as messages of ``run.mcap``: poses, why there is none, kept images.
 
 
 def camera_messages(
@@ -44,7 +44,7 @@ def camera_messages(
     """All messages of a run's cameras.
 
     Args:
-        folder: Holds the kept pictures.
+        folder: Holds the kept images.
         poses: What all cameras measured together.
         alone: What each of several measured, by its name; nothing for a single one.
         start: [ns since 1970].
@@ -110,10 +110,10 @@ def write_mcap(
     """Writes ``run.mcap``; times in it are the start of the run plus run time.
 
     Args:
-        folder: The run's folder; its pictures go into the file too.
+        folder: The run's folder; its images go into the file too.
         context: What the run was.
         cycles: Every cycle is logged.
-        poses: Every picture's pose, or why there is none.
+        poses: Every image's pose, or why there is none.
         clearance: Every row.
         fused: Every row.
         alone: What each of several cameras measured, by its name; nothing for a single one.
@@ -157,7 +157,7 @@ def write_messages(path: Path, messages: Sequence[Message], start: int) -> None:
             "the log cannot be written",
             where=str(path),
             why=error.strerror or str(error),
-            next_step="free some space; the CSV files hold the same numbers",
+            next_step="free some space; the CSV files hold the same data",
         ) from None
 
 

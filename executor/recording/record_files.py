@@ -81,14 +81,14 @@ class LimitedSizeRecord(SizeRecord):
 
 
 class TagErrorRecord(SizeRecord):
-    """With the pictures behind it."""
+    """With the images behind it."""
 
     frames: Count
     frames_without_pose: Count
 
 
 class CameraRecordDocument(_Record):
-    """What became of a camera's pictures."""
+    """What became of a camera's images."""
 
     name: str
     source: str

@@ -1,4 +1,4 @@
-"""Takes in what the loop tells of a run: cycles and events to log and disk, pictures asked."""
+"""Records cycles and events of the loop to log and disk; requests images."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class RunLog:
         rig, planned = self._rig, self._checked.table
         records = self._records[first:end]
         began = self._records[0].at if records else 0.0
-        # A drive answers a SYNC with where it is then: at what it was told one cycle before.
+        # A drive answers a SYNC with where it is then: at its target of one cycle before.
         before = self._records[first - 1].index if first else 0.0
         index = np.array([before, *(r.index for r in records[:-1])])[: len(records)]
         rows = np.rint(index).astype(np.int64)
@@ -102,17 +102,17 @@ class RunLog:
         )
 
     def _lengths(self, records: list[CycleRecord], rows: Integers) -> tuple[Array, Array]:
-        """Cable lengths [m] by the drives' positions, and tensions [N] where torques tell them.
+        """Cable lengths [m] by the drives' positions, and tensions [N] where torques give them.
 
         Args:
             records: n cycles.
-            rows: The set-points that the drives were told, shape (n,).
+            rows: The set-points that the drives were sent, shape (n,).
         """
         actual = _matrix([r.actual for r in records], self._rig.cable_count)
         tensions = self._rig.tensions_by(
             _matrix([r.torques for r in records], self._rig.cable_count)
         )
-        # Only drives that follow their set-points tell the cables' tensions by their torques.
+        # Only drives that follow their set-points give the cables' tensions by their torques.
         taut = np.isfinite([r.following_error for r in records])[:, None]
         stretch = np.where(taut, tensions, self._checked.table.tensions[rows])
         winches = self._checked.winches
@@ -252,7 +252,7 @@ class RecordWriter:
         behind = self._queued_until - self._written_until
         if behind > BEHIND or self._waiting.qsize() >= _MOST_WAITING:
             self._trouble = Fault(
-                f"the disk is {behind:.1f} s behind the run, allowed are {BEHIND:g} s",
+                f"the disk is {behind:.1f} s behind the run; the limit is {BEHIND:g} s",
                 where=str(self._folder.path),
                 why="it is too slow, or hangs",
                 next_step="choose a run folder on another disk",
@@ -267,11 +267,11 @@ class RecordWriter:
             except CdprError as error:
                 self._trouble = self._trouble or error
             except Exception as error:
-                what = f"the record broke: {type(error).__name__}: {error}"
+                what = f"recording failed: {type(error).__name__}: {error}"
                 self._trouble = self._trouble or Fault(what, where=str(self._folder.path))
 
 
-#: Asks for a picture: time since the start of the run [s], the same moment on the monotonic clock
+#: Asks for an image: time since the start of the run [s], the same moment on the monotonic clock
 #: [s], where the simulated platform is then, and where the drives' positions put it.
 FrameTrigger = Callable[[float, float, Pose | None, Pose | None], None]
 
@@ -298,10 +298,10 @@ class Recorder:
             prepared: What is run.
             folder: Where cycles and events are written as they happen.
             status: Kept up to date for those who ask.
-            trigger: Called for every picture.
-            every: Cycles from one picture to the next.
+            trigger: Called for every image.
+            every: Cycles from one image to the next.
             progress: Called now and then with the number of rows that are done.
-            announce: Told in a sentence when a stop is reached and left.
+            announce: Called with a sentence when a stop is reached and left.
             on_event: Called with each event, after it is on record.
             own_thread: The disk is waited for in a thread, which `writer` ends.
         """
@@ -311,11 +311,11 @@ class Recorder:
         self.folder = folder
         """Where events are written."""
         self.writer = RecordWriter(folder, self.log, own_thread=own_thread)
-        """Writes them; whoever made this closes it."""
+        """Writes them; the caller closes it."""
         self._status = status
         self._trigger, self._progress = trigger, progress
         self.every = every
-        """Cycles from one picture to the next."""
+        """Cycles from one image to the next."""
         self._began: float | None = None
         self.last = 0.0
         """When the last cycle began, on the loop's clock, [s]."""
@@ -323,7 +323,7 @@ class Recorder:
         """Where the run was then."""
 
     def wants_pose(self, cycle: int) -> bool:
-        """Whether a picture will be asked for in this cycle."""
+        """Whether an image will be asked for in this cycle."""
         return self._trigger is not None and cycle % self.every == 0
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
@@ -331,7 +331,7 @@ class Recorder:
 
         Args:
             record: What happened in it.
-            true_pose: Where the simulated platform is, in cycles with a picture.
+            true_pose: Where the simulated platform is, in cycles with an image.
 
         Raises:
             CdprError: The record cannot be written; all else is done.

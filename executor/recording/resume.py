@@ -50,15 +50,13 @@ def run_end(folder: RunFolder) -> RunEnd:
 
     Raises:
         BadInput: A file of the folder is missing or was changed.
-        Refused: The drives' positions do not tell where the platform is.
+        Refused: The platform pose is unknown.
     """
     rig, plan, cycles = folder.rig(), folder.plan(), folder.cycles()
     where = str(folder.path)
     final_state = folder.summary()["final_state"]
     if final_state == NOT_ENDED:
-        raise _unknown(
-            "the run did not come to its end, so its last cycles are not on record", where
-        )
+        raise _unknown("the run did not finish, so its last cycles are not on record", where)
     if not len(cycles):
         raise BadInput("the run has no cycle", where=where, next_step="plan with --start-mm")
     stops, leg = plan.scene.document.stops, int(cycles.leg[-1])
@@ -90,12 +88,12 @@ def continued(scene: Scene, end: RunEnd) -> tuple[Scene, tuple[StopDocument, ...
     changed = [stop.name for stop in done if stop != visited[stop.name]]
     if changed or done != scene.document.stops[: len(done)]:
         names = changed or [stop.name for stop in done]
-        how = "as other stops than the scene's" if changed else "in another order"
+        how = "as stops that differ from the scene's" if changed else "in another order"
         raise BadInput(
             f"the run visited {', '.join(map(repr, names))} {how}",
             where=f"scene {scene.name}",
-            why="the scene's stops were changed since, or it is another task",
-            next_step="restore them; or give the stops of another task other names",
+            why="the scene's stops have changed since, or it is another task",
+            next_step="restore them, or give the stops of another task other names",
         )
     rest = scene.document.stops[len(done) :]
     return scene.changed(start=end.pose, stops=rest, payload=end.payload), tuple(done)
@@ -115,8 +113,8 @@ def _pose(rig: Rig, cycles: CycleTable, where: str) -> Pose:
     away, allowed = found.distance_to(commanded), rig.motion.following_error
     if not away <= allowed:
         raise _unknown(
-            f"by its drives the platform is {away * 1e3:.2f} mm from where it was told to be,"
-            f" allowed are {allowed * 1e3:g} mm",
+            f"the encoder pose is {away * 1e3:.2f} mm from the commanded pose,"
+            f" the limit is {allowed * 1e3:g} mm",
             where,
         )
     pose = Pose(found.position, commanded.rotation)
@@ -124,8 +122,8 @@ def _pose(rig: Rig, cycles: CycleTable, where: str) -> Pose:
     worst, allowed = int(np.argmax(off)), rig.motion.start_tolerance
     if not off[worst] <= allowed:
         raise _unknown(
-            f"cable {worst + 1} is {off[worst] * 1e3:.2f} mm longer or shorter than at the pose"
-            f" that fits the drives' positions best, allowed are {allowed * 1e3:g} mm",
+            f"cable {worst + 1} is {off[worst] * 1e3:.2f} mm longer or shorter than at the"
+            f" best-fit encoder pose, the limit is {allowed * 1e3:g} mm",
             where,
         )
     return pose
@@ -133,10 +131,10 @@ def _pose(rig: Rig, cycles: CycleTable, where: str) -> Pose:
 
 def _unknown(what: str, where: str) -> Refused:
     return Refused(
-        f"where the platform is cannot be told: {what}",
+        f"the platform pose is unknown: {what}",
         where=where,
-        why="a drive slipped, stood still while others moved, or was lost; or the run was killed",
-        next_step="look at the rig, reference the drives, and plan from where the platform is with"
+        why="a drive slipped, stalled or was lost, or the run was killed",
+        next_step="check the rig, home the drives, and plan from the platform's pose with"
         " `cdpr plan --start-mm`",
     )
 
@@ -155,7 +153,7 @@ def scene_after(
 
     Raises:
         BadInput: The folder is no whole run, or of another rig or task; or nothing is left to do.
-        Refused: Where the platform is cannot be told.
+        Refused: The platform pose is unknown.
     """
     opened = RunFolder.open(folder)
     require_same_rig(opened.plan(), rig, folder / PLAN)
@@ -163,7 +161,7 @@ def scene_after(
     after, done = continued(scene, end)
     if end.finished and not after.stops and _is_there(after):
         raise BadInput(
-            "the run ended at the scene's goal: nothing is left to do",
+            "the run ended at the scene's goal: nothing remains to be done",
             where=str(folder),
             next_step="give another scene, or another goal with --goal-mm",
         )
@@ -190,13 +188,13 @@ def require_room(scene: Scene, rig: Rig) -> None:
         if nearest.distance >= asked + CLEARANCE_RESERVE:
             continue
         possible = math.floor((nearest.distance - CLEARANCE_RESERVE) * 1e5) / 100.0
-        step = "move the platform away by hand and plan from where it is with --start-mm"
+        step = "move the platform away by hand and plan from its new pose with --start-mm"
         if possible > 0.0:
-            step = f"{ask} {possible:g}, which the whole new plan then keeps; or {step}"
+            step = f"{ask} {possible:g}, which then holds for the whole new plan; or {step}"
         raise BadInput(
             f"the platform stopped with {nearest.first} {nearest.distance * 1e3:.3f} mm from"
-            f" {nearest.second}; a plan that keeps {asked * 1e3:g} mm and"
-            f" {CLEARANCE_RESERVE * 1e3:g} mm in reserve cannot begin there",
+            f" {nearest.second}; a plan with a clearance of {asked * 1e3:g} mm and"
+            f" {CLEARANCE_RESERVE * 1e3:g} mm in reserve cannot start there",
             where="start of the new plan",
             next_step=step,
         )

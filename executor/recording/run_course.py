@@ -1,4 +1,4 @@
-"""``run.json``: what no table of a run tells, from before it moves, and at its end how it ended.
+"""``run.json``: what no table of a run holds, from before it moves, and how it ended.
 
 Keys (``schema_version`` 1): ``started`` (ISO 8601, UTC), ``interface``, ``simulated``, ``fast``,
 ``final_state``, ``cause`` and ``cycles``. Until the motion is over the last three are empty or 0:
@@ -58,7 +58,7 @@ class RunCourse:
             return cls._of(json.loads(read_text(path)))
         except (TypeError, ValueError) as error:
             raise BadInput(
-                f"not the course of a run: {error}",
+                f"not a valid course of a run: {error}",
                 where=str(path),
                 why="the file was changed after the run",
                 next_step="restore the file",
@@ -67,7 +67,7 @@ class RunCourse:
     @classmethod
     def _of(cls, data: Any) -> RunCourse:
         if not isinstance(data, dict) or data.get("schema_version") != 1:
-            raise ValueError("not of schema_version 1")
+            raise ValueError("schema_version is not 1")
         values = {name: value for name, value in data.items() if name != "schema_version"}
         course = cls(**{**values, "started": datetime.fromisoformat(str(values.get("started")))})
         if course.started.tzinfo is None:

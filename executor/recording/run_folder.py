@@ -72,7 +72,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path) -> RunFolder:
-        """Makes a new folder, empty but for its folder of pictures, and its missing parents.
+        """Makes a new folder, empty but for its folder of images, and its missing parents.
 
         Raises:
             BadInput: The path exists, or it cannot be made or written to.
@@ -102,12 +102,12 @@ class RunFolder:
             raise BadInput(
                 "exists already",
                 where=str(path),
-                why="a run never writes into the folder of another",
+                why="a run never writes into another run's folder",
                 next_step="choose another folder or remove this one",
             )
         above = next(folder for folder in path.absolute().parents if folder.exists())
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-            raise _not_made(path, f"{above} is not a folder that you may write to")
+            raise _not_made(path, f"{above} is not a writable folder")
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
@@ -120,15 +120,15 @@ class RunFolder:
             raise BadInput(
                 "no such run folder",
                 where=str(path),
-                next_step="give the folder that `cdpr run -o` made",
+                next_step="give the folder that `cdpr run -o` created",
             )
         missing = [name for name in NEEDED if not (path / name).is_file()]
         if missing:
             raise BadInput(
-                f"not a whole run folder: {', '.join(missing)} missing",
+                f"incomplete run folder: {', '.join(missing)} missing",
                 where=str(path),
-                why="the run was cut short, or this is another folder",
-                next_step="give a folder that `cdpr run -o` made, or run the plan again",
+                why="the run was interrupted, or this is another kind of folder",
+                next_step="give a folder that `cdpr run -o` created, or run the plan again",
             )
         return cls(path)
 
@@ -145,9 +145,9 @@ class RunFolder:
         folder = cls(path)
         if folder.is_under_way():
             raise BadInput(
-                "the run is still under way",
+                "the run is still in progress",
                 where=str(path),
-                next_step="wait for its end, or look at it with `cdpr monitor`",
+                next_step="wait until it ends, or follow it with `cdpr monitor`",
             )
         return folder
 
@@ -160,7 +160,7 @@ class RunFolder:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every file of a run that came to its end is there."""
+        """Whether every file of a run that finished is there."""
         return all((self.path / name).is_file() for name in NEEDED)
 
     @contextmanager
@@ -353,7 +353,7 @@ class RunFolder:
         write_atomic(self.path / EVENTS, "".join(event.line for event in events))
 
     def write_picture(self, frame: int, image: NDArray[np.uint8], camera: str = "") -> str:
-        """Keeps a camera picture, grey or BGR, as JPEG.
+        """Keeps a camera image, grey or BGR, as JPEG.
 
         Args:
             frame: Number of the moment at which it was taken.
@@ -372,7 +372,7 @@ class RunFolder:
         name = "/".join([PICTURES, *([camera] if camera else []), f"frame_{frame:06d}.jpg"])
         done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
-            raise ValueError(f"no picture: shape {image.shape}, type {image.dtype}")
+            raise ValueError(f"no image: shape {image.shape}, type {image.dtype}")
         try:
             (self.path / name).parent.mkdir(exist_ok=True)
             (self.path / name).write_bytes(data.tobytes())
@@ -384,7 +384,7 @@ class RunFolder:
         """The JPEG that `write_picture` named.
 
         Raises:
-            BadInput: It is gone, or not in the folder of pictures.
+            BadInput: It is gone, or not in the folder of images.
         """
         try:
             place = (self.path / name).resolve()
@@ -393,7 +393,7 @@ class RunFolder:
             return read_bytes(place, PICTURE_LIMIT)
         except OSError as error:
             raise BadInput(
-                "the picture cannot be read",
+                "the image cannot be read",
                 where=str(self.path / name),
                 why=error.strerror or str(error),
             ) from None
@@ -431,17 +431,17 @@ class RunFolder:
 
     def _not_written(self, name: str, error: OSError) -> Fault:
         return Fault(
-            "the run folder cannot be written to",
+            "the run folder cannot be written",
             where=str(self.path / name),
             why=error.strerror or str(error),
-            next_step="free some space; the motion does not depend on it, the record does",
+            next_step="free some space; the motion continues without the record",
         )
 
 
 def _not_made(path: Path, why: str) -> BadInput:
     return BadInput(
-        "the run folder cannot be made",
+        "the run folder cannot be created",
         where=str(path),
         why=why,
-        next_step="name another folder with -o, one with space that you may write to",
+        next_step="name another writable folder with free space with -o",
     )

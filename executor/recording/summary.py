@@ -8,7 +8,7 @@ Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, 
 ``reached_s``, ``left_s``}], ``following_error_mm`` {``max``, ``rms``, ``limit``},
 ``encoder_error_mm`` {``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``,
 ``frames_without_pose``} or null without a camera, ``cameras`` [{``name``, ``source``, ``pictures``,
-``poses``, ``dropped``, ``measuring_ms`` (median), ``failed`` (why it gave no pictures any more, or
+``poses``, ``dropped``, ``measuring_ms`` (median), ``failed`` (why it gave no images any more, or
 nothing)}], ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
 ``measured_uncertainty``, ``measured_at_most``, ``pair``, ``at_s``, ``source``} or null without
 obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``,
@@ -53,7 +53,7 @@ class RunContext:
         events: What happened, in order.
         versions: Of the programs that took part, by name.
         cause: Why the run did not finish; when left out, what the last event says.
-        cameras: What became of each camera's pictures.
+        cameras: What became of each camera's images.
         troubles: What of the record is lost, a sentence each.
     """
 

@@ -233,7 +233,7 @@ def quaternions_of(rotations: Array) -> Array:
     return np.array([quaternion_from_matrix(r) for r in rotations]).reshape(-1, 4)
 
 
-# What the camera measured during a run: a row a picture.
+# What the camera measured during a run: a row an image.
 
 
 _POSE_MM, _DEG = 1e3, float(np.degrees(1.0))
@@ -249,10 +249,10 @@ OK = "ok"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTable:
-    """Measured poses of n pictures; NaN where a picture gave no pose.
+    """Measured poses of n images; NaN where an image gave no pose.
 
     Attributes:
-        frame: Number of the picture, shape (n,).
+        frame: Number of the image, shape (n,).
         time: Since the start of the run, shape (n,), [s].
         status: ``ok``, or why there is no pose, n texts.
         position: Of the platform in the world, shape (n, 3), [m].
@@ -261,7 +261,7 @@ class PoseTable:
         tags: Numbers of the tags that were used, n texts such as ``301 303``.
         reprojection: RMS of the corners, shape (n,), [px].
         planned: Commanded position at that time, shape (n, 3), [m].
-        picture: Name of the kept picture inside the run folder, or nothing, n texts.
+        picture: Name of the kept image inside the run folder, or nothing, n texts.
     """
 
     frame: Integers
@@ -284,7 +284,7 @@ class PoseTable:
 
     @property
     def ok(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Which pictures gave a pose, shape (n,)."""
+        """Which images gave a pose, shape (n,)."""
         return np.array([status == OK for status in self.status], dtype=bool)
 
     @property

@@ -94,7 +94,7 @@ def judge(
         cycles: What the drives did.
         poses: What the cameras saw together.
         clearance: How near it came.
-        cameras: What became of each camera's pictures.
+        cameras: What became of each camera's images.
         too_near: It was stopped for what the cameras measured, and not by the operator.
         silent: It was stopped for drives that did not answer.
         troubles: What of its record is lost, a sentence each.
@@ -119,7 +119,7 @@ def judge(
         return Verdict(PASSED, sentence, (end, *measured))
     if final_state == NOT_ENDED:
         end = Check("finished", False, f"Its record ends {at}. {_KILLED}")
-        return Verdict(FAILED, "The run did not come to its end.", (end, *measured))
+        return Verdict(FAILED, "The run did not finish.", (end, *measured))
     told = cause.rstrip(".") or f"the final state is {final_state!r}"
     end = Check("finished", False, f"The run ended {at}, before the goal: {told}.")
     if final_state == "stopped" and not failures and not too_near:
@@ -129,8 +129,8 @@ def judge(
 
 
 _KILLED = (
-    "Its program was killed, the computer stopped, or its end could not be written:"
-    " what came after that is not known."
+    "Its program was killed, the computer stopped, or its end could not be recorded;"
+    " what happened after that is unknown."
 )
 
 
@@ -142,7 +142,7 @@ def judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
         cause: Likewise.
         trouble: Why there are no tables.
     """
-    known = Check("evaluated", False, f"What was measured could not be evaluated: {trouble}.")
+    known = Check("evaluated", False, f"The measurements could not be evaluated: {trouble}.")
     if final_state == "finished":
         end = Check("finished", True, "The platform reached the goal.")
         return Verdict(FAILED, "The run reached the goal, but was not evaluated.", (end, known))
@@ -164,7 +164,7 @@ def following(cycles: CycleTable, limit: float) -> Check:
     """Every cable within ``limit`` [m] of its set-point, in every cycle."""
     known = np.flatnonzero(np.isfinite(cycles.following_error))
     if not known.size and not _ON_PATH & {*cycles.state}:
-        text = "The platform never moved along the path, so no following error was measured."
+        text = "The platform did not move along the path, so no following error was measured."
         return Check("following_error", True, text)
     if not known.size:
         return Check("following_error", False, _never_followed(cycles))
@@ -209,7 +209,7 @@ def replies(cycles: CycleTable, simulated: bool, silent: bool = False) -> Check:
         return Check("lost_replies", False, f"{text}, and the run was stopped for it.")
     if simulated:
         return Check("lost_replies", False, f"{text}; simulated drives lose none.")
-    return Check("lost_replies", True, f"{text}, never so many that the run had to stop.")
+    return Check("lost_replies", True, f"{text}, too few to stop the run.")
 
 
 def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
@@ -245,25 +245,25 @@ def distances(
     A distance is too small only when it is so by more than its own uncertainty.
     """
     checks = []
-    for source, teller in (("tag", _who(cameras)), ("encoder", "the drives")):
+    for source, source_name in (("tag", _who(cameras)), ("encoder", "the drives")):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
-            checks.append(_against_required(rows, required, teller))
+            checks.append(_against_required(rows, required, source_name))
             if source == "tag":
                 checks.append(_against_plan(rows))
     return checks
 
 
-def _against_required(rows: ClearanceTable, required: float, teller: str) -> Check:
+def _against_required(rows: ClearanceTable, required: float, source_name: str) -> Check:
     passed = not bool(np.any(rows.at_most < required - ROUNDING))
     worst = int(np.nanargmin(rows.distance if passed else rows.at_most))
     distance, high = rows.distance[worst] * 1e3, rows.at_most[worst] * 1e3
     low = distance - rows.uncertainty[worst] * 1e3
     bounds = f"bounds {low:.1f} to {high:.1f} mm" if passed else f"upper bound {high:.1f} mm"
     text = (
-        f"The smallest clearance seen by {teller} was {distance:.1f} mm, {bounds}"
+        f"Smallest clearance measured by {source_name}: {distance:.1f} mm, {bounds}"
         f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
-        f" the scene asks for {required * 1e3:g} mm."
+        f" required {required * 1e3:g} mm."
     )
     return Check(f"clearance_{rows.source[worst]}", passed, text)
 
@@ -295,12 +295,12 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
         return []
     seen = int(poses.ok.sum())
     if not seen:
-        text = f"None of {len(poses)} pictures gave a pose: {poses.status[0]}."
+        text = f"None of {len(poses)} images gave a pose: {poses.status[0]}."
         return [Check("camera", False, text)]
     error = poses.error[poses.ok] * 1e3
     rms = float(np.sqrt(np.mean(error**2)))
     text = (
-        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} pictures,"
+        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} images,"
         f" {rms:.2f} mm RMS from the plan (largest {error.max():.2f} mm)."
     )
     if len(cameras) > 1:

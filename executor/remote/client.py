@@ -24,8 +24,8 @@ class Answer:
 
     Attributes:
         process: Its number.
-        status: See `executor.remote.status`; None when it did not tell.
-        what: Why it did not tell, in its own words; nothing when it was silent.
+        status: See `executor.remote.status`; None when it did not answer.
+        what: Why it has no status, in its own words; empty when it was silent.
         ended: It is gone, so that nothing more will be heard of it.
     """
 
@@ -55,7 +55,7 @@ def _told(run: Reached, line: bytes) -> bool:
 
 
 def _heard(run: Reached) -> Answer:
-    """What it answers; a run that hangs is told apart from one that ended."""
+    """What it answers; a run that hangs is distinguished from one that ended."""
     try:
         answer = json.loads(_line(run.link))
     except TimeoutError:
@@ -68,7 +68,7 @@ def _heard(run: Reached) -> Answer:
     if isinstance(status, dict):
         return Answer(run.process, status)
     what = answer.get("what") if isinstance(answer, dict) else None
-    return Answer(run.process, None, str(what or "its answer says nothing"))
+    return Answer(run.process, None, str(what or "its answer is empty"))
 
 
 def last_word(run: Reached) -> dict[str, Any] | None:
@@ -99,53 +99,53 @@ def the_one(runs: Sequence[Reached], process: int | None, verb: str) -> Reached:
         raise no_run(verb)
     if process is None and len(runs) > 1:
         raise BadInput(
-            f"{len(runs)} runs are under way",
+            f"{len(runs)} runs are in progress",
             where=f"cdpr {verb}",
-            next_step=f"name one of them with --process: {numbers}",
+            next_step=f"name one with --process: {numbers}",
         )
     for run in runs:
         if process is None or run.process == process:
             return run
     raise BadInput(
-        f"process {process} is no run of yours",
+        f"process {process} is not a run of this user",
         where=f"cdpr {verb}",
-        next_step=f"name one of these: {numbers}",
+        next_step=f"name one of: {numbers}",
     )
 
 
 def no_run(verb: str) -> Fault:
     """Nothing was reached."""
     return Fault(
-        "no run of yours is going on, so nothing was told to anybody",
+        "no active run found for this user",
         where=f"cdpr {verb}",
-        why="it ended already, or another user started it",
-        next_step="press the emergency stop if something moves; a run of another user is"
-        f" reached by that user, or by `sudo cdpr {verb}`",
+        why="it has ended, or another user started it",
+        next_step="press the emergency stop if the robot moves; a run of another user is"
+        f" stopped by that user, or with `sudo cdpr {verb}`",
     )
 
 
 def no_answer(verb: str, answers: Sequence[Answer]) -> Fault:
-    """Runs that were told something and do not say how they stand."""
+    """Runs that got a command and do not report their status."""
     numbers = ", ".join(str(answer.process) for answer in answers)
     words = [answer.what for answer in answers if answer.what]
     if words:
         return Fault(
-            f"process {numbers} did not do it, or cannot tell: {'; '.join(words)}",
+            f"process {numbers} did not obey, or cannot confirm: {'; '.join(words)}",
             where=f"cdpr {verb}",
-            next_step="press the emergency stop if something moves that must not",
+            next_step="press the emergency stop if the robot still moves",
         )
     if all(answer.ended for answer in answers):
         return Fault(
-            f"process {numbers} ended before it could be told",
+            f"process {numbers} ended before it received the command",
             where=f"cdpr {verb}",
-            next_step="see what its run folder says; press the emergency stop if something moves",
+            next_step="check its run folder; press the emergency stop if the robot still moves",
         )
     return Fault(
         f"process {numbers} did not answer within {ANSWER_TIMEOUT:g} s",
         where=f"cdpr {verb}",
-        why="it is ending, was suspended, or hangs; what moves the drives stops by itself when"
-        " nobody supervises it",
-        next_step="press the emergency stop if something still moves",
+        why="it is ending, was suspended, or hangs; motion stops on its own when"
+        " the supervisor is lost",
+        next_step="press the emergency stop if the robot still moves",
     )
 
 

@@ -70,7 +70,7 @@ class Told(Protocol):
 def answer_to(line: bytes, board: RequestBoard, status: Told) -> bytes:
     """Does what a line asks for; the answer as it is sent.
 
-    A command counts even where the run then cannot tell how it stands.
+    A command counts even where the run then cannot report its status.
     """
     try:
         _put_up(parse_command(line), board)
@@ -78,7 +78,7 @@ def answer_to(line: bytes, board: RequestBoard, status: Told) -> bytes:
     except NotACommand as error:
         return _line({"ok": False, "what": f"not a command: {error}"})
     except Exception as error:
-        what = f"the run cannot tell how it stands: {type(error).__name__}: {error}"
+        what = f"the run cannot report its status: {type(error).__name__}: {error}"
         return _line({"ok": False, "what": what})
 
 

@@ -1,8 +1,8 @@
 """Which runs are under way, so that `cdpr stop` and its like reach them from any terminal.
 
 A run listens on a socket named after its process in the user's run-time folders; a socket on which
-nobody listens was left by a process that is gone. It is announced in every folder that another
-terminal may look into, and only in folders that nobody else can write to: a folder in /tmp that
+no process listens was left by one that ended. It is announced in every folder that another
+terminal may look into, and only in folders that no other user can write to: a folder in /tmp that
 another user made could hold links to this user's files, or sockets of somebody else. Root reaches
 the runs of all users, each in a folder that is that user's alone.
 """
@@ -91,10 +91,10 @@ def announced() -> Iterator[list[socket.socket]]:
         folders = [folder.descriptor for folder in opened if folder.owner == os.getuid()]
         if not folders:
             raise Refused(
-                "`cdpr stop` could not reach this run",
+                "`cdpr stop` would not reach this run",
                 where=" or ".join(map(str, places)),
-                why="no such folder belongs to this user alone; another user may have made it",
-                next_step="remove it or close it to others (chmod 700), or set XDG_RUNTIME_DIR",
+                why="no such folder belongs to this user alone; another user may have created it",
+                next_step="remove it or restrict it (chmod 700), or set XDG_RUNTIME_DIR",
             )
         name = f"{os.getpid()}{_ENDING}"
         listeners = []
@@ -163,7 +163,7 @@ def find_runs() -> Iterator[list[Reached]]:
 
 
 def _reached(folder: int, name: str, owner: int) -> Reached | None:
-    """The folder owner's run behind a name; a name behind which nobody listens is removed."""
+    """The folder owner's run behind a name; a name behind which no process listens is removed."""
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISSOCK(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
             return None

@@ -28,7 +28,7 @@ def serving(
     Args:
         listeners: Listening; they stay the caller's.
         board: Where wishes are put up.
-        status: What is told.
+        status: What is reported.
     """
     waker, woken = socket.socketpair()
     server = _Server(listeners, woken, board, status)
@@ -131,7 +131,7 @@ class _Server:
 
 
 def _is_ours(client: socket.socket) -> bool:
-    """The folder lets nobody else in; the system says once more who it is."""
+    """The folder admits no other user; the system confirms who it is."""
     credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     _, user, _ = struct.unpack("3i", credentials)
     return user in (os.getuid(), 0)

@@ -33,12 +33,12 @@ from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.trajectory.prepare import PreparedRun
 from model.rig import Rig
 
-#: So many of the newest events are told.
+#: Number of newest events reported.
 EVENTS_TOLD = 12
 
 
 class CyclesSoFar:
-    """What the cycles tell, whatever they are sent for."""
+    """Status from cycles, for any kind of motion."""
 
     def __init__(self, rig: Rig, *, simulated_time: bool) -> None:
         """None so far."""
@@ -50,7 +50,7 @@ class CyclesSoFar:
         self._lost = 0
         self._end: tuple[State, str] | None = None
         self.before = "preparing"
-        """What is told as state as long as there is no cycle."""
+        """State reported as long as there is no cycle."""
 
     def take(self, record: CycleRecord) -> None:
         """One more is over."""
@@ -61,7 +61,7 @@ class CyclesSoFar:
         self.last = record
 
     def take_end(self, state: State, cause: str) -> None:
-        """The motion is over; nothing is told of it but this."""
+        """The motion is over; only this is reported of it."""
         self._end = state, cause
 
     def as_dict(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def wished(board: RequestBoard) -> dict[str, Any]:
 
 
 class MotionStatus(ABC):
-    """Takes in what happens; tells it to whoever asks, from any thread."""
+    """Collects events; answers requests for status, from any thread."""
 
     def __init__(self, rig: Rig, board: RequestBoard, *, simulated_time: bool) -> None:
         """A motion that is being prepared."""
@@ -147,7 +147,7 @@ class MotionStatus(ABC):
         """Where it is on record, if anywhere."""
 
     def take_release(self) -> None:
-        """The torque is being taken off; nothing moves, and no cycle is told."""
+        """The torque is being taken off; nothing moves, and no cycle is reported."""
         self._cycles.before = "releasing"
 
     def take_end(self, state: State, cause: str) -> None:

@@ -35,7 +35,7 @@ SMALL_POINTS = 300
 """Of a line in one of several charts beside each other."""
 TOO_SMALL = 1e-6
 """A following error that is never larger has nothing to show, [m]."""
-_NAMES = {"tag": "measured (camera)", "encoder": "from the drives"}
+_NAMES = {"tag": "measured (camera)", "encoder": "encoders"}
 
 
 def _whole(run: RunData) -> tuple[float, float]:

@@ -81,16 +81,18 @@ def _clearance(run: RunData) -> str:
     if not len(run.clearance):
         return paragraph("The scene has no obstacles.")
     text = (
-        "Distances between surfaces. The true one lies in the shaded band, as the measurement"
-        " itself states; planned is the pose that was commanded at the same time."
+        "Distances between surfaces. The shaded band shows the measurement's"
+        " uncertainty; planned is for the pose commanded at the same time."
     )
     return paragraph(text) + clearance_figure(run)
 
 
 def _position(run: RunData) -> str:
-    text = "Drives: the pose that fits the drives' actual positions. Camera: the pose of the tags."
+    text = (
+        "Encoders: the pose that fits the drives' actual positions. Camera: the pose of the tags."
+    )
     if run.alone:
-        text += " Together: all cameras, each by its weight; the others are each camera's own pose."
+        text += " Fused: all cameras, weighted; the others are the poses of single cameras."
     return paragraph(text) + position_figure(run) + camera_table(run)
 
 
@@ -110,8 +112,8 @@ def _timing(run: RunData) -> str:
     note = ""
     if run.fast:
         note = paragraph(
-            "Simulated time: a cycle follows the one before as soon as it is computed, so lateness"
-            " has no meaning here. A run in real time shows it."
+            "Simulated time: a cycle starts as soon as the previous one is computed, so lateness"
+            " has no meaning. A run in real time shows it."
         )
     return note + timing_figure(run)
 

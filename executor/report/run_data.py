@@ -69,7 +69,7 @@ def _require_agreement(run: RunData) -> None:
     else:
         return
     raise BadInput(
-        what, where=str(run.folder.path), why="files of several runs were mixed", next_step=AGAIN
+        what, where=str(run.folder.path), why="files of different runs are mixed", next_step=AGAIN
     )
 
 

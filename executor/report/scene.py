@@ -74,7 +74,7 @@ def run_scene(run: RunData) -> RunScene:
 
 
 def scene_viewer(run: RunData, view: RunScene) -> str:
-    """The viewer with its still picture; HTML."""
+    """The viewer with its still image; HTML."""
     scene = view.scene
     drawn = {stroke.layer for stroke in scene.strokes if len(stroke.segments)}
     drawn |= {surface.layer for surface in scene.surfaces} | {"robot", "numbers"}

@@ -99,7 +99,7 @@ def _camera(key: dict[str, Any] | None) -> list[str]:
     if key is None:
         return []
     seen = key["frames"] - key["frames_without_pose"]
-    note = f"RMS; largest {known(key['max'], 2, 'mm')}, {seen} of {key['frames']} pictures"
+    note = f"RMS; largest {known(key['max'], 2, 'mm')}, {seen} of {key['frames']} images"
     return [tile("Camera to plan", known(key["rms"], 2, "mm"), note)]
 
 
@@ -167,7 +167,7 @@ def camera_table(run: RunData) -> str:
         )
         for one in run.summary["cameras"]
     ]
-    head = ("Camera", "Source", "Poses", "Left out", "Time a picture", "Alone to plan", "Failed")
+    head = ("Camera", "Source", "Poses", "Left out", "Time per image", "Alone to plan", "Failed")
     return list_table(head, rows) if rows else ""
 
 
@@ -238,7 +238,7 @@ def _planner(
         case PlannerDocument():
             return _tree(planner)
         case WaypointsDocument(author=author):
-            return [("Planner", author or "waypoints of the user's own")]
+            return [("Planner", author or "user's waypoints")]
 
 
 def _improving(planner: OptimalPlannerDocument) -> list[tuple[str, str]]:
@@ -307,7 +307,7 @@ def _short(digest: str) -> str:
     return f"{kind}:{value[:16]}…" if value else digest
 
 
-# Pictures of the run at a few instants, with what was measured in them (paper, Fig. 12).
+# Images of the run at a few instants, with what was measured in them (paper, Fig. 12).
 
 
 COUNT = 6
@@ -316,7 +316,7 @@ _QUALITY = 80
 
 
 def frames(run: RunData) -> str:
-    """Up to six pictures, evenly over the kept ones; nothing for a run without pictures."""
+    """Up to six images, evenly over the kept ones; nothing for a run without images."""
     kept = [i for i, name in enumerate(run.poses.picture) if name]
     if not kept:
         return ""
@@ -330,7 +330,7 @@ def _figure(run: RunData, row: int) -> str:
     time = f"{float(poses.time[row]):.1f} s"
     data = base64.b64encode(_smaller(run.folder.picture(poses.picture[row]))).decode()
     return (
-        f'<figure><img src="data:image/jpeg;base64,{data}" alt="Camera picture after {time}">'
+        f'<figure><img src="data:image/jpeg;base64,{data}" alt="Camera image after {time}">'
         f"<figcaption><b>{time}</b> {prose(_clearance_frame(run, row))}<br>"
         f"{prose(_measured(run, row))}</figcaption></figure>"
     )
@@ -361,7 +361,7 @@ def _measured(run: RunData, row: int) -> str:
 
 
 def _smaller(jpeg: bytes) -> bytes:
-    """The same picture, at most ``WIDEST`` wide, so that the page stays small."""
+    """The same image, at most ``WIDEST`` wide, so that the page stays small."""
     import cv2
 
     if not jpeg or is_too_large(jpeg):

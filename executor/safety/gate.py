@@ -40,7 +40,7 @@ class Limits:
         """
         rows = (self.lowest, self.highest, self.largest_step, self.largest_lag)
         if not self.lowest or len({len(row) for row in rows}) > 1:
-            raise ValueError("the safety gate needs one limit of each kind for every drive")
+            raise ValueError("the safety gate needs one limit of each kind per drive")
         if not all(_whole(row) for row in rows):
             raise ValueError("the safety gate's limits must be whole numbers of counts")
         ranges = zip(self.lowest, self.highest, strict=True)
@@ -48,7 +48,7 @@ class Limits:
             any(low > high for low, high in ranges)
             or min(*self.largest_step, *self.largest_lag) < 0
         ):
-            raise ValueError("the safety gate's limits leave nothing that is allowed")
+            raise ValueError("the safety gate's limits allow nothing")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def examine(limits: Limits, request: Request) -> GateDecision:
         if len(positions) != count:
             return GateDecision(False, f"{len(positions)} {name} for {count} drives")
         if not _whole(positions):
-            return GateDecision(False, f"{name} that are not all whole numbers")
+            return GateDecision(False, f"{name} are not all whole numbers")
     if request.purpose is Purpose.HOLD:
         return _hold(limits, request)
     if request.purpose is Purpose.MOVE:
@@ -107,7 +107,9 @@ def _hold(limits: Limits, request: Request) -> GateDecision:
     if request.previous is not None and tuple(request.targets) == tuple(request.previous):
         return ALLOWED
     if request.enabled is not False:
-        return GateDecision(False, "a hold would change the targets of drives that follow them")
+        return GateDecision(
+            False, "a hold would change the targets of drives that follow set-points"
+        )
     return _near_actual(limits, request)
 
 
@@ -119,7 +121,7 @@ def _move(limits: Limits, request: Request) -> GateDecision:
     if request.enabled is not True:
         return GateDecision(False, "not all drives are enabled")
     if request.previous is None:
-        return GateDecision(False, "no targets were sent before")
+        return GateDecision(False, "no previous targets")
     for drive, target in enumerate(request.targets):
         if not limits.lowest[drive] <= target <= limits.highest[drive]:
             return GateDecision(
@@ -131,7 +133,7 @@ def _move(limits: Limits, request: Request) -> GateDecision:
         if step > limits.largest_step[drive]:
             return GateDecision(
                 False,
-                f"cable {drive + 1}: step of {step} counts, allowed {limits.largest_step[drive]}",
+                f"cable {drive + 1}: step of {step} counts, limit {limits.largest_step[drive]}",
             )
     return _near_actual(limits, request)
 
@@ -148,6 +150,6 @@ def _near_actual(limits: Limits, request: Request) -> GateDecision:
             return GateDecision(
                 False,
                 f"cable {drive + 1}: target {lag} counts from the actual position,"
-                f" allowed {limits.largest_lag[drive]}",
+                f" limit {limits.largest_lag[drive]}",
             )
     return ALLOWED

@@ -16,7 +16,7 @@ from model.rig import Rig
 #: A cable is slack below this share of the least planned tension. Plans run at the least tension
 #: itself (in 6 % of the paper rig's box), and a whole count is worth 1.7 N there: not yet slack.
 SLACK_SHARE = 0.5
-#: Below this share of it a cable carries nothing: it is torn, or hangs loose.
+#: Below this share of it a cable has no tension: it is broken or slack.
 LOOSE_SHARE = 0.1
 #: Set-points are whole counts and so are positions: both together are noise of one count, and a
 #: drive is judged over 8/3 of the noise at least. See `executor.safety.stall`.

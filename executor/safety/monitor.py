@@ -45,7 +45,7 @@ class WatchLimits:
         following_error: Cable length, [m].
         min_tension: Slack below this, [N].
         max_tension: Over-tension above this, [N].
-        no_tension: Below this a cable is torn or hangs loose, [N].
+        no_tension: Below this a cable is broken or slack, [N].
         slack_cycles: Cycles of slack or over-tension that are one too many.
         loose_cycles: Cycles without tension that are one too many.
         missing_cycles: Missing replies in a row that are one too many.
@@ -117,7 +117,9 @@ class Monitor:
         limits = self.limits
         counts = {len(seen.following_errors), len(seen.tensions), len(seen.missing)}
         if counts != {len(self.missing)}:
-            raise ValueError(f"the watch was shown {counts} entries for {len(self.missing)} drives")
+            raise ValueError(
+                f"the monitor was given {counts} entries for {len(self.missing)} drives"
+            )
         # "Not at least" and "not at most", so that a tension that is no number counts as wrong.
         slack = [seen.following and not t >= limits.min_tension for t in seen.tensions]
         loose = [seen.following and not t >= limits.no_tension for t in seen.tensions]
@@ -164,7 +166,7 @@ class Monitor:
             if not abs(error) <= self.limits.following_error:
                 text = (
                     f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
-                    f" allowed {self.limits.following_error * 1000:.2f} mm"
+                    f" limit {self.limits.following_error * 1000:.2f} mm"
                 )
                 found.append(Alarm(StopReaction.QUICK_STOP, "following_error", text, drive))
         return found
@@ -174,7 +176,7 @@ class Monitor:
         for drive, tension in enumerate(seen.tensions):
             text = f"cable {drive + 1} carries {tension:.1f} N,"
             if self.loose[drive] >= self.limits.loose_cycles:
-                loose = f"{text} no tension: it is torn or hangs loose"
+                loose = f"{text} no tension: it is broken or slack"
                 found.append(Alarm(StopReaction.QUICK_STOP, "cable_loose", loose, drive + 1))
             elif self.slack[drive] >= self.limits.slack_cycles:
                 slack = f"{text} less than {self.limits.min_tension:.1f} N: it may be slack"

@@ -154,8 +154,8 @@ class StuckWatch:
 
 
 def _finding(number: int, name: str, cycles: int) -> Alarm:
-    text = f"{name} stood still for {cycles} cycle{'s' if cycles > 1 else ''}"
-    text += " while its set-points went on"
+    text = f"{name} did not move for {cycles} cycle{'s' if cycles > 1 else ''}"
+    text += " while its set-points advanced"
     if cycles < STUCK_CYCLES:
         return Alarm(StopReaction.NOTE, "set_point_missed", text, number)
     return Alarm(StopReaction.QUICK_STOP, "drive_stuck", text, number)

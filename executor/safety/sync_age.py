@@ -1,7 +1,7 @@
-"""How old the last SYNC may be when drives are told to follow a set-point.
+"""How old the last SYNC may be when drives are commanded to follow a set-point.
 
 A drive that misses SYNC stops by itself, and "enable operation" (0Fh) takes it out of that stop
-again: CiA 402 transition 16 acts by level. So whoever sends 0Fh must know that no drive has stopped
+again: CiA 402 transition 16 acts by level. So the sender of 0Fh must know that no drive has stopped
 meanwhile. A drive stops `timeout` periods after the SYNC that it received last; the age of that
 SYNC is measured here from just before it was sent, which is never less than what the drive counts.
 
@@ -50,7 +50,9 @@ class SyncAge:
             ValueError: It leaves no room beside one period.
         """
         if not self.timeout >= LEAST_TIMEOUT:
-            raise ValueError(f"drives that stop after {self.timeout} periods cannot be kept going")
+            raise ValueError(
+                f"drives that stop after {self.timeout} periods cannot be kept enabled"
+            )
 
     @property
     def margin(self) -> float:
@@ -59,7 +61,7 @@ class SyncAge:
 
     @property
     def limit(self) -> float:
-        """From this age of the last SYNC on no drive is told to follow, in periods."""
+        """From this age of the last SYNC on no drive is commanded to follow, in periods."""
         return self.timeout - self.margin
 
     def may_enable(self, age: float) -> bool:

@@ -36,7 +36,7 @@ def rounded(
         tolerance: Largest distance of a rounded corner from the sharp one, rotation counted as
             ``weight`` metres for a radian, [m]; 0 keeps all sharp.
         weight: Metres of path for a radian of rotation.
-        is_allowed: Tells whether all of some dense poses keep the scene's clearances.
+        is_allowed: Returns whether all of some dense poses keep the scene's clearances.
     """
     points = _needed(waypoints, weight)
     segments: list[Segment] = []

@@ -56,9 +56,9 @@ def order_violations(scene: Scene, stands: Sequence[Dwell], rows: int) -> list[s
     """Stands that are not one for each stop, in order, within the table."""
     bounds = [row for stand in stands for row in (stand.first, stand.last)]
     if len(stands) != len(scene.stops):
-        return [f"the table stands at {len(stands)} stops, the scene has {len(scene.stops)}"]
+        return [f"the table rests at {len(stands)} stops, the scene has {len(scene.stops)}"]
     if any(a > b for a, b in pairwise([0, *bounds, rows - 1])):
-        return [f"the table stands at the rows {bounds} of {rows}, which are in no order"]
+        return [f"the table rests at the rows {bounds} of {rows}, which are out of order"]
     return []
 
 
@@ -79,8 +79,8 @@ def stand_violations(
         stands_for = (stand.last - stand.first) * cycle
         if not stands_for >= stop.dwell - 1e-9:
             found.append(
-                f"at stop {stop.name!r} the table stands for {stands_for:g} s,"
-                f" asked are {stop.dwell:g} s"
+                f"at stop {stop.name!r} the table rests for {stands_for:g} s,"
+                f" required {stop.dwell:g} s"
             )
     return found
 

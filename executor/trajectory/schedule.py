@@ -34,13 +34,13 @@ def stop_events(scene: Scene, stands: Sequence[Dwell]) -> Schedule[tuple[str, st
     for number, (stop, stand) in enumerate(zip(scene.stops, stands, strict=True)):
         text = f"at stop {stop.name!r}"
         if stop.dwell > 0.0:
-            text += f", standing still for {stop.dwell:g} s"
+            text += f", resting for {stop.dwell:g} s"
         if stop.kind in _HAPPENS:
             changed = abs(carried[number + 1] - carried[number])
             text += f" while {changed:g} kg {_HAPPENS[stop.kind]}"
         due.append((stand.first, (stop.kind, text)))
         if stop.dwell > 0.0:
-            text = f"going on from stop {stop.name!r}, carrying {carried[number + 1]:g} kg"
+            text = f"continuing from stop {stop.name!r}, carrying {carried[number + 1]:g} kg"
             due.append((stand.last, ("leaving", text)))
     return Schedule(due)
 
@@ -48,7 +48,7 @@ def stop_events(scene: Scene, stands: Sequence[Dwell]) -> Schedule[tuple[str, st
 def load_changes(scene: Scene, stands: Sequence[Dwell]) -> Schedule[Load]:
     """What is carried on from each pick and place.
 
-    Nobody says when in its dwell that happens; in the middle, the planned tensions are there, too.
+    When in its dwell that happens is not given; in the middle, the planned tensions are there, too.
     """
     loads = [leg.scene.load for leg in legs_of(scene)][1:]
     return Schedule(

@@ -67,7 +67,7 @@ class CheckedSetpoints:
 
     @property
     def unchanged(self) -> bool:
-        """The set-points are still those that were checked; computed anew every time."""
+        """The set-points are still those that were checked; recomputed every time."""
         return fingerprint(self.cycle, self.setpoints) == self.hash
 
 
@@ -124,7 +124,7 @@ class Trajectory:
 
     @property
     def hash(self) -> str:
-        """SHA-256 over the set-points and their cycle, computed anew every time."""
+        """SHA-256 over the set-points and their cycle, recomputed every time."""
         return fingerprint(self.cycle, self.setpoints)
 
     def poses(self) -> list[Pose]:
@@ -252,7 +252,7 @@ def check_table(rig: Rig, scene: Scene, table: Trajectory) -> CheckedTrajectory:
     if not report.passed:
         raise _refusal(
             [violation.sentence() for violation in report.violations],
-            "plan again, with a larger clearance where that is what is missing",
+            "plan again, with a larger clearance if that is violated",
         )
     return CheckedTrajectory(table, rig, table.hash, report, WinchMap(rig), _PROOF)
 
@@ -263,7 +263,7 @@ def _refusal(
     return Refused(
         "; ".join(found),
         where="set-point table",
-        why="the executed curve is not what the plan and the rig file allow",
+        why="the trajectory violates the plan or the rig file",
         next_step=f"{next_step}; nothing was armed",
     )
 
@@ -280,12 +280,12 @@ def _number_violations(rig: Rig, table: Trajectory) -> list[str]:
             return [f"{name} have the shape {values.shape}, not {shape}"]
         if not np.isfinite(values).all():
             row = int(np.argwhere(~np.isfinite(values))[0][0])
-            return [f"row {row} holds {name} that are no numbers"]
+            return [f"row {row} has {name} that are not numbers"]
     if np.abs(table.counts).max() > INT32_MAX - 1:
         largest = int(np.abs(table.counts).argmax())
         row, cable = divmod(largest, table.counts.shape[1])
         value = table.counts[row, cable]
-        return [f"row {row}, cable {cable + 1}: {value:.0f} counts do not fit into 32 bits"]
+        return [f"row {row}, cable {cable + 1}: {value:.0f} counts exceed 32 bits"]
     return []
 
 
@@ -307,8 +307,8 @@ def _tension_violations(rig: Rig, table: Trajectory) -> list[str]:
     if low >= rig.min_tension - TENSION_ACCURACY and high <= rig.max_tension + TENSION_ACCURACY:
         return []
     return [
-        f"planned tensions run from {low:.3f} to {high:.3f} N,"
-        f" the rig allows {rig.min_tension:g} to {rig.max_tension:g} N"
+        f"planned tensions range from {low:.3f} to {high:.3f} N,"
+        f" the limits are {rig.min_tension:g} to {rig.max_tension:g} N"
     ]
 
 
@@ -334,7 +334,7 @@ def _speed_violations(rig: Rig, table: Trajectory) -> list[str]:
         fastest = float(speeds[:, cable].max(initial=0.0))
         if not fastest <= winch.max_speed + rounding[cable]:
             found.append(
-                f"cable {cable + 1} would run at {fastest * 1000:.1f} mm/s,"
+                f"cable {cable + 1} would move at {fastest * 1000:.1f} mm/s,"
                 f" its winch allows {winch.max_speed * 1000:.1f} mm/s"
             )
     return found

@@ -291,7 +291,7 @@ def _reachable(known: float, wanted: float, segment: Segment, motion: Motion) ->
 # From one place to another in a given time, at rest at both ends.
 
 
-#: The middle of the step is so many times as fast as the step on average.
+#: Ratio of the step's peak speed to its mean speed.
 PEAK = 1.875
 
 

@@ -59,7 +59,9 @@ def _is_name(text: str) -> str:
     if not text.isprintable():
         raise ValueError(f"must be a name on one line; it is {text[:60]!r}")
     if len(text.encode()) > NAME_BYTES:
-        raise ValueError(f"must be a name of {NAME_BYTES} bytes at most; it has {len(text)} signs")
+        raise ValueError(
+            f"must be a name of {NAME_BYTES} bytes at most; it has {len(text)} characters"
+        )
     return text
 
 
@@ -128,7 +130,7 @@ class Document(BaseModel):
         """Checks between the document's parts; each reads as few of them as it can.
 
         Of a file with other problems only the rules are asked whose parts are sound, so that one
-        reading tells everything.
+        reading reports everything.
         """
         return ()
 
@@ -150,7 +152,7 @@ class PoseDocument(Document):
         return Pose.from_quaternion(np.asarray(self.position_mm) / 1000.0, unit)
 
     def bare(self) -> PoseDocument:
-        """The pose alone, without what else the document tells."""
+        """The pose alone, without the document's other keys."""
         return PoseDocument(position_mm=self.position_mm, rotation_wxyz=self.rotation_wxyz)
 
     @staticmethod
@@ -200,7 +202,7 @@ def read_yaml(path: Path) -> YamlTree:
 
 
 def load_yaml(path: Path, model: type[Model]) -> Model:
-    """Reads a YAML file into ``model``, or tells every problem with file:line:column.
+    """Reads a YAML file into ``model``, or reports every problem with file:line:column.
 
     Raises:
         BadInput: The file cannot be read.
@@ -330,11 +332,11 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
         if path.is_dir():
             raise BadInput("this is a folder", where=str(path), next_step="name a file")
         if path.exists() and not path.is_file():
-            what = "this is no plain file but a device, a pipe or a socket"
+            what = "not a regular file but a device, a pipe or a socket"
             raise BadInput(what, where=str(path), next_step="name a file")
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:40]}.")
     except OSError as error:
-        hint = "choose a folder that exists and that you may write to"
+        hint = "choose an existing folder with write permission"
         raise _not_written(path, error, hint) from None
     try:
         with os.fdopen(handle, "wb") as stream:

@@ -54,7 +54,7 @@ def _is_object(text: str) -> str:
 def _is_known(text: str) -> str:
     if text not in OBJECTS:
         there = ", ".join(OBJECTS)
-        raise ValueError(f"this program sets no object {text!r} up; those it does: {there}")
+        raise ValueError(f"object {text!r} is not one that this program sets; it sets: {there}")
     return text
 
 
@@ -102,11 +102,11 @@ class ProfileDocument(Document):
 
     name: Text = Field(description="maker and type, as people name them")
     sources: Annotated[list[Text], Field(min_length=1)] = Field(
-        description="where every fact of this file comes from"
+        description="source of every fact in this file"
     )
-    absent: list[KnownObject] = Field(default=[], description="objects that the drive has not")
+    absent: list[KnownObject] = Field(default=[], description="objects missing in the drive")
     ranges: dict[KnownObject, Range] = Field(
-        default={}, description="values that objects take, where they are fewer than the standard's"
+        default={}, description="values that objects accept, where narrower than the standard"
     )
     expect: list[Expected] = Field(
         default=[], description="objects that are read and must hold a value, such as units"
@@ -160,7 +160,7 @@ class ProfileDocument(Document):
 
     def _needed(self) -> list[Finding]:
         return [
-            (("absent", place), f"no run is safe without {name} {OBJECTS[name]}")
+            (("absent", place), f"required for a safe run: {name} {OBJECTS[name]}")
             for place, name in enumerate(self.absent)
             if name in NEEDED
         ]

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from model.errors import BadInput
+from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_bytes_atomic
 from model.files.reading import read_bytes, read_text, shown, unreadable
 
@@ -108,11 +108,10 @@ def copy_examples(
     wanted = [(e, folder / (e.group if grouped else "") / e.file_name) for e in examples]
     existing = [target for _, target in wanted if os.path.lexists(target)]
     if existing and not replace:
-        raise BadInput(
+        raise AlreadyExists(
             "the file exists already",
-            where=shown(existing[0]),
-            why=f"{len(existing)} of the {len(wanted)} copies exist; nothing was copied",
-            next_step="pass --force to replace it, or name another folder with -o",
+            shown(existing[0]),
+            f"{len(existing)} of the {len(wanted)} copies exist; nothing was copied",
         )
     for example, target in wanted:
         _copy(example.source, target)

@@ -215,7 +215,7 @@ AFTER_COORDINATES = (
     RigQuestion("home_mm", "home position of the platform X Y Z", "mm", _point(), _middle),
     RigQuestion(
         "lower_mm",
-        "lower corner of the workspace X Y Z, where the platform's origin may be",
+        "lower corner of the workspace X Y Z, limits of the platform's origin",
         "mm",
         _point(),
         lambda answers: _box(answers, 0),

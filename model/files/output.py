@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from model.errors import BadInput
+from model.errors import AlreadyExists, BadInput
 
 
 def require_new_file(path: Path, replace: bool = False) -> None:
@@ -21,17 +21,13 @@ def require_new_file(path: Path, replace: bool = False) -> None:
     if path.is_dir():
         raise BadInput("this is a folder", where=str(path), next_step="name a file")
     if path.exists() and not replace:
-        raise BadInput(
-            "the file exists already",
-            where=str(path),
-            next_step="choose another name, or pass --force to replace it",
-        )
+        raise AlreadyExists("the file exists already", str(path))
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise BadInput(
-            "the file cannot be written there",
+            "the file cannot be written",
             where=str(path),
             why="the folder does not exist or is read-only",
-            next_step="choose a folder that you may write to",
+            next_step="choose a folder with write permission",
         )
 
 
@@ -43,11 +39,7 @@ def make_folder(folder: Path, force: bool = False) -> None:
     """
     make_place(folder)
     if any(folder.iterdir()) and not force:
-        raise BadInput(
-            "the folder is not empty",
-            where=str(folder),
-            next_step="choose another name, or pass --force to write into it",
-        )
+        raise AlreadyExists("the folder is not empty", str(folder))
 
 
 def make_place(folder: Path) -> None:
@@ -61,14 +53,14 @@ def make_place(folder: Path) -> None:
         next(folder.iterdir(), None)
     except OSError as error:
         raise BadInput(
-            "the folder cannot be made",
+            "the folder cannot be created",
             where=str(folder),
             why=str(error.strerror),
-            next_step="name a folder, not a file, in a place where you may write",
+            next_step="name a folder (not a file) where you have write permission",
         ) from error
     if not os.access(folder, os.W_OK):
         raise BadInput(
             "the folder is read-only",
             where=str(folder),
-            next_step="name a folder in a place where you may write",
+            next_step="name a folder where you have write permission",
         )

@@ -92,7 +92,7 @@ class NearestDocument(Document):
 
 
 class QualityDocument(Document):
-    """What the path is worth, as the planner found it; `cdpr check` finds it anew."""
+    """Quality of the path as the planner computed it; `cdpr check` recomputes it."""
 
     length_mm: NonNegative
     raw_length_mm: NonNegative
@@ -104,7 +104,7 @@ class QualityDocument(Document):
 
 
 class TreeDocument(Document):
-    """The search trees, for pictures: positions, and the parent of each node (-1: a root)."""
+    """The search trees, for images: positions, and the parent of each node (-1: a root)."""
 
     positions_mm: list[Vector]
     parents: list[Annotated[int, Field(ge=-1, le=WHOLE_LARGEST)]]

@@ -24,7 +24,7 @@ TEXT_LIMIT = 256 * MEGABYTE
 YAML_LIMIT = 1 * MEGABYTE
 """Of a YAML file, [bytes]; its parser needs several seconds for that."""
 PICTURE_LIMIT = 256 * MEGABYTE
-"""Of a picture file, [bytes]."""
+"""Of an image file, [bytes]."""
 
 
 def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
@@ -55,23 +55,23 @@ def _require_plain(path: Path, found: os.stat_result, limit: int) -> None:
         raise IsADirectoryError
     if not stat.S_ISREG(found.st_mode):
         raise BadInput(
-            "this is no plain file but a device, a pipe or a socket",
+            "not a regular file but a device, a pipe or a socket",
             where=str(path),
-            next_step="save its content to a file and name that",
+            next_step="save its content to a file and pass that file",
         )
     if found.st_size > limit:
         raise BadInput(
             f"the file has {found.st_size / MEGABYTE:.1f} MB; at most {limit / MEGABYTE:.0f} MB"
             " are read",
             where=str(path),
-            why="such a file has no more than that; this is another one",
+            why="a file of this kind is never larger; this is probably the wrong file",
             next_step="check the path",
         )
 
 
 def unreadable(path: Path, error: Exception) -> BadInput:
     """The message about a file that the operating system does not give."""
-    what, why, hint = "the file cannot be read", "", "check the path and who may read it"
+    what, why, hint = "the file cannot be read", "", "check the path and its read permissions"
     match error:
         case FileNotFoundError():
             what, hint = "no such file", "check the path and its spelling"
@@ -104,7 +104,7 @@ def read_text(path: Path, limit: int = TEXT_LIMIT) -> str:
         raise BadInput(
             f"the file is not UTF-8 text: byte 0x{error.object[error.start]:02x} in line {line}",
             where=str(path),
-            why="it is no text file, or in another encoding",
+            why="it is not a text file, or uses another encoding",
             next_step="save it as UTF-8",
         ) from None
 
@@ -151,13 +151,13 @@ def parse_json(text: str) -> Any:
 
 
 def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"the file holds {name}, which is no number")
+    raise ValueError(f"the file holds {name}, which is not a number")
 
 
 def _finite(text: str) -> float:
     value = float(text)
     if value in (float("inf"), float("-inf")):
-        raise ValueError(f"the file holds {text[:40]}, which is no finite number")
+        raise ValueError(f"the file holds {text[:40]}, which is not a finite number")
     return value
 
 
@@ -171,7 +171,7 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     data = dict(pairs)
     if len(data) != len(pairs):
         (twice, _), *_ = Counter(key for key, _ in pairs).most_common(1)
-        raise ValueError(f"the key {twice[:60]!r} stands twice")
+        raise ValueError(f"the key {twice[:60]!r} appears twice")
     return data
 
 
@@ -208,6 +208,6 @@ def _rows(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
         raise BadInput(
             f"not valid CSV: {error}",
             where=f"{path}:{reader.line_num}",
-            why="a quote is not closed, or this is no CSV file",
-            next_step="write a line of names, then lines of values with commas between",
+            why="a quote is not closed, or this is not a CSV file",
+            next_step="write a header line, then comma-separated lines of values",
         ) from None

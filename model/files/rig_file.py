@@ -43,10 +43,10 @@ class Cia402Document(Document):
         " of a YAML file",
     )
     vendor_id: Identity | None = Field(
-        default=None, description="1018h:01 that every drive must tell; left out: not looked at"
+        default=None, description="required 1018h:01 of every drive; left out: not checked"
     )
     product_code: Identity | None = Field(
-        default=None, description="1018h:02 that every drive must tell; left out: not looked at"
+        default=None, description="required 1018h:02 of every drive; left out: not checked"
     )
 
 
@@ -59,7 +59,7 @@ class OdriveDocument(Document):
     )
     watchdog_ms: Annotated[float, Field(ge=10, le=1000)] | None = Field(
         default=None,
-        description="axis0.config.watchdog_timeout of every drive; without one nothing is armed",
+        description="axis0.config.watchdog_timeout of every drive; required for arming",
     )
     heartbeat_ms: Period = Field(default=100, description="axis0.config.can.heartbeat_msg_rate_ms")
     estimates_ms: Period = Field(default=10, description="axis0.config.can.encoder_msg_rate_ms")
@@ -89,7 +89,7 @@ ArucoDictionary = Literal[
     "ARUCO_ORIGINAL", "ARUCO_MIP_36H12",
 ]  # fmt: skip
 TagFamily = Literal[AprilTagFamily, ArucoDictionary]
-#: What finds tags in pictures: OpenCV, or pyapriltags of the extra `apriltag`.
+#: What finds tags in images: OpenCV, or pyapriltags of the extra `apriltag`.
 TagDetectorName = Literal["opencv", "apriltag"]
 
 APRILTAG_FAMILIES: tuple[str, ...] = get_args(AprilTagFamily)
@@ -108,7 +108,7 @@ def opencv_dictionary(family: str) -> str:
 def drawn_upside_down(family: str) -> bool:
     """Whether OpenCV draws the family turned by 180° against the prints of its own project.
 
-    It does so with the families of the AprilTag project, whose pictures labs print.
+    It does so with the families of the AprilTag project, whose images labs print.
     """
     return family in APRILTAG_FAMILIES
 
@@ -191,16 +191,16 @@ class WinchDocument(Document):
         default=0, description="drive position at the home pose"
     )
     drum_to_outlet_mm: NonNegative = Field(
-        default=0.0, description="cable between drum and outlet; it stretches too"
+        default=0.0, description="cable between drum and outlet, which also stretches"
     )
     encoder: Literal["absolute", "incremental"] = Field(
         default="incremental",
-        description="absolute: the drive knows its position after its power was gone",
+        description="absolute: the drive keeps its position without power",
     )
     max_speed_mm_s: Positive
     torque_constant_n: Positive = Field(description="cable tension at rated torque")
     brake: bool = Field(
-        default=False, description="a brake that closes by itself when the drive has no torque"
+        default=False, description="a brake that closes when the drive has no torque"
     )
 
 
@@ -217,16 +217,16 @@ class MotionDocument(Document):
     following_error_mm: Positive = Field(default=2.0, description="cable length; more is a fault")
     start_tolerance_mm: Positive = Field(
         default=1.0,
-        description="cable length; a run starts only this close to its plan",
+        description="cable length; largest distance from the plan's start at which a run starts",
     )
     stuck_travel_mm: Positive = Field(
         default=0.07,
-        description="cable length that set-points may go on without a drive, 2 cycles at least;"
-        " give 8/3 of the noise of positions or more",
+        description="cable length that set-points may advance with a drive at rest, at least 2"
+        " cycles; give 8/3 of the noise of positions or more",
     )
     stuck_speed_mm_s: Positive = Field(
         default=2.0,
-        description="a drive whose set-points are slower may rest on its own friction",
+        description="below this set-point speed, friction may hold a drive still",
     )
 
 
@@ -378,7 +378,7 @@ class RigDocument(Document):
 
     def _camera_names(self) -> list[Finding]:
         what = (
-            "is part of file names and of NAME=SOURCE: it must hold no /, no = and no leading dot"
+            "is part of file names and NAME=SOURCE: it must not contain / or = or begin with a dot"
         )
         return [
             (("cameras", i, "name"), what)
@@ -419,6 +419,6 @@ def _repeated(
     found: list[Finding] = []
     for place, value in values:
         if value in seen:
-            found.append((place, f"{kind} {value!r} stands twice"))
+            found.append((place, f"{kind} {value!r} appears twice"))
         seen.add(value)
     return found

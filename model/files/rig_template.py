@@ -29,7 +29,7 @@ def rig_text(answers: Answers) -> str:
     problems = _problems(text)
     if problems:
         raise BadInput(
-            "the answers make no valid rig",
+            "the answers do not give a valid rig",
             where="cdpr new",
             why="; ".join(problems),
             next_step="correct these answers; nothing was written",
@@ -80,10 +80,10 @@ name: {name}
 platform:  # a box about the platform frame's origin
   size_mm: {platform_mm}
   mass_kg: {mass_kg}
-  centre_of_mass_mm: [0, 0, 0]  # in the platform frame; measure it when a tool hangs off centre
-  home: {{position_mm: {home_mm}}}  # a pose known well, for `cdpr home --at-home`
+  centre_of_mass_mm: [0, 0, 0]  # in the platform frame; measure it if a tool is mounted off centre
+  home: {{position_mm: {home_mm}}}  # a well-known pose, for `cdpr home --at-home`
 
-workspace:  # where the platform's origin may be
+workspace:  # limits of the platform's origin
   lower_mm: {lower_mm}
   upper_mm: {upper_mm}
 
@@ -95,9 +95,9 @@ anchors_mm:  # where each cable is tied to the platform, in the platform frame, 
 
 cables:
   radius_mm: {radius_mm}
-  stiffness_n: {stiffness_n}  # E·A: the tension that would double its length, were it linear
-  min_tension_n: {min_tension_n}  # above what keeps a cable from sagging
-  max_tension_n: {max_tension_n}  # below what cable, winch and drive bear
+  stiffness_n: {stiffness_n}  # E·A: tension at 100 % strain, extrapolated linearly
+  min_tension_n: {min_tension_n}  # enough to keep a cable from sagging
+  max_tension_n: {max_tension_n}  # below the limits of cable, winch and drive
 
 # Where swivelling pulleys guide the cables, outlets_mm are the points where cables enter them:
 # pulleys:
@@ -114,9 +114,9 @@ motion:  # along a plan; begin slowly
   speed_mm_s: 20
   acceleration_mm_s2: 100
   jerk_mm_s3: 1000
-  blend_tolerance_mm: 1  # how far a rounded corner may be from the planned one
+  blend_tolerance_mm: 1  # largest distance of a rounded corner from the planned one
   following_error_mm: 2  # of a cable; more is a fault
-  start_tolerance_mm: 1  # of a cable; a run begins only so near to its plan
+  start_tolerance_mm: 1  # of a cable; a run starts only this close to its plan
 
 bus:
   interface: {interface}  # virtual: simulated drives inside the program
@@ -124,5 +124,5 @@ bus:
   bitrate: {bitrate}
   cycle_ms: 10
 
-# Tags on the platform and cameras, to measure where it really is: docs/rig-file.md.
+# Tags on the platform and cameras, to measure its pose: docs/rig-file.md.
 """

@@ -64,7 +64,7 @@ class Payload:
         """
         rest = self.mass_kg - mass_kg
         if rest < -NOTHING_KG:
-            raise ValueError(f"puts down {mass_kg:g} kg, but {self.mass_kg:g} kg are carried then")
+            raise ValueError(f"puts down {mass_kg:g} kg, but only {self.mass_kg:g} kg are carried")
         if rest > NOTHING_KG:
             return Payload(rest, self._centre(-mass_kg, centre_mm or self.centre_mm, rest))
         away = [
@@ -73,7 +73,7 @@ class Payload:
         if max(away) > SAME_PLACE_MM:
             x, y, z = self.centre_mm
             raise ValueError(
-                f"puts down all that is carried, and its centre is at [{x:g}, {y:g}, {z:g}] mm"
+                f"puts down the whole payload, whose centre is at [{x:g}, {y:g}, {z:g}] mm"
             )
         return Payload(0.0, (0.0, 0.0, 0.0))
 
@@ -95,10 +95,10 @@ class StopDocument(PoseDocument):
     name: Name
     kind: Literal["pass", "pick", "place"] = "pass"
     dwell_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = Field(
-        default=0.0, description="the platform stands still for so long"
+        default=0.0, description="how long the platform rests there"
     )
     mass_kg: Positive | None = Field(
-        default=None, description="taken up at a pick, put down at a place"
+        default=None, description="picked up at a pick, put down at a place"
     )
     mass_centre_mm: Vector | None = Field(
         default=None,
@@ -136,9 +136,9 @@ def misfits(stops: Sequence[StopDocument]) -> list[Finding]:
     names = [stop.name for stop in stops]
     for i, stop in enumerate(stops):
         if stop.name in names[:i]:
-            found.append((("stops", i, "name"), f"stop name {stop.name!r} stands twice"))
+            found.append((("stops", i, "name"), f"stop name {stop.name!r} appears twice"))
         if stop.kind == "pass":
-            what = f"stop {stop.name!r} changes no load; say kind: pick or place"
+            what = f"stop {stop.name!r} does not change the load; set kind: pick or place"
             keys = ("mass_kg", "mass_centre_mm")
             found += [(("stops", i, k), what) for k in keys if getattr(stop, k) is not None]
         if stop.kind in ("pick", "place"):
@@ -146,7 +146,7 @@ def misfits(stops: Sequence[StopDocument]) -> list[Finding]:
             if stop.mass_kg is None:
                 found.append((("stops", i), f"{needs} mass_kg, by which the load changes"))
             if stop.dwell_s == 0.0:
-                found.append((("stops", i), f"{needs} a dwell_s above 0, while it changes"))
+                found.append((("stops", i), f"{needs} a dwell_s above 0 for the change of load"))
     return found
 
 
@@ -234,10 +234,10 @@ class LoadDocument(Document):
     payload_kg: NonNegative = 0.0
     payload_centre_mm: Vector = [0.0, 0.0, 0.0]
     force_n: NonNegativeVector = Field(
-        default=[0.0, 0.0, 0.0], description="external force up to ± this, world axes"
+        default=[0.0, 0.0, 0.0], description="external force up to ± these, world axes"
     )
     moment_nm: NonNegativeVector = Field(
-        default=[0.0, 0.0, 0.0], description="external moment up to ± this, world axes"
+        default=[0.0, 0.0, 0.0], description="external moment up to ± these, world axes"
     )
 
     def payload(self) -> Payload:
@@ -258,7 +258,7 @@ class RotationLimitsDocument(Document):
         description="largest angle of the platform's z axis from the vertical"
     )
     turn_deg: Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)] = Field(
-        description="largest turn about the vertical, either way; 180 for any"
+        description="largest rotation about the vertical, either direction; 180 for any"
     )
 
 
@@ -305,7 +305,7 @@ class SceneDocument(Document):
     def _names_once(self) -> list[Finding]:
         names = [obstacle.name for obstacle in self.obstacles]
         return [
-            (("obstacles", i, "name"), f"obstacle name {name!r} stands twice")
+            (("obstacles", i, "name"), f"obstacle name {name!r} appears twice")
             for i, name in enumerate(names)
             if name in names[:i]
         ]
@@ -383,5 +383,5 @@ def _wrong_triangles(mesh: MeshDocument) -> list[tuple[int, str]]:
         if not all(0 <= i < count for i in triangle):
             found.append((number, f"{triangle} names a point outside 0..{count - 1}"))
         elif len(set(triangle)) < 3:
-            found.append((number, f"{triangle} names one point twice"))
+            found.append((number, f"{triangle} names a point twice"))
     return found

@@ -32,7 +32,7 @@ class AsBuiltDocument(Document):
     anchors_mm: list[Vector]
     drums_mm_per_rev: list[Positive]
     home_counts: list[Number] = Field(
-        description="drive positions with the platform truly at home under its working tensions"
+        description="true drive positions with the platform at home under its working tensions"
     )
     pulley_radius_mm: Positive | None = None
     stiffness_n: list[Positive] | None = Field(
@@ -44,11 +44,11 @@ class SimulatedWinchesDocument(Document):
     """What lies between a simulated motor and its cable, and how well torque is measured."""
 
     backlash_mm: NonNegative = Field(
-        default=0.0, description="cable that does not move when a motor turns back"
+        default=0.0, description="cable length lost when a motor reverses (backlash)"
     )
-    step_counts: Positive = Field(default=1.0, description="a drum stands only at multiples of it")
+    step_counts: Positive = Field(default=1.0, description="resolution of a drum's position")
     tension_noise_n: NonNegative = Field(
-        default=0.0, description="of tensions told by torques, standard deviation"
+        default=0.0, description="standard deviation of tensions computed from torques"
     )
 
 
@@ -63,17 +63,17 @@ class LensDocument(Document):
 
 
 class SimulatedCameraDocument(Document):
-    """What the simulated pictures of one of the rig's cameras show."""
+    """What the simulated images of one of the rig's cameras show."""
 
     name: Annotated[str, Field(min_length=1)] = Field(description="of the camera in `cameras`")
-    lens: LensDocument | None = Field(default=None, description="left out, as `cameras` says")
+    lens: LensDocument | None = Field(default=None, description="left out, as in `cameras`")
     world_from_camera: PoseDocument | None = Field(
-        default=None, description="where it truly is; left out, as `cameras` says"
+        default=None, description="true pose; left out, as in `cameras`"
     )
     noise: NonNegative = Field(default=1.5, description="standard deviation, grey levels of 255")
     blur_px: NonNegative = Field(default=0.0, description="standard deviation")
     exposure_ms: NonNegative = Field(
-        default=0.0, description="the platform's motion meanwhile is smeared; 0 for none"
+        default=0.0, description="motion blur over this time; 0 for none"
     )
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
     light: Positive = Field(default=1.0, description="share of full light")
@@ -94,7 +94,7 @@ class SimulationDocument(Document):
         Args:
             cables: Number of outlets.
             pulleys: The rig has pulleys.
-            cameras: Names of its cameras and how many pictures they take, [1/s].
+            cameras: Names of its cameras and how many images they take, [1/s].
         """
         found: list[Finding] = []
         if self.as_built is not None:
@@ -110,10 +110,10 @@ class SimulationDocument(Document):
         for i, name in enumerate(names):
             place_of_name = ("simulation", "cameras", i, "name")
             if name not in cameras:
-                found.append((place_of_name, f"no camera is called {name!r}"))
+                found.append((place_of_name, f"there is no camera {name!r}"))
             elif name in names[:i]:
-                found.append((place_of_name, f"camera {name!r} stands twice"))
+                found.append((place_of_name, f"camera {name!r} appears twice"))
             elif self.cameras[i].exposure_ms > 1000.0 / cameras[name]:
-                what = f"at {cameras[name]:g} pictures/s there is no time to expose one so long"
+                what = f"the exposure exceeds the frame period at {cameras[name]:g} pictures/s"
                 found.append((("simulation", "cameras", i, "exposure_ms"), what))
         return found

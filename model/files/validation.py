@@ -175,7 +175,7 @@ def _parsed(text: str) -> YamlTree:
 def _what(error: yaml.MarkedYAMLError) -> str:
     problem = str(error.problem or error)
     if "'\\t'" in problem:
-        return "not valid YAML: a tab stands here; YAML is indented with spaces"
+        return "not valid YAML: a tab is used here; indent YAML with spaces"
     context = f" {error.context}" if error.context else ""
     return f"not valid YAML: {problem}{context}"
 
@@ -195,7 +195,7 @@ def _walk(loader: _Loader, node: yaml.Node, path: KeyPath, tree: YamlTree, seen:
         for key, value in node.value:
             inner = (*path, _name_of(loader, key, path, tree))
             if inner in tree.places:
-                tree.faults.append(YamlFault(inner, "this key stands twice", *_place_of(key)))
+                tree.faults.append(YamlFault(inner, "this key appears twice", *_place_of(key)))
             tree.places[inner] = _place_of(key)
             _walk(loader, value, inner, tree, seen)
     elif isinstance(node, yaml.SequenceNode):
@@ -245,8 +245,8 @@ SENTENCES = {
     "model_type": "must hold keys and values",
     "dict_type": "must hold keys and values",
     "model_attributes_type": "must hold keys and values",
-    "union_tag_invalid": "its {discriminator} {tag!r} is none of {expected_tags}",
-    "union_tag_not_found": "must tell its {discriminator}",
+    "union_tag_invalid": "its {discriminator} {tag!r} is not one of {expected_tags}",
+    "union_tag_not_found": "must have the key {discriminator}",
     "literal_error": "must be {expected}",
     "recursion_loop": "refers to itself",
 }
@@ -275,7 +275,7 @@ def problems_of(error: ValidationError, model: type[BaseModel], places: Places) 
     """Pydantic's findings as our problems, each with its place in the file."""
     found = []
     for item in error.errors(include_url=False):
-        if item["type"] != "invalid_key":  # told with its place by whoever read the text
+        if item["type"] != "invalid_key":  # reported with its position by the YAML reader
             parts, _ = _followed(item["loc"], model)
             found.append(
                 Problem(key_path(parts), sentence_of(item, model), *place_of(parts, places))
@@ -364,7 +364,7 @@ def _followed(parts: KeyPath, model: type[BaseModel]) -> tuple[KeyPath, type[Bas
 
 
 def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
-    """The models a key may hold, by the value of the entry that tells them apart."""
+    """The models a key may hold, by the value of the discriminating entry."""
     if not isinstance(field.discriminator, str):
         return {}
     name, found = field.discriminator, {}

@@ -4,7 +4,7 @@ FCL's distances between convex shapes are right to round-off nearly always, and 
 thousand cases wrong by millimetres to the unsafe side. So no distance is taken on trust. The two
 points that FCL names give a direction, and along any direction the gap between the bodies' extents
 (their support functions, in closed form) can be no larger than the distance: a gap as large as
-FCL's distance proves it. Where the proof fails, the distance is found anew by a min-norm-point
+FCL's distance proves it. Where the proof fails, the distance is computed again by a min-norm-point
 search (Wolfe), which has the same proof as its stopping rule.
 """
 
@@ -265,10 +265,10 @@ def _searched(first: ConvexBody, second: ConvexBody, guess: Array) -> Separation
         pairs.append(added)
         pairs, weights = _nearest_face(pairs, np.append(weights, 0.0))
     raise Fault(
-        "the distance of two bodies could not be proved",
+        "the distance between two bodies could not be proved",
         where="clearance",
-        why="the search for the nearest points did not settle",
-        next_step="report it with the rig and the scene; nothing was assumed in its place",
+        why="the search for the nearest points did not converge",
+        next_step="report this with the rig and the scene; no distance was assumed",
     )
 
 

@@ -1,4 +1,4 @@
-"""Obstacles as polygons, for pictures and logs; never for distances."""
+"""Obstacles as polygons, for images and logs; never for distances."""
 
 from __future__ import annotations
 

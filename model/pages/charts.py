@@ -1,7 +1,7 @@
 """Line charts as SVG that keeps its text size at any width, and the data for `charts.js`.
 
 The lines live in an inner SVG that stretches with the page; ticks and names are placed by shares of
-its size. Colours are the page's variables, which people with any colour vision can tell apart
+its size. Colours are the page's variables, distinguishable with any colour vision
 (Okabe and Ito's palette). The script adds zoom and values under the pointer; the page is complete
 without it.
 """

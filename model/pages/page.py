@@ -34,7 +34,7 @@ def page(
         lead: HTML below the title.
         scripts: File names of this package, such as ``charts.js``.
         data: What the scripts read, JSON-like, by the id of its element.
-        files_beside: Whether the page shows pictures that are files in its folder.
+        files_beside: Whether the page shows images that are files in its folder.
     """
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     policy += " 'self' file:" if files_beside else ""
@@ -131,7 +131,7 @@ def _cell(text: str) -> str:
 
 
 def picture(name: str, alternative: str) -> str:
-    """A picture that is a file beside the page, on white as its colours need, and a link to it."""
+    """An image that is a file beside the page, on white as its colours need, and a link to it."""
     file = escape(name)
     return f'<a href="{file}"><img class="paper" src="{file}" alt="{escape(alternative)}"></a>'
 

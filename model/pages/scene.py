@@ -1,4 +1,4 @@
-"""A scene in 3-D: a still picture as SVG, and the data with which `viewer.js` turns it.
+"""A scene in 3-D: a still image as SVG, and the data with which `viewer.js` turns it.
 
 Both draw the same surfaces, strokes and labels, the far ones first, in the page's colours.
 """
@@ -20,7 +20,7 @@ from model.pose import Array
 AZIMUTH, ELEVATION = -58.0, 30.0
 """From where a scene is seen at first, [deg]."""
 _WIDTH = 1000.0
-"""Of the still picture's coordinates."""
+"""Of the still image's coordinates."""
 _MARGIN = 34.0
 _PIECES = 10
 """Of a cable, so that it can pass behind one obstacle and in front of another."""
@@ -102,7 +102,7 @@ class Moment:
         position: World frame, shape (3,), [m].
         rotation: ``world_from_platform``, shape (3, 3).
         exits: Where cables leave outlets or pulleys, shape (m, 3), [m].
-        text: What is written below the picture; plain text.
+        text: What is written below the image; plain text.
     """
 
     time: float
@@ -184,13 +184,13 @@ def viewer(
     layers: Iterable[tuple[str, str, str, bool]],
     hint: str = "",
 ) -> str:
-    """The viewer and, for print and without scripts, the still picture; HTML.
+    """The viewer and, for print and without scripts, the still image; HTML.
 
     Args:
         scene: What is drawn.
         label: What a reader who does not see it should know; plain text.
         layers: Name, title, CSS variable of its colour, and whether it is shown at first.
-        hint: More about the picture; plain text.
+        hint: More about the image; plain text.
     """
     boxes = "".join(
         f'<label><input type="checkbox" data-layer="{name}"{" checked" if on else ""}>'
@@ -261,15 +261,15 @@ def _mm(values: Array) -> Any:
     return np.round(values * 1e3, 1).tolist()
 
 
-# The still picture.
+# The still image.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eye:
-    """A perspective view; pictures have x to the right and y up.
+    """A perspective view; images have x to the right and y up.
 
     Attributes:
-        centre: Point in the middle of the picture, shape (3,), [m].
+        centre: Point in the middle of the image, shape (3,), [m].
         distance: From the eye to it, [m].
         axes: Rows: right, up, toward the eye; shape (3, 3).
     """

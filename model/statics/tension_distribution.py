@@ -70,7 +70,7 @@ class TensionSolution:
 
     @property
     def wrench_residual(self) -> NDArray[np.float64]:
-        """What is left unbalanced, shape (6,), [N, N·m]; computed anew from the tensions."""
+        """What is left unbalanced, shape (6,), [N, N·m]; recomputed from the tensions."""
         return np.asarray(self.structure_matrix @ self.tensions + self.external_wrench)
 
     @property
@@ -108,8 +108,8 @@ class TensionInfeasible(Refused):
             )
             return
         super().__init__(
-            f"no tensions within the limits balance the wrench: every limit would have to give"
-            f" way by {shortfall:.4g} N",
+            f"no tensions within the limits balance the wrench: every limit would have to"
+            f" be relaxed by {shortfall:.4g} N",
             why=_blame(at_largest, at_smallest),
             next_step="lower the load, widen the tension limits, or choose a pose farther inside"
             " the workspace",
@@ -285,7 +285,7 @@ def solve_tensions(
     matrix = checked_structure_matrix(structure_matrix)
     wrench = checked_wrench(external_wrench, "external wrench")
     if matrix.ndim != 2 or wrench.ndim != 1:
-        raise BadInput("solve_tensions takes one pose and one wrench")
+        raise BadInput("solve_tensions accepts one pose and one wrench")
     low, high = checked_limits(t_min, t_max, matrix.shape[1])
     _check_method(method, matrix.shape[1])
     wanted = checked_per_cable(reference, matrix.shape[1], "reference")
@@ -296,7 +296,7 @@ def solve_tensions(
         _raise_unless_round_off(matrix, wrench, low, high, round_off)
         z = _choice(balance.relaxed(2.0 * round_off), method, wanted)
         if z is None:
-            raise Fault("two routes differ on whether tensions exist that balance the wrench")
+            raise Fault("two methods disagree on whether tensions exist that balance the wrench")
     # Only round-off is clipped here; wrench_residual shows what it costs.
     tensions = np.minimum(np.maximum(balance.tensions(z), low), high)
     return TensionSolution(tensions, method, matrix.copy(), wrench.copy(), low.copy(), high.copy())

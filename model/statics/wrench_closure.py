@@ -51,7 +51,7 @@ class WrenchClosure:
 
     @property
     def residual(self) -> float:
-        """How far the proof is from a proof, computed anew; round-off when it holds.
+        """Residual of the proof, recomputed; round-off when it holds.
 
         Where closed, the size of the wrench that the self-balancing tensions leave. Otherwise, the
         largest pull of any unit tension along the wrench that none should pull along.

@@ -66,7 +66,7 @@ def checked_per_cable(values: ArrayLike, cable_count: int, name: str) -> NDArray
     if checked.shape[-1] != cable_count:
         raise BadInput(
             f"{name} has {checked.shape[-1]} values for {cable_count} cables",
-            next_step=f"give {cable_count} values, one a cable",
+            next_step=f"give {cable_count} values, one per cable",
         )
     if not np.isfinite(checked).all():
         raise BadInput(f"{name} holds a value that is not a finite number")

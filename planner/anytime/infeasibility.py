@@ -177,17 +177,17 @@ def no_path(
         return NoSolution(
             "there is no path: the obstacles separate start and goal",
             where=where,
-            why=f"proved by cells of the workspace that one cable or the platform forbids as a"
+            why=f"proved by cells of the workspace that a cable or the platform excludes as a"
             f" whole, at {scene.obstacle_clearance * 1e3:g} mm clearance and 0.05 mm reserve;"
             f" {_in_the_way(rig, scene, problem, search)}",
-            next_step="ask for less clearance, or move the goal or an obstacle",
+            next_step="reduce the clearance, or move the goal or an obstacle",
             values={**values, "proved": "yes"},
         )
     return NoSolution(
         settings.not_found(int(search.totals[0]), gap),
         where=where,
-        why=f"it is not proved that there is none; {_in_the_way(rig, scene, problem, search)}",
-        next_step=f"{settings.longer}, ask for less clearance, try another seed, or move the"
+        why=f"it is not proved that no path exists; {_in_the_way(rig, scene, problem, search)}",
+        next_step=f"{settings.longer}, reduce the clearance, try another seed, or move the"
         " goal or an obstacle",
         values=values,
     )

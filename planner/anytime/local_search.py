@@ -1,6 +1,6 @@
 """Making a path cheaper by small random changes, each of which is exact.
 
-An allowed change costs about a microsecond to find out, so many simple ones beat few clever ones:
+An allowed change costs about a microsecond to find out, so use many simple ones:
 cutting a corner between two places of the path, moving one or two vertices by any size, and moving
 a vertex away and drawing it tight again, which lets it slide along what it touches.
 """
@@ -218,7 +218,7 @@ _NOWHERE = (0.0, 0.0, 0.0)
 
 @leaf
 def polish(problem: PathProblem, line: Polyline, state: State, trials: int) -> None:
-    """Tries so many kinds of changes at random places.
+    """Tries a number of kinds of changes at random positions.
 
     Where moving vertices was better, they are moved on by ever more the same way.
     """

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 PLACES = 1024
-"""Room for nodes; a full roadmap is begun anew."""
+"""Room for nodes; a full roadmap is restarted."""
 _IN_GAPS, _NEAR_NODES = 0.6, 0.3
 """Shares of the samples: drawn into gaps, and near a node; the rest is from all the workspace."""
 _DRAWN, _OTHER_PLANE = 24, 0.3

@@ -62,7 +62,7 @@ def optimal_route(
         scene: Obstacles, clearances, load, start and goal.
         settings: Objective, seed and budget.
         kinematic: The cost of poses at the start's orientation.
-        progress: Told what is done and the most there will be, both in seconds of the budget or in
+        progress: Called with the work done and its limit, both in seconds of the budget or in
             rounds, and the cost of the best path; about ten times a second.
         clock: Seconds; decides when a budget is spent.
 
@@ -126,7 +126,7 @@ def _improved(
 def _limited(
     problem: PathProblem, search: AnytimeSearch, settings: OptimalSettings, limit: LengthLimit
 ) -> None:
-    """Tells the limit what the best path is, and asks by the price that it sets."""
+    """Passes the best path to the limit, and applies the price that it sets."""
     path, weights = best_path(search), settings.weights
     if path is None:
         return

@@ -38,19 +38,19 @@ _TRIALS, _SLOW_TRIALS = 400, 100
 _TURNS = ((100, 30), (300, 90), (600, 180))
 """Samples of the two trees and of the roadmap in a round without a path, taking turns."""
 _SAMPLES_OF_TREES = 4000
-"""After so many without a path the two trees are begun anew."""
+"""After this many without a path the two trees are restarted."""
 _LATTICE_EVERY = 4
-"""One in so many rounds without a path is spent on the lattice, which narrow gaps slip through."""
+"""One in this many rounds without a path goes to the lattice, which narrow gaps slip through."""
 _COARSE, _MIDDLE = 4, 2
 _SPREAD = 1.0
 _FINE, _FINE_FOR_LENGTH = 1, 9
 """Which of the first paths comes from all points of the grid; it takes longest where the cost is
 not the length, and finds the narrow ways that matter then."""
 _ANOTHER_EVERY = 8
-"""After the first `KEPT` rounds, one in so many begins with a new path."""
+"""After the first `KEPT` rounds, one in this many begins with a new path."""
 _TO_THE_BEST = 0.7
 _VERTEX_PRICES = ((2, 1.5e-3), (5, 5e-4), (12, 2e-4))
-"""What a vertex must save, as part of the straight way, up to so many rounds of polishing."""
+"""What a vertex must save, as share of the straight path, up to a number of rounds of polishing."""
 _LAST_VERTEX_PRICE = 1e-4
 _PATIENCE = 8
 """Rounds without a path after which the grid's margins are no longer relied upon."""
@@ -61,7 +61,7 @@ def advance(problem: PathProblem, search: AnytimeSearch, rounds: int) -> float:
     """Does some rounds; returns the cost of the best path so far, infinite without one.
 
     Where the grid's margins mislead, `PathProblem.terms` is changed: where they leave no path they
-    are no longer asked, which tells whether obstacles do; and where a path is found that is not
+    are no longer asked, which shows whether obstacles do; and where a path is found that is not
     proved to hold the wrenches, proofs are asked for from then on.
     """
     for _ in range(rounds):
@@ -86,7 +86,7 @@ def advance(problem: PathProblem, search: AnytimeSearch, rounds: int) -> float:
 
 @kernel
 def measure_again(problem: PathProblem, search: AnytimeSearch) -> None:
-    """Finds the costs of all paths anew, after a change of what is made small."""
+    """Recomputes the costs of all paths, after a change of the objective."""
     for k in range(KEPT + 1):
         if search.counts[k, 0] > 0:
             search.costs[k] = measure(problem, _line(search, k))
@@ -111,7 +111,7 @@ def _worth(problem: PathProblem, search: AnytimeSearch, k: int) -> float:
 
 @kernel
 def _remember(problem: PathProblem, search: AnytimeSearch, kept: int) -> None:
-    """Keeps a path as the best, if wrenches are proved to be held along it; else begins anew."""
+    """Keeps a path as the best, if wrenches are proved to be held along it; else restarts."""
     line = _line(search, kept)
     if _may_mislead(problem):
         for i in range(line.counts[0] - 1):
@@ -241,7 +241,7 @@ def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> 
 
 @kernel
 def _vertex_price(problem: PathProblem, search: AnytimeSearch, polished: float) -> float:
-    """What a vertex must save, after so many rounds of polishing."""
+    """What a vertex must save, after a number of rounds of polishing."""
     straight = 0.0
     for axis in range(3):
         straight += (search.ends[1, axis] - search.ends[0, axis]) ** 2

@@ -39,7 +39,7 @@ class AnytimeSearch(NamedTuple):
         parts: Likewise, shape (PLACES,).
         made: Likewise, shape (2,).
         totals: Rounds; nodes of finished trees and edge tests in them; first paths sought;
-            vertices of the very first path; the round at which all began anew, shape (6,).
+            vertices of the very first path; the round of the last restart, shape (6,).
         first: That path, shape (MOST_VERTICES, 3), [m].
         state: Of the random numbers.
     """

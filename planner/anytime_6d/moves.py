@@ -50,7 +50,7 @@ def turn_between(start: Array, end: Array) -> Vector:
 
 @kernel
 def move_length(start: Array, end: Array, radian: float) -> float:
-    """Length of a move, a radian of turning counted as so many metres, [m]."""
+    """Length of a move, a radian of rotation weighted as a length, [m]."""
     turn = turn_between(start, end)
     squared = radian * radian * (turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     for axis in range(3):

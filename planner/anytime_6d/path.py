@@ -62,7 +62,7 @@ def turning_problem(
     limits = scene.rotation_limits
     if limits is None:
         raise BadInput(
-            "the scene does not say how far the platform may turn",
+            "the scene has no limits for rotation",
             where=f"scene {scene.name}",
             why="--free-rotation searches orientations within the scene's rotation_limits",
             next_step="add a line such as `rotation_limits: {tilt_deg: 10, turn_deg: 30}`",
@@ -95,7 +95,7 @@ def turning_route(
         scene: Obstacles, clearances, load, rotation limits, start and goal.
         settings: Objective, seed and budget.
         kinematic: The cost of poses at the start's orientation, which gives its scaling.
-        progress: Told time spent [s] and the budget, or rounds, and the cost.
+        progress: Called with the time spent [s] and the budget, or rounds, and the cost.
         clock: Seconds; decides when a budget is spent.
 
     Raises:
@@ -144,7 +144,7 @@ def _unit(weights: Weights, kinematic: KinematicCost) -> float:
 
 
 def _tell_limit(limit: LengthLimit, search: RotatingSearch, weights: Weights) -> None:
-    """Tells the limit what the best path is, and asks by the price that it sets."""
+    """Passes the best path to the limit, and applies the price that it sets."""
     path = search.path
     if path is None:
         return
@@ -178,8 +178,8 @@ def _no_path(scene: Scene, search: RotatingSearch, settings: TurningSettings) ->
     return NoSolution(
         settings.not_found(search.rounds, gap),
         where=f"scene {scene.name}",
-        why=f"it is not proved that there is none; moves were refused for: {listed}",
-        next_step=f"{settings.longer}, ask for less clearance, allow more in rotation_limits, try"
+        why=f"it is not proved that no path exists; moves were refused for: {listed}",
+        next_step=f"{settings.longer}, reduce the clearance, widen rotation_limits, try"
         " another seed, or move the goal or an obstacle",
         values=values,
     )

@@ -23,7 +23,7 @@ from planner.settings import Weights
 _KEPT = 6
 _SAMPLES, _TRIALS = 50, 40
 _ANOTHER_EVERY = 30
-"""After the first rounds, one in so many begins with a new path."""
+"""After the first rounds, one in this many begins with a new path."""
 _TO_THE_BEST = 0.5
 
 

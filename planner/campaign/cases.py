@@ -21,7 +21,7 @@ def random_ends(planner: PaperPlanner, distance: float, random: Generator) -> tu
     that see each other are left out: neither planner has anything to search there.
 
     Args:
-        planner: Of the scene; tells what is free.
+        planner: Of the scene; decides what is free.
         distance: Of start and goal, [m].
         random: Drawn from.
 
@@ -44,7 +44,7 @@ def random_ends(planner: PaperPlanner, distance: float, random: Generator) -> tu
     raise NoSolution(
         f"no start and goal {distance * 1e3:.0f} mm apart with an obstacle between them",
         where="random starts and goals",
-        next_step="ask for less clearance, or leave the random ends out",
+        next_step="reduce the clearance, or leave out the random ends",
     )
 
 

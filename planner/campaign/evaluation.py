@@ -1,4 +1,4 @@
-"""The paper's whole evaluation: its searches, what they were, and the files that tell them."""
+"""The paper's whole evaluation: its searches, their settings, and its files."""
 
 from __future__ import annotations
 

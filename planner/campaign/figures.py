@@ -1,4 +1,4 @@
-"""Pictures of a campaign: Fig. 9, and what the claim owes to the reading and to the box."""
+"""Images of a campaign: Fig. 9, and what the claim owes to the reading and to the box."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 FIRST, SECOND, THIRD, CLAIM, MUTED = "#2f7fb5", "#c98500", "#3f9b6b", "#c0392b", "#5c6675"
 _COLOURS = {"adaptive": FIRST, "goal-bias": SECOND, "kinematic": THIRD, "length": MUTED}
 _SHOWN = ((-45.0, 75.0), (-80.0, 100.0))
-"""Changes that the picture of the readings shows in place, [%]; beyond, at its edge."""
+"""Changes that the image of the readings shows in place, [%]; beyond, at its edge."""
 _SETTINGS: dict[Any, Any] = {  # matplotlib types the keys as a union of every setting's name
     "svg.fonttype": "none",
     "svg.hashsalt": "cdpr",
@@ -50,7 +50,7 @@ _COST_LABEL = "mean kinematic cost along the path"
 
 
 def save_figures(results: Results, folder: Path) -> tuple[str, ...]:
-    """Writes every picture as SVG and PNG; the names without their ends."""
+    """Writes every image as SVG and PNG; the names without their ends."""
     import matplotlib as mpl
 
     drawn = {
@@ -82,7 +82,7 @@ def figure_9(results: Results, ends: Any = "scene") -> Figure:
 def readings_figure(results: Results) -> Figure:
     """Every reading as a dot: change of nodes and of their deviation, in both boxes.
 
-    Readings beyond the picture are triangles at its edge.
+    Readings beyond the image are triangles at its edge.
     """
     figure, all_axes = _new(7.4, 3.2, 2)
     for axes, box in zip(all_axes, (OWN, WIDE), strict=True):
@@ -151,7 +151,7 @@ def _bars(axes: Axes, results: Results, ends: Any, arms: dict[Any, Arm], quantit
 
 
 def _dots(axes: Axes, points: Array, colour: str, name: str) -> None:
-    """Points in the picture as dots, those beyond it as triangles at its edge."""
+    """Points in the image as dots, those beyond it as triangles at its edge."""
     low, high = np.array(_SHOWN).T
     beyond = np.any((points < low) | (points > high), axis=1)
     shown = np.clip(points, low, high)

@@ -39,7 +39,7 @@ _QUANTITIES = {
 
 
 def page(results: Results, about: dict[str, Any]) -> str:
-    """The whole page, HTML, with its pictures beside it as SVG."""
+    """The whole page, HTML, with its images beside it as SVG."""
     lead = _paragraph(
         f"{about['seeds']} seeds in each of {len(results.environments)} environments. Changes"
         " are of the mean over the seeds, averaged over the environments; in brackets the 95 %"
@@ -49,7 +49,7 @@ def page(results: Results, about: dict[str, Any]) -> str:
     )
     reading = _paragraph(
         f"Reading: {_reading()}. Both planners take the same steps; the baseline rejects"
-        " nothing here, and below is shown how it does with the same rejection."
+        " nothing here; results with the same rejection are below."
     )
     figure_9 = (
         picture("figure_9.svg", "Nodes and kinematic cost by environment"),

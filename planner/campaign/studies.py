@@ -144,12 +144,12 @@ Progress = Callable[[int], None]
 
 
 def run_all(batches: Sequence[Batch], pool: Executor | None, progress: Progress) -> list[Trial]:
-    """Does all batches; the trials are in the order of the batches whoever did them.
+    """Does all batches; the trials are in the order of the batches, whatever process did them.
 
     Args:
         batches: What to do.
         pool: Does it, in other processes or on other machines; this process without one.
-        progress: Told how many searches are newly done.
+        progress: Called with the number of searches newly done.
     """
     if pool is None:
         trials = []

@@ -48,7 +48,7 @@ def hulls_distance(
         second: Points of the second, likewise.
         axis: Unit normal of the disc that the second is grown by.
         disc: Its radius, [m]; 0 for none.
-        enough: The search ends where either bound tells on which side of this the distance is;
+        enough: The search ends where either bound decides on which side of this the distance is;
             infinite for the distance itself, at which the bounds meet but for round-off.
     """
     corners = np.empty((4, 3))

@@ -96,7 +96,7 @@ def _no_solution(
         f" goal with {len(result.points)} nodes",
         where=f"scene {scene.name}",
         why=f"edges refused: {why}",
-        next_step="ask for less clearance, allow more iterations, try another seed, or move the"
+        next_step="reduce the clearance, allow more iterations, try another seed, or move the"
         " goal or an obstacle",
         values={
             "best_distance_mm": best,

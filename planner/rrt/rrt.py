@@ -116,7 +116,7 @@ def try_straight(search: Search, task: Task) -> None:
 
 @kernel
 def go_on(search: Search, task: Task, rules: Rules, random: Generator, iterations: int) -> None:
-    """Does so many iterations more, fewer where the search ends before."""
+    """Does a number of further iterations, fewer where the search ends before."""
     counts, tree = search.counts, search.tree
     wanted = np.empty(len(task.goal))
     for _ in range(iterations):

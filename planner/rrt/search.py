@@ -175,7 +175,7 @@ class PaperPlanner:
             start: Shape (3,), [m].
             goal: Likewise.
             random: Drawn from.
-            progress: Told once in 500 iterations.
+            progress: Called once in 500 iterations.
         """
         settings = self.settings
         lower, upper = np.array(self.space.lower), np.array(self.space.upper)

@@ -1,4 +1,4 @@
-"""The choices that the paper leaves open, by name (docs/paper.md tells what speaks for each)."""
+"""The choices that the paper leaves open, by name (docs/paper.md has the arguments for each)."""
 
 from __future__ import annotations
 

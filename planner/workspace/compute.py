@@ -98,7 +98,7 @@ def compute(
         grid: Where.
         pool: Does the work, in other processes or on other machines; this process without one.
             The values do not depend on it.
-        progress: Told how many points are newly done.
+        progress: Called with the number of points newly done.
     """
     bounds = [(k, min(k + POINTS_IN_A_PART, grid.count)) for k in _starts(grid)]
     values = {name: np.empty(grid.count) for name in question.quantities}

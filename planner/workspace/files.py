@@ -1,4 +1,4 @@
-"""Pictures, tables and page of maps, as files in a folder."""
+"""Images, tables and page of maps, as files in a folder."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_maps(folder: Path, made: list[Maps], title: str, lead: str) -> dict[st
 
     Args:
         folder: An existing folder.
-        made: Of slices; of a volume named ``frame`` for the picture of the whole space; of other
+        made: Of slices; of a volume named ``frame`` for the image of the whole space; of other
             volumes.
         title: Of the page.
         lead: First sentence of the page.
@@ -66,7 +66,7 @@ def _chapter(folder: Path, maps: Maps) -> Chapter:
 
 
 def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
-    """Heading, sentence and pictures of a grid."""
+    """Heading, sentence and images of a grid."""
     name = maps.grid.name
     if maps.grid.normal is not None:
         figures: list[tuple[str, Draw]] = [
@@ -74,7 +74,7 @@ def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
             (f"{name}_costs", partial(cost_figure, maps)),
         ]
         text = (
-            "Red lines: where a limit is reached. Colours leave out the most extreme hundredth"
+            "Red lines: where a limit is reached. Colours leave out the most extreme 1 %"
             " at each end. The two surfaces are the paper's Fig. 7."
         )
         return f"Slice {title_of(maps.grid)}", text, figures

@@ -25,7 +25,7 @@ class Chapter:
     Attributes:
         title: Heading.
         text: What is seen.
-        pictures: File names of the pictures, each with its alternative text.
+        pictures: File names of the images, each with its alternative text.
         tables: File names of the numbers.
         summary: From `planner.workspace.report.summary_of`.
     """

@@ -1,4 +1,4 @@
-"""Pictures of a slice: every quantity as colours, and the two costs as surfaces (paper, Fig. 7)."""
+"""Images of a slice: every quantity as colours, and the two costs as surfaces (paper, Fig. 7)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# One look for all pictures of maps.
+# One look for all images of maps.
 
 
 CLOSED = "#3f9b6b"
@@ -158,7 +158,7 @@ def colour_range(slices: list[Maps], quantity: Shown) -> tuple[float, float]:
 
 
 def values_on_slice(maps: Maps, quantity: Shown) -> Array:
-    """Values as a picture has them: rows upward, columns to the right, in the unit shown."""
+    """Values as an image has them: rows upward, columns to the right, in the unit shown."""
     flat: Array = _flat(maps.values[quantity.name], maps.grid) * quantity.scale
     return flat
 
@@ -174,13 +174,13 @@ def _coordinates(grid: Grid) -> tuple[Array, Array]:
 
 
 def sides_of(grid: Grid) -> tuple[int, int]:
-    """Numbers of the axes that go to the right and upward in a picture of a slice."""
+    """Numbers of the axes that go to the right and upward in an image of a slice."""
     across, up = (axis for axis in range(3) if axis != _normal(grid))
     return across, up
 
 
 def height_to_width(grid: Grid) -> float:
-    """Shape of a picture of a slice, within what still can be read."""
+    """Shape of an image of a slice, within what still can be read."""
     x, y = _coordinates(grid)
     return float(np.clip(np.ptp(y) / np.ptp(x), 0.35, 2.0))
 

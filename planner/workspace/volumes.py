@@ -1,4 +1,4 @@
-"""Pictures of volumes: where the robot can be (paper, Fig. 6), and quantities level by level."""
+"""Images of volumes: where the robot can be (paper, Fig. 6), and quantities level by level."""
 
 from __future__ import annotations
 

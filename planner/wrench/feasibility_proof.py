@@ -129,7 +129,7 @@ def tensions_stay(
     bends: Array,
     residual: float,
 ) -> bool:
-    """Whether tensions that leave a small residual wrench can be mended within their limits.
+    """Whether tensions that leave a small residual wrench can be corrected within their limits.
 
     Args:
         load: What must be held.
@@ -138,7 +138,7 @@ def tensions_stay(
         tensions: There, shape (m,), [N].
         travels: How far each goes from there so that the wrench stays, shape (m,), [N].
         changes: How far each column changes over the region at most, shape (m,).
-        bends: What each column at its middle tension leaves to be mended, shape (m,).
+        bends: What each column at its middle tension leaves to be corrected, shape (m,).
         residual: What is left of the wrench besides, [N].
     """
     count, squared, norm_squared = len(tensions), 0.0, 0.0

@@ -4,8 +4,8 @@ Over a piece of the edge the pose depends on a share s from -1 to 1. An anchor a
 velocity o + h × R b, with o half of the way and h half of the turn; its acceleration is no more
 than |h| |h × b|. With that the columns of the structure matrix, the weight's moment among them,
 have bounds of their first and second derivatives. In the middle there are tensions t, with
-the exact slope T that keeps the wrench to first order; what t + T s leaves of the wrench is mended
-as `planner.wrench.feasibility_proof` tells. Where that does not decide, the margin in the middle
+the exact slope T that keeps the wrench to first order; what t + T s leaves of the wrench is fixed
+as `planner.wrench.feasibility_proof` shows. Where that does not decide, the margin in the middle
 may, which nothing lowers by more than the largest tensions times the changes of the columns. Else
 the piece is halved.
 """

@@ -1,4 +1,4 @@
-"""Cables in the synthetic camera's picture: thin lines, hidden by what stands before them."""
+"""Cables in the synthetic camera's image: thin lines, hidden by what stands before them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from simulation.camera.rendering import Image8, Image32, pixels_of
 
 #: Points along a cable, and how far a point must lie behind a surface to be hidden, [m].
 POINTS, HIDDEN = 96, 3e-3
-#: Where a cable is hidden or leaves the picture is found to this part of the way between points.
+#: Where a cable is hidden or leaves the image is found to this part of the way between points.
 HALVINGS = 8
 #: Cables without a radius in the rig file are drawn with this one, [m].
 DRAWN_RADIUS = 0.75e-3
 #: Brightness of a cable, and binary digits of a pixel that OpenCV draws with.
 CABLE, SHIFT = 34.0, 4
-#: Nearest distance that is drawn, [m], and how far beyond the picture's edges: a thick line is cut
+#: Nearest distance that is drawn, [m], and how far beyond the image's edges: a thick line is cut
 #: off square at its end, [px].
 NEAR, BEYOND = 0.05, 40.0
 #: Points that are drawn in one width.
@@ -112,7 +112,7 @@ class _Lines:
         return seen
 
     def _seen(self, line: NDArray[np.int64], share: Array) -> NDArray[np.bool_]:
-        """Whether points are in the picture or just beyond it, and not behind a surface."""
+        """Whether points are in the image or just beyond it, and not behind a surface."""
         points = self._points(line, share)
         if not len(points):
             return np.zeros(0, dtype=bool)

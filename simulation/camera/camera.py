@@ -1,7 +1,7 @@
-"""The synthetic camera: pictures of the rig with an exactly known pose.
+"""The synthetic camera: images of the rig with an exactly known pose.
 
 Tags, platform and obstacles are met by the undistorted ray of every sample, 2 × 2 samples a pixel.
-What stands still is drawn once; a picture redraws the platform's surroundings and the cables.
+What stands still is drawn once; an image redraws the platform's surroundings and the cables.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from simulation.camera.rendering import Image8
 
 
-# How a simulated platform moves while a picture is exposed, and pictures one after the other.
+# How a simulated platform moves while an image is exposed, and images one after the other.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,15 +63,15 @@ class PlatformMotion:
         return cls((after.position - before.position) / seconds, turn / seconds)
 
     def moved(self, pose: Pose, seconds: float) -> Pose:
-        """The pose so much later, or earlier."""
+        """The pose at a later or earlier time."""
         turn = matrix_from_rotation_vector(self.turning * seconds)
         return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)
 
 
 class Film:
-    """Pictures of one camera, each smeared by the platform's motion since the one before.
+    """Images of one camera, each smeared by the platform's motion since the one before.
 
-    The first is sharp. Between pictures the platform is taken to have moved steadily.
+    The first is sharp. Between images the platform is taken to have moved steadily.
     """
 
     def __init__(self, camera: SyntheticCamera) -> None:
@@ -80,15 +80,15 @@ class Film:
         self._before: tuple[float, Pose] | None = None
 
     def picture(self, time: float, pose: Pose, frame: int) -> Image8:
-        """The next picture.
+        """The next image.
 
         Args:
             time: At the middle of its exposure, [s].
             pose: Of the platform there, ``world_from_platform``.
-            frame: Number of the picture; it picks the noise.
+            frame: Number of the image; it picks the noise.
 
         Returns:
-            Grey picture, shape (height, width).
+            Grey image, shape (height, width).
         """
         motion = None
         if self._before is not None and time > self._before[0]:
@@ -101,22 +101,22 @@ class Film:
 PLATFORM = 168.0
 #: A platform that is nearer to the lens is not drawn, or not smeared, [m].
 NEAREST = 0.02
-#: A smear is drawn as so many poses that neighbours are this far apart, [px], but no more than:
+#: Motion blur is drawn as poses this far apart, [px], but no more of them than:
 SMEAR_STEP, MOST_POSES = 0.5, 64
 #: A shorter smear is not to be seen, [px].
 LEAST_SMEAR = 0.02
-#: Slack of the precomputed noise, in which each picture takes another place, [px].
+#: Slack of the precomputed noise, in which each image takes another place, [px].
 NOISE_SLACK = 96
 
 
 class SyntheticCamera:
-    """Takes pictures of a simulated rig.
+    """Takes images of a simulated rig.
 
     Args:
         rig: Its platform, tags and cables.
         scene: Its obstacles.
         camera: One of the rig's cameras, or another.
-        seed: Of the noise: the same seed, pose and frame give the same picture.
+        seed: Of the noise: the same seed, pose and frame give the same image.
         optics: Imperfections of lens and sensor.
 
     Raises:
@@ -128,7 +128,7 @@ class SyntheticCamera:
     ) -> None:
         if not rig.tag_family:
             raise BadInput(
-                "the rig has no tags, a camera can measure nothing",
+                "the rig has no tags, so a camera cannot measure it",
                 where=f"rig {rig.name}",
                 next_step="add a `tags` section to the rig file",
             )
@@ -143,15 +143,15 @@ class SyntheticCamera:
         self._noise = _noise(camera, self.optics.noise, seed)
 
     def render(self, pose: Pose, frame: int = 0, motion: PlatformMotion | None = None) -> Image8:
-        """The picture with the platform at ``pose`` (``world_from_platform``).
+        """The image with the platform at ``pose`` (``world_from_platform``).
 
         Args:
-            pose: Exact truth of the picture, in the middle of its exposure.
-            frame: Number of the picture; it picks the noise.
+            pose: Exact truth of the image, in the middle of its exposure.
+            frame: Number of the image; it picks the noise.
             motion: Of the platform meanwhile; left out, it stands still.
 
         Returns:
-            Grey picture, shape (height, width).
+            Grey image, shape (height, width).
         """
         poses = self._while_exposed(pose, motion)
         if len(poses) == 1:
@@ -166,7 +166,7 @@ class SyntheticCamera:
         return self._with_noise(np.asarray(np.minimum(mean, 255.0), dtype=np.uint8), frame)
 
     def _while_exposed(self, pose: Pose, motion: PlatformMotion | None) -> list[Pose]:
-        """Poses in the middles of equal parts of the exposure, so many that the smear is even."""
+        """Poses in the middles of equal parts of the exposure, close enough for even blur."""
         time = self.optics.exposure
         if motion is None or time <= 0.0:
             return [pose]
@@ -180,7 +180,7 @@ class SyntheticCamera:
         return [motion.moved(pose, ((k + 0.5) / count - 0.5) * time) for k in range(count)]
 
     def _at(self, pose: Pose) -> Image8:
-        """The picture of a platform that stands still, without noise."""
+        """The image of a platform that stands still, without noise."""
         picture, depth = self._still.copy(), self._depth
         region = self._platform_region(pose)
         if not region.empty:
@@ -250,7 +250,7 @@ def _vignette(camera: Camera, loss: float) -> Image32:
 
 
 def _noise(camera: Camera, deviation: float, seed: int) -> NDArray[np.int16]:
-    """Noise somewhat larger than a picture."""
+    """Noise somewhat larger than an image."""
     shape = (camera.height + NOISE_SLACK, camera.width + NOISE_SLACK)
     values = np.random.default_rng([seed, 0xCA3E]).standard_normal(shape, dtype=np.float32)
     return np.round(values * np.float32(deviation)).astype(np.int16)

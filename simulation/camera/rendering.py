@@ -108,7 +108,7 @@ class Canvas:
 
     @classmethod
     def blank(cls, camera: Camera, rays: Image32, brightness: float = 0.0) -> Canvas:
-        """A whole picture with nothing in it."""
+        """A whole image with nothing in it."""
         shape = rays.shape[:2]
         whole = CanvasRegion(0, 0, camera.width, camera.height)
         light = np.full(shape, brightness, dtype=np.float32)
@@ -159,11 +159,11 @@ class Canvas:
 def draw_quad(
     canvas: Canvas, camera_from_quad: Pose, half_size: tuple[float, float], texture: Image32
 ) -> None:
-    """Draws a flat picture, seen from its front (+z) only.
+    """Draws a flat image, seen from its front (+z) only.
 
     Args:
         canvas: What to draw on.
-        camera_from_quad: x to the right of the picture, y up, z out of it.
+        camera_from_quad: x to the right of the image, y up, z out of it.
         half_size: Half width and half height, [m].
         texture: Brightness 0..255, shape (rows, columns).
     """
@@ -294,7 +294,7 @@ def _strips(grid: Array) -> Array:
     return np.concatenate([first.reshape(-1, 3, 3), second.reshape(-1, 3, 3)])
 
 
-# Printed tags for the synthetic camera: the official pictures, white border included.
+# Printed tags for the synthetic camera: the official images, white border included.
 
 
 #: Brightness of ink and paper in full light.

@@ -152,44 +152,44 @@ def _range(behaviour: DriveBehaviour, text: str) -> DriveBehaviour:
 
 BEHAVIOURS: tuple[NamedBehaviour, ...] = (
     NamedBehaviour(
-        "strict", "", "", "CiA 301 and CiA 402 to the letter; the default", lambda b, _text: b
+        "strict", "", "", "CiA 301 and CiA 402 as written; the default", lambda b, _text: b
     ),
     NamedBehaviour(
         "sync-periods",
         "PERIODS",
         "1.5",
-        "SYNC is overdue after so many periods of 1006h; strict: 3",
+        "periods of 1006h after which SYNC is overdue; strict: 3",
         _number("sync_periods", low=1.0),
     ),
     NamedBehaviour(
         "heartbeat-loss-is-fault",
         "",
         "",
-        "a lost heartbeat is a fault: torque off, although 6007h asks for a quick stop",
+        "a lost heartbeat is a fault: torque off, although 6007h requests a quick stop",
         _switch(heartbeat_loss_is_fault=True),
     ),
     NamedBehaviour(
         "maps-when-operational",
         "",
         "",
-        "a PDO that is off is mapped in NMT operational, too; strict: only in pre-operational",
+        "a disabled PDO can be mapped in NMT operational; strict: only in pre-operational",
         _switch(maps_when_operational=True),
     ),
     NamedBehaviour(
-        "sdo-delay", "MS", "300", "every SDO answer takes so long", _number("sdo_delay", 1e-3)
+        "sdo-delay", "MS", "300", "delay of every SDO answer", _number("sdo_delay", 1e-3)
     ),
     NamedBehaviour(
         "sdo-late",
         "MS",
         "800",
-        "every seventh SDO answer takes so much longer, and may come after the next request",
+        "extra delay of every seventh SDO answer, which may then follow the next request",
         _number("sdo_late", 1e-3),
     ),
     NamedBehaviour(
         "sdo-twice",
         "MS",
         "0",
-        "every SDO answer comes a second time, so much later",
+        "every SDO answer is repeated after this delay",
         _number("sdo_twice", 1e-3),
     ),
     NamedBehaviour("sdo-lost", "N", "5", "every N-th SDO answer is lost", _count("sdo_lost")),
@@ -197,7 +197,7 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "absent",
         "INDEX[:SUB][/ABORT]",
         "",
-        "has not got an object, and answers with this abort code, 06020000 without one:"
+        "an object is missing; access is answered with this abort code, by default 06020000:"
         " absent=1400:05/06010000",
         _absent,
     ),
@@ -205,12 +205,12 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "range",
         "INDEX[:SUB]/LOW..HIGH",
         "",
-        "takes an object's values only from LOW to HIGH, and answers others with 06090030h:"
+        "accepts an object's values only from LOW to HIGH, and answers others with 06090030h:"
         " range=6066/0..0",
         _range,
     ),
     NamedBehaviour(
-        "mode-late", "MS", "50", "6061h follows 6060h so late", _number("mode_delay", 1e-3)
+        "mode-late", "MS", "50", "delay of 6061h after 6060h", _number("mode_delay", 1e-3)
     ),
     NamedBehaviour(
         "mode-when-enabled",
@@ -223,7 +223,7 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "warning",
         "CODE",
         "4210",
-        "while it is enabled, EMCY with this code and status word bit 7 come and go; it goes on",
+        "while enabled, a warning (EMCY code, status word bit 7) comes and goes; it keeps running",
         _count("warning", 16),
     ),
     NamedBehaviour(
@@ -237,35 +237,35 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "boot-late",
         "MS",
         "2000",
-        "the boot-up message comes so late, and nothing is answered before",
+        "delay of the boot-up message; no request is answered before it",
         _number("boot_delay", 1e-3),
     ),
     NamedBehaviour(
         "position-noise",
         "COUNTS",
         "2",
-        "standard deviation of the position that is reported",
+        "standard deviation of the reported position",
         _number("position_noise"),
     ),
     NamedBehaviour(
         "torque-noise",
         "PER_MILLE",
         "10",
-        "standard deviation of the torque that is reported",
+        "standard deviation of the reported torque",
         _number("torque_noise"),
     ),
     NamedBehaviour(
         "friction",
         "PER_MILLE",
         "50",
-        "the drive train rubs: torque that is not the cable's tension, against the motion",
+        "friction of the drive train: torque against the motion that is not cable tension",
         _number("friction"),
     ),
     NamedBehaviour(
         "stick-slip",
         "COUNTS",
         "40",
-        "the motor stands until it lags so far behind its set-point, then jumps to it",
+        "stick-slip: the motor rests until its lag reaches this value, then jumps",
         _number("stick"),
     ),
 )
@@ -284,10 +284,10 @@ def behaviour_named(names: Iterable[str], base: DriveBehaviour = STRICT) -> Driv
         named = _BY_NAME.get(name)
         if named is None:
             raise BadInput(
-                f"no behaviour of a simulated drive is called {name!r}",
+                f"there is no behaviour {name!r} of a simulated drive",
                 where="--drive-behaviour",
                 why="there are: " + ", ".join(_BY_NAME),
-                next_step="cdpr sim RIG --drive-behaviour list explains them",
+                next_step="`cdpr sim RIG --drive-behaviour list` explains them",
             )
         if equals and not named.value:
             raise BadInput(f"{name} takes no value", where="--drive-behaviour")
@@ -295,10 +295,10 @@ def behaviour_named(names: Iterable[str], base: DriveBehaviour = STRICT) -> Driv
             base = named.put(base, value if equals else named.example)
         except ValueError:
             raise BadInput(
-                f"{text!r} cannot be used",
+                f"{text!r} is not valid",
                 where="--drive-behaviour",
                 why=f"{name} needs a value: {name}={named.value}; {named.says}",
-                next_step="cdpr sim RIG --drive-behaviour list explains it",
+                next_step="`cdpr sim RIG --drive-behaviour list` explains it",
             ) from None
     return base
 

@@ -35,10 +35,10 @@ PDO_IDS = range(TPDO1_BASE, SDO_REPLY_BASE)
 """Identifiers that process data may have."""
 
 PATIENCE = 2.0
-"""A master in this thread that asks a drive lets at most so much time pass for the answer, [s]."""
+"""Simulated time that a request from this thread waits for its answer, at most, [s]."""
 
 FINEST = 0.001
-"""Shorter times are added up before the drives are told of them, [s]: it costs less."""
+"""Shorter times are added up before the drives are stepped, [s], which costs less."""
 
 
 class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
@@ -81,7 +81,7 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
         self._cyclic = {SYNC_ID, *(RPDO1_BASE + drive.node for drive in self.drives)}
         self._begun = False
         self._passed = 0.0  # of the drives' time since the last SYNC
-        self._waited = 0.0  # and what is too short to be told to every drive
+        self._waited = 0.0  # and what is too short for a step
 
     def _torque_per_newton(self) -> Array:
         """In per mille of rated torque."""

@@ -91,7 +91,7 @@ def profile_path(profile: str) -> Path:
         raise BadInput(
             f"the simulation has no EDS file for the drive profile {profile!r}",
             where="drives.profile",
-            why=f"it has these: {known}",
+            why=f"it has: {known}",
             next_step="choose one of them, or pass the maker's file with --eds",
         )
     return path

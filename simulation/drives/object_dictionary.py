@@ -26,7 +26,7 @@ _SIMULATED = {
     (0x1009, 0): b"none",
     (0x100A, 0): b"simulation",
 }
-"""Whatever the EDS file says: nobody may take a simulated drive for the maker's."""
+"""Whatever the EDS file says: a simulated drive must not pass for the maker's."""
 
 
 class Abort(Exception):

@@ -48,7 +48,7 @@ def ran(name: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
         ("track_images.py", "place_06.jpg:", []),
         ("compare_objectives.py", "capacity ", []),
         ("own_planner.py", "around passes: <Plan", ["own-plan.json"]),
-        ("calibrate_camera.py", "next: take more pictures", []),
+        ("calibrate_camera.py", "next: take more images", []),
     ],
 )
 def test_an_example_runs_and_leaves_what_it_says(

@@ -1,4 +1,4 @@
-"""Pictures of boards from a camera that is known exactly."""
+"""Images of boards from a camera that is known exactly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SUB = 2
 def poses_before_the_camera(
     middle: Array, count: int, seed: int = 4, spread: float = 0.06
 ) -> list[Pose]:
-    """Tilted board poses whose middle, board frame, shape (3,), [m], is near the picture's."""
+    """Tilted board poses whose middle, board frame, shape (3,), [m], is near the image's."""
     rng = np.random.default_rng(seed)
     poses = []
     for _ in range(count):
@@ -30,7 +30,7 @@ def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> n
     """What the camera sees of a print on a board, on a grey wall.
 
     Args:
-        print_: Grey picture of the print.
+        print_: Grey image of the print.
         pixel: Side of its pixels, [m].
         origin: Where the board's origin is on it, shape (2,), [m] from its top left corner.
         pose: Of the board's frame, whose x and y run along the print's, in the camera's.
@@ -55,6 +55,6 @@ def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> n
 
 
 def with_noise(image: np.ndarray, seed: int) -> np.ndarray:
-    """A picture with the noise of a sensor."""
+    """An image with the noise of a sensor."""
     noise = np.random.default_rng(seed).normal(scale=1.5, size=image.shape)
     return np.clip(image + noise, 0.0, 255.0).round().astype(np.uint8)

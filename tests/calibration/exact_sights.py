@@ -17,7 +17,7 @@ from tracking.edges.refine import RefinedTag
 def seen_tag(
     camera: Camera, camera_from_carrier: Pose, tag: Tag, noise: float, rng: np.random.Generator
 ) -> RefinedTag | None:
-    """The square of a tag; None where it shows its back or is out of the picture."""
+    """The square of a tag; None where it shows its back or is out of the image."""
     points = camera_from_carrier.apply(tag_corners(tag))
     normal = camera_from_carrier.rotation @ tag.pose.rotation[:, 2]
     middle = points.mean(axis=0)
@@ -38,7 +38,7 @@ def sights_at(
     noise: float,
     rng: np.random.Generator,
 ) -> TagSights:
-    """Tags of a carrier at poses ``camera_from_carrier``, by picture."""
+    """Tags of a carrier at poses ``camera_from_carrier``, by image."""
     squares = {}
     for name, pose in poses.items():
         seen = {tag.id: seen_tag(camera, pose, tag, noise, rng) for tag in tags}

@@ -1,4 +1,4 @@
-"""Pictures as turned cameras store them."""
+"""Images as turned cameras store them."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def pages_in(data: bytes) -> list[tuple[Array, Array, list[str]]]:
 
 
 def drawn(size_mm: Array, rectangles: Array, per_mm: float) -> np.ndarray:
-    """A grey picture of a page, ink 20 and paper 235."""
+    """A grey image of a page, ink 20 and paper 235."""
     width, height = np.round(size_mm * per_mm).astype(int)
     picture = np.full((height, width), 235, np.uint8)
     for x, y, w, h in rectangles * per_mm:

@@ -1,4 +1,4 @@
-"""Boards in rendered pictures: every point where it is, and no point that is not there."""
+"""Boards in rendered images: every point where it is, and no point that is not there."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def charuco_print() -> np.ndarray:
 
 
 def tag_print() -> np.ndarray:
-    """White, with the official pictures of the tags, which are OpenCV's turned by 180°."""
+    """White, with the official images of the tags, which are OpenCV's turned by 180°."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11)
     sheet = np.full((4 * 104 + 40, 5 * 104 + 40), 255, np.uint8)
     for number in range(20):
@@ -115,13 +115,13 @@ def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
     image = next(image for image, _ in pictures(board) if board.find(image) is not None)
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
-    assert "is to be seen in 0 of 2 pictures" in caught.value.what
+    assert "is detected in 0 of 2 images" in caught.value.what
     assert told in caught.value.why
     assert "; a shows " in caught.value.why
 
 
 def test_what_most_pictures_show_instead_is_told_not_what_the_first_one_does() -> None:
-    """One picture of another board lies among twelve."""
+    """One image of another board lies among twelve."""
     image, stray = (
         next(image for image, _ in pictures(board) if board.find(image) is not None)
         for board in (TAGS, CHARUCO)
@@ -174,12 +174,12 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> 
         (lambda: Chessboard(9, 6, 0.0), "side of a square"),
         (lambda: Charuco(7, 5, 0.03, 0.03, "4X4_50"), "smaller than its square"),
         (lambda: Charuco(7, 5, 0.03, 0.02, "9X9_50"), "unknown dictionary"),
-        (lambda: Charuco(20, 20, 0.03, 0.02, "4X4_50"), "50 markers, the board needs 200"),
+        (lambda: Charuco(20, 20, 0.03, 0.02, "4X4_50"), "50 markers; the board needs 200"),
         (lambda: TagGrid(3, 1, 0.03, 0.01, "tag36h11"), "needs 4 tags"),
         (lambda: TagGrid(3, 2, 0.03, 0.0, "tag36h11"), "gap"),
         (lambda: TagGrid(3, 2, 0.03, 0.01, "tag99h1"), "unknown tag family"),
-        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586, .* 580 to 591"),
-        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586, .* -1 to 10"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586; .* 580 to 591"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586; .* -1 to 10"),
     ],
 )
 def test_boards_that_cannot_be_are_refused(make, named: str) -> None:

@@ -1,4 +1,4 @@
-"""Which pictures a live camera takes, and what the person with the board is told."""
+"""Which images a live camera takes, and what the person with the board is told."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def show(guide: CaptureGuide, board: Shown, pose: Pose | None, times: int = 2):
 
 def test_a_picture_is_taken_when_the_board_stands_still_and_shows_something_new(shown) -> None:
     guide = CaptureGuide(shown, wanted=10)
-    assert guide.look(BLANK).text == "0 of 10 pictures: show the board"
+    assert guide.look(BLANK).text == "0 of 10 images: show the board"
     shown.pose = held(0.0, 0.0)
     moving = guide.look(BLANK)
     assert not moving.taken
@@ -70,7 +70,7 @@ def test_a_picture_is_taken_when_the_board_stands_still_and_shows_something_new(
 def test_the_part_of_the_picture_that_is_missing_is_named(shown) -> None:
     guide = CaptureGuide(shown, wanted=4)
     advice = show(guide, shown, held(0.0, 0.0))
-    assert "bring the board to the top left of the picture" in advice.text
+    assert "bring the board to the top left of the image" in advice.text
     advice = show(guide, shown, held(-0.21, -0.11))
     assert "top left" not in advice.text
 

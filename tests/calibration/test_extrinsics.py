@@ -177,8 +177,8 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
     )
     verdict = judge_extrinsics(found, 1.0)
     assert not verdict.good
-    assert any("from where the rig file puts it" in reason for reason in verdict.reasons)
-    assert any("again, or take it out of the rig file" in step for step in verdict.next_steps)
+    assert any("from its position in the rig file" in reason for reason in verdict.reasons)
+    assert any("again, or remove it from the rig file" in step for step in verdict.next_steps)
 
 
 @pytest.mark.parametrize(("count", "seen"), [(1, "1 frame tag is"), (2, "2 frame tags are")])
@@ -188,8 +188,8 @@ def test_too_few_tags_are_not_good_enough(rig: Rig, count: int, seen: str) -> No
     sights = sights_at(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
     found = locate_by_frame_tags(rig, camera, sights, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
-    assert f"{seen} seen, 3 are needed" in verdict.reasons
-    assert "survey more tags, all around what the camera sees" in verdict.next_steps
+    assert f"{seen} seen; 3 are required" in verdict.reasons
+    assert "survey more tags, all around the camera's view" in verdict.next_steps
 
 
 def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> None:
@@ -242,7 +242,7 @@ def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictur
     result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
     other = rig.document.cameras[0].model_copy(update={"fx_px": 901.0})
     changed = replace(rig, document=rig.document.model_copy(update={"cameras": [other]}))
-    with pytest.raises(BadInput, match="rests on other numbers of the camera or frame tags"):
+    with pytest.raises(BadInput, match="was made with parameters of the camera or frame tags"):
         changed.with_calibration(result)
 
 
@@ -276,8 +276,8 @@ def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
     more = [("blank.png", blank), ("copy.png", image.copy())]
     sights = sights_of([*pictures, *more], rig, camera, numbers(rig))
     assert sights.unused == {
-        "blank.png": "shows none of the tags whole",
-        "copy.png": f"is the same picture as {first}",
+        "blank.png": "shows no complete tag",
+        "copy.png": f"is the same image as {first}",
     }
     assert sights.squares.keys() == {name for name, _ in pictures}
     with pytest.raises(BadInput, match="none of the tag36h11 tags 401, 402, 403, 404"):
@@ -308,7 +308,7 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(rig: Rig, pictures) -> 
     doubled = image.copy()
     doubled[4 : 4 + patch.shape[0], 4 : 4 + patch.shape[1]] = patch
     sights = sights_of([(name, doubled)], rig, camera, numbers(rig))
-    assert sights.unused == {f"{name}, tag 402": "is seen more than once"}
+    assert sights.unused == {f"{name}, tag 402": "is detected more than once"}
     assert 402 not in sights.squares[name]
     assert sights.squares[name].keys() == seen.keys() - {402}
 

@@ -32,7 +32,7 @@ def shaken(pose: Pose, noise: float, rng: np.random.Generator) -> Pose:
 def session(
     rig: Rig, count: int, turn: float, noise: float, seed: int, tags_off: Pose | None = None
 ):
-    """Pictures of a platform that the drives put near where they tell: sights and told poses."""
+    """Images of a platform that the drives put near where they tell: sights and told poses."""
     rng = np.random.default_rng(seed)
     camera, told, seen = rig.cameras[0], {}, {}
     off = tags_off or Pose.level(np.zeros(3))
@@ -82,7 +82,7 @@ def test_motion_without_rotation_leaves_the_drawing_and_says_so(rig: Rig) -> Non
     assert (turning.half_widths[:3] < 1.0e-3).all()
     verdict = judge_extrinsics(still, 1e-3)
     assert not verdict.good
-    assert "turned up to 20°" in " ".join(verdict.next_steps)
+    assert "rotated up to 20°" in " ".join(verdict.next_steps)
 
 
 def test_a_pose_that_was_written_wrongly_counts_little(rig: Rig) -> None:
@@ -106,7 +106,7 @@ def test_poses_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
 
 
 def test_the_same_view_counts_once(rig: Rig) -> None:
-    """As of one picture saved several times, or of a platform that stood still."""
+    """As of one image saved several times, or of a platform that stood still."""
     sights, told = session(rig, 10, 0.3, 1e-4, seed=7)
     rng = np.random.default_rng(1)
     copies = {
@@ -123,7 +123,7 @@ def test_the_same_view_counts_once(rig: Rig) -> None:
     assert found.pictures == once.pictures
     assert found.half_widths == pytest.approx(once.half_widths)
     assert set(found.unused) == set(copies)
-    assert found.unused["again 3.png"] == "shows the same as 3.png: nothing moved in between"
+    assert found.unused["again 3.png"] == "duplicates 3.png: nothing moved in between"
 
 
 def test_of_two_views_of_one_stand_the_one_with_more_tags_counts(rig: Rig) -> None:
@@ -134,7 +134,7 @@ def test_of_two_views_of_one_stand_the_one_with_more_tags_counts(rig: Rig) -> No
     for order in ({"a": fewer, "b": squares}, {"b": squares, "a": fewer}):
         once = TagSights(order, {}).each_view_once()
         assert set(once.squares) == {"b"}
-        assert once.unused == {"a": "shows the same as b: nothing moved in between"}
+        assert once.unused == {"a": "duplicates b: nothing moved in between"}
 
 
 def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> None:
@@ -142,9 +142,9 @@ def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> 
     del told["2.png"]
     found = locate_by_motion(rig, rig.cameras[0], sights, told)
     assert found.unused == {"2.png": "has no pose"}
-    assert any("5 poses were seen, 8 are needed" in lack.reason for lack in found.lacks)
+    assert any("5 poses were seen; 8 are required" in lack.reason for lack in found.lacks)
     few = {name: told[name] for name in ("0.png", "1.png")}
-    with pytest.raises(BadInput, match="2 pictures show the platform at a pose that is known"):
+    with pytest.raises(BadInput, match="2 images show the platform at a known pose"):
         locate_by_motion(rig, rig.cameras[0], sights, few)
 
 
@@ -166,8 +166,8 @@ def test_poses_are_read_by_picture_and_rows_without_one_left_out(tmp_path: Path)
         (HEAD + "a.png,1,2,x,1,0,0,0\n", "2:1: a.png: 1, 2, x, 1, 0, 0, 0 are not seven numbers"),
         (HEAD + "a.png,1,2,nan,1,0,0,0\n", "not finite"),
         (HEAD + "a.png,1,2,3,1,1,0,0\n", "length 1"),
-        (HEAD + "a.png,1,2,3,1,0,0,0\n" * 2, "stands twice"),
-        (HEAD + ",1,2,3,1,0,0,0\n", "no picture is named"),
+        (HEAD + "a.png,1,2,3,1,0,0,0\n" * 2, "appears twice"),
+        (HEAD + ",1,2,3,1,0,0,0\n", "no image is named"),
     ],
 )
 def test_files_of_poses_that_cannot_be_used_are_told(tmp_path: Path, text: str, named: str) -> None:

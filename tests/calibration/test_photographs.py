@@ -51,7 +51,7 @@ def test_a_real_camera_is_calibrated_from_thirteen_photographs(found: CameraCali
 def test_thirteen_photographs_with_a_small_error_are_not_said_to_be_good(found) -> None:
     verdict = judge_camera(found, 1e-3).verdict
     assert not verdict.good
-    assert "take more pictures: 40 are good" in verdict.next_steps
+    assert "take more images: 40 are recommended" in verdict.next_steps
 
 
 def test_turned_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_a_board_that_does_not_fit_is_refused_with_the_paper_that_would_do() -> 
 
 
 def test_tags_whose_white_borders_would_be_lost_are_refused() -> None:
-    with pytest.raises(BadInput, match="less than a module"):
+    with pytest.raises(BadInput, match="less than one module"):
         board_print(TagGrid(3, 2, 0.040, 0.002, "tag36h11"))
 
 

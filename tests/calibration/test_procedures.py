@@ -34,7 +34,7 @@ class Heard(Listener):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six pictures of the board."""
+    """Six images of the board."""
     path = tmp_path_factory.mktemp("pictures")
     for number, image in enumerate(pictures(6, 0.09)):
         cv2.imwrite(str(path / f"{number}.png"), image)
@@ -45,7 +45,7 @@ def test_a_folder_becomes_a_result_file_and_a_report(folder: Path, tmp_path: Pat
     heard = Heard()
     to = Destination(tmp_path, on=ON)
     made = calibrate_camera(folder, BOARD, name="front", to=to, listener=heard)
-    assert heard.totals == [("looking for the board", 6)]
+    assert heard.totals == [("detecting the board", 6)]
     assert [path.name for path in made.files] == [
         "calibration_camera_front_2026-03-01.yaml",
         "calibration_camera_front_2026-03-01.html",
@@ -70,5 +70,5 @@ def test_a_result_that_exists_is_refused_before_any_picture_is_read(tmp_path: Pa
 
 
 def _unread():  # type: ignore[no-untyped-def]
-    raise AssertionError("a picture was read")
+    raise AssertionError("an image was read")
     yield

@@ -86,8 +86,8 @@ def test_two_results_of_one_camera_are_refused(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("kind: rigg\n", "no calibration result"),
-        ("- 1\n", "no calibration result"),
+        ("kind: rigg\n", "not a calibration result"),
+        ("- 1\n", "not a calibration result"),
         ("kind: camera\n", "fx_px"),
         ("kind: [\n", "yaml"),
     ],
@@ -105,7 +105,7 @@ def test_a_result_tells_how_far_it_is_from_another() -> None:
     one, two = camera_result_of(), camera_result_of(fx=908.0)
     assert one.changes_to(two)["fx_px"] == pytest.approx(3.0)
     assert one.apart_mm(one) == 0.0
-    # Points of a picture lie up to 0.7 of the distance off its axis; 3 of 905 px is 0.33 %.
+    # Points of an image lie up to 0.7 of the distance off its axis; 3 of 905 px is 0.33 %.
     assert 0.5 < one.apart_mm(two) < 3.5
 
 

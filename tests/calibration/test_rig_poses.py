@@ -85,7 +85,7 @@ def test_the_way_through_all_poses_has_no_detour() -> None:
 
 def test_a_scene_without_room_is_told(rig: Rig, scene: Scene) -> None:
     narrow = replace(scene, self_clearance=0.05)
-    with pytest.raises(NoSolution, match="poses tried can be held and are free"):
+    with pytest.raises(NoSolution, match="tried poses are feasible and free"):
         chosen_poses(
             rig, narrow, replace(WISH, candidates=15), Parameters.of(rig, {"offsets": 1e-3}), 0
         )

@@ -1,4 +1,4 @@
-"""The tags' places on the platform from pictures taken from anywhere."""
+"""The tags' places on the platform from images taken from anywhere."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def as_glued(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[T
 def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
     """Poses ``camera_from_platform`` of a platform that is turned every way before the camera.
 
-    As asked for, no picture looks straight at one face.
+    As asked for, no image looks straight at one face.
     """
     poses = {}
     for k in range(count):
@@ -139,17 +139,17 @@ def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
 
 
 def test_what_pictures_cannot_tell_is_said(rig: Rig) -> None:
-    """A tag that is never seen with others stays as drawn; a picture of one tag tells nothing."""
+    """A tag that is never seen with others stays as drawn; an image of one tag tells nothing."""
     sights = session(rig, rig.platform_tags, 24, seed=4)
     squares = {
         name: {k: s for k, s in seen.items() if k != 306} for name, seen in sights.squares.items()
     }
     squares["alone.png"] = {301: next(s[301] for s in squares.values() if 301 in s)}
     found = measure_layout(rig, rig.cameras[0], TagSights(squares, {}))
-    assert found.unseen == {306: "was not seen together with the others"}
-    assert "one tag only" in found.unused["alone.png"]
+    assert found.unseen == {306: "was not detected together with the others"}
+    assert "only one tag" in found.unused["alone.png"]
     verdict = judge_layout(found, 1e-3)
-    assert "take pictures that show tag 306 together with others" in verdict.next_steps
+    assert "take images that show tag 306 together with others" in verdict.next_steps
 
 
 def test_sizes_that_are_not_as_told_are_noticed(rig: Rig) -> None:
@@ -185,8 +185,8 @@ def test_a_picture_of_another_tag_is_left_out_by_name(rig: Rig) -> None:
     wrong = {**sights.squares, name: {**seen, number: off}}
     found = measure_layout(rig, rig.cameras[0], TagSights(wrong, {}))
     others = [why for other, why in found.unused.items() if other != name]
-    assert all("one tag only" in why for why in others)
-    assert "px off, far more than the others" in found.unused[name]
+    assert all("only one tag" in why for why in others)
+    assert "px, far more than the others" in found.unused[name]
     assert gaps(found, rig.platform_tags)[0] < 0.08
 
 
@@ -197,24 +197,24 @@ def test_pictures_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
     camera = rig.cameras[0]
     sights = sights_at(camera, rig.platform_tags, poses, 0.02, rng)
     verdict = judge_layout(measure_layout(rig, camera, sights), 1.0)
-    assert any("all pictures are taken from within" in reason for reason in verdict.reasons)
-    assert "take pictures from all sides, not alike" in verdict.next_steps
+    assert any("all images are taken from within" in reason for reason in verdict.reasons)
+    assert "take images from all sides, all different" in verdict.next_steps
 
 
 def test_too_few_pictures_and_tags_are_refused(rig: Rig) -> None:
-    with pytest.raises(BadInput, match="pictures show two tags of the platform or more; 4 are"):
+    with pytest.raises(BadInput, match="images show two platform tags or more; 4 are"):
         measure_layout(rig, rig.cameras[0], session(rig, rig.platform_tags, 3, seed=7))
     with pytest.raises(BadInput, match="no tag 999 on the platform"):
         require_tags(rig, 999)
-    with pytest.raises(BadInput, match="no two tags"):
+    with pytest.raises(BadInput, match="fewer than two tags"):
         require_tags(replace(rig, platform_tags=rig.platform_tags[:1]), None)
 
 
 def test_a_fixed_tag_that_no_picture_shows_is_refused_by_name(rig: Rig) -> None:
     unseen, *seen = rig.platform_tags
-    with pytest.raises(BadInput, match=f"^0 pictures show .* tied to tag {unseen.id}") as told:
+    with pytest.raises(BadInput, match=f"^0 images show .* linked to tag {unseen.id}") as told:
         measure_layout(rig, rig.cameras[0], session(rig, seen, 6, seed=3), unseen.id)
-    assert f"no picture shows with tag {unseen.id}" in told.value.why
+    assert f"no image shows together with tag {unseen.id}" in told.value.why
 
 
 def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> None:
@@ -235,7 +235,7 @@ def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> 
         update={"platform": [other, *rig.document.tags.platform[1:]]}
     )
     changed = replace(rig, document=rig.document.model_copy(update={"tags": resized}))
-    with pytest.raises(BadInput, match="rests on other sizes or numbers of tags"):
+    with pytest.raises(BadInput, match="made with sizes or numbers of tags"):
         changed.with_calibration(read)
 
 

@@ -21,7 +21,7 @@ START_MM, GOAL_MM = (0.0, 0.0, 445.0), (0.0, 30.0, 495.0)
 
 
 def rig_with_two_pictures_a_second(folder: Path) -> Path:
-    """The paper's rig for long runs: drawing its pictures takes longer than all the rest."""
+    """The paper's rig for long runs: drawing its images takes longer than all the rest."""
     rig = folder / "rig.yaml"
     text = RIG.read_text()
     assert "rate_hz: 10" in text

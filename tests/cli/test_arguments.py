@@ -81,7 +81,7 @@ def test_a_camera_s_own_log_is_an_output_too(tmp_path: Path) -> None:
 
 
 def test_a_device_is_never_replaced_by_a_file() -> None:
-    with pytest.raises(BadInput, match="no plain file"):
+    with pytest.raises(BadInput, match="not a regular file"):
         check_arguments({"output": Path("/dev/null"), "force": True})
 
 

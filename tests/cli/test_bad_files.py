@@ -25,7 +25,7 @@ RIG_MISTAKES = {
         ["max_tension_n", "min_tension_n"],
     ),
     "two winches of one node": ("node_id: 2,", "node_id: 1,", ["node_id", "1"]),
-    "a key that stands twice": ("  mass_kg: 0.4\n", "  mass_kg: 0.4\n" * 2, ["mass_kg", "twice"]),
+    "a key that appears twice": ("  mass_kg: 0.4\n", "  mass_kg: 0.4\n" * 2, ["mass_kg", "twice"]),
     "a bracket that is not closed": ("size_mm: [130, 130, 130]", "size_mm: [130, 130, 130", []),
     "another schema version": ("schema_version: 1", "schema_version: 9", ["9", "1"]),
 }

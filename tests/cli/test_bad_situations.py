@@ -165,7 +165,7 @@ def test_a_read_only_folder_is_told_before_the_work(read_only: Path, verb: str) 
             timeout=60,
             check=False,
         )
-    one_message(Answer(done.returncode, done.stdout, done.stderr), 2, "you may write to")
+    one_message(Answer(done.returncode, done.stdout, done.stderr), 2, "write permission")
 
 
 # The bus and the drives.
@@ -200,7 +200,7 @@ def test_a_platform_that_stands_elsewhere_is_not_moved(folder: Path) -> None:
         folder,
         3,
         "not at the start of the plan",
-        "allowed 1.0 mm",
+        "limit 1.0 mm",
         "nothing was enabled",
         rig=RIG,
         fast=True,
@@ -298,9 +298,15 @@ def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
         ({"interface": "udp_multicast"}, ["no camera was named"]),
         ({"interface": "udp_multicast", "camera": "synthetic"}, ["synthetic"]),
         ({"camera": "0", "fast": True}, ["--camera 0", "--fast needs synthetic cameras"]),
-        ({"camera": "plan.json"}, ["'plan.json' is no camera", "while the platform moves"]),
-        ({"camera": "/nowhere/run.avi"}, ["'/nowhere/run.avi' is no camera", "/dev/video0"]),
-        ({"camera": "file:///tmp/run.avi"}, ["is no camera"]),
+        (
+            {"camera": "plan.json"},
+            ["'plan.json' is not a live camera source", "during the motion"],
+        ),
+        (
+            {"camera": "/nowhere/run.avi"},
+            ["'/nowhere/run.avi' is not a live camera source", "/dev/video0"],
+        ),
+        ({"camera": "file:///tmp/run.avi"}, ["is not a live camera source"]),
         ({"camera": "frnt=0"}, ["no camera 'frnt'", "name one of: front"]),
         ({"camera": "front"}, ["camera 'front' has no source", "write front=0"]),
         ({"camera": "front="}, ["camera 'front' has no source", "write front=0"]),
@@ -319,7 +325,7 @@ def test_wishes_that_contradict_each_other_are_told(
 @pytest.mark.parametrize(
     ("source", "code", "part"),
     [
-        ("no such thing", 2, "neither a folder of pictures"),
+        ("no such thing", 2, "not a folder of images"),
         ("77", 4, "camera front (77)"),
         ("empty", 2, "empty"),
         ("text.mp4", 2, "text.mp4"),

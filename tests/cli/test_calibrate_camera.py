@@ -42,8 +42,8 @@ def save(path: Path, image: np.ndarray) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fourteen good pictures in several formats, and files that are of no use."""
-    folder = tmp_path_factory.mktemp("my pictures")
+    """Fourteen good images in several formats, and files that are of no use."""
+    folder = tmp_path_factory.mktemp("my images")
     for k, image in enumerate(pictures(14, 0.09)):
         if k == 0:
             (folder / "turned.jpg").write_bytes(turned_by_exif(image))
@@ -91,12 +91,12 @@ def test_squares_told_too_small_do_not_make_a_result_good(folder) -> None:
     """All millimetres shrink with the squares, pixels do not."""
     answer = call("calibrate", "camera", folder, *BOARD, "--wanted-mm", "5", "--square-mm", "2")
     assert answer.code == 3, answer
-    assert "1 px is needed" in answer.said
+    assert "1 px is required" in answer.said
     assert "pass --distance-m" in answer.said
 
 
 def test_a_poor_set_with_small_errors_is_not_good_enough(tmp_path) -> None:
-    """Twelve sharp pictures, all nearly alike: the RMS is small and says nothing."""
+    """Twelve sharp images, all nearly alike: the RMS is small and says nothing."""
     rng = np.random.default_rng(1)
     base = poses_before_the_camera(MIDDLE, 1, spread=0.0)[0]
     for k in range(12):
@@ -110,7 +110,7 @@ def test_a_poor_set_with_small_errors_is_not_good_enough(tmp_path) -> None:
     found = json.loads(answer.out)
     assert found["rms_px"] < 0.1
     assert found["verdict"].startswith("not good enough")
-    assert "tilt the board up to 40° every way" in found["next_steps"]
+    assert "tilt the board up to 40° in every direction" in found["next_steps"]
     assert any("edges and corners" in step for step in found["next_steps"])
 
 
@@ -118,7 +118,7 @@ def test_one_picture_many_times_is_never_good_enough(tmp_path) -> None:
     for k, image in enumerate(pictures(1, 0.0) * 8):
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
-    one_message(answer, 2, "seen in 1 of 8 pictures", "1.png shows the same as 0.png")
+    one_message(answer, 2, "detected in 1 of 8 images", "1.png duplicates 0.png")
     assert "tilt" in answer.said
 
 
@@ -130,7 +130,7 @@ def test_a_board_of_another_number_of_corners_is_told(tmp_path) -> None:
 
 
 def test_a_wrong_size_of_squares_shows_in_the_distance_of_the_boards(folder) -> None:
-    """Pictures alone cannot tell it: the camera is the same, everything lies ten times as far."""
+    """Images alone cannot tell it: the camera is the same, everything lies ten times as far."""
     answer = call("calibrate", "camera", folder, *BOARD[:-1], "250", "--wanted-mm", "10")
     (line,) = (row for row in answer.out.splitlines() if "boards were" in row)
     near, far = line.split()[2], line.split()[4]
@@ -144,7 +144,7 @@ def test_a_wrong_size_of_squares_shows_in_the_distance_of_the_boards(folder) -> 
         ((*BOARD, "--name", "front/left"), "--name"),
         (("--square-mm", "25"), "needs --columns and --rows"),
         (("--columns", "9", "--rows", "6"), "needs --square-mm"),
-        ((*BOARD, "--tag-mm", "30"), "knows no --tag-mm"),
+        ((*BOARD, "--tag-mm", "30"), "does not take --tag-mm"),
         (("--columns", "2", "--rows", "5", "--square-mm", "25"), "3 inner corners"),
     ],
 )
@@ -160,4 +160,4 @@ def test_three_pictures_are_too_few(tmp_path) -> None:
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
     assert answer.code == 2
-    assert "seen in 3 of 3 pictures; 4 are the least" in answer.err
+    assert "detected in 3 of 3 images; 4 are required" in answer.err

@@ -40,8 +40,8 @@ def truth() -> Pose:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, truth: Pose) -> Path:
-    """Ten pictures, a file of the platform's poses, and files that are of no use."""
-    folder = tmp_path_factory.mktemp("rig pictures")
+    """Ten images, a file of the platform's poses, and files that are of no use."""
+    folder = tmp_path_factory.mktemp("rig images")
     rig = load_rig(RIG)
     scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())
     camera = SyntheticCamera(rig, scene, replace(rig.cameras[0], world_from_camera=truth), seed=5)
@@ -121,7 +121,7 @@ def test_the_pictures_of_another_camera_are_refused(short_plan: Path, tmp_path: 
     two.write_text(yaml.safe_dump(document))
     options = ("--poses", run, "--camera", "side")
     answer = call("calibrate", "extrinsics", two, run / "pictures", *options)
-    one_message(answer, 2, "camera 'side' took no pictures in this run", "front")
+    one_message(answer, 2, "camera 'side' took no images in this run", "front")
 
 
 @pytest.mark.parametrize("number", ["inf", "nan"])
@@ -158,7 +158,7 @@ def test_people_read_the_verdict_first(folder) -> None:
         (("--camera", "side"), "no camera 'side'"),
         (("--pictures", "2"), "--pictures is for a video or a camera"),
         (("--poses", "missing.csv"), "no such file"),
-        (("--calibration", RIG), "no calibration result"),
+        (("--calibration", RIG), "not a calibration result"),
     ],
 )
 def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: str) -> None:
@@ -170,12 +170,12 @@ def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: st
 def test_folders_that_cannot_be_used_are_told(folder, tmp_path) -> None:
     out = tmp_path / "out"
     answer = call("calibrate", "extrinsics", RIG, tmp_path / "nowhere", "-o", out)
-    one_message(answer, 2, "neither a folder of pictures")
+    one_message(answer, 2, "not a folder of images")
     assert not out.exists()
     (tmp_path / "small").mkdir()
     (tmp_path / "small" / "a.png").write_bytes((folder / "small.png").read_bytes())
     answer = call("calibrate", "extrinsics", RIG, tmp_path / "small")
-    one_message(answer, 2, "none of the 1 pictures has the camera's 1280 x 720 px", "320 x 240")
+    one_message(answer, 2, "none of the 1 images has the camera's 1280 x 720 px", "320 x 240")
     (tmp_path / "walls").mkdir()
     (tmp_path / "walls" / "a.png").write_bytes((folder / "wall.png").read_bytes())
     answer = call("calibrate", "extrinsics", RIG, tmp_path / "walls")

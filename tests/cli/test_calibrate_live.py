@@ -19,7 +19,7 @@ TURNS = ([0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0], [0.3, 0.3, 0.2])
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A board that is held at nine places, two pictures each, and tilted every way."""
+    """A board that is held at nine places, two images each, and tilted every way."""
     places = [(x, y) for x in (-0.11, 0.0, 0.11) for y in (-0.08, 0.0, 0.08)]
     held = [(*place, [0.0, 0.0, 0.0]) for place in places] + [(0.0, 0.0, turn) for turn in TURNS]
     path = tmp_path_factory.mktemp("live") / "board.avi"
@@ -44,7 +44,7 @@ def test_pictures_are_taken_with_advice_and_then_used(video: Path, tmp_path: Pat
     assert 10 <= len(taken) <= 14
     assert taken[0] == "live_001.png"
     assert found["pictures_used"] == len(taken)
-    assert "bring the board to the top right of the picture" in answer.err
+    assert "bring the board to the top right of the image" in answer.err
     assert "edge away from the camera" in answer.err
     assert "enough" in answer.err
 
@@ -53,15 +53,15 @@ def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None
     other = ("--board", "charuco", "--columns", "5", "--rows", "4", "--square-mm", "25")
     other += ("--marker-mm", "20")
     answer = call("calibrate", "camera", tmp_path / "taken", "--live", video, *other)
-    one_message(answer, 2, "no picture was taken", "a ChArUco board of 5 x 4 squares")
+    one_message(answer, 2, "no image was captured", "a ChArUco board of 5 x 4 squares")
 
 
 @pytest.mark.parametrize(
     ("options", "code", "named"),
     [
-        (("--live", "nowhere.avi"), 2, "neither a folder of pictures"),
+        (("--live", "nowhere.avi"), 2, "not a folder of images"),
         (("--live", "97"), 4, "the camera cannot be opened"),
-        (("--pictures", "12"), 2, "are for taking pictures"),
+        (("--pictures", "12"), 2, "are for capturing images"),
     ],
 )
 def test_cameras_that_are_none_are_told(tmp_path: Path, options, code: int, named: str) -> None:
@@ -74,7 +74,7 @@ def test_a_video_that_is_missing_leaves_no_folder_behind(tmp_path: Path) -> None
         answer = call(
             "calibrate", "camera", tmp_path / "taken", "--live", tmp_path / "no.mp4", *BOARD
         )
-    one_message(answer, 2, "neither a folder of pictures, nor a video file, nor a camera")
+    one_message(answer, 2, "not a folder of images, a video file or a camera")
 
 
 def test_pictures_of_before_are_not_mixed_with_new_ones(video: Path, tmp_path: Path) -> None:

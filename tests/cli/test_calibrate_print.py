@@ -48,7 +48,7 @@ def test_the_tags_of_a_rig_are_printed(tmp_path: Path) -> None:
         (("--columns", "9", "--rows", "6"), "needs --square-mm"),
         (
             ("--board", "tags", "--columns", "3", "--rows", "2", "--tag-mm", "40", "--gap-mm", "2"),
-            "less than a module",
+            "less than one module",
         ),
     ],
 )
@@ -70,7 +70,7 @@ def test_camera_and_print_know_boards_by_the_same_options() -> None:
 def test_a_print_is_named_as_what_it_is(tmp_path: Path) -> None:
     with nothing_written(tmp_path):
         answer = call("calibrate", "print", tmp_path / "board.txt", *BOARD)
-    one_message(answer, 2, "prints are PDF files", "name it board.pdf")
+    one_message(answer, 2, "the output must be a PDF file", "name it board.pdf")
 
 
 def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_a_result_and_its_report_are_written_and_applied(file: Path, tmp_path: P
 def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
     rig: Rig, tmp_path: Path
 ) -> None:
-    """Poses by the tracker, from pictures; the truth is the simulation's. Then a jog with it."""
+    """Poses by the tracker, from images; the truth is the simulation's. Then a jog with it."""
     folder = tmp_path / "calibration"
     done = call("calibrate", "rig", RIG, SESSION / "places.csv", "-o", folder, "--json")
     assert done.code == 0, done
@@ -71,7 +71,7 @@ def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
 
 
 def test_pictures_of_the_recorded_session_show_the_poses_in_its_table(tmp_path: Path) -> None:
-    """To the noise of a JPEG file; a table and pictures of different rigs would be far apart."""
+    """To the noise of a JPEG file; a table and images of different rigs would be far apart."""
     log = tmp_path / "poses.csv"
     assert call("track", RIG, SESSION / "pictures", "-o", log).code == 0
     tables = [
@@ -130,7 +130,7 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
 @pytest.mark.parametrize(
     ("how", "what"),
     [
-        ("few", "only 5 places"),
+        ("few", "only 5 stationary samples"),
         ("nan", "line 4, x_mm: 'nan' is not a finite number"),
         ("text", "line 6, actual_1_counts: 'lost' is not a finite number"),
         ("short", "line 5 has 22 values for 23 columns"),
@@ -138,7 +138,7 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
         ("time", "line 3: time_s does not rise"),
         ("quaternion", "line 3: the quaternion's length is"),
         ("more", "the rig has 8 cables, the file more"),
-        ("twice", "the column 'actual_1_counts' stands twice"),
+        ("twice", "the column 'actual_1_counts' appears twice"),
         ("empty", "the file holds no measurement"),
         ("deviation", "a standard deviation is not positive"),
     ],
@@ -156,7 +156,7 @@ def test_a_file_that_cannot_be_used_is_refused_with_its_place(
 def test_a_file_that_is_named_twice_is_refused(file: Path) -> None:
     done = call("calibrate", "rig", RIG, file, file.parent / ".." / file.parent.name / file.name)
     assert done.code == 2, done
-    assert "named twice" in done.err
+    assert "given twice" in done.err
 
 
 def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path) -> None:
@@ -182,13 +182,13 @@ def test_a_file_in_place_of_the_folder_is_told_with_a_next_step(file: Path) -> N
     other.write_text("mine")
     done = call("calibrate", "rig", RIG, file, "-o", other, "--json")
     assert done.code == 2, done
-    assert "name a folder, not a file" in json.loads(done.out)["next_step"]
+    assert "name a folder (not a file)" in json.loads(done.out)["next_step"]
 
 
 def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
     done = call("calibrate", "rig", RIG, finished_run, "--json")
     assert done.code == 2
-    assert "this run was made with other" in json.loads(done.out)["what"]
+    assert "this run was made with outlets" in json.loads(done.out)["what"]
 
 
 def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
@@ -205,7 +205,7 @@ def test_a_run_with_too_few_rests_is_told_so(finished_run: Path) -> None:
     done = call("calibrate", "rig", ROOT / "configs/gachon_8_6.yaml", finished_run, "--json")
     assert done.code == 2
     answer = json.loads(done.out)
-    assert "places at rest, 10 are needed" in answer["what"]
+    assert "stationary samples; 10 required" in answer["what"]
     assert "cdpr calibrate poses" in answer["next_step"]
 
 

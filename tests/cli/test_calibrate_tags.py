@@ -1,4 +1,4 @@
-"""`cdpr calibrate tags` on rendered pictures of a platform whose tags were glued by hand."""
+"""`cdpr calibrate tags` on rendered images of a platform whose tags were glued by hand."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_pictures_that_were_saved_anew_count_once(folder, tmp_path) -> None:
         if k < 6:
             cv2.imwrite(str(tmp_path / f"copy_{k}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
     found = json.loads(call("calibrate", "tags", RIG, tmp_path, "--json").out)
-    copies = {name: why for name, why in found["unused"].items() if "shows the same as" in why}
+    copies = {name: why for name, why in found["unused"].items() if "duplicates" in why}
     assert len(copies) == sum(f"{k}.png" in found["picture_errors_px"] for k in range(6))
 
 
@@ -126,7 +126,7 @@ def test_people_read_what_changed_against_the_rig_file(folder) -> None:
     assert answer.code == 3
     assert answer.out.splitlines()[1].split()[:4] == ["verdict", "not", "good", "enough:"]
     assert "moved" in answer.out
-    assert "broken.png is no picture that can be read" in answer.out
+    assert "broken.png is not a readable image" in answer.out
 
 
 @pytest.mark.parametrize(
@@ -146,4 +146,4 @@ def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: st
 def test_pictures_of_no_platform_are_told(folder, tmp_path) -> None:
     (tmp_path / "a.png").write_bytes((folder / "wall.png").read_bytes())
     answer = call("calibrate", "tags", RIG, tmp_path)
-    one_message(answer, 2, "none of the tag36h11 tags 301", "a.png shows none of the tags whole")
+    one_message(answer, 2, "none of the tag36h11 tags 301", "a.png shows no complete tag")

@@ -43,7 +43,7 @@ def test_results_about_another_camera_are_refused_by_name(tmp_path: Path, verb: 
 
 @pytest.mark.parametrize("good", [True, False])
 def test_a_result_that_is_not_good_enough_is_used_and_told(tmp_path: Path, good: bool) -> None:
-    why = "not good enough: few [pictures]"
+    why = "not good enough: few [images]"
     changes = {} if good else {"good_enough": False, "verdict": why}
     result = write_result(tmp_path, camera_result_of().model_copy(update=changes))
     answer = call("status", RIG, "--calibration", result)
@@ -53,7 +53,7 @@ def test_a_result_that_is_not_good_enough_is_used_and_told(tmp_path: Path, good:
 
 def test_a_file_that_is_no_result_is_refused(tmp_path: Path) -> None:
     answer = call("track", RIG, tmp_path, "-o", tmp_path / "a.csv", "--calibration", RIG)
-    one_message(answer, 2, "no calibration result", "gachon_8_6.yaml")
+    one_message(answer, 2, "not a calibration result", "gachon_8_6.yaml")
 
 
 def test_results_are_compared(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_applying_a_result_never_replaces_a_file(tmp_path: Path) -> None:
     new.write_text("mine", encoding="utf-8")
     with nothing_written(tmp_path):
         answer = call("calibrate", "apply", RIG, result, "-o", new)
-    one_message(answer, 2, "exists already", "never replaced")
+    one_message(answer, 2, "exists already", "never replaces")
     assert new.read_text(encoding="utf-8") == "mine"
 
 

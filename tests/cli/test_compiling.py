@@ -20,7 +20,7 @@ def test_the_edge_finder_is_compiled_before_processes_begin_unless_it_is_there(
     monkeypatch.setattr(edges, "load_kernels", lambda: loaded.append("edges"))
     kernels.ready_for_camera_processes(Terminal(quiet=True))
     assert loaded == ([] if is_there else ["edges"])
-    assert ("compiling the tags' edge finder" in capsys.readouterr().err) == (not is_there)
+    assert ("compiling the tag edge detector" in capsys.readouterr().err) == (not is_there)
 
 
 def test_a_simulated_platform_waits_for_its_code_before_a_drive_is_switched_on(

@@ -159,7 +159,7 @@ def test_locked_memory(limit: int, privileged: bool, good: bool) -> None:
 
 
 class FakeCapture:
-    """A camera of OpenCV with pictures of one size."""
+    """A camera of OpenCV with images of one size."""
 
     size = (720, 1280)
 
@@ -198,7 +198,7 @@ def test_a_camera_that_is_not_there_is_missing_and_one_not_named_is_not_tried() 
     assert (code, camera["good"]) == (4, False)
     code, camera = camera_answer()
     assert (code, camera["good"]) == (0, True)
-    assert "not tried" in camera["text"]
+    assert "not tested" in camera["text"]
 
 
 def test_a_camera_needs_the_rig_that_describes_it() -> None:

@@ -30,14 +30,14 @@ def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("options", "code", "part"),
     [
-        ((), 2, "how the platform's pose is known"),
-        (("--at-home", "--camera", "synthetic"), 2, "how the platform's pose is known"),
+        ((), 2, "state the platform pose"),
+        (("--at-home", "--camera", "synthetic"), 2, "state the platform pose"),
         (("--camera", "0"), 2, "--fast needs synthetic cameras"),
-        (("--camera", "run.avi"), 2, "'run.avi' is no camera"),
+        (("--camera", "run.avi"), 2, "'run.avi' is not a live camera source"),
         (("--camera", "side=0"), 2, "no camera 'side'"),
-        (("--camera", "front=0", "--camera", "front=1"), 2, "2 cameras are named, and one"),
-        (("--at-home", "--pose-mm", "0", "0", "445"), 2, "how the platform's pose is known"),
-        (("--at-home", "--as-rig-file"), 2, "how the platform's pose is known"),
+        (("--camera", "front=0", "--camera", "front=1"), 2, "2 cameras are given; only one"),
+        (("--at-home", "--pose-mm", "0", "0", "445"), 2, "state the platform pose"),
+        (("--at-home", "--as-rig-file"), 2, "state the platform pose"),
         (("--as-rig-file", "--tension-n", "7"), 2, "no effect here: --tension-n"),
         (("--as-rig-file", "--pictures", "9", "--fast"), 2, "no effect here: --pictures, --fast"),
         (("--pose-mm", "0", "0", "4450"), 2, "outside the workspace"),
@@ -139,14 +139,14 @@ def test_a_lost_reference_can_be_dropped_for_what_absolute_encoders_count(tmp_pa
     MotionInterlock(rig).file.write(
         as_in_the_file(rig).model_copy(update={"lost": "emergency stop"})
     )
-    with pytest.raises(Refused, match="no more referenced"):
+    with pytest.raises(Refused, match="homing reference is lost"):
         MotionInterlock(rig).require_ready()
     asked = call("home", RIG, "--as-rig-file", *bus, answers="n\n")
     assert asked.code == 130
-    assert "does not count: the drives are no more referenced: emergency stop" in asked.out
+    assert "not valid: the homing reference is lost: emergency stop" in asked.out
     assert MotionInterlock(rig).file.path.is_file()
     assert call("home", RIG, "--as-rig-file", *bus, "--yes").code == 0
     MotionInterlock(rig).require_ready()
     counting = tmp_path / "rig.yaml"
     counting.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
-    one_message(call("home", counting, "--as-rig-file", *bus, "--yes"), 3, "never referenced")
+    one_message(call("home", counting, "--as-rig-file", *bus, "--yes"), 3, "never homed")

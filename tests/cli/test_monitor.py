@@ -83,7 +83,7 @@ def test_everything_of_a_run_is_shown_as_it_is(shown: Any) -> None:
         *("holding", "gachon_8_6", "77", "runs/[first]", "10.0 of 58.3 mm", "0 % of 50 %"),
         *("late 0.06 ms, at most 0.20 ms", "following error – mm", "3 lost replies"),
         *("12", "operation enabled", "-4711", "-3", "20.50", "broken", "what [drives] told"),
-        "camera side (rtsp://x/[y]), 9.8 pictures/s, 5.3 ms, 2 tags, 3 of 12 with a pose, 4",
+        "camera side (rtsp://x/[y]), 9.8 images/s, 5.3 ms, 2 tags, 3 of 12 with a pose, 4",
         "4 dropped, gave no answer for 2 s",
     ):
         assert part.lower() in text.lower(), part
@@ -159,7 +159,7 @@ def _record(cycle: int) -> CycleRecord:
         ({"state": "finished"}, 0, "ended: finished"),
         ({"state": "stopped", "cause": "stop requested"}, 130, "ended: stopped, stop requested"),
         ({"state": "latched", "cause": "cable 6 is slack"}, 1, "latched, cable 6 is slack"),
-        ({}, 1, "without a last word; last seen holding"),
+        ({}, 1, "without a final status; last state holding"),
     ],
 )
 def test_the_monitor_ends_as_the_run_did(

@@ -30,7 +30,7 @@ def test_enter_for_every_question_makes_a_rig_that_can_be_planned_and_looked_at(
     rig = tmp_path / "my rig.yaml"
     answer = call("new", rig, answers="\n" * 50)
     assert answer.code == 0, answer
-    assert "next: read it, then cdpr doctor" in answer.out
+    assert "next: review it, then cdpr doctor" in answer.out
     assert load_rig(rig).cable_count == 8
     assert load_rig(rig).name == "my rig"
     assert call("doctor", rig).code == 0
@@ -65,7 +65,7 @@ def test_a_bad_answer_is_asked_again_with_the_reason(
     rig = tmp_path / "rig.yaml"
     answer = call("new", rig, answers="\n" * question + f"{bad}\n" + "\n" * 50)
     assert answer.code == 0, answer
-    assert answer.err.count("; once more") == 1
+    assert answer.err.count("; try again") == 1
     assert reason in answer.err
     load_rig(rig)
 
@@ -83,7 +83,7 @@ def test_answers_are_in_the_file(tmp_path: Path) -> None:
 def test_the_end_of_the_answers_writes_nothing(tmp_path: Path) -> None:
     with nothing_written(tmp_path):
         answer = call("new", tmp_path / "rig.yaml", answers="\n\n\n8\n1 2")
-    one_message(answer, 2, "the answers ended at the question about 'outlet of cable 1", "--from")
+    one_message(answer, 2, "no answer to the question about 'outlet of cable 1", "--from")
 
 
 def test_coordinates_from_a_table_ask_nothing(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def test_a_plan_that_was_made_for_calibrated_numbers_is_refused_with_that_as_a_r
     [
         ("latched", "socketcan", "cdpr reset RIG"),
         ("latched", "virtual", "run again into a new folder"),
-        ("finished", "socketcan", "see in the report"),
+        ("finished", "socketcan", "check the report"),
     ],
 )
 def test_a_run_that_failed_has_a_next_step_and_its_faults_explained(
@@ -84,7 +84,7 @@ def test_a_run_that_failed_has_a_next_step_and_its_faults_explained(
     lines = capsys.readouterr().out.splitlines()
     assert says in lines[-1]
     assert lines[-1].startswith("  next: ")
-    (explained,) = (commands_in(line)[0] for line in lines if "more about it" in line)
+    (explained,) = (commands_in(line)[0] for line in lines if "details" in line)
     assert call(*explained).out.strip() == page_text("drive_silent").strip()
 
 
@@ -96,7 +96,7 @@ def test_a_run_that_went_well_points_to_no_fault(
     events = [{"code": "pass"}, {"code": "reply_lost"}]
     summary = {"verdict": verdict, "sentence": "", "reasons": [], "events": events}
     show_summary(summary, Path("run"), as_json=False)
-    assert "more about it" not in capsys.readouterr().out
+    assert "details" not in capsys.readouterr().out
 
 
 STANDING: dict[str, Any] = {
@@ -118,20 +118,20 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
 
 
 def test_monitor_calls_itself_by_its_name() -> None:
-    with pytest.raises(Fault, match="no run of yours") as caught:
+    with pytest.raises(Fault, match="no active run") as caught:
         told("status", None, verb="monitor")
     assert caught.value.where == "cdpr monitor"
     assert "cdpr status" not in str(caught.value)
     answer = call("monitor", "--once")
     assert answer.code == 1
-    assert "cdpr monitor: no run of yours" in answer.err
+    assert "cdpr monitor: no active run" in answer.err
 
 
 def test_a_jig_has_no_uncertainty_of_nothing() -> None:
     homed = call("home", RIG, "--at-home", "--fast")
     assert homed.code == 0, homed
     assert "0.000" not in homed.out
-    assert "that of the jig, which was not measured" in homed.out
+    assert "that of the jig (not measured)" in homed.out
 
 
 def test_no_coordinate_is_a_negative_zero(short: Path, tmp_path: Path) -> None:

@@ -45,6 +45,7 @@ STEPS = (
     (0, "home configs/gachon_8_6.yaml --at-home --fast"),
     (0, "home configs/gachon_8_6.yaml --camera synthetic --fast --pictures 5"),
     (0, "jog --help"),
+    (0, "plan --help"),
     (0, "jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene SCENE --fast"),
     (0, "jog configs/gachon_8_6.yaml --to-home --no-scene --fast"),
     (1, "jog configs/gachon_8_6.yaml --cable 3 --mm -5 --fast"),  # it is taut, and says so

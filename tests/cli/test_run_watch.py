@@ -50,6 +50,6 @@ def test_too_little_clearance_stops_the_run(names: list[str], who: str) -> None:
     reason = board.read().for_what
     assert reason is not None
     assert reason.code == "clearance_low"
-    assert reason.text.startswith(f"{who} measured less clearance than the scene asks for: ")
+    assert reason.text.startswith(f"{who} measured less clearance than the scene requires: ")
     board, _ = watched(4, 10.0, *(Scripted(name, [0]) for name in names), clearance_stop=False)
     assert not board.read().stop

@@ -98,11 +98,11 @@ def test_compiling_is_told_where_it_does_not_disturb_json(
     scene = CONFIGS / "environment_1.yaml"
     planned = call("plan", RIG, scene, "-o", tmp_path / "plan.json", "--json")
     assert document(planned)["plan"] == str(tmp_path / "plan.json")
-    assert "compiling the planner for this machine, once" in planned.said
+    assert "compiling the planner for this machine (once" in planned.said
     assert noted == ["optimal"]
     monkeypatch.setattr(machine_code, "can_be_kept", lambda task: False)
     again = call("plan", RIG, scene, "-o", tmp_path / "second.json", "--json")
-    assert "every time anew" in again.said
+    assert "on every start" in again.said
     assert "NUMBA_CACHE_DIR" in again.said
 
 
@@ -120,7 +120,7 @@ def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
 def test_a_wish_that_reaches_no_run_is_no_success(verb: tuple[str, ...]) -> None:
     told = call(*verb)
     assert told.code == 1
-    assert "no run of yours is going on" in told.err
+    assert "no active run found" in told.err
     assert "emergency stop" in told.err
 
 
@@ -133,7 +133,7 @@ def test_a_stop_that_stops_nothing_is_no_success() -> None:
     """Who presses stop and sees something move must not read that all is well."""
     told = call("stop")
     assert told.code == 1
-    assert "no run of yours is going on" in told.err
+    assert "no active run found" in told.err
     assert "emergency stop" in told.err
     nobody = {"stopped_processes": [], "silent_processes": []}
     assert document(call("stop", "--json")) == nobody

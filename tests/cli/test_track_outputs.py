@@ -1,4 +1,4 @@
-"""`cdpr track`: pose log, clearance, MCAP, and pictures with what was measured in them."""
+"""`cdpr track`: pose log, clearance, MCAP, and images with what was measured in them."""
 
 from __future__ import annotations
 
@@ -88,7 +88,9 @@ def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), grey[:, ::-1])
     rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
     answer = call("track", rig, tmp_path, "-o", tmp_path / "poses.csv")
-    one_message(answer, 2, "a.png shows no tag of any known family; flipped over they are there")
+    one_message(
+        answer, 2, "a.png shows no tag of any known family; the expected tags appear mirrored"
+    )
 
 
 def test_tags_that_are_not_as_told_are_named_as_the_cause(tmp_path: Path) -> None:
@@ -121,7 +123,10 @@ def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("drawn.gif", "neither a folder nor a video"), ("there.avi", "it exists already")],
+    [
+        ("drawn.gif", "neither a folder nor a supported video"),
+        ("there.avi", "the file exists already"),
+    ],
 )
 def test_a_place_that_cannot_be_drawn_to_is_refused(
     plan: Path, tmp_path: Path, name: str, words: str

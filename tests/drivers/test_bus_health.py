@@ -53,7 +53,7 @@ def test_what_a_back_end_raises_gets_a_name(error: Exception, kind: type[BusFaul
     fault = bus_fault("the bus cannot be read", "bus can0", error)
     assert type(fault) is kind
     assert str(error) in fault.what
-    assert "stop by themselves" in fault.next_step
+    assert "stop on their own" in fault.next_step
 
 
 def test_an_error_number_may_be_in_the_cause() -> None:
@@ -221,7 +221,7 @@ class TestAnotherProgramWhileDrivesAreSetUp:
 def test_two_devices_with_one_node_id_are_told_before_anything_is_written(bench: Bench) -> None:
     send = bench.drives[4]._bus_send
     bench.drives[4]._bus_send = lambda i, d: (send(i, d), send(i, d))
-    with pytest.raises(Refused, match="drive 5 answers twice"):
+    with pytest.raises(Refused, match="drive 5 answered twice"):
         bench.group.configure()
     assert bench.drives[4].objects[0x6007, 0] == 1
 
@@ -233,7 +233,7 @@ def test_a_second_device_that_comes_later_is_a_fault(bench: Bench) -> None:
     for _ in range(4):
         bench.cycle()
     assert bench.group.state is GroupState.FAULT
-    assert any(node == 5 and "answers twice" in text for node, text in bench.status.faults)
+    assert any(node == 5 and "answered twice" in text for node, text in bench.status.faults)
 
 
 def test_an_answer_to_another_question_is_no_silence(bench: Bench) -> None:
@@ -244,7 +244,7 @@ def test_an_answer_to_another_question_is_no_silence(bench: Bench) -> None:
         send(can_id, wrong)
 
     bench.drives[1]._bus_send = another
-    with pytest.raises(Refused, match="drive 2 answers something else"):
+    with pytest.raises(Refused, match="drive 2 answered a different request"):
         bench.group.configure()
 
 

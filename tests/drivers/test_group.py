@@ -88,9 +88,9 @@ def test_set_up_is_read_back_and_reaches_the_drives(bench: Bench) -> None:
 
 
 def test_nothing_is_sent_before_configure(bench: Bench) -> None:
-    with pytest.raises(Refused, match="not set up"):
+    with pytest.raises(Refused, match="not configured"):
         bench.group.send_cycle([0] * 8)
-    with pytest.raises(Refused, match="not set up"):
+    with pytest.raises(Refused, match="not configured"):
         bench.group.command(GroupCommand.ENABLE)
     assert bench.control_words() == []
 
@@ -128,12 +128,12 @@ def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
 
     def not_kept(nodes: tuple[int, ...]) -> None:
         told.append(nodes)
-        raise Refused("the reference of the drives cannot be kept")
+        raise Refused("the homing reference cannot be written")
 
     bench.group.configure()
     bench.drives[4].power_on()
     for _ in range(2):
-        with pytest.raises(Refused, match="cannot be kept"):
+        with pytest.raises(Refused, match="cannot be written"):
             bench.group.configure(on_restarted=not_kept)
     assert told == [(5,), (5,)]
 
@@ -165,7 +165,7 @@ def test_every_object_that_is_not_kept_refuses_to_arm(bench: Bench) -> None:
         with pytest.raises(Refused) as caught:
             bench.group.configure()
         assert f"drive 6, object {key[0]:04X}h:{key[1]:02X}" in caught.value.where
-        assert "must hold" in caught.value.what
+        assert "is required" in caught.value.what
         assert bench.group.state is GroupState.OFFLINE
 
 
@@ -181,7 +181,7 @@ def test_every_object_that_is_refused_refuses_to_arm(bench: Bench) -> None:
 
 def test_a_node_that_is_no_servo_drive_is_refused(bench: Bench) -> None:
     bench.drives[1].objects[0x1000, 0] = 0x00020191  # an input/output module
-    with pytest.raises(Refused, match="drive holds") as caught:
+    with pytest.raises(Refused, match="drive has") as caught:
         bench.group.configure()
     assert "drive 2" in caught.value.where
 
@@ -372,7 +372,7 @@ def test_a_bus_that_fails_is_a_fault_of_ours(bench: Bench, monkeypatch: pytest.M
     monkeypatch.setattr(bench.group._bus, "recv", down)
     with pytest.raises(Fault, match="Network is down") as caught:
         bench.group.receive(0.0)
-    assert "stop by themselves" in caught.value.next_step
+    assert "stop on their own" in caught.value.next_step
 
 
 def test_another_master_on_the_bus_is_refused(bench: Bench) -> None:
@@ -414,7 +414,7 @@ def test_torque_that_goes_without_a_word_stops_the_others(bench: Bench) -> None:
     bench.drives[6].state = DriveState.SWITCH_ON_DISABLED
     for _ in range(2):
         bench.cycle()
-    assert bench.status.faults == ((7, "cable 7 (drive 7) stopped by itself: switch on disabled"),)
+    assert bench.status.faults == ((7, "cable 7 (drive 7) stopped on its own: switch on disabled"),)
     assert [d.state for d in bench.drives].count(HOLDING) == 7
 
 

@@ -95,12 +95,15 @@ def test_messages_lie_where_the_named_file_says(tmp_path: Path) -> None:
             TEXT.replace("Pos_Estimate : 0|32", "Pos_Estimate : 32|32", 1).replace(
                 "Vel_Estimate : 32|32", "Vel_Estimate : 0|32", 1
             ),
-            "Vel_Estimate is no number of whole bytes in order",
+            "Vel_Estimate is not a whole number of bytes in order",
         ),
-        (TEXT.replace("Axis_State : 32|8", "Axis_State : 33|7"), "Axis_State is no number"),
+        (
+            TEXT.replace("Axis_State : 32|8", "Axis_State : 33|7"),
+            "State is not a whole number",
+        ),
         (TEXT.replace("Axis0_Get_Torques: 8", "Axis0_Get_Torques: 4"), "its signals need 8"),
-        (TEXT.replace("(0.001,0)", f"({'9' * 399},0)"), "has steps of 999"),
-        (TEXT.replace("(0.001,0)", "(0,0)"), "has steps of 0"),
+        (TEXT.replace("(0.001,0)", f"({'9' * 399},0)"), "has a scale of 999"),
+        (TEXT.replace("(0.001,0)", "(0,0)"), "has a scale of 0"),
     ],
 )
 def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, words: str) -> None:
@@ -121,7 +124,7 @@ def test_without_cantools_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "cantools", None)
     for module in [name for name in sys.modules if name.startswith("cantools.")]:
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(BadInput, match="cantools is not installed") as caught:
+    with pytest.raises(BadInput, match="is not installed") as caught:
         read_layouts()
     assert "cdpr[odrive]" in caught.value.next_step
 
@@ -129,7 +132,7 @@ def test_without_cantools_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) ->
 def test_errors_and_states_are_told_in_words() -> None:
     assert "watchdog" in error_text(AxisError.WATCHDOG_TIMER_EXPIRED)
     both = error_text(0x2000 | AxisError.ESTOP_REQUESTED)
-    assert "motor too hot, emergency stop" in both
+    assert "motor over-temperature, emergency stop" in both
     assert "unknown error (error 00000080h)" in error_text(0x80)
     assert state_text(status_word(8, 0)) == "closed loop control"
     assert state_text(status_word(1, 0x20)) == "idle, in error"

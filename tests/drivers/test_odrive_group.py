@@ -143,7 +143,7 @@ def test_after_that_a_new_master_finds_them_idle_and_starts_from_where_they_are(
 
 
 FAULTS: dict[str, tuple[Callable[[OdriveBench], object], str, int]] = {
-    "axis error": (lambda b: b.drives[2].fail(0x2000), "(drive 3): motor too hot", 6),
+    "axis error": (lambda b: b.drives[2].fail(0x2000), "(drive 3): motor over-temperature", 6),
     "watchdog of one": (
         lambda b: b.drives[2].fail(AxisError.WATCHDOG_TIMER_EXPIRED),
         "(drive 3): watchdog",
@@ -151,20 +151,20 @@ FAULTS: dict[str, tuple[Callable[[OdriveBench], object], str, int]] = {
     ),
     "disarmed by another tool": (
         lambda b: b.drives[2]._disarm(0),
-        "(drive 3) was disarmed; its brake holds",
+        "(drive 3) disarmed itself; its brake holds",
         6,
     ),
     "no heartbeat": (
         lambda b: b.drives[2].silent.add("heartbeat"),
-        "(drive 3): its heartbeat is missing",
+        "(drive 3): heartbeat missing",
         18,
     ),
     "no torque": (
         lambda b: b.drives[2].silent.add("torques"),
-        "(drive 3) does not tell its torque",
+        "(drive 3) does not report its torque",
         7,
     ),
-    "no number": (
+    "not a number": (
         lambda b: setattr(b.drives[2].motor, "position", float("nan")),
         "(drive 3): its position is not a number",
         3,
@@ -274,14 +274,18 @@ REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]]
         Refused,
         "firmware 0.5.6 is too old",
     ),
-    "enabled already": (
+    "already enabled": (
         lambda b: setattr(b.drives[1], "state", AxisState.CLOSED_LOOP_CONTROL),
         Refused,
         "drive 2 is enabled already",
     ),
     "in fault": (lambda b: b.drives[1].fail(0x100), Refused, "supply over-voltage"),
-    "no supply": (lambda b: setattr(b.drives[1], "supply", 0.0), Refused, "drive 2 has no supply"),
-    "a twin": (_twin, Refused, "drive 4 answers twice"),
+    "no motor supply": (
+        lambda b: setattr(b.drives[1], "supply", 0.0),
+        Refused,
+        "drive 2 has no motor supply",
+    ),
+    "a twin": (_twin, Refused, "drive 4 answered twice"),
 }
 
 
@@ -324,7 +328,7 @@ def test_a_setting_that_is_not_kept_is_refused_with_drive_and_endpoint(tmp_path:
     file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
     with odrive_bench(odrive_rig(endpoints=str(file))) as bench:
         bench.drives[6].settings.stuck.add(200)
-        with pytest.raises(Refused, match=r"holds 0, it must hold 0\.1") as caught:
+        with pytest.raises(Refused, match=r"has 0; 0\.1 is required") as caught:
             bench.group.configure()
     assert caught.value.where == "drive 7, endpoint axis0.config.watchdog_timeout"
     assert "drives.watchdog_ms" in caught.value.why
@@ -357,7 +361,7 @@ def test_a_file_that_holds_no_endpoints_is_refused(tmp_path: Path, text: str) ->
     document: Any = odrive_rig().document.drives
     path = tmp_path / "endpoints.json"
     path.write_text(text)
-    with pytest.raises(BadInput, match=r"not the endpoints that are needed|not valid JSON|finite"):
+    with pytest.raises(BadInput, match=r"lacks required endpoints|not valid JSON|finite"):
         read_endpoints(path, document)
 
 
@@ -403,7 +407,7 @@ def with_counts(rig: Rig, counts_per_rev: int) -> Rig:
 
 def test_counts_that_a_float_cannot_tell_apart_are_refused() -> None:
     check_resolution(with_counts(odrive_rig(), 100_000))
-    with pytest.raises(BadInput, match="finer than an ODrive's set-point") as caught:
+    with pytest.raises(BadInput, match="an ODrive's set-point does not resolve") as caught:
         check_resolution(with_counts(odrive_rig(), 2_000_000))
     assert "counts_per_rev" in caught.value.next_step
 

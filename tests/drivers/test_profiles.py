@@ -228,7 +228,7 @@ def test_without_sync_monitoring_the_platform_goes_further(
     assert distance == pytest.approx(millimetres / 1000.0)
     require_stopping_room(theirs, distance)
     require_stopping_room(theirs, math.inf)
-    with pytest.raises(Refused, match="without the master"):
+    with pytest.raises(Refused, match="without its master"):
         require_stopping_room(theirs, 0.99 * distance)
 
 
@@ -267,7 +267,7 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
     [
         ('absent: ["6073h:00"]', "6072h:00"),
         ("abscent: []", "absent"),
-        ('absent: ["605Ah:00"]', "no run is safe"),
+        ('absent: ["605Ah:00"]', "required for a safe run"),
         ('absent: ["1006h:00"]', "heartbeat"),
         ('absent: ["6072h:00"]', "torque_limit"),
         ('warnings: ["31"]', "3180h"),

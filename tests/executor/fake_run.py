@@ -295,7 +295,7 @@ def _at(cycles: CycleTable, time: float) -> Array:
 
 
 def picture(position: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """A grey picture with a bright square where the platform is."""
+    """A grey image with a bright square where the platform is."""
     grey = np.tile(np.linspace(40, 120, 640, dtype=np.uint8), (360, 1))
     if np.isfinite(position).all():
         x, y = int(320 + 600 * position[0]), int(320 - 400 * position[2])

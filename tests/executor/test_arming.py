@@ -41,7 +41,7 @@ def test_drives_that_stop_together_and_hold_are_armed(drives: Capabilities) -> N
 @pytest.mark.parametrize(
     ("drives", "words"),
     [
-        (replace(SYNCED, sync=False), "one SYNC"),
+        (replace(SYNCED, sync=False), "common SYNC"),
         (replace(SYNCED, holds_on_comm_loss=False), "hold when the master is lost"),
         (replace(SYNCED, holds_on_quick_stop=False), "hold after a quick stop"),
         (replace(SYNCED, max_hz=99.0), "keep up with a cycle of 10 ms"),

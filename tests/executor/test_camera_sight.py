@@ -10,7 +10,7 @@ from executor.cameras.client import BLIND_PICTURES, SILENCE, CameraHealth
 
 
 def looked(seen: list[bool]) -> list[str]:
-    """What is told after each picture, ten a second, each answered at once."""
+    """What is told after each image, ten a second, each answered at once."""
     sight, told = CameraHealth(), []
     for frame, pose in enumerate(seen):
         sight.ask(frame / 10)
@@ -29,7 +29,7 @@ def test_it_is_in_trouble_exactly_while_the_last_pictures_gave_no_pose(seen: lis
 def test_a_camera_that_saw_once_and_then_loses_the_tags_is_told() -> None:
     told = looked([True] + [False] * BLIND_PICTURES)
     assert not any(told[:-1])
-    assert "gave no pose in 10 pictures in a row" in told[-1]
+    assert "gave no pose in 10 images in a row" in told[-1]
 
 
 @pytest.mark.parametrize("blind", [False, True])
@@ -39,7 +39,7 @@ def test_a_camera_that_hangs_is_told_until_it_answers(blind: bool) -> None:
         sight.answer(not blind)
     sight.ask(100.0)
     assert "no answer" not in sight.trouble(100.0 + SILENCE)
-    assert "no answer for 2 s" in sight.trouble(100.001 + SILENCE)
+    assert "did not answer for 2 s" in sight.trouble(100.001 + SILENCE)
     sight.answer(not blind)
     assert "no answer" not in sight.trouble(200.0)
     assert bool(sight.trouble(200.0)) is blind

@@ -180,10 +180,10 @@ def test_a_run_that_ends_is_told_apart_from_one_that_hangs(monkeypatch):
     ("said", "what"),
     [
         (b"no json\n", "cannot be read"),
-        (b"[]\n", "says nothing"),
-        (b'{"ok": false}\n', "says nothing"),
+        (b"[]\n", "answer is empty"),
+        (b'{"ok": false}\n', "answer is empty"),
         (b'{"ok": false, "what": "not a command: no"}\n', "not a command: no"),
-        (b'{"status": 3}\n', "says nothing"),
+        (b'{"status": 3}\n', "answer is empty"),
     ],
 )
 def test_a_run_that_refuses_is_quoted(said, what):
@@ -229,9 +229,9 @@ def test_which_run_is_meant_must_be_clear():
         assert the_one([one, other], 8, "hold") is other
         with pytest.raises(BadInput, match="2 runs"):
             the_one([one, other], None, "hold")
-        with pytest.raises(BadInput, match="process 9 is no run"):
+        with pytest.raises(BadInput, match="process 9 is not a run"):
             the_one([one, other], 9, "hold")
-        with pytest.raises(Fault, match="no run of yours"):
+        with pytest.raises(Fault, match="no active run"):
             the_one([], None, "hold")
 
 

@@ -122,7 +122,7 @@ def full_at(size: int, folder: RunFolder) -> RecordWriter:
 
 def test_a_full_disk_is_a_fault_and_leaves_whole_lines(folder: RunFolder) -> None:
     writer = full_at(1003, folder)
-    with pytest.raises(CdprError, match="cannot be written to"):
+    with pytest.raises(CdprError, match="cannot be written"):
         writer.take_event(RunEvent(4.5, "stop", "stop requested"))
     rows = recorded(folder)
     assert rows == list(range(len(rows)))
@@ -134,7 +134,7 @@ def test_a_folder_that_is_gone_is_a_fault(folder: RunFolder) -> None:
     writer = RecordWriter(folder, log, own_thread=False)
     folder.discard()
     log.count = 1
-    with pytest.raises(Fault, match="cannot be written to"):
+    with pytest.raises(Fault, match="cannot be written"):
         writer.take_cycles(0.0)
 
 

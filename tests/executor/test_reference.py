@@ -51,7 +51,7 @@ def test_without_one_only_absolute_encoders_move() -> None:
     MotionInterlock(rig_with("absolute")).require_ready()
     for ask in (MotionInterlock(rig_with("incremental")).reference, MotionInterlock(
         rig_with("incremental")).require_ready):  # fmt: skip
-        with pytest.raises(Refused, match=r"referenced: cable 1 \(drive 1\), cable 2 ") as caught:
+        with pytest.raises(Refused, match=r"homed: cable 1 \(drive 1\), cable 2 ") as caught:
             ask()
         assert "cdpr home" in caught.value.next_step
 
@@ -61,7 +61,7 @@ def test_it_counts_for_its_rig_file_alone() -> None:
     MotionInterlock(rig).file.write(reference_of(rig))
     with pytest.raises(Refused, match="another rig file"):
         MotionInterlock(rig_with("incremental", drum_mm_per_rev=200.0)).reference()
-    with pytest.raises(Refused, match="another reference"):
+    with pytest.raises(Refused, match="different homing reference"):
         MotionInterlock(rig).require_ready()
     MotionInterlock(MotionInterlock(rig).referenced_rig()).require_ready()
 
@@ -76,7 +76,7 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
     custody.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
     custody.prevented()  # as a reset releases the latch
     for ask in (custody.reference, custody.require_ready):
-        with pytest.raises(Refused, match="no more referenced") as caught:
+        with pytest.raises(Refused, match="homing reference is lost") as caught:
             ask()
         assert "emergency stop" in caught.value.why
     MotionInterlock(rig).file.write(reference_of(rig))
@@ -113,7 +113,7 @@ def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
 
 
 def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
-    """Setting them up wipes out what tells of it, so the next opening sees nothing any more."""
+    """Setting them up wipes out its evidence, so the next opening sees nothing any more."""
     rig = rig_with("incremental")
     custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
@@ -121,9 +121,9 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     assert custody.reference() is not None
     custody.found_restarted((4,))
     for ask in (custody.reference, custody.reference, custody.require_ready):
-        with pytest.raises(Refused, match="no more referenced") as caught:
+        with pytest.raises(Refused, match="homing reference is lost") as caught:
             ask()
-        assert "cable 4 (drive 4): switched on" in caught.value.why
+        assert "cable 4 (drive 4): power-cycled" in caught.value.why
     found = custody.kept_reference()
     assert found is not None
     assert custody.still_counts(found.stands_at) is None
@@ -142,12 +142,12 @@ def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) 
     rig = rig_with("incremental")
     custody = MotionInterlock(rig)
     custody.file.write(reference_of(rig))
-    custody.begin(Path("run"), reference_of(rig), anew=True)
+    custody.begin(Path("run"), reference_of(rig), rehome=True)
     custody.end(ended, "stopped", Path("run"), holding=True, stands_at=range(8))
     custody.prevented()
-    with pytest.raises(Refused, match="no more referenced") as caught:
+    with pytest.raises(Refused, match="homing reference is lost") as caught:
         custody.reference()
-    assert "did not come to its end" in caught.value.why
+    assert "did not finish" in caught.value.why
 
 
 def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
@@ -159,12 +159,12 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
     custody.begin(Path("run"), reference_of(rig))
 
     def full(_reference: object) -> None:
-        raise Refused("the reference of the drives cannot be kept")
+        raise Refused("the homing reference cannot be written")
 
     monkeypatch.setattr(custody.file, "write", full)
-    with pytest.raises(Refused, match="cannot be kept"):
+    with pytest.raises(Refused, match="cannot be written"):
         custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
-    with pytest.raises(Refused, match=r"latched.*cannot be kept"):
+    with pytest.raises(Refused, match=r"latched.*cannot be written"):
         custody.require_free()
 
 
@@ -188,7 +188,7 @@ def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
         custody.reference()
     # Homing replaces it; what was moved meanwhile must not stumble over it.
     custody.found_restarted((1,))
-    custody.begin(Path("run"), custody.still_counts(range(8)), anew=True)
+    custody.begin(Path("run"), custody.still_counts(range(8)), rehome=True)
     custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
     assert custody.file.path.read_text() == content
     custody.file.write(reference_of(rig))
@@ -205,9 +205,9 @@ def test_a_drive_that_was_switched_on_again_or_moved_by_hand_is_found_out() -> N
     rig = rig_with("incremental")
     reference = reference_of(rig)
     require_still_referenced(rig, reference, (), positions_at(rig, 0.9))
-    with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it stands 1\.1 mm"):
+    with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it is 1\.1 mm"):
         require_still_referenced(rig, reference, (), positions_at(rig, 1.1))
-    with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it was switched on"):
+    with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it was power-cycled"):
         require_still_referenced(rig, reference, (4,), positions_at(rig))
     absolute = rig_with("absolute")
     require_still_referenced(absolute, reference, (4,), positions_at(absolute, 50.0))

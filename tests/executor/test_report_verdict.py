@@ -236,12 +236,12 @@ def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRu
     count = len(run.poses)
     blind = replace(
         run.poses,
-        status=("no tags in the picture",) * count,
+        status=("no tags in the image",) * count,
         position=np.full((count, 3), np.nan),
     )
     made = replace(run, poses=blind).summary
     assert made["verdict"] == "FAILED"
-    assert f"None of {count} pictures gave a pose: no tags in the picture." in made["reasons"]
+    assert f"None of {count} images gave a pose: no tags in the image." in made["reasons"]
 
 
 def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:

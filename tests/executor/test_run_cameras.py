@@ -120,7 +120,7 @@ def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(5):
         run.trigger(k / RATE, k / RATE, None, None)
-    assert "the scene asks for 10000 mm" in run.near
+    assert "the scene requires 10000 mm" in run.near
 
 
 def test_pictures_of_both_make_a_better_pose() -> None:
@@ -137,7 +137,7 @@ def test_cameras_that_disagree_are_told_once_and_clearance_is_not_measured() -> 
     run, told = run_of(25, Scripted("front", [0]), Scripted("side", [0], shift=0.02))
     assert told == [
         f"cameras front and side disagree by 20.0 mm, {BLIND_PICTURES} times in a row;"
-        " clearance is not measured together, only watched by each alone"
+        " fused clearance is not measured, each camera monitors it alone"
     ]
     assert all(look.clearance is None for look in run.finish(never).together)
 
@@ -164,7 +164,7 @@ def test_of_cameras_that_disagree_one_that_sees_too_little_clearance_is_enough(w
         run.trigger(k / RATE, k / RATE, None, None)
         told.append(run.near)
     assert not any(told[:2])
-    assert f"as camera {sees} alone sees it" in run.near
+    assert f"measured by camera {sees} alone" in run.near
     assert all(look.clearance is None for look in run.finish(never).together)
 
 
@@ -188,8 +188,8 @@ def test_moments_in_which_cameras_were_not_taken_together_are_counted_and_told()
     run.finish(never)
     told += [news.text for news in run.news()]
     assert told == [
-        "in 10 of 10 moments not all cameras were taken together: pictures were taken more than"
-        " 50 ms apart from the others"
+        "at 10 of 10 times not all cameras were used: images were taken more than 50 ms from"
+        " the others"
     ]
 
 
@@ -210,7 +210,7 @@ def test_at_the_end_all_that_hang_are_waited_for_together_and_a_stop_cuts_it_sho
     seen = run.finish(stopped)
     longest = {None: PATIENCE, 0: HURRY, 100: 100 * ROUND}[stops]
     assert sum(camera.waited for camera in hanging) == pytest.approx(longest, abs=2 * ROUND)
-    assert [c.failed for c in seen.cameras] == ["no answer any more from 0.00 s on"] * 3 + [""]
+    assert [c.failed for c in seen.cameras] == ["no answer since 0.00 s"] * 3 + [""]
     assert seen.cameras[-1].poses == 3
 
 
@@ -290,7 +290,7 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
     front, side = seen.cameras
     assert front.poses == front.pictures > 20
     assert side.poses == side.pictures - 1 >= 3
-    assert side.failed.startswith("no answer any more from")
+    assert side.failed.startswith("no answer since")
     assert [n.code for n in run.news()] == ["camera"]
     assert not [c for c in multiprocessing.active_children() if c.name.startswith("cdpr-camera")]
 

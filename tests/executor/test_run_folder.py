@@ -70,7 +70,7 @@ def test_folders_above_a_run_are_made(tmp_path: Path) -> None:
 
 def test_a_file_that_cannot_hold_a_folder_is_bad_input(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(BadInput, match="cannot be made"):
+    with pytest.raises(BadInput, match="cannot be created"):
         RunFolder.create(tmp_path / "file" / "run")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
@@ -82,7 +82,7 @@ def test_nothing_half_made_is_left_when_the_disk_is_full(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "touch", full)
-    with pytest.raises(BadInput, match="cannot be made"):
+    with pytest.raises(BadInput, match="cannot be created"):
         RunFolder.create(tmp_path / "run")
     assert not list(tmp_path.iterdir())
 

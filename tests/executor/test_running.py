@@ -209,7 +209,7 @@ def test_a_folder_that_others_control_is_not_used_while_there_is_another(
 def test_a_run_that_no_stop_could_reach_is_refused(folders, tmp_path, monkeypatch, how):
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     _spoil(folders[1], how, tmp_path, monkeypatch)
-    with pytest.raises(Refused, match="could not reach this run") as caught, announced():
+    with pytest.raises(Refused, match="would not reach this run") as caught, announced():
         pass
     assert str(folders[1]) in caught.value.where
 

@@ -252,7 +252,7 @@ def test_a_winch_that_would_run_too_fast_is_refused_by_name(name, share, wrong):
     counts = table.counts.copy()
     counts[20:, 2] += np.copysign(step, here) - here
     what = _refused(name, replace(table, counts=counts))
-    assert ("cable 3 would run at" in what) is wrong
+    assert ("cable 3 would move at" in what) is wrong
 
 
 @names
@@ -284,7 +284,7 @@ def test_tensions_outside_the_rigs_limits_are_refused(name):
     for bound in (rig.min_tension - 0.01, rig.max_tension + 0.01):
         tensions = table.tensions.copy()
         tensions[4, 1] = bound
-        assert "planned tensions run" in _refused(name, replace(table, tensions=tensions))
+        assert "planned tensions range" in _refused(name, replace(table, tensions=tensions))
 
 
 def test_a_table_of_another_shape_is_refused():
@@ -301,7 +301,7 @@ def test_everything_that_is_wrong_is_told_at_once():
     tensions[0, 0] = 200.0
     what = _refused("gachon_8_6", replace(table, tensions=tensions))
     assert "the start of the table" in what
-    assert "planned tensions run" in what
+    assert "planned tensions range" in what
 
 
 def test_a_curve_that_fails_the_independent_check_is_refused():

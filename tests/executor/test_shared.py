@@ -230,7 +230,7 @@ def test_a_supervisor_that_says_nothing_for_too_long_is_lost_until_it_is_heard_a
 def test_a_supervisor_that_is_gone_is_noticed_at_once(board, clock):
     other = Supervised(board.memory, os.getpid())  # not this process's parent
     board.beat()
-    assert "is gone" in other.read().lost
+    assert "has ended" in other.read().lost
 
 
 @pytest.mark.parametrize("text", ["the disk is full", "ü" * 1000])

@@ -161,16 +161,16 @@ def test_a_dwell_that_is_too_short_is_refused() -> None:
     longer = [s.model_copy() for s in scene.document.stops]
     longer[0] = longer[0].model_copy(update={"dwell_s": 0.52})
     what = _refused(table, scene.changed(stops=longer))
-    assert "stands for 0.5 s, asked are 0.52 s" in what
+    assert "rests for 0.5 s, required 0.52 s" in what
 
 
 @pytest.mark.parametrize(
     ("stands", "words"),
     [
-        ((), "stands at 0 stops, the scene has 3"),
-        ((Dwell(60, 50), Dwell(90, 90), Dwell(90, 95)), "in no order"),
-        ((Dwell(20, 50), Dwell(40, 90), Dwell(90, 95)), "in no order"),
-        ((Dwell(20, 50), Dwell(60, 90), Dwell(90, 10**6)), "in no order"),
+        ((), "rests at 0 stops, the scene has 3"),
+        ((Dwell(60, 50), Dwell(90, 90), Dwell(90, 95)), "out of order"),
+        ((Dwell(20, 50), Dwell(40, 90), Dwell(90, 95)), "out of order"),
+        ((Dwell(20, 50), Dwell(60, 90), Dwell(90, 10**6)), "out of order"),
     ],
 )
 def test_stands_that_are_none_are_refused(stands: tuple[Dwell, ...], words: str) -> None:
@@ -181,7 +181,7 @@ def test_stops_are_announced_once_when_they_are_reached_and_left() -> None:
     _, scene, table = _made()
     told, take = stop_events(scene, table.stands), table.stands[0]
     assert told.due(take.first - 0.5) == []
-    text = "at stop 'take', standing still for 0.5 s while 2 kg is picked up"
+    text = "at stop 'take', resting for 0.5 s while 2 kg is picked up"
     assert told.due(float(take.first)) == [("pick", text)]
     assert told.due(take.last - 0.5) == []
     codes = [code for code, _ in told.due(float(len(table)))]

@@ -61,5 +61,5 @@ def test_positions_of_a_drive_that_lost_its_reference_fit_no_pose(cable):
 
 def test_a_pose_outside_the_workspace_is_refused():
     outside = Pose.level(PAPER.workspace_upper + np.array([0.005, 0.0, -0.1]))
-    with pytest.raises(CdprError, match="fit no pose of the workspace"):
+    with pytest.raises(CdprError, match="fit no pose in the workspace"):
         standing_pose(PAPER, planned_counts(PAPER, outside), LOAD)

@@ -151,7 +151,7 @@ def test_a_file_too_large_is_not_read(size: int, readable: bool) -> None:
     if readable:
         assert len(read_state_file(_latched())) == size
     else:
-        with pytest.raises(Refused, match="more than 65536 bytes"):
+        with pytest.raises(Refused, match="larger than 65536 bytes"):
             read_state_file(_latched())
     latched = FaultLatch(BUS).read()
     assert latched is not None

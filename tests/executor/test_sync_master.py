@@ -150,7 +150,7 @@ def test_the_cycle_goes_on_until_the_word_is_heard() -> None:
 def test_a_drive_that_falls_silent_before_the_word_is_named() -> None:
     master, group, _ = made()
     group.missing[4] = True
-    with pytest.raises(HardwareMissing, match=r"cable 5 \(drive 5\) fell silent before") as caught:
+    with pytest.raises(HardwareMissing, match=r"cable 5 \(drive 5\) stopped answering") as caught:
         master.keep_until(lambda: None)
     assert len(group.sent) == 2
     assert caught.value.where == "arming"

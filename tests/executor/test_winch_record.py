@@ -47,6 +47,6 @@ def test_nothing_is_left_of_what_did_not_move(tmp_path: Path) -> None:
         kept.take_event(LoopEvent(0, 1.0, "stop", "stop requested"))
     assert not (tmp_path / "home").exists()
     (tmp_path / "home").mkdir()
-    with pytest.raises(BadInput, match="cannot be made"), recording(tmp_path / "home"):
+    with pytest.raises(BadInput, match="cannot be written"), recording(tmp_path / "home"):
         pytest.fail("it would write into another's folder")
     assert (tmp_path / "home").exists()

@@ -94,7 +94,7 @@ def enabling_words(frames: list[Frame], since: float) -> int:
 
 
 def assert_restart_moves_nothing(rig: Rig, trace: Path) -> None:
-    """The fault is latched: a new run is refused, and no drive is told to follow anything."""
+    """The fault is latched: a new run is refused, and no drive is commanded to follow anything."""
     held, before = rig.positions(), last_sync(read_trace(trace))
     again = rig.run("again")
     assert again.ended() == 3, again.said.read_text()

@@ -123,4 +123,4 @@ def test_a_folder_that_may_not_be_written_is_told(
     with pytest.raises(BadInput, match="cannot be written") as caught:
         write_atomic(tmp_path / "file.json", "new")
     assert caught.value.why == "Permission denied"
-    assert "may write to" in caught.value.next_step
+    assert "write permission" in caught.value.next_step

@@ -20,13 +20,13 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def test_a_device_is_refused_without_reading_it() -> None:
-    with pytest.raises(BadInput, match="no plain file"):
+    with pytest.raises(BadInput, match="not a regular file"):
         read_text(Path("/dev/zero"))
 
 
 def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(BadInput, match="no plain file"):
+    with pytest.raises(BadInput, match="not a regular file"):
         read_text(tmp_path / "pipe")
 
 
@@ -56,7 +56,7 @@ def test_a_path_that_can_be_none_is_refused(tmp_path: Path, name: str) -> None:
     ],
 )
 def test_json_that_no_program_of_ours_writes_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"nested|twice|finite|no number|digits|Expecting"):
+    with pytest.raises(ValueError, match=r"nested|twice|finite|not a number|digits|Expecting"):
         parse_json(text)
 
 

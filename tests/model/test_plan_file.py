@@ -260,7 +260,7 @@ def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
     """Another program might read the first one."""
     text = json.dumps(DATA)
     text = text.replace('"seed": 1', '"seed": 2, "seed": 1')
-    assert "'seed' stands twice" in refused(text, tmp_path).what
+    assert "'seed' appears twice" in refused(text, tmp_path).what
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def test_a_folder_is_no_plan_and_no_place_for_one(tmp_path: Path) -> None:
 def test_a_missing_folder_is_told(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="cannot be written") as caught:
         save_plan(DOCUMENT, tmp_path / "nowhere" / "plan.json")
-    assert "folder that exists" in caught.value.next_step
+    assert "existing folder" in caught.value.next_step
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -144,7 +144,7 @@ def test_pulleys_are_checked(
 def test_two_cameras_of_one_name_are_told(tmp_path: Path) -> None:
     start = PAPER.index("  - name: front")
     [(_, _, key, what)] = problems_in(PAPER + PAPER[start:], tmp_path)
-    assert (key, what) == ("cameras[1].name", "camera name 'front' stands twice")
+    assert (key, what) == ("cameras[1].name", "camera name 'front' appears twice")
 
 
 def test_five_cables_are_too_few(tmp_path: Path) -> None:
@@ -324,7 +324,7 @@ def test_a_document_whose_parts_disagree_makes_no_rig() -> None:
     data = paper_data()
     data["anchors_mm"].pop()
     data["winches"][1]["node_id"] = 1
-    with pytest.raises(BadInput, match=r"7 anchors for 8 outlets.*; .*node_id 1 stands twice"):
+    with pytest.raises(BadInput, match=r"7 anchors for 8 outlets.*; .*node_id 1 appears twice"):
         rig_from_document(RigDocument.model_validate(data))
 
 

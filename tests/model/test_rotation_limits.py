@@ -66,8 +66,8 @@ def test_what_is_exceeded_is_told_with_figures() -> None:
     tipped = turned(Rotation.from_euler("y", 12, degrees=True))
     spun = turned(Rotation.from_euler("z", -45, degrees=True))
     for pose, sentence in (
-        (tipped, "tilted by 12 deg, where rotation_limits allow 10 deg"),
-        (spun, "turned by 45 deg, where rotation_limits allow 30 deg"),
+        (tipped, "tilted by 12 deg, rotation_limits allow 10 deg"),
+        (spun, "turned by 45 deg, rotation_limits allow 30 deg"),
     ):
         excess = limits.excess(level, pose)
         assert excess is not None

@@ -82,7 +82,7 @@ def problems_with(obstacles: list[dict[str, Any]], tmp_path: Path) -> list[tuple
         (
             {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1, 1]]}},
             "obstacles[0].mesh.triangles[0]",
-            "[0, 1, 1] names one point twice",
+            "[0, 1, 1] names a point twice",
         ),
         (
             {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1]]}},
@@ -128,7 +128,7 @@ def test_two_obstacles_of_one_name_are_told_beside_other_problems(tmp_path: Path
         tmp_path,
     )
     assert dict(found) == {
-        "obstacles[1].name": "obstacle name 'a' stands twice",
+        "obstacles[1].name": "obstacle name 'a' appears twice",
         "obstacles[1].box.size_mm": "needs 3 entries, it has 1",
         "obstacles[2]": "obstacle 'b' needs exactly one shape: one of box, sphere, cylinder, "
         "capsule, convex, mesh",

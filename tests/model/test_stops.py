@@ -38,18 +38,18 @@ def problems(stops: list[dict[str, Any]], path: Path, **parts: Any) -> dict[str,
 @pytest.mark.parametrize(
     ("stops", "key", "words"),
     [
-        ([stop("a"), stop("a")], "stops[1].name", "'a' stands twice"),
+        ([stop("a"), stop("a")], "stops[1].name", "'a' appears twice"),
         ([stop("")], "stops[0].name", "must not be empty"),
         ([stop("a", kind="grasp")], "stops[0].kind", "must be 'pass', 'pick' or 'place'"),
         ([stop("a", dwell_s=-1.0)], "stops[0].dwell_s", "must be 0 or more"),
-        ([stop("a", mass_kg=1.0)], "stops[0].mass_kg", "changes no load"),
+        ([stop("a", mass_kg=1.0)], "stops[0].mass_kg", "does not change the load"),
         ([stop("a", kind="pick", dwell_s=1.0)], "stops[0]", "needs mass_kg"),
         ([stop("a", kind="pick", mass_kg=1.0)], "stops[0]", "needs a dwell_s above 0"),
         ([stop("a", **PICK | {"mass_kg": 0.0})], "stops[0].mass_kg", "must be more than 0"),
         (
             [stop("a", **PICK), stop("b", kind="place", dwell_s=1.0, mass_kg=0.6)],
             "stops[1].mass_kg",
-            "place 'b' puts down 0.6 kg, but 0.5 kg are carried then",
+            "place 'b' puts down 0.6 kg, but only 0.5 kg are carried",
         ),
         (
             [
@@ -57,7 +57,7 @@ def problems(stops: list[dict[str, Any]], path: Path, **parts: Any) -> dict[str,
                 stop("b", **PICK | {"kind": "place", "mass_centre_mm": [5.0, 0.0, 0.0]}),
             ],
             "stops[1].mass_kg",
-            "all that is carried, and its centre is at [0, 0, 0] mm",
+            "the whole payload, whose centre is at [0, 0, 0] mm",
         ),
         ([{"name": "a"}], "stops[0].position_mm", "this key is missing"),
         ([stop("a", payload_kg=1.0)], "stops[0].payload_kg", "unknown key 'payload_kg'"),
@@ -142,7 +142,7 @@ def test_a_scene_without_stops_is_its_only_leg() -> None:
 def test_a_payload_that_does_not_fit_the_stops_is_refused() -> None:
     scene = load_scene(CONFIGS / "pick_and_place.yaml")
     later = scene.document.stops[2:]
-    with pytest.raises(BadInput, match=r"'shelf' puts down 1\.2 kg, but 0 kg are carried"):
+    with pytest.raises(BadInput, match=r"'shelf' puts down 1\.2 kg, but only 0 kg are carried"):
         scene.changed(stops=later)
     changed = scene.changed(stops=later, payload=Payload(1.2, (0.0, 0.0, -80.0)))
     assert len(changed.stops) == 3
@@ -151,11 +151,11 @@ def test_a_payload_that_does_not_fit_the_stops_is_refused() -> None:
 @pytest.mark.parametrize(
     ("marks", "words"),
     [
-        ([], "marks the stops [], its scene has ['a']"),
-        ([("b", 1)], "marks the stops ['b'], its scene has ['a']"),
+        ([], "marks the stops []; its scene has ['a']"),
+        ([("b", 1)], "marks the stops ['b']; its scene has ['a']"),
         ([("a", 0)], "marks the waypoints [0] of 3 as stops"),
         ([("a", 3)], "marks the waypoints [3] of 3 as stops"),
-        ([("a", 1)], "passes a stop 1 mm off"),
+        ([("a", 1)], "misses a stop by 1 mm"),
     ],
 )
 def test_a_plan_whose_marks_are_not_the_scenes_stops_is_refused(

@@ -38,10 +38,10 @@ def test_the_papers_planners_have_their_own_cost_and_variant() -> None:
     ("options", "named"),
     [
         ({"planner": "best"}, "unknown planner 'best'"),
-        ({"cost": "time"}, "'time' is no objective"),
-        ({"weight": {"time": 1.0}}, "'time' is no objective"),
+        ({"cost": "time"}, "'time' is not an objective"),
+        ({"weight": {"time": 1.0}}, "'time' is not an objective"),
         ({"weight": ["length=1", "length=2"]}, "twice"),
-        ({"weight": ["length=1"], "cost": "length"}, "both say what to optimise"),
+        ({"weight": ["length=1"], "cost": "length"}, "contradict each other"),
         ({"budget_ms": 1.0, "rounds": (1,)}, "both say how long"),
         ({"mode": "paper"}, "knows no --mode"),
         ({"planner": "adaptive", "rounds": (3,)}, "knows no --rounds"),

@@ -165,7 +165,7 @@ def test_a_load_too_heavy_for_the_cables_is_bad_input(gachon, scene_with) -> Non
 def test_start_and_goal_turned_differently_are_bad_input(gachon, scene_with) -> None:
     turned = [float(np.cos(0.05)), 0.0, 0.0, float(np.sin(0.05))]
     scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": turned})
-    with pytest.raises(BadInput, match=r"turned against each other by 5\.73 deg"):
+    with pytest.raises(BadInput, match=r"differ in orientation by 5\.73 deg"):
         make_plan(gachon, scene, QUICK)
 
 

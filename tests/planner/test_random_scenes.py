@@ -87,5 +87,5 @@ def test_no_path_in_random_scenes_violates_anything(tmp_path, capsys) -> None:
     assert sum(result["outcome"] == PLANNED for result in results) >= 6
     assert all(result["problems"] == [] for result in results)
     capsys.readouterr()
-    assert main(arguments) == 0  # nothing is left to do
+    assert main(arguments) == 0  # nothing remains to be done
     assert len((tmp_path / "random_scenes_5.jsonl").read_text().splitlines()) == 12

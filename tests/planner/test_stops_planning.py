@@ -136,7 +136,7 @@ def test_a_load_picked_on_the_way_is_planned_for(gachon, scene_with) -> None:
         ),
         (
             [stop("turned", 0, 0, 445, rotation_wxyz=[0.0, 0.0, 0.0, 1.0])],
-            ["start and stop 'turned' are turned against each other by 180 deg"],
+            ["start and stop 'turned' differ in orientation by 180 deg"],
         ),
     ],
 )

@@ -16,8 +16,52 @@ ROOT = Path(__file__).parents[2]
 MOST_FILES, MOST_LINES, MOST_IN_FUNCTION = 20, 450, 80
 FULL_FOLDERS: set[str] = {"cdpr/cli"}
 LONG_MODULES: set[str] = set()
-LONG_FUNCTIONS: set[str] = {"cdpr/cli/home.py:home", "cdpr/cli/jog.py:jog"}
+LONG_FUNCTIONS: set[str] = set()
 CIRCLES: list[list[str]] = []
+#: Modules that import inside functions, by the reason; all others import at their top.
+INNER_IMPORTS: dict[str, set[str]] = {
+    "a heavy library is loaded by the few calls that need it": {
+        "cdpr/cli/app.py",
+        "executor/recording/run_folder.py",
+        "executor/report/figures.py",
+        "executor/report/tiles.py",
+        "executor/run_result.py",
+        "model/geometry/shapes.py",
+        "model/plan.py",
+        "model/rig.py",
+        "model/statics/tension_distribution.py",
+        "model/statics/wrench_closure.py",
+        "planner/campaign/figures.py",
+        "planner/kernels/gjk.py",
+        "planner/workspace/files.py",
+        "planner/workspace/slices.py",
+        "planner/workspace/volumes.py",
+    },
+    "of several protocols, back ends or planners one is loaded": {
+        "drivers/factory.py",
+        "drivers/stopping_distance.py",
+        "executor/cameras/open.py",
+        "executor/drives.py",
+        "executor/homing.py",
+        "planner/planning.py",
+        "simulation/factory.py",
+    },
+    "an extra may not be installed": {
+        "drivers/odrive/dbc.py",
+        "planner/parallel.py",
+        "tracking/detection/libraries.py",
+    },
+    "compiled kernels are loaded when their machine code is wanted": {
+        "executor/kernels.py",
+        "planner/workspace/maps.py",
+    },
+    "an installation is examined of which a part may be missing": {"executor/doctor.py"},
+    "the real-time process and the start of a run must not wait for it": {
+        "cdpr/cli/options.py",
+        "executor/report/__init__.py",
+        "executor/runner.py",
+    },
+}
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +98,11 @@ def test_no_modules_import_each_other_in_a_circle(house: Any) -> None:
 
 def test_no_import_runs_back_up(house: Any) -> None:
     assert house.back_arrows() == []
+
+
+def test_an_import_inside_a_function_has_a_reason(house: Any) -> None:
+    explained = sorted(path for paths in INNER_IMPORTS.values() for path in paths)
+    assert sorted(m.path for m in house.modules if m.inner_imports()) == explained
 
 
 def test_only_the_command_line_prints_and_asks(house: Any) -> None:

@@ -34,7 +34,7 @@ from tracking.measurement import PoseMeasurement
 #: The platform truly stands so far towards the block, [m].
 OFF = np.array([-0.005, 0.0, 0.0])
 #: What a camera may have seen.
-NEAR = "less clearance than the scene asks for: platform to block: 6.0 ± 1.0 mm"
+NEAR = "less clearance than the scene requires: platform to block: 6.0 ± 1.0 mm"
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def narrow_plan(rig_file: Path) -> Path:
-    """Along a small block, 12 mm from it, where the scene asks for 10 mm."""
+    """Along a small block, 12 mm from it, where the scene requires 10 mm."""
     document = {
         "schema_version": 1,
         "name": "narrow",
@@ -91,10 +91,10 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     run = tmp_path / "run"
     answer = call("run", narrow_plan, "--rig", rig_file, "-o", run, "--fast")
     assert answer.code == 1, answer
-    assert "below 10 mm, as the cameras see it" in answer.out
+    assert "below 10 mm, measured by the cameras" in answer.out
     assert "front (synthetic)" in answer.out
     assert "too near" in answer.said
-    assert "the scene asks for 10 mm" in answer.said
+    assert "the scene requires 10 mm" in answer.said
     summary: dict[str, Any] = RunFolder.open(run).summary()
     assert summary["final_state"] == "stopped"
     assert summary["verdict"] == "FAILED"
@@ -102,9 +102,9 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     assert codes.count("clearance_low") == 1
     assert codes.index("clearance_low") < codes.index("held")
     (low,) = (event["text"] for event in summary["events"] if event["code"] == "clearance_low")
-    assert re.search(r"to block \[/left\]: \d+\.\d ± \d\.\d mm; the scene asks for 10 mm", low)
+    assert re.search(r"to block \[/left\]: \d+\.\d ± \d\.\d mm; the scene requires 10 mm", low)
     assert "to block [/left]: " in answer.said
-    assert "more about it: cdpr explain clearance_low" in answer.said
+    assert "details: cdpr explain clearance_low" in answer.said
 
 
 def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
@@ -148,7 +148,7 @@ def test_the_loop_tells_what_the_stop_was_for(
 
 
 class Rendered:
-    """Pictures of the platform where a trigger says that it is."""
+    """Images of the platform where a trigger says that it is."""
 
     def __init__(self, camera: SyntheticCamera) -> None:
         self._camera = camera

@@ -115,9 +115,9 @@ CASES = {
     "a drive starts anew": Case(
         lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
     ),
-    "a winch jams": Case(jam, "drive_stuck", ("(drive 2) stood still",), lost=(1,)),
-    "a winch slips": Case(slip, "following_error", ("cable 2", "allowed 2.00 mm"), lost=(1,)),
-    "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "torn"), within=5),
+    "a winch jams": Case(jam, "drive_stuck", ("(drive 2) did not move",), lost=(1,)),
+    "a winch slips": Case(slip, "following_error", ("cable 2", "limit 2.00 mm"), lost=(1,)),
+    "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "broken"), within=5),
     "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "102.0 N"), within=60),
     "the loop is late": Case(late, "late", ("1.4 cycles late; stopped along",), within=40),
     "the loop hung": Case(far_too_late, "late", ("1371.9 cycles late; quick stop",)),
@@ -138,7 +138,7 @@ CASES = {
     "a drive does not go over to hold": Case(
         lambda stage: setattr(stage.drives[4], "_command_quick_stop", lambda: None),
         "hold_timeout",
-        ("did not go over to hold",),
+        ("did not hold within",),
         within=600,
         lost=(4,),
     ),
@@ -223,7 +223,7 @@ def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
     profile.write_text(f"name: Gentle\nsources: [this test]\n{gentle}\n")
     document = prepared.rig.document.model_dump()
     document["drives"]["profile"] = str(profile)
-    with pytest.raises(Refused, match="without the master the platform goes on for up to 31"):
+    with pytest.raises(Refused, match="without its master the platform travels up to 31"):
         prepare(prepared.plan, rig_from_document(RigDocument.model_validate(document)))
 
 
@@ -269,7 +269,7 @@ def test_a_full_disk_stops_the_drives(
     """An event that cannot be written is a fault; the drives are stopped before it is told."""
 
     def full(_folder: RunFolder, _event: RunEvent) -> None:
-        raise Fault("the run folder cannot be written to", why="No space left on device")
+        raise Fault("the run folder cannot be written", why="No space left on device")
 
     with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
         monkeypatch.setattr(RunFolder, "append_event", full)
@@ -424,7 +424,7 @@ def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
     answer = call("run", short_plan, "--rig", rig, "-o", run, "--fast")
     assert answer.code == 1, answer
     assert "FAILED" in answer.out
-    assert "pictures gave a pose: " in answer.said
+    assert "images gave a pose: " in answer.said
     summary = RunFolder.open(run).summary()
     codes = [event["code"] for event in summary["events"]]
     assert codes.count("camera_sees_nothing") == 1

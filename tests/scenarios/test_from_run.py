@@ -140,7 +140,7 @@ def test_a_plan_from_a_stopped_run_runs_to_the_goal_through_the_stops_left(
     folder = stopped.folder.path
     answer = call("plan", RIG, scene_file, "-o", plan, "--from-run", folder, "--rounds", "3")
     assert answer.code == 0, answer
-    assert "carrying 1.5 kg; 1 stops done, 2 left" in answer.said
+    assert "with 1.5 kg; 1 stops done, 2 left" in answer.said
     rest = load_plan(plan)
     assert [stop.name for stop in rest.scene.stops] == ["by", "leave"]
     assert [stop.name for stop in rest.document.done] == ["take"]
@@ -157,7 +157,7 @@ def test_a_plan_from_a_stopped_run_runs_to_the_goal_through_the_stops_left(
         nothing = call(
             "plan", RIG, scene_file, "-o", plan, "--force", "--from-run", tmp_path / "run"
         )
-    one_message(nothing, 2, "nothing is left to do", "--goal-mm")
+    one_message(nothing, 2, "nothing remains to be done", "--goal-mm")
 
 
 def test_a_dwell_cut_short_is_done_again_with_the_load_before_it(
@@ -194,7 +194,7 @@ def test_a_stop_that_was_changed_since_is_refused(stopped: Ended, tmp_path: Path
     path.write_text(yaml.safe_dump(changed), encoding="utf-8")
     out = tmp_path / "plan.json"
     answer = call("plan", RIG, path, "-o", out, "--from-run", stopped.folder.path)
-    one_message(answer, 2, "visited 'take' as other stops than the scene's")
+    one_message(answer, 2, "visited 'take' as stops that differ from the scene's")
 
 
 def test_a_clearance_that_is_not_there_is_told_with_the_one_that_is(
@@ -221,7 +221,7 @@ def copied(folder: RunFolder, path: Path) -> RunFolder:
 
 @pytest.mark.parametrize(
     ("cable", "off_mm", "words"),
-    [(None, 3.0, "mm from where it was told to be"), (4, 2.2, "longer or shorter than")],
+    [(None, 3.0, "mm from the commanded pose"), (4, 2.2, "longer or shorter than")],
 )
 def test_drives_that_contradict_the_plan_or_each_other_are_refused(
     stopped: Ended, scene_file: Path, tmp_path: Path, cable: int | None, off_mm: float, words: str
@@ -243,7 +243,7 @@ def test_drives_that_contradict_the_plan_or_each_other_are_refused(
     folder.write_cycles(replace(cycles, actual_counts=counts))
     out = tmp_path / "plan.json"
     answer = call("plan", RIG, scene_file, "-o", out, "--from-run", folder.path)
-    one_message(answer, 3, "where the platform is cannot be told", words, "--start-mm")
+    one_message(answer, 3, "the platform pose is unknown", words, "--start-mm")
     assert not out.exists()
 
 
@@ -258,9 +258,9 @@ def test_a_folder_without_its_cycles_or_with_silent_drives_is_refused(
     folder.write_cycles(replace(cycles, missing=missing))
     one_message(call(*arguments), 3, "2 drives did not answer in the last cycle")
     (folder.path / "cycles.csv").unlink()
-    one_message(call(*arguments), 2, "not a whole run folder", "cycles.csv missing")
+    one_message(call(*arguments), 2, "incomplete run folder", "cycles.csv missing")
     both = call(*arguments, "--start-mm", "0", "0", "445")
-    one_message(both, 2, "--from-run and --start-mm both say where to begin")
+    one_message(both, 2, "--from-run and --start-mm contradict each other")
 
 
 def test_way_poses_of_the_command_line_are_met_before_the_scenes_stops(
@@ -275,4 +275,4 @@ def test_way_poses_of_the_command_line_are_met_before_the_scenes_stops(
     np.testing.assert_allclose(made.waypoints[made.stops[0]].position, [0.005, -0.005, 0.45])
     for wrong in ("1 2", "1 2 x", "1 2 nan"):
         told = call(*arguments, "--force", "--via-mm", *wrong.split())
-        one_message(told, 2, f"--via-mm {wrong}: needs")
+        one_message(told, 2, f"--via-mm {wrong}:", "numbers are required")

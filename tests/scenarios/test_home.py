@@ -82,7 +82,7 @@ class Place:
     script: Callable[[Place, int], None] = lambda _place, _cycle: None
     at_rest: Callable[[WinchesStand], HomingReference | None] = lambda _stand: None
     custody: MotionInterlock | None = None
-    anew: bool = True
+    rehome: bool = True
     board: LocalRequests = field(default_factory=LocalRequests)
     records: list[CycleRecord] = field(default_factory=list)
     events: list[LoopEvent] = field(default_factory=list)
@@ -106,7 +106,7 @@ class Place:
             self.custody or MotionInterlock(self.rig),
             Told(on_cycle, self.events.append),
             record=Path("nowhere"),
-            anew=self.anew,
+            rehome=self.rehome,
             at_rest=lambda stand, _true_pose: self.at_rest(stand),
         )
 
@@ -152,7 +152,7 @@ def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
     custody = MotionInterlock(kept)
 
     def at_rest(stand: WinchesStand) -> HomingReference:
-        with pytest.raises(Refused, match="under way"):
+        with pytest.raises(Refused, match="in progress"):
             MotionInterlock(kept).require_free()
         return reference_at(kept, kept.home, stand.counts, stand.tensions, "stated pose", 0.0)
 
@@ -457,7 +457,7 @@ def moved_by_hand(place: Place) -> None:
     [
         (lambda _place: None, None),
         (moved_by_hand, r"cable 4 \(drive 4\) moved by 0.20 mm"),
-        (loses_all_torque, "not all drives hold"),
+        (loses_all_torque, "not all drives still hold"),
         (fails, "drive 7"),
     ],
 )
@@ -479,17 +479,17 @@ def no_more_heard(place: Place) -> None:
     place.rehearsal.drives[5].silent = True
 
 
-@pytest.mark.parametrize("anew", [True, False])
+@pytest.mark.parametrize("rehome", [True, False])
 @pytest.mark.parametrize(
     ("happens", "told", "counts"),
     [
         (moved_by_hand, "moved by 0.20 mm", True),
-        (loses_all_torque, "not all drives hold", False),
+        (loses_all_torque, "not all drives still hold", False),
         (no_more_heard, "no answer after", True),
     ],
 )
 def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
-    anew: bool, happens: Callable[[Place], None], told: str, counts: bool
+    rehome: bool, happens: Callable[[Place], None], told: str, counts: bool
 ) -> None:
     """The reference of before counts only where every cable was held, and none is made."""
     rig = load_rig(RIG)
@@ -505,7 +505,7 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
             happens(place)
             return reference_at(kept, kept.home, stand.counts, tensions, "new", 0.0)
 
-        place.custody, place.at_rest, place.anew = custody, at_rest, anew
+        place.custody, place.at_rest, place.rehome = custody, at_rest, rehome
         with pytest.raises(CdprError, match=told):
             place.take_up()
         assert place.events[-1].code == "not_held"
@@ -516,7 +516,7 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
     reference = custody.kept_reference()
     assert reference is not None
     assert reference.how == "stated pose"
-    assert bool(reference.lost) is (anew or not counts)
+    assert bool(reference.lost) is (rehome or not counts)
     if not reference.lost:
         assert reference.stands_at == pytest.approx(moved, abs=1.0)
         assert reference.stands_at != list(begin)
@@ -535,10 +535,10 @@ def test_a_pose_that_is_not_known_well_is_refused() -> None:
     rig = load_rig(RIG)
     home = rig.home
     away = Pose.level(home.position + np.array([0.004, 0.0, 0.0]))
-    with pytest.raises(Refused, match="does not stand still"):
+    with pytest.raises(Refused, match="is not at rest"):
         rest_pose(rig, looks(rig, home, away, home, away))
     far = Pose.level(home.position + np.array([5.0, 5.0, 0.0]))
-    with pytest.raises(Refused, match="0 of 2 pictures"):
+    with pytest.raises(Refused, match="0 of 2 images"):
         rest_pose(rig, looks(rig, far, far))
 
 
@@ -560,7 +560,7 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         stand = move_winches(
             mover(limited, law, group, LocalRequests()), rig, MotionInterlock(rig),
             Told(lambda _record: None, lambda _event: None),
-            record=Path("nowhere"), anew=True, at_rest=lambda _stand, _true_pose: None,
+            record=Path("nowhere"), rehome=True, at_rest=lambda _stand, _true_pose: None,
         )  # fmt: skip
         assert stand.state is State.FINISHED, stand.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0

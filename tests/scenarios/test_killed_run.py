@@ -92,7 +92,7 @@ def test_wherever_the_files_were_cut_there_is_a_verdict(
     folder = cut(killed, tmp_path_factory.getbasetemp() / "cut", **sizes)
     summary = evaluate_cut_short(folder).summary
     assert (summary["verdict"], summary["final_state"]) == ("FAILED", "not_ended")
-    assert summary["sentence"] == "The run did not come to its end."
+    assert summary["sentence"] == "The run did not finish."
     assert (summary["interface"], summary["simulated"]) == ("socketcan", False)
 
 
@@ -105,11 +105,11 @@ def test_the_report_of_a_killed_run_shows_what_there_is(
     folder = cut(killed, tmp_path / "run", cycles_csv=size)
     answer = call("report", folder.path)
     assert answer.code == 0, answer
-    assert "did not come to its end" in folder.report.read_text()
+    assert "did not finish" in folder.report.read_text()
     assert len(RunFolder.open(folder.path).cycles()) == max(0, lines - 1)
     # Made once, it is a run folder as any other; but from where it ended nothing is planned.
     assert call("report", folder.path).code == 0
-    with pytest.raises(Refused, match="did not come to its end"):
+    with pytest.raises(Refused, match="did not finish"):
         run_end(RunFolder.open(folder.path))
 
 
@@ -154,13 +154,13 @@ def test_a_killed_run_without_a_cycle_file_has_a_report_too(
     folder = cut(killed, tmp_path / "run")
     (folder.path / "cycles.csv").unlink()
     assert call("report", folder.path).code == 0
-    assert "did not come to its end" in folder.report.read_text()
+    assert "did not finish" in folder.report.read_text()
 
 
 def test_a_run_that_is_under_way_has_no_report_yet(killed: RunFolder, tmp_path: Path) -> None:
     folder = cut(killed, tmp_path / "run")
     with folder.held():
-        one_message(call("report", folder.path), 2, "still under way")
+        one_message(call("report", folder.path), 2, "still in progress")
     assert call("report", folder.path).code == 0
 
 
@@ -219,11 +219,11 @@ def test_a_folder_that_is_removed_while_drives_move_ends_in_a_latched_fault(
         out, err = process.communicate()
     assert process.returncode == 1, (out, err)
     assert "\nFAILED " in out
-    assert "not every file of the run could be written" in err
+    assert "some files of the run could not be written" in err
     channel = f"239.74.163.22:{20000 + (os.getpid() * 7 + number) % 20000}"
     latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
-    assert "what records the run failed" in latched.cause
+    assert "recording failed" in latched.cause
 
 
 def wait_until(enough: Callable[[dict[str, float]], bool]) -> float:

@@ -63,7 +63,7 @@ def test_a_run_engages_it_and_only_a_good_end_disengages_it(tmp_path: Path) -> N
 
 def test_a_run_that_never_came_to_its_end_is_a_fault(tmp_path: Path) -> None:
     FaultLatch(BUS).engage("rig", tmp_path)
-    with pytest.raises(Refused, match="did not come to its end"):
+    with pytest.raises(Refused, match="did not finish"):
         FaultLatch(BUS).require_disengaged()
 
 
@@ -72,7 +72,7 @@ def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
     running = FaultLatch(BUS)
     running.engage("rig", tmp_path)
     for ask in (FaultLatch(BUS).require_disengaged, FaultLatch(BUS).require_no_run):
-        with pytest.raises(Refused, match=f"process {os.getpid()}.*under way"):
+        with pytest.raises(Refused, match=f"process {os.getpid()}.*in progress"):
             ask()
     running.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
     FaultLatch(BUS).require_no_run()
@@ -101,7 +101,7 @@ def test_of_two_that_begin_at_once_one_is_refused(
     first = FaultLatch(BUS)
     first.path.parent.mkdir(parents=True)
     first._hold()  # it is about to write why
-    with pytest.raises(Refused, match="under way"):
+    with pytest.raises(Refused, match="in progress"):
         FaultLatch(BUS).engage("rig", tmp_path)
     assert first.read() is None
     first.engage("rig", tmp_path)
@@ -115,7 +115,7 @@ def test_a_program_that_was_killed_runs_no_more(tmp_path: Path) -> None:
     killed.join()
     assert killed.exitcode == -signal.SIGKILL
     FaultLatch(BUS).require_no_run()
-    with pytest.raises(Refused, match="did not come to its end"):
+    with pytest.raises(Refused, match="did not finish"):
         FaultLatch(BUS).require_disengaged()
 
 
@@ -138,7 +138,7 @@ def test_all_users_share_it_where_an_administrator_made_a_folder_for_it(
     monkeypatch.setattr("executor.interlock.locks.SHARED", shared)
     FaultLatch(BUS).engage("rig", tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
-    with pytest.raises(Refused, match="did not come to its end"):
+    with pytest.raises(Refused, match="did not finish"):
         FaultLatch(BUS).require_disengaged()
     assert FaultLatch(BUS).path.parent == shared
 
@@ -147,7 +147,7 @@ def test_a_reset_keeps_runs_off_the_bus_and_leaves_it_as_it_was_when_it_fails(
     tmp_path: Path,
 ) -> None:
     latch = FaultLatch(BUS)
-    with pytest.raises(Refused, match=r"reset .*under way"), latch.held_for_reset("rig", None):
+    with pytest.raises(Refused, match=r"reset .*in progress"), latch.held_for_reset("rig", None):
         FaultLatch(BUS).engage("rig", tmp_path)
     latch.require_disengaged()
     latch.engage("rig", tmp_path, "cable 3 is slack")
@@ -248,7 +248,7 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
         bus = ("--interface", "udp_multicast", "--channel", channel)
         answer = call("reset", slow_rig, *bus, "--yes")
     assert answer.code == 4, answer
-    assert "(drive 5) fell silent" in answer.err
+    assert "(drive 5) stopped answering" in answer.err
     assert latch.read() is not None
 
 
@@ -273,10 +273,10 @@ def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_sta
         rest = ("--no-camera", "--yes", "--without-real-time")
         again = call("run", short_plan, "--rig", slow_rig, "-o", tmp_path / "again", *bus, *rest)
         assert again.code == 3
-        assert "did not come to its end" in again.err
+        assert "did not finish" in again.err
         answer = call("reset", slow_rig, *bus, "--yes")
         assert answer.code == 0, answer
-        assert "did not come to its end" in answer.out
+        assert "did not finish" in answer.out
         assert {drive.state for drive in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}
         again = call("run", short_plan, "--rig", slow_rig, "-o", tmp_path / "again", *bus, *rest)
         assert again.code == 3

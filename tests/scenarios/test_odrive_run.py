@@ -152,12 +152,12 @@ CASES = {
         lambda stage: stage.drives[2].hear(2, b""), "drive_fault", "emergency stop", 7
     ),
     "starts anew": Case(
-        lambda stage: stage.drives[2].power_on(), "drive_fault", "(drive 3) was disarmed", 7
+        lambda stage: stage.drives[2].power_on(), "drive_fault", "(drive 3) disarmed itself", 7
     ),
     "no heartbeat": Case(
         lambda stage: stage.drives[2].silent.add("heartbeat"),
         "drive_fault",
-        "its heartbeat is missing",
+        "heartbeat missing",
         18,
     ),
     "no position": Case(

@@ -83,7 +83,7 @@ def test_speeds_are_kept_and_change_smoothly(prepared: PreparedRun, tmp_path: Pa
     assert outcome.state is State.FINISHED
     told = [event.text for event in stage.events() if event.code == "speed"]
     assert [text.split(": ")[1] for text in told] == [
-        f"{share} of the planned" for share in ("50%", "10%", "100%")
+        f"{share} of the planned speed" for share in ("50%", "10%", "100%")
     ]
     rates, _ = rates_on_path(prepared, outcome)
     moving = int(np.flatnonzero(np.array(outcome.log.table().state) == "moving")[0])
@@ -138,7 +138,7 @@ def test_a_fault_while_holding_is_latched(prepared: PreparedRun, tmp_path: Path)
 
     stage, outcome = run(prepared, tmp_path, c150=HOLD, c250=tear, c400=RESUME)
     assert outcome.state is State.LATCHED
-    assert "torn" in outcome.cause
+    assert "broken" in outcome.cause
     assert states(outcome)[-2:] == ["holding", "latched"]
     assert {drive.state for drive in stage.drives} == {DriveState.QUICK_STOP_ACTIVE}
 

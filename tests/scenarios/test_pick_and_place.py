@@ -29,7 +29,7 @@ def test_the_ready_scene_is_planned_checked_and_run_with_the_camera(tmp_path: Pa
     assert checked.code == 0, checked
     ran = call("run", plan, "--rig", rig_file, "-o", run, "--fast")
     assert ran.code == 0, ran.out
-    assert "at stop 'tray', standing still for 2 s while 1.2 kg is picked up" in ran.err
+    assert "at stop 'tray', resting for 2 s while 1.2 kg is picked up" in ran.err
 
     folder = RunFolder.open(run)
     cycles, summary, rig = folder.cycles(), folder.summary(), load_rig(rig_file)

@@ -161,7 +161,7 @@ def test_a_real_time_process_that_hangs_is_ended_and_told(
         wait_until_all_hold(rehearsal)
     summary = RunFolder.open(run).summary()
     assert summary["final_state"] == "latched"
-    assert any("hung and was ended" in reason for reason in summary["reasons"])
+    assert any("hung and was killed" in reason for reason in summary["reasons"])
     assert summary["events"][-1]["code"] == "real_time_lost"
 
 
@@ -215,7 +215,7 @@ def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
         assert json.loads(out)["state"] == "holding"
         code, out, err = finished("speed", "100")
         assert (code, err) == (0, "")
-        assert "counts from `cdpr resume` on" in out
+        assert "applies after `cdpr resume`" in out
         code, out, err = finished("resume")
         assert (code, err) == (0, "")
         assert f"process {moving.pid} was told to go on" in out

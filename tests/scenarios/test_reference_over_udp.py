@@ -41,7 +41,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         loss.happen_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         first = call(*run, "-o", tmp_path / "first")
         assert first.code == 3
-        assert "never referenced" in first.err
+        assert "never homed" in first.err
         start = [f"{x:.6f}" for x in slow_run.scene.start.position * 1000.0]
         homed = call("home", rig, "--pose-mm", *start, *bus, "--json")
         assert homed.code == 0, homed
@@ -65,7 +65,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         elsewhere = {**kept, "stands_at": [count + 10**6 for count in kept["stands_at"]]}
         Path(told["file"]).write_text(json.dumps(elsewhere))
         killed = call(*run, "-o", tmp_path / "killed")
-        assert (killed.code, "away from where it was left" in killed.err) == (3, True)
+        assert (killed.code, "from its last known position" in killed.err) == (3, True)
         reset = call("reset", rig, *bus[:5], "--json")
         assert reset.code == 0
         after = json.loads(reset.out)
@@ -75,17 +75,17 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         rehearsal.drives[5].power_on()
         third = call(*run, "-o", tmp_path / "third")
         assert third.code == 3
-        assert "cable 6 (drive 6) is lost: it was switched on" in third.err
+        assert "cable 6 (drive 6) is lost: it was power-cycled" in third.err
         again = call(*run, "-o", tmp_path / "again")
         assert again.code == 3
-        assert "no more referenced" in again.err
+        assert "homing reference is lost" in again.err
         reset = call("reset", rig, *bus[:5])
         assert reset.code == 0
         assert "reference: does not count" in reset.out
-        assert "cable 6 (drive 6): switched on" in reset.out.replace("\n", " ")
+        assert "cable 6 (drive 6): power-cycled" in reset.out.replace("\n", " ")
         jogged = call("jog", rig, "--by-mm", "0", "0", "1", "--no-scene", *bus)
         assert jogged.code == 3
-        assert "cable 6 (drive 6): switched on" in jogged.err.replace("\n", " ").replace("  ", "")
+        assert "cable 6 (drive 6): power-cycled" in jogged.err.replace("\n", " ").replace("  ", "")
         assert [drive.motor.position for drive in rehearsal.drives] == stood
         Path(told["file"]).write_text("{")
         anew = call("home", rig, "--pose-mm", *start, *bus, "--json")

@@ -161,10 +161,8 @@ def test_ctrl_c_on_the_way_stops_all_and_says_what_is_left(
             _, err = process.communicate(timeout=60)
         assert process.returncode == 130, err
         assert DriveState.OPERATION_ENABLED not in {drive.state for drive in rehearsal.drives}
-    assert "a fault is latched, and the drives have to be referenced again" in err.replace(
-        "\n", " "
-    )
+    assert "a fault is latched, and the drives must be homed again" in err.replace("\n", " ")
     latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
-    assert "stopped while the torque was being taken off" in latched.cause
+    assert "stopped while releasing the drives" in latched.cause
     assert "next:" not in latched.cause

@@ -121,7 +121,7 @@ def test_a_run_folder_that_is_removed_meanwhile_is_a_fault_of_the_record_with_a_
 ) -> None:
     answer = run("fault")
     told(answer, "fault")
-    assert "what records the run failed" in answer.out
+    assert "recording failed" in answer.out
     assert "No such file or directory" in answer.err
     assert not (tmp_path / "run").exists()
 

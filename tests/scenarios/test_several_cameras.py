@@ -126,7 +126,7 @@ def test_the_kept_pictures_of_each_camera_have_the_drives_poses(
     kept = [Path(name).name for name in folder.poses_by_camera()["side"].picture if name]
     poses = poses_of_run(folder.path, "side")
     assert set(kept[1:-1]) <= poses.keys() <= set(kept)
-    with pytest.raises(BadInput, match="camera 'back' took no pictures") as told:
+    with pytest.raises(BadInput, match="camera 'back' took no images") as told:
         poses_of_run(folder.path, "back")
     assert "front, side" in told.value.next_step
 
@@ -152,12 +152,12 @@ def test_cameras_are_chosen_as_they_are_named(
     ("cameras", "parts"),
     [
         (["front=0", "back=1"], ["no camera 'back'", "front, side"]),
-        (["0", "side=1"], ["'0' does not say which camera it is of"]),
+        (["0", "side=1"], ["'0' does not name its camera"]),
         (["side=0", "side=1"], ["'side' has two sources"]),
         (["side=0", "front=0"], ["cameras 'side' and 'front' have the same source '0'"]),
         (["side=0", "front=/dev/video0"], ["have the same source"]),
         (["side=0", "front"], ["camera 'front' has no source", "write front=0"]),
-        (["side=0", "http://x/?a=b"], ["'http://x/?a=b' does not say which camera it is of"]),
+        (["side=0", "http://x/?a=b"], ["'http://x/?a=b' does not name its camera"]),
         (["front=0", "--no-camera"], ["--camera and --no-camera contradict"]),
     ],
 )
@@ -189,7 +189,7 @@ def test_a_camera_that_looks_away_is_told_and_the_other_measures(
     assert folder.poses().ok.all()
     events = [e["text"] for e in folder.summary()["events"] if e["code"] == "camera_sees_nothing"]
     (text,) = events
-    assert "camera side gave no pose in 10 pictures in a row" in text
+    assert "camera side gave no pose in 10 images in a row" in text
     assert text.endswith("clearance is measured by front")
     assert "camera side gave no pose" in " ".join(answer.err.split())
     assert re.search(r"side 0 of \d+", answer.out)
@@ -239,20 +239,20 @@ def test_a_camera_that_hangs_is_told_and_the_run_goes_on_with_the_other(
     folder = RunFolder.open(run)
     hangs, end = told_of(folder, "camera_sees_nothing"), told_of(folder, "camera")
     assert [e["text"] for e in hangs] == [
-        "camera side gave no answer for 2 s; clearance is measured by front"
+        "camera side did not answer for 2 s; clearance is measured by front"
     ]
-    assert "camera side failed (no answer any more from 0." in end[0]["text"]
+    assert "camera side failed (no answer since 0." in end[0]["text"]
     moved = [e["time_s"] for e in folder.summary()["events"] if e["code"] == "held"]
     assert hangs[0]["time_s"] < moved[0], "told while it moves"
     assert folder.poses().ok.all()
     alone = folder.poses_by_camera()
     assert len(alone["front"]) == len(folder.poses()) > len(alone["side"]) > 1
-    assert alone["side"].status[-1].startswith("no answer any more from 0.")
+    assert alone["side"].status[-1].startswith("no answer since 0.")
     (front, side) = folder.summary()["cameras"]
     assert side["dropped"] > 10
     assert side["failed"]
     assert not front["failed"]
-    assert "(no answer any more from" in answer.out, "told at the end"
+    assert "(no answer since" in answer.out, "told at the end"
 
 
 @pytest.mark.usefixtures("no_report")
@@ -267,7 +267,7 @@ def test_a_run_whose_only_camera_hangs_comes_to_its_end_and_does_not_pass(
     summary = folder.summary()
     assert summary["final_state"] == "finished"
     (hangs,) = told_of(folder, "camera_sees_nothing")
-    assert hangs["text"] == "camera front gave no answer for 2 s; clearance is not measured"
+    assert hangs["text"] == "camera front did not answer for 2 s; clearance is not measured"
     assert any("Camera front failed: no answer" in reason for reason in summary["reasons"])
     assert folder.poses().ok[:-1].all(), "what was measured before is on record"
     assert not folder.poses().ok[-1]
@@ -301,4 +301,4 @@ def test_a_camera_that_dies_leaves_the_run_to_the_other(
 
 def test_silence_is_told_after_the_time_that_the_docs_say() -> None:
     page = (Path(__file__).parents[2] / "docs" / "faults" / "camera_sees_nothing.md").read_text()
-    assert f"no answer for {camera_sight.SILENCE:g} s" in page
+    assert f"did not answer for {camera_sight.SILENCE:g} s" in page

@@ -101,7 +101,7 @@ def test_nobody_is_watched_any_more_when_the_program_leaves(kind: type[Standstil
 
 def test_drives_beyond_their_limits_are_not_enabled() -> None:
     with held(set_up_where_they_are=False) as bench:
-        with pytest.raises(Refused, match="beyond its position limits"):
+        with pytest.raises(Refused, match="outside its position limits"):
             bench.do(Release)
         assert bench.states == {HOLDING}
 
@@ -136,7 +136,7 @@ def test_a_drive_that_falls_silent_stops_the_others() -> None:
 
     with held() as bench:
         error = error_of(bench.do(Release, silence))
-        assert "cable 5 (drive 5) fell silent" in error.what
+        assert "cable 5 (drive 5) stopped answering" in error.what
         assert FOLLOWING not in {drive.state for drive in bench.drives if not drive.silent}
 
 
@@ -156,7 +156,7 @@ def test_a_drive_that_stopped_by_itself_is_not_enabled_again() -> None:
 
     with held() as bench:
         error = error_of(bench.do(Release, drop))
-        assert "cable 3 (drive 3) stopped by itself" in error.what
+        assert "cable 3 (drive 3) stopped on its own" in error.what
         assert FOLLOWING not in bench.states
         assert set(after) <= {HOLDING}
         assert bench.drives[2].state is HOLDING
@@ -202,7 +202,7 @@ def test_a_drive_that_does_not_stay_as_it_was_left_is_told(kind: type[Standstill
     with held() as bench:
         bench.drives[5].objects.changed = _fails_unwatched(bench.drives[5])  # type: ignore[method-assign]
         error = error_of(bench.do(kind))
-        assert "drives did not stay as they were left" in error.what
+        assert "drives left the state they held in" in error.what
         told = next(each for each in error.what.split(", ") if "cable 6 (drive 6)" in each)
         assert told.endswith("to fault")
         assert bench.ended is State.LATCHED

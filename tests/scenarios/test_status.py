@@ -58,8 +58,10 @@ def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
         running.engage("rig", tmp_path)
         answer = call("status", counting, *bus)
         assert answer.code == 0, answer
-        assert re.search(r"latched fault +none; process \d+ moves or resets it", answer.out)
-        assert "never referenced: cable 1 (drive 1)" in answer.out.replace("\n", " ")
+        assert re.search(
+            r"latched fault +none; process \d+ is moving or resetting the rig", answer.out
+        )
+        assert "never homed: cable 1 (drive 1)" in answer.out.replace("\n", " ")
         assert "switch on disabled" not in answer.out, "who runs them must not be disturbed"
 
 
@@ -87,7 +89,7 @@ def test_drives_that_somebody_sets_up_are_not_asked(slow_run: PreparedRun, slow_
         assert answer.code == 0, answer
         told = json.loads(answer.out)
         assert (told["being_set_up"], told["drives"], told["run"]) == (True, None, None)
-        assert "a motion is being prepared" in call("status", slow_rig, *bus).out.replace("\n", " ")
+        assert "preparing a motion" in call("status", slow_rig, *bus).out.replace("\n", " ")
         assert rehearsal.cycles == 0
 
 
@@ -102,7 +104,10 @@ def test_who_sets_drives_up_waits_for_who_asks_and_does_so_alone(
     with SetUpLock(settings).held():
         with SetUpLock(settings).tried() as alone:
             assert not alone
-        with pytest.raises(Refused, match="sets these drives up"), SetUpLock(settings).held():
+        with (
+            pytest.raises(Refused, match="configuring or reading"),
+            SetUpLock(settings).held(),
+        ):
             pytest.fail("two programs set the same drives up")
         with SetUpLock(BusSettings("socketcan", "can7")).held():
             pass

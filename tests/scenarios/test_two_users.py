@@ -99,10 +99,10 @@ def test_what_one_user_moves_the_other_leaves_alone_and_what_is_left_of_it_he_ma
     assert ben.does(would_move) == ""
     assert ann.does(moves) == ""
     for act in (would_move, would_reset, moves):
-        assert f"(process {ann.process.pid}) is under way" in ben.does(act)
+        assert f"(process {ann.process.pid}) is in progress" in ben.does(act)
     ann.killed()
     told = ben.does(would_move)
-    assert "did not come to its end" in told
+    assert "did not finish" in told
     assert "cdpr reset RIG" in told
     assert ben.does(would_reset) == ""
     assert ben.does(resets) == ""

@@ -1,4 +1,4 @@
-"""Cables in the synthetic camera's picture end where they are hidden, and nowhere else."""
+"""Cables in the synthetic camera's image end where they are hidden, and nowhere else."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ farther_away = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0
 
 
 def drawn(start: tuple[float, ...], end: tuple[float, ...], wall: bool) -> Image8:
-    """A white picture with one cable, and a wall behind which nothing shows on its right half."""
+    """A white image with one cable, and a wall behind which nothing shows on its right half."""
     way = np.array(end) - start
     length = float(np.linalg.norm(way))
     cable = Cables(np.array([start]), np.array([end]), -way[None] / length, np.array([length]))

@@ -30,7 +30,7 @@ def scene(rig: Rig) -> Scene:
 
 @pytest.fixture(scope="module")
 def facing(rig: Rig) -> Camera:
-    """A small camera that looks straight at the first tag, its picture upright."""
+    """A small camera that looks straight at the first tag, its image upright."""
     tag = rig.home.compose(rig.platform_tags[0].pose)
     right, up, out = tag.rotation.T
     matrix = np.array([[FOCAL, 0.0, 319.5], [0.0, FOCAL, 239.5], [0.0, 0.0, 1.0]])
@@ -95,9 +95,7 @@ def test_turning_smears_and_no_exposure_or_no_motion_does_not(
     smeared = slow.render(rig.home, 0, turning).astype(int)
     changed = np.abs(smeared - sharp)
     assert changed.max() > 30
-    assert (
-        changed[235:245, 315:325].max() < changed.max() / 2
-    )  # it turns about the picture's middle
+    assert changed[235:245, 315:325].max() < changed.max() / 2  # it turns about the image's middle
 
 
 def test_a_film_smears_by_the_velocity_since_the_picture_before(
@@ -125,7 +123,7 @@ def test_the_exposure_comes_from_the_rig_file(rig: Rig) -> None:
 def test_a_short_smear_is_as_bright_as_what_it_is_the_mean_of(
     rig: Rig, scene: Scene, facing: Camera
 ) -> None:
-    """The mean of two pictures lies between two grey levels half the time."""
+    """The mean of two images lies between two grey levels half the time."""
     exposure = 0.005
     camera = SyntheticCamera(rig, scene, facing, optics=Optics(noise=0.0, exposure=exposure))
     motion = PlatformMotion(np.array([0.02, 0.0, 0.0]), np.zeros(3))

@@ -205,12 +205,12 @@ def test_two_cameras_in_one_place_differ_by_their_noise_alone(rig: Rig, scene: S
     [
         ({"as_built": "short"}, "simulation.as_built.outlets_mm", "needs 8 entries"),
         ({"as_built": "pulleys"}, "pulley_radius_mm", "the rig has no pulleys"),
-        ({"cameras": [{"name": "rear"}]}, "simulation.cameras[0].name", "no camera is called"),
-        ({"cameras": [{"name": "front"}] * 2}, "simulation.cameras[1].name", "stands twice"),
+        ({"cameras": [{"name": "rear"}]}, "simulation.cameras[0].name", "there is no camera"),
+        ({"cameras": [{"name": "front"}] * 2}, "simulation.cameras[1].name", "appears twice"),
         (
             {"cameras": [{"name": "front", "exposure_ms": 101}]},
             "simulation.cameras[0].exposure_ms",
-            "at 10 pictures/s there is no time",
+            "exceeds the frame period at 10 pictures/s",
         ),
     ],
 )

@@ -196,7 +196,7 @@ def test_absurd_drum_positions_are_a_fault_that_says_so(rig: Rig, bad: float) ->
     plant = Plant(rig, rig.home)
     counts = plant.counts_for(rig.home, plant.tensions).copy()
     counts[0] = bad
-    with pytest.raises(Fault, match="platform is lost"):
+    with pytest.raises(Fault, match="simulation failed"):
         plant.settle_counts(counts)
 
 

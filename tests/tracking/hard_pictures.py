@@ -1,4 +1,4 @@
-"""Pictures of single tags under one hard condition each, with exactly known corners."""
+"""Images of single tags under one hard condition each, with exactly known corners."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Condition:
     Attributes:
         side_px: Side of its square seen from the front.
         tilt: Between its normal and the view, [rad].
-        motion_px: Way of the picture during the exposure.
+        motion_px: Way of the image during the exposure.
         blur_px: Standard deviation of the lens's blur.
         contrast: Brightness of paper less that of ink, of 255.
         noise: Standard deviation, of 255.
@@ -41,7 +41,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class HardPicture:
-    """A picture of one tag and its true corners, shape (4, 2), [px], lens included."""
+    """An image of one tag and its true corners, shape (4, 2), [px], lens included."""
 
     image: NDArray[np.uint8]
     number: int
@@ -54,7 +54,7 @@ class HardPrinter:
     Args:
         family: Of the tag.
         numbers: As many the family has.
-        camera: Whose pictures they are.
+        camera: Whose images they are.
     """
 
     def __init__(self, family: str, numbers: int, camera: Camera | None = None) -> None:
@@ -62,7 +62,7 @@ class HardPrinter:
         self._rays = sample_rays(self.camera)
 
     def picture(self, condition: Condition, rng: np.random.Generator) -> HardPicture:
-        """A picture with a tag somewhere in it, turned at will."""
+        """An image with a tag somewhere in it, turned at will."""
         number = int(rng.integers(self.numbers))
         tag = Tag(number, SIZE, Pose.level(np.zeros(3)))
         pose = self._pose(condition, rng)

@@ -1,4 +1,4 @@
-"""Tags that the AprilTag library found in its own test pictures."""
+"""Tags that the AprilTag library found in its own test images."""
 
 from __future__ import annotations
 

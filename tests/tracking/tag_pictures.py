@@ -1,4 +1,4 @@
-"""Pictures of single tags with exactly known corners, for tests."""
+"""Images of single tags with exactly known corners, for tests."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def small_camera(distortion: tuple[float, ...] = (-0.08, 0.03, 0.0005, -0.0005))
 
 @dataclass(frozen=True)
 class TagPicture:
-    """A picture of one tag, its pose and its true corners."""
+    """An image of one tag, its pose and its true corners."""
 
     image: NDArray[np.uint8]
     tag: Tag
@@ -44,7 +44,7 @@ class TagPrinter:
     def picture(
         self, camera_from_tag: Pose, rng: np.random.Generator, noise: float = 1.0, number: int = 301
     ) -> TagPicture:
-        """A picture with a tag at a pose."""
+        """An image with a tag at a pose."""
         tag = Tag(number, SIZE, Pose.level(np.zeros(3)))
         canvas = Canvas.blank(self.camera, self._rays, 120.0)
         draw_tag(canvas, FAMILY, tag, Pose.level(np.zeros(3)), camera_from_tag)

@@ -153,7 +153,7 @@ def test_the_camera_that_is_named_first_does_not_decide_which_pictures_count(fir
 
 @pytest.mark.parametrize("late", [0.0, 0.07, 0.099])
 def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) -> None:
-    """Asked every 0.1 s, each answers with a picture of its own time: up to a period apart."""
+    """Asked every 0.1 s, each answers with an image of its own time: up to a period apart."""
     front, common = measured([0.0, 0.0, 0.4], [1e-4] * 3), MultiCameraFusion(0.05)
     for now in (0.0, 0.1):
         seen = {"front": replace(front, time=now), "side": replace(front, time=now + late)}
@@ -170,7 +170,7 @@ def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) 
 def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
     speed: float, late: float, pause: float
 ) -> None:
-    """First pictures, and those after nothing was seen for long: the later, worse camera."""
+    """First images, and those after nothing was seen for long: the later, worse camera."""
 
     def seen(time: float, deviation: float) -> PoseMeasurement:
         one = measured([speed * time, 0.0, 0.4], [deviation] * 3)

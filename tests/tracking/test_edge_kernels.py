@@ -153,7 +153,7 @@ def reference(image: np.ndarray, edge: int, rough: Array, found: Array) -> tuple
         x = (u - p[0] - p[1] * q) / p[2]
         share = (1.0 - p[3]) * norm.cdf(x) + p[3] * box.cdf(x)
         dark, bright = p[4] + p[5] * q, p[6] + p[7] * q
-        kind = 2.0 * (p[3] - KIND) / KIND_DEVIATION  # 2 is the noise of the pictures
+        kind = 2.0 * (p[3] - KIND) / KIND_DEVIATION  # 2 is the noise of the images
         return np.append(dark + (bright - dark) * share - value, kind)
 
     start = [0.0, 0.0, 0.8, 0.5, 30.0, 0.0, 220.0, 0.0]

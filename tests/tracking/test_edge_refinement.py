@@ -1,4 +1,4 @@
-"""Corners to hundredths of a pixel on pictures with exactly known corners."""
+"""Corners to hundredths of a pixel on images with exactly known corners."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_cable_across_an_edge_does_not_move_it(printer: TagPrinter) -> None:
     start, end = picture.corners[0], picture.corners[1]
     middle = np.round((start + end) / 2).astype(int)
     image = picture.image.copy()
-    image[:, middle[0] - 1 : middle[0] + 2] = 40  # a dark line of 3 px down the picture
+    image[:, middle[0] - 1 : middle[0] + 2] = 40  # a dark line of 3 px down the image
     square = only(printer, image, picture.corners)
     whitened = square.whitening @ picture.corners.ravel() - square.target
     assert np.abs(whitened).max() < 5.0

@@ -67,8 +67,8 @@ def test_one_measurement_in_ten_is_wrong_and_none_of_them_moves_the_pose() -> No
 
 
 def test_measurements_are_compared_with_the_drives_at_their_own_time() -> None:
-    """At 0.03 m/s a picture that is taken for 50 ms younger than it is costs 1.5 mm."""
-    times = np.arange(0.0, 4.0, 0.1)  # slow drives, so that cycles lie far from pictures
+    """At 0.03 m/s an image that is taken for 50 ms younger than it is costs 1.5 mm."""
+    times = np.arange(0.0, 4.0, 0.1)  # slow drives, so that cycles lie far from images
     exact = [Measured(t + 0.05, truth_at(t + 0.05), np.eye(6) * 1e-12) for t in times[:-1]]
     found = list(fused(times.tolist(), [truth_at(t) for t in times], exact))
     assert max(f.pose.distance_to(truth_at(f.time)) for f in found) < 1e-4

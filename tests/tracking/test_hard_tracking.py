@@ -72,7 +72,7 @@ def test_two_prints_of_one_tag_are_told_apart_by_nothing(
     image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
     found = Tracker(one, camera).observe(image, 0.0)
     assert isinstance(found, NoPose)
-    assert "do not agree" in found.reason
+    assert "inconsistent" in found.reason
 
 
 def test_another_print_of_a_frame_tag_does_not_move_the_camera(
@@ -124,7 +124,7 @@ def test_motion_is_carried_on() -> None:
 
 
 def test_a_fast_platform_is_followed_by_its_speed(rig: Rig, camera: Camera, empty: Scene) -> None:
-    """0.15 m/s at 10 pictures a second are 9 px from picture to picture, more than a module."""
+    """0.15 m/s at 10 images a second are 9 px from image to image, more than a module."""
     eye, tracker = SyntheticCamera(rig, empty, camera, seed=6), Tracker(rig, camera)
     for frame in range(8):
         truth = Pose.level([-0.06 + 0.015 * frame, 0.1, 0.4])

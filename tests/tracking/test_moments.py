@@ -1,4 +1,4 @@
-"""Pictures of several cameras are put together by their times, and none is lost."""
+"""Images of several cameras are put together by their times, and none is lost."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_nearer_than_planned_counts_the_upper_side_too() -> None:
 def test_what_is_told_names_the_obstacle_that_is_surely_too_near() -> None:
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
     told = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
-    assert told == "platform to post 1: 12.0 ± 1.0 mm; the scene asks for 20 mm"
+    assert told == "platform to post 1: 12.0 ± 1.0 mm; the scene requires 20 mm"
 
 
 @given(obstacles_mm=OBSTACLES, shares=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))

@@ -1,4 +1,4 @@
-"""A camera that takes pictures faster than they are asked for: none grows old in a queue."""
+"""A camera that takes images faster than they are asked for: none grows old in a queue."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from model.rig import Camera
 
 
 class Queue:
-    """Pictures of a camera, waiting for whoever reads them.
+    """Images of a camera, waiting for whoever reads them.
 
-    A picture's brightness is its number. Reading one takes no time; when none waits, reading waits,
+    An image's brightness is its number. Reading one takes no time; when none waits, reading waits,
     as with a camera, for the next.
     """
 
@@ -67,7 +67,7 @@ class Queue:
         self.released = True
 
     def clock(self) -> float:
-        """Each picture arrives when it is read, a hundred a second."""
+        """Each image arrives when it is read, a hundred a second."""
         return (self._taken - 1) / 100.0
 
 
@@ -88,7 +88,7 @@ def test_the_newest_picture_is_answered_with_the_time_at_which_it_came(
             queue.take(30)
             queue.wait_until_read()
             frame = live.read()
-            assert (int(frame.image[0, 0]), frame.name) == (number, f"picture {number}")
+            assert (int(frame.image[0, 0]), frame.name) == (number, f"image {number}")
             assert frame.time == pytest.approx(number / 100.0)
         queue.unplug()
     assert queue.released
@@ -99,7 +99,7 @@ def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
     with LiveCamera("0", camera, queue.clock) as live:
         later = threading.Timer(0.0, queue.take, [1])
         later.start()
-        assert live.read().name == "picture 1"
+        assert live.read().name == "image 1"
         later.join()
         queue.unplug()
 
@@ -117,7 +117,7 @@ def test_a_camera_that_never_gave_a_picture_or_another_size_is_let_go_of(
     queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue.unplug()
-    with pytest.raises(HardwareMissing, match="gave no picture"):
+    with pytest.raises(HardwareMissing, match="delivered no image"):
         LiveCamera("0", camera, queue.clock)
     assert queue.released
     monkeypatch.setattr(queue, "released", False)

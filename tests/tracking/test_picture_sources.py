@@ -25,8 +25,8 @@ TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(4)]
 
 @pytest.fixture
 def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
-    """Pictures 8 to 11, so that the order of names is not that of letters."""
-    place = tmp_path / "some pictures"
+    """Images 8 to 11, so that the order of names is not that of letters."""
+    place = tmp_path / "some images"
     place.mkdir()
     for k, pose in enumerate(TRUTH):
         name = str(place / f"frame_{8 + k}.png")
@@ -35,7 +35,7 @@ def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
 
 
 def test_a_folder_is_read_in_the_order_of_its_numbers(folder: Path, camera: Camera) -> None:
-    (folder / "notes.txt").write_text("not a picture")
+    (folder / "notes.txt").write_text("not an image")
     frames = list(ImageFolder(folder, camera))
     assert [frame.name for frame in frames] == [f"frame_{8 + k}.png" for k in range(4)]
     np.testing.assert_allclose([frame.time for frame in frames], [0.0, 0.1, 0.2, 0.3])
@@ -65,7 +65,7 @@ def test_a_folder_of_broken_files_only_is_refused(tmp_path: Path, camera: Camera
 
 
 def test_an_empty_or_missing_folder_is_refused(tmp_path: Path, camera: Camera) -> None:
-    with pytest.raises(BadInput, match="no pictures"):
+    with pytest.raises(BadInput, match="no images"):
         ImageFolder(tmp_path, camera)
     with pytest.raises(BadInput, match="no such folder"):
         ImageFolder(tmp_path / "nowhere", camera)
@@ -86,10 +86,10 @@ def test_pictures_that_are_all_of_another_size_are_refused_by_name(
 ) -> None:
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((480, 640), dtype=np.uint8))
     (tmp_path / "broken.png").write_bytes(b"nothing")
-    with pytest.raises(BadInput, match="none of the 2 pictures has the camera's 1280 x 7") as told:
+    with pytest.raises(BadInput, match="none of the 2 images has the camera's 1280 x 7") as told:
         list(ImageFolder(tmp_path, camera))
     assert "small.png has 640 x 480 px" in told.value.why
-    assert "broken.png is no picture" in told.value.why
+    assert "broken.png is not a readable image" in told.value.why
 
 
 def test_a_video_is_measured_picture_by_picture(
@@ -116,8 +116,8 @@ def test_a_video_is_measured_picture_by_picture(
 
 def test_a_file_that_is_no_video_is_refused(tmp_path: Path, camera: Camera) -> None:
     path = tmp_path / "notes.avi"
-    path.write_text("no video")
-    with pytest.raises(BadInput, match="no video"):
+    path.write_text("not a readable video")
+    with pytest.raises(BadInput, match="not a readable video"):
         VideoFile(path, camera)
     with pytest.raises(BadInput, match="no such file"):
         VideoFile(tmp_path / "missing.avi", camera)
@@ -138,7 +138,7 @@ def test_pictures_without_tags_say_what_was_expected(rig: Rig, camera: Camera) -
             pass
     message = str(told.value)
     assert told.value.exit_code == 2
-    assert "none of 3 pictures" in message
+    assert "none of 3 images" in message
     assert "tag36h11 tags 301, 302, 303, 304, 305, 306" in message
     assert "no tag of any known family" in message
 
@@ -155,14 +155,14 @@ def test_pictures_with_other_tags_say_which(
 def test_a_source_without_pictures_and_one_without_an_end_come_to_an_end(
     rig: Rig, camera: Camera
 ) -> None:
-    with pytest.raises(NoPlatformSeen, match="no pictures"):
+    with pytest.raises(NoPlatformSeen, match="no images"):
         list(track([], Tracker(rig, camera)))
 
     def endless() -> object:
         while True:
             yield Frame(0.0, np.full((720, 1280), 90, np.uint8), "again")
 
-    with pytest.raises(NoPlatformSeen, match="none of 2 pictures"):
+    with pytest.raises(NoPlatformSeen, match="none of 2 images"):
         list(track(endless(), Tracker(rig, camera), give_up_after=2))  # type: ignore[arg-type]
 
 
@@ -190,4 +190,4 @@ def test_the_pose_log_has_a_row_a_picture_whether_it_gave_a_pose_or_not(
         1e3 * np.degrees(1.0) * found.covariance[0, 5], rel=1e-4
     )
     assert row["tags"].split() == [str(tag) for tag in found.tags]
-    assert "to be seen" in lines[2]
+    assert "detected" in lines[2]

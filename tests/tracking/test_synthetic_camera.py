@@ -1,4 +1,4 @@
-"""The synthetic camera: exact places, right order of what hides what, the same picture again."""
+"""The synthetic camera: exact places, right order of what hides what, the same image again."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _disk(camera: Camera, point: np.ndarray, radius: int) -> tuple[np.ndarray, n
 
 
 def test_tags_lie_where_dense_sampling_puts_them() -> None:
-    """The mean brightness of the picture equals that of a picture with 6 x 6 samples a pixel."""
+    """The mean brightness of the image equals that of an image with 6 x 6 samples a pixel."""
     camera = small_camera(())
     printer = TagPrinter(camera)
     rng = np.random.default_rng(3)
@@ -149,7 +149,7 @@ def test_tags_lie_where_dense_sampling_puts_them() -> None:
 
 
 def _sampled(camera: Camera, pose: Pose, number: int, samples: int) -> np.ndarray:
-    """A tag's picture by plain sampling; NaN outside of the black square's inside."""
+    """A tag's image by plain sampling; NaN outside of the black square's inside."""
     from simulation.camera.rendering import INK, PAPER, shade
     from tests.tracking.tag_pictures import FAMILY, SIZE
     from tracking.detection.tags import official_modules

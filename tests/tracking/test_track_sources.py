@@ -19,7 +19,7 @@ TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(3)]
 
 @pytest.fixture
 def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
-    """Three pictures, and a file that is no picture."""
+    """Three images, and a file that is no image."""
     place = tmp_path / "pictures"
     place.mkdir()
     for k, pose in enumerate(TRUTH):
@@ -50,7 +50,7 @@ def test_it_stops_before_the_next_picture_when_it_is_asked_to(folder: Path, rig:
 
 def test_a_source_that_is_none_and_a_camera_without_a_path_are_refused(rig: Rig) -> None:
     camera = rig.cameras[0]
-    with pytest.raises(BadInput, match="neither a folder of pictures"):
+    with pytest.raises(BadInput, match="not a folder of images"):
         track_sources(rig, {camera: "nowhere"})
-    with pytest.raises(BadInput, match="needs a path to look at"):
+    with pytest.raises(BadInput, match="needs a path to render"):
         track_sources(rig, {camera: "synthetic"})

@@ -1,4 +1,4 @@
-"""The tracker on rendered pictures: exact enough, honest, never mirrored, never silent."""
+"""The tracker on rendered images: exact enough, honest, never mirrored, never silent."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_a_picture_of_another_kind_is_refused(rig: Rig, camera: Camera, wrong: n
 
 def test_a_rig_without_tags_cannot_be_tracked(rig: Rig, camera: Camera) -> None:
     bare = replace(rig, platform_tags=())
-    with pytest.raises(BadInput, match="no tags"):
+    with pytest.raises(BadInput, match="no platform tags"):
         Tracker(bare, camera)
 
 

@@ -1,4 +1,4 @@
-"""The files that are mutated: rigs, scenes, a plan, a run folder, results, pictures, drives."""
+"""The files that are mutated: rigs, scenes, a plan, a run folder, results, images, drives."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def _work(
     end: float,
 ) -> None:
     sys.stdout = sys.stderr = (keep / f"worker-{number}.log").open("a")
-    os.dup2(sys.stderr.fileno(), 2)  # what libraries print about damaged pictures
+    os.dup2(sys.stderr.fileno(), 2)  # what libraries print about damaged images
     scratch = place / f"worker-{number}-{start}"
     scratch.mkdir()
     os.chdir(scratch)

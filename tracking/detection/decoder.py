@@ -1,4 +1,4 @@
-"""Which tag a square in the picture shows, by correlation of its brightness with all patterns.
+"""Which tag a square in the image shows, by correlation of its brightness with all patterns.
 
 Unlike a decision module by module this reads tags whose modules run into each other: seen from far,
 out of focus, in motion, or with little contrast.
@@ -65,7 +65,7 @@ class TagDecoder:
         """The tag in a square, or None when it shows none for sure.
 
         Args:
-            image: Grey picture.
+            image: Grey image.
             square: Corners clockwise on the screen from any, shape (4, 2), [px].
         """
         values = module_brightness(image, square, self._side, around=1)
@@ -88,7 +88,7 @@ def module_brightness(image: Image, square: Array, modules: int, around: int = 0
     """Brightness in the middle of every module of a square.
 
     Args:
-        image: Grey picture.
+        image: Grey image.
         square: Corners, the first at the upper left of the result, shape (4, 2), [px].
         modules: Along the side of the square.
         around: Rings of modules outside the square that are read too.
@@ -124,7 +124,7 @@ def _normalised(values: Array) -> Array:
     return np.asarray(centred / np.maximum(length, 1e-12))
 
 
-# Whether a square in the picture carries a given tag's pattern.
+# Whether a square in the image carries a given tag's pattern.
 
 
 #: Least correlation of brightness and pattern; another tag's pattern reaches about 0.5.
@@ -135,9 +135,9 @@ def carries_tag(image: Image, corners: Array, family: str, number: int) -> bool:
     """Compares the inner modules of a square with a tag's.
 
     Args:
-        image: Grey picture.
+        image: Grey image.
         corners: In the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2), [px], as in
-            the picture.
+            the image.
         family: Such as ``tag36h11``.
         number: Number in the family.
     """

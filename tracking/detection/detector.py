@@ -1,4 +1,4 @@
-"""Finding tags in a picture, in all of it or in a part, by their numbers."""
+"""Finding tags in an image, in all of it or in a part, by their numbers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tracking.camera_model import Image, Region, pixels_of
 from tracking.detection.decoder import TagDecoder
 from tracking.detection.tags import dictionary, tag_corners, upright_corners
 
-# Squares in a picture that may be tags, also small, faint and blurred ones.
+# Squares in an image that may be tags, also small, faint and blurred ones.
 
 
 #: Shortest outline of a square, [px].
 LEAST_SQUARE_PERIMETER = 30.0
-#: Larger pictures are not enlarged: their tags have pixels enough, and time is short, [px].
+#: Larger images are not enlarged: their tags have pixels enough, and time is short, [px].
 MOST_PIXELS = 4_000_000
 
 
@@ -29,10 +29,10 @@ class Pass:
     """One way to make dark squares stand out.
 
     Attributes:
-        scale: How much the picture is enlarged.
+        scale: How much the image is enlarged.
         smoothing: Standard deviation of the smoothing before, [px].
         step: How much darker than its surroundings ink is, [grey levels].
-        windows: Sides of the surroundings: smallest, largest, step, [px of the enlarged picture].
+        windows: Sides of the surroundings: smallest, largest, step, [px of the enlarged image].
     """
 
     scale: int
@@ -53,7 +53,7 @@ def squares_in(image: Image, family: str) -> list[Array]:
     """Outlines of squares, clockwise on the screen from any corner, shape (4, 2) each, [px].
 
     Args:
-        image: Grey picture.
+        image: Grey image.
         family: Whose tags are looked for.
     """
     found: list[Array] = []
@@ -126,10 +126,10 @@ class TagDetector:
     def detect(
         self, image: Image, region: Region | None = None, *, thorough: bool = False
     ) -> list[Detection]:
-        """Tags in the picture or in a region of it, each number once (the largest).
+        """Tags in the image or in a region of it, each number once (the largest).
 
         Args:
-            image: Grey picture.
+            image: Grey image.
             region: Where to look; everywhere when left out.
             thorough: Also finds small, faint and blurred tags, in about ten times the time.
         """
@@ -155,7 +155,7 @@ class TagDetector:
         return found + self._thoroughly(image, found) if thorough else found
 
     def _plainly(self, image: Image) -> list[Detection]:
-        # OpenCV counts this limit in shares of the picture: in a small region noise would pass it.
+        # OpenCV counts this limit in shares of the image: in a small region noise would pass it.
         self._parameters.minMarkerPerimeterRate = LEAST_PERIMETER / max(image.shape)
         self._detector.setDetectorParameters(self._parameters)
         corners, numbers, _ = self._detector.detectMarkers(image)
@@ -196,7 +196,7 @@ def _area(corners: Array) -> float:
     return abs(float(x[0] * y[1] - x[1] * y[0])) / 2.0
 
 
-# Where things of known place in the world lie in a camera's picture: frame tags, the platform.
+# Where things of known place in the world lie in a camera's image: frame tags, the platform.
 
 
 #: Nearer to the camera's plane nothing is seen, [m].

@@ -1,4 +1,4 @@
-"""Which tags a picture shows that nobody asked for: for messages that help."""
+"""Which tags an image shows besides the expected ones, for helpful messages."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from model.files.rig_file import APRILTAG_FAMILIES
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
 
-#: Families by which a wrong one is told: of ArUco dictionaries of a size the largest holds the
+#: Families that identify a wrong one: of ArUco dictionaries of a size the largest holds the
 #: others. Those with 16 modules are left out: they are found by chance.
 TOLD = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000", "7X7_1000")
 
 
 def what_else_is_seen(image: Image, family: str, expected: Sequence[int]) -> str:
-    """Says which tags a picture shows that are not the expected ones, for an error message.
+    """Says which tags an image shows that are not the expected ones, for an error message.
 
     Also whether the expected ones are there once it is flipped over.
     """
@@ -29,7 +29,7 @@ def what_else_is_seen(image: Image, family: str, expected: Sequence[int]) -> str
     told = "; ".join(seen) or "no tag of any known family"
     flipped = np.ascontiguousarray(image[:, ::-1])
     if any(d.id in expected for d in TagDetector(family).detect(flipped)):
-        told += "; flipped over they are there, so the pictures are mirrored"
+        told += "; the expected tags appear mirrored, so the images are mirrored"
     return told
 
 

@@ -40,7 +40,7 @@ FAMILIES = ("tag16h5", "tag25h9", "tag36h11")
 class AprilTagLibrary(TagDetector):
     """As `TagDetector`, by pyapriltags: better at small and faint tags, some times slower.
 
-    Plainly it looks at a picture of half the size, thoroughly at the whole one.
+    Plainly it looks at an image of half the size, thoroughly at the whole one.
 
     Args:
         family: Such as ``tag36h11``.

@@ -1,8 +1,8 @@
-"""Tag families: their pictures and the corners of a tag.
+"""Tag families: their images and the corners of a tag.
 
-OpenCV draws every AprilTag family turned by 180° against the pictures of the AprilTag project,
+OpenCV draws every AprilTag family turned by 180° against the images of the AprilTag project,
 which labs print; ArUco markers are printed as OpenCV draws them. A tag's frame here is that of the
-printed picture: x right, y up, z out of it.
+printed image: x right, y up, z out of it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from model.files.rig_file import FAMILIES, drawn_upside_down, opencv_dictionary
 from model.pose import Array
 from model.rig import Tag
 
-#: Top left, top right, bottom right, bottom left of the upright picture, in half sides.
+#: Top left, top right, bottom right, bottom left of the upright image, in half sides.
 CORNER_SIGNS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 
 
@@ -43,7 +43,7 @@ def modules_across(family: str) -> int:
 
 @lru_cache(maxsize=256)
 def official_modules(family: str, number: int) -> NDArray[np.bool_]:
-    """White modules of the printed picture, black border included, rows from the top."""
+    """White modules of the printed image, black border included, rows from the top."""
     side = modules_across(family)
     picture = cv2.aruco.generateImageMarker(dictionary(family), number, side)
     return np.asarray((picture[::-1, ::-1] if drawn_upside_down(family) else picture) > 127)

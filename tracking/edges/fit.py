@@ -206,7 +206,7 @@ def _expect(
     return float(weight * error * error)
 
 
-#: Pixels are read so far from an edge: so many deviations of its blur and so many pixels, but not
+#: Pixels are read this far from an edge: deviations of its blur plus a number of pixels, but not
 #: beyond this share of a module.
 REACH_SPREADS, REACH, REACH_MODULES = 2.2, 1.5, 0.95
 #: And so far from its corners: pixels, and deviations of the neighbouring edges' blur.

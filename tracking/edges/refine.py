@@ -1,7 +1,7 @@
 """Tag corners to hundredths of a pixel: lines fitted to the four edges of the black square.
 
 A blurred step from ink to paper is fitted to the pixels beside each edge, freed of what its corners
-and the modules next to it add. Pixels tell their noise themselves, so each line comes with what it
+and the modules next to it add. Pixels show their noise themselves, so each line comes with what it
 may be off. The lines are freed of lens distortion and meet at the corners.
 """
 
@@ -57,12 +57,12 @@ def meet(lines: Lines, rough: Array) -> Array:
     return np.where(good[..., None], points + share[..., None] * directions, rough)
 
 
-# Edges of tags as curves in the picture, bent by the lens, and as lines in ideal pixels.
+# Edges of tags as curves in the image, bent by the lens, and as lines in ideal pixels.
 
 
 #: An edge is used only if this share of it looks like one.
 LEAST_SHARE = 0.4
-#: Where the brightness of pixels tells so little that one pixel of its length places an edge no
+#: Where the brightness of pixels says so little that one pixel of its length places an edge no
 #: better than this, there is none, [px].
 MOST_SCATTER = 1.2
 
@@ -72,7 +72,7 @@ class EdgeCurves:
     """Where the edges of squares are looked for.
 
     Attributes:
-        camera: In whose picture.
+        camera: In whose image.
         pixels: Corners, shape (t, 4, 2), [px], lens distortion included.
         ideal: The same in ideal pixels.
         lengths: Of the chords, shape (t, 4), [px].
@@ -158,7 +158,7 @@ def _outward(along: Array) -> Array:
 
 
 def _bows(camera: Camera, pixels: Array, ideal: Array, lengths: Array, along: Array) -> Array:
-    """Through the pictures of two points of each straight edge."""
+    """Through the images of two points of each straight edge."""
     share = np.array([1.0, 2.0])[:, None] / 3.0
     way = np.roll(ideal, -1, axis=1) - ideal
     inner = pixels_from_ideal(camera, ideal[:, :, None] + share * way[:, :, None])
@@ -181,7 +181,7 @@ SECOND_ROW = 1.0
 CROWDED = 0.22
 #: Elsewhere they are fitted again only if they move by more than `FAR`, [px].
 NEAR, FAR = 0.03, 0.3
-#: At most so many fits.
+#: Largest number of fits.
 MOST_FITS = 4
 
 
@@ -221,19 +221,19 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     """Refines the corners of tags.
 
     Args:
-        image: Grey picture, shape (h, w).
-        camera: Whose picture it is.
+        image: Grey image, shape (h, w).
+        camera: Whose image it is.
         corners: Roughly (to about a module), in the order of
             `tracking.detection.tags.CORNER_SIGNS`, shape (t, 4, 2), [px], lens distortion included.
         modules: Modules along the side of the black square.
 
     Returns:
-        One entry a tag: None where it leaves the picture or fewer than two edges are to be seen.
+        One entry a tag: None where it leaves the image or fewer than two edges are to be seen.
     """
     if not len(corners):
         return []
     pixels = np.ascontiguousarray(image)[:]
-    pixels.flags.writeable = False  # kernels are compiled for pictures that nobody writes to
+    pixels.flags.writeable = False  # kernels are compiled for images that are read-only
     rough = np.array(corners, dtype=np.float64)
     inside = _inside(rough, image.shape)
     curves = EdgeCurves.between(camera, np.where(inside, rough, _somewhere(image.shape)))
@@ -261,7 +261,7 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
 
 
 def load_kernels() -> None:
-    """Loads the machine code of `refine`, or compiles it, so that no picture waits for it."""
+    """Loads the machine code of `refine`, or compiles it, so that no image waits for it."""
     grey = np.zeros((16, 16), dtype=np.uint8)
     grey.flags.writeable = False
     square, bows = _somewhere(grey.shape)[None], np.zeros((1, 4, 2))
@@ -271,7 +271,7 @@ def load_kernels() -> None:
 
 
 def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Which tags lie in the picture, shape (t, 1, 1)."""
+    """Which tags lie in the image, shape (t, 1, 1)."""
     limit = np.array([shape[1], shape[0]]) - 3.0
     return np.asarray(
         np.all((corners >= 2.0) & (corners <= limit), axis=(1, 2), keepdims=True), dtype=np.bool_
@@ -279,7 +279,7 @@ def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def _somewhere(shape: tuple[int, ...]) -> Array:
-    """A square in the picture that stands in for unusable tags, so that arrays stay whole."""
+    """A square in the image that stands in for unusable tags, so that arrays stay whole."""
     return np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
 
 

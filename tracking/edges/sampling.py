@@ -14,7 +14,7 @@ from model.jit import compiled
 from model.pose import Array
 from tracking.camera_model import Image
 
-# A tag's square in the picture: its edges' frames, and where its modules lie beside an edge.
+# A tag's square in the image: its edges' frames, and where its modules lie beside an edge.
 
 
 @compiled
@@ -64,7 +64,7 @@ def beside(quad: Array, edge: int, plane: Array, a: float, b: float) -> tuple[fl
 
 # What is known of one edge, as columns of an array.
 #
-# Along an edge places are told by q, from -1 at the first pixel that was read to 1 at the last one.
+# Positions on an edge are given by q, from -1 at the first pixel read to 1 at the last one.
 
 
 OFFSET = 0
@@ -90,7 +90,7 @@ COLUMNS = 10
 # How brightness rises across a blurred edge.
 
 
-#: Beyond so many standard deviations a blurred edge is flat.
+#: Beyond this many standard deviations a blurred edge is flat.
 FLAT = 4.5
 _STEPS = 64  # of the table, a standard deviation
 _ROOT_3 = math.sqrt(3.0)
@@ -209,7 +209,7 @@ def tell_ink(
         edge: Which edge of it.
         pixels: Row `INK` is written.
         count: Of the pixels.
-        found: Of the edge; tells the span that was read.
+        found: Of the edge; has the span that was read.
         spread: Of the neighbouring edges' blur, [px].
     """
     _, _, ax, ay, length = edge_frame(quad, edge)
@@ -243,7 +243,7 @@ def tell_modules(
         modules: Along the side of the square.
         pixels: Rows `WITHIN`, `BEYOND` and those from `MODULES` on are written.
         count: Of the pixels.
-        found: Of the edge; tells the span that was read.
+        found: Of the edge; has the span that was read.
         spread: Of the neighbouring edges' blur, [px].
     """
     module = 1.0 / modules

@@ -19,11 +19,11 @@ def apply(
         list[Path], typer.Argument(help="result files of `cdpr calibrate`", metavar="RESULT...")
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="rig file to write; it must not exist yet")
+        Path, typer.Option("-o", "--output", help="rig file to write; must not exist yet")
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Write a new rig file with calibration results in place of the rig file's numbers.
+    """Write a new rig file with calibration results in place of its own values.
 
     The rig file itself is never changed, and comments of it are not copied.
 

@@ -35,23 +35,25 @@ _SIZES = ("square_mm", "marker_mm", "tag_mm", "gap_mm")
 class BoardOptions:
     """What was said about a board; every field is an option of the verbs that know boards."""
 
-    board: Annotated[BoardName, typer.Option(help="what was printed")] = BoardName.chessboard
+    board: Annotated[BoardName, typer.Option(help="kind of target")] = BoardName.chessboard
     columns: Annotated[
         int | None,
-        typer.Option(min=1, help="inner corners (chessboard), squares (charuco) or tags in a row"),
+        typer.Option(min=1, help="inner corners (chessboard), squares (charuco) or tags per row"),
     ] = None
-    rows: Annotated[int | None, typer.Option(min=1, help="how many rows of them")] = None
+    rows: Annotated[int | None, typer.Option(min=1, help="number of rows")] = None
     square_mm: Annotated[
         float | None, typer.Option(help="side of a square (chessboard, charuco)")
     ] = None
     marker_mm: Annotated[float | None, typer.Option(help="side of a marker (charuco)")] = None
-    dictionary: Annotated[str, typer.Option(help="of the markers (charuco), as 5X5_100")] = "4X4_50"
+    dictionary: Annotated[
+        str, typer.Option(help="marker dictionary (charuco), such as 5X5_100")
+    ] = "4X4_50"
     legacy: Annotated[
-        bool, typer.Option("--legacy", help="charuco as OpenCV before 4.6 drew it")
+        bool, typer.Option("--legacy", help="charuco layout of OpenCV before 4.6")
     ] = False
     tag_mm: Annotated[float | None, typer.Option(help="side of a tag's black square (tags)")] = None
-    gap_mm: Annotated[float | None, typer.Option(help="between black squares (tags)")] = None
-    family: Annotated[str, typer.Option(help="of the tags (tags)")] = "tag36h11"
+    gap_mm: Annotated[float | None, typer.Option(help="gap between black squares (tags)")] = None
+    family: Annotated[str, typer.Option(help="tag family (tags)")] = "tag36h11"
     first: Annotated[int, typer.Option(min=0, help="number of the top left tag (tags)")] = 0
 
     def made(self) -> Board:
@@ -64,7 +66,7 @@ class BoardOptions:
         if self.columns is None or self.rows is None:
             raise BadInput(
                 "a board needs --columns and --rows",
-                next_step="count inner corners (chessboard), squares (charuco) or tags on it",
+                next_step="count inner corners (chessboard), squares (charuco) or tags",
             )
         count, sides = (self.columns, self.rows), self._sides()
         match self.board:
@@ -82,11 +84,11 @@ class BoardOptions:
         if missing := [name for name in needed if sizes[name] is None]:
             raise BadInput(
                 f"--board {self.board.value} needs {_listed(missing)}",
-                next_step="measure it on the print, with a ruler over many squares",
+                next_step="measure over many squares of the print with a ruler",
             )
         given = [name for name, size in sizes.items() if size is not None]
         if others := [name for name in given if name not in needed]:
-            what = f"--board {self.board.value} knows no {_listed(others)}"
+            what = f"--board {self.board.value} does not take {_listed(others)}"
             raise BadInput(what, next_step="leave it out")
         return [(sizes[name] or 0.0) / 1e3 for name in needed]
 

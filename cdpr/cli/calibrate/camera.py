@@ -1,4 +1,4 @@
-"""`cdpr calibrate camera`: from pictures of a board."""
+"""`cdpr calibrate camera`: from images of a board."""
 
 from __future__ import annotations
 
@@ -26,31 +26,34 @@ from model.files.output import make_folder
 @with_option_groups
 def camera(
     folder: Annotated[
-        Path, typer.Argument(help="folder of pictures of the board, or for --live", metavar="DIR")
+        Path,
+        typer.Argument(
+            help="folder of images of the target; with --live, folder to fill", metavar="DIR"
+        ),
     ],
     printed: BoardOptions,
     live: Annotated[
         str | None,
-        typer.Option(help="take the pictures with this camera (or of a video) into DIR first"),
+        typer.Option(help="first capture images from this camera or video into DIR"),
     ] = None,
     pictures: Annotated[
-        int | None, typer.Option(min=4, help="with --live: how many at least (default: 40)")
+        int | None, typer.Option(min=4, help="with --live: minimum number of images (default: 40)")
     ] = None,
     size_px: Annotated[
         tuple[int, int] | None,
-        typer.Option(help="with --live: width and height (default: 1280 720)"),
+        typer.Option(help="with --live: image width and height (default: 1280 720)"),
     ] = None,
-    name: Annotated[str, typer.Option(help="of the camera in the rig file")] = "camera",
+    name: Annotated[str, typer.Option(help="name of the camera in the rig file")] = "camera",
     wanted_mm: WantedOption = 1.0,
     distance_m: Annotated[
         float | None,
-        typer.Option(min=0.01, help="from which the camera measures, else the boards'"),
+        typer.Option(min=0.01, help="working distance of the camera (default: that of the target)"),
     ] = None,
     output: FolderOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find a camera's matrix and lens distortion, and say whether they are good enough.
+    """Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.
 
     Exit code 3 where they are not. Files that cannot be used are named; the others are used.
 
@@ -67,9 +70,9 @@ def camera(
     board = printed.made()
     if live is None and (pictures is not None or size_px is not None):
         raise BadInput(
-            "--pictures and --size-px are for taking pictures",
+            "--pictures and --size-px are for capturing images",
             where="calibrate camera",
-            next_step="pass --live CAMERA too, or leave them out: a folder's pictures are all used",
+            next_step="pass --live CAMERA as well, or leave them out",
         )
     to = Destination(output, force)
     if live is not None:
@@ -93,7 +96,7 @@ def camera(
 def _take_pictures(
     source: str, folder: Path, board: Board, wanted: int, size: tuple[int, int]
 ) -> None:
-    """Takes pictures until enough are there, the video ends, or Ctrl-C."""
+    """Takes images until enough are there, the video ends, or Ctrl-C."""
     requests = LocalRequests()
     with stop_requests(requests):
         take_pictures(
@@ -106,22 +109,22 @@ def _take_pictures(
             stopped=lambda: requests.read().stop,
         )
     if requests.read().stop:
-        err.print("no more pictures are taken; those that were are used")
+        err.print("capture stopped; the images so far are used")
 
 
 def _facts(made: CameraOutcome) -> list[tuple[str, str]]:
     """What was found beside the numbers, for people."""
     result, quality = made.found, made.quality
     return [
-        ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
+        ("corners", f"{result.error:.3f} px RMS error in {len(result.views)} images"),
         (
             "boards were",
             f"{quality.nearest:.3g} to {quality.farthest:.3g} m away; if not, the sizes are wrong",
         ),
-        ("covered", f"{quality.covered:.0%} of the picture, {FULL_COVERAGE:.0%} are good"),
+        ("covered", f"{quality.covered:.0%} of the image; {FULL_COVERAGE:.0%} or more is good"),
         (
             "precision",
             f"{quality.verdict.error * 1e3:.2g} mm at {quality.distance:.2f} m (95 %); two halves"
-            f" of the pictures are {quality.halves * 1e3:.2g} mm apart",
+            f" of the images differ by {quality.halves * 1e3:.2g} mm",
         ),
     ]

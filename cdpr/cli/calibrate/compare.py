@@ -42,7 +42,7 @@ def diff(
             )
             for change in found.changes
         ]
-        facts += [(name, "in one of them only") for name in found.only_in_one]
+        facts += [(name, "in one result only") for name in found.only_in_one]
         show_facts(title, facts)
     if not found.agree:
         raise typer.Exit(3)

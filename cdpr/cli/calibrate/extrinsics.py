@@ -21,8 +21,7 @@ from cdpr.cli.calibrate.output import (
     WantedOption,
     show_calibration,
 )
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import JsonOption, RigArgument, finite
+from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig, finite
 from cdpr.cli.output import Terminal
 from model.rig import load_rig
 
@@ -34,14 +33,16 @@ def extrinsics(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="go by the rig's motion: poses by picture (CSV), or the folder of a run",
+            help="use the rig's motion: poses per image (CSV), or a run folder",
             metavar="FILE",
         ),
     ] = None,
     survey_mm: Annotated[
         float,
         typer.Option(
-            min=0.0, callback=finite, help="how well corners of frame tags were surveyed, deviation"
+            min=0.0,
+            callback=finite,
+            help="standard deviation of the surveyed corners of frame tags",
         ),
     ] = 0.5,
     survey_deg: Annotated[
@@ -49,7 +50,7 @@ def extrinsics(
         typer.Option(
             min=0.0,
             callback=finite,
-            help="how well turns of frame tags are known, deviation; --survey-mm is then of whole"
+            help="standard deviation of frame tags' rotations; --survey-mm is then of whole"
             " tags (default: each corner was surveyed by itself)",
         ),
     ] = None,
@@ -60,9 +61,9 @@ def extrinsics(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where a camera stands, by surveyed tags on the frame or by the rig's own motion.
+    """Find a camera's pose, from surveyed tags on the frame or from the rig's motion.
 
-    Pictures must be taken while the camera stands still. Exit code 3 where the result is not good
+    Images must be taken while the camera stands still. Exit code 3 where the result is not good
     enough.
 
     [dim]Examples:[/dim]
@@ -87,8 +88,8 @@ def extrinsics(
     )
     found = made.found
     facts = [
-        ("by", f"{found.by}, {found.pictures} pictures"),
-        *((f"tag {k}", f"{error:.3f} px off") for k, error in found.tag_errors.items()),
+        ("by", f"{found.by}, {found.pictures} images"),
+        *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
         *moved_rows(the_camera.world_from_camera, found.world_from_camera),
     ]
     show_calibration(made, facts, as_json)

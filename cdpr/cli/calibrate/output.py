@@ -16,18 +16,18 @@ FolderOption = Annotated[
     Path | None, typer.Option("-o", "--output", help="folder for the result and its report")
 ]
 ForceOption = Annotated[
-    bool, typer.Option("--force", help="replace the result of the same name and day")
+    bool, typer.Option("--force", help="replace a result of the same name and date")
 ]
 WantedOption = Annotated[
-    float, typer.Option(min=0.001, callback=finite, help="what is good enough, 95 %")
+    float, typer.Option(min=0.001, callback=finite, help="required accuracy, 95 %")
 ]
 SourceArgument = Annotated[
     str,
-    typer.Argument(help="folder of pictures, video file or camera index", metavar="SOURCE"),
+    typer.Argument(help="folder of images, video file or camera index", metavar="SOURCE"),
 ]
 PicturesOption = Annotated[
     int | None,
-    typer.Option(min=1, help="how many to take of a video or of a camera (default: 20; tags: 40)"),
+    typer.Option(min=1, help="number of images from a video or camera (default: 20; tags: 40)"),
 ]
 CameraOption = Annotated[
     str | None, typer.Option(help="name of the camera in the rig file (default: the first)")

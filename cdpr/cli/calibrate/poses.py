@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from calibration.geometry.pose_selection import measurement_poses
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
 from cdpr.cli.options import (
+    CalibrationOption,
     JsonOption,
     PlanFileOption,
     ReplacePlanOption,
     RigArgument,
     SceneArgument,
+    calibrated_rig,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
 from cdpr.cli.plan_facts import facts_of, sentences_of
@@ -28,27 +29,29 @@ def poses(
     rig: RigArgument,
     scene: SceneArgument,
     output: PlanFileOption,
-    count: Annotated[int, typer.Option(min=10, max=500, help="how many poses")] = 60,
+    count: Annotated[int, typer.Option(min=10, max=500, help="number of poses")] = 60,
     tilt_deg: Annotated[
-        float, typer.Option(min=0.0, max=45.0, help="tilt the platform up to so much")
+        float, typer.Option(min=0.0, max=45.0, help="largest tilt of the platform")
     ] = 15.0,
     turn_deg: Annotated[
-        float, typer.Option(min=0.0, max=45.0, help="turn it about the vertical up to so much")
+        float, typer.Option(min=0.0, max=45.0, help="largest rotation about the vertical")
     ] = 15.0,
-    dwell_s: Annotated[float, typer.Option(min=0.7, help="how long it stands at each")] = 1.5,
+    dwell_s: Annotated[float, typer.Option(min=0.7, help="time at rest at each pose")] = 1.5,
     candidates: Annotated[
-        int, typer.Option(min=10, max=5000, help="places that they are chosen from")
+        int, typer.Option(min=10, max=5000, help="number of candidate poses")
     ] = 300,
     reserve_n: Annotated[
         float | None,
-        typer.Option(min=0.0, help="kept from the tension limits (default: 7.5 % of their range)"),
+        typer.Option(
+            min=0.0, help="distance kept from the tension limits (default: 7.5 % of their range)"
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="of the candidates and of the ways")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="random seed of the candidates and paths")] = 0,
     calibration: CalibrationOption = None,
     force: ReplacePlanOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose the poses that tell most about the rig, and plan a way through them with stops.
+    """Choose the most informative poses for calibration, and plan a path with stops at them.
 
     Each can be held, is free, and is turned as far as cables and tensions allow. `cdpr run` runs
     the plan; `cdpr calibrate rig` reads the run folder.
@@ -76,7 +79,7 @@ def poses(
     if as_json:
         show_json({"plan": str(output), "turned_deg": angles, **facts_of(made.document)})
         return
-    sentences = [s for s in sentences_of(made.document) if s[0] not in ("by way of", "search")]
-    text = f"{len(made.poses)}, turned by up to {max(angles):.1f}°"
+    sentences = [s for s in sentences_of(made.document) if s[0] not in ("via", "search")]
+    text = f"{len(made.poses)}, rotated by up to {max(angles):.1f}°"
     next_step = f"cdpr run {output} --rig {rig} -o RUNDIR, then cdpr calibrate rig {rig} RUNDIR"
     show_facts(f"plan {output}", [("poses", text), *sentences, ("next", next_step)])

@@ -36,23 +36,36 @@ class Deviations:
     outlets_mm: Annotated[
         float,
         typer.Option(
-            min=1e-6, callback=finite, help="how far off outlets may be, one standard deviation"
+            min=1e-6, callback=finite, help="standard deviation of the outlets in the rig file"
         ),
     ] = 4.0
     anchors_mm: Annotated[
-        float, typer.Option(min=1e-6, callback=finite, help="likewise anchors")
+        float, typer.Option(min=1e-6, callback=finite, help="standard deviation of the anchors")
     ] = 1.0
     pulleys_mm: Annotated[
-        float, typer.Option(min=1e-6, callback=finite, help="the pulleys' radius")
+        float,
+        typer.Option(min=1e-6, callback=finite, help="standard deviation of the pulleys' radius"),
     ] = 0.5
     drum_scale_percent: Annotated[
-        float, typer.Option(min=1e-6, callback=finite, help="cable per turn of each drum")
+        float,
+        typer.Option(
+            min=1e-6, callback=finite, help="standard deviation of the cable per drum turn"
+        ),
     ] = 0.5
     offsets_mm: Annotated[
-        float, typer.Option(min=1e-6, callback=finite, help="cable at the reference (home)")
+        float,
+        typer.Option(
+            min=1e-6, callback=finite, help="standard deviation of the cable length at home"
+        ),
     ] = 2.0
     stiffness_percent: Annotated[
-        float, typer.Option(min=1e-6, max=1000.0, callback=finite, help="of the cables")
+        float,
+        typer.Option(
+            min=1e-6,
+            max=1000.0,
+            callback=finite,
+            help="standard deviation of the cables' stiffness",
+        ),
     ] = 20.0
 
     def but(self, known: Sequence[GroupName]) -> dict[str, float]:
@@ -78,51 +91,59 @@ def rig(
     data: Annotated[
         list[Path],
         typer.Argument(
-            help="run folders, and CSV files of places at rest (docs/data-formats.md)",
+            help="run folders and CSV files of stationary samples (docs/data-formats.md)",
             metavar="DATA...",
         ),
     ],
     without_poses: Annotated[
-        bool, typer.Option("--without-poses", help="use drive positions alone, as without a camera")
+        bool,
+        typer.Option("--without-poses", help="use drive positions alone, without camera poses"),
     ] = False,
     known: Annotated[
         list[GroupName] | None,
-        typer.Option(help="numbers to leave as in the rig file; again for more"),
+        typer.Option(help="parameters to keep as in the rig file; repeatable"),
     ] = None,
     deviations: Deviations = DRAWING,
     length_mm: Annotated[
         float,
         typer.Option(
-            min=1e-6, callback=finite, help="how far off lengths by drive positions may be"
+            min=1e-6, callback=finite, help="standard deviation of cable lengths from the encoders"
         ),
     ] = 0.1,
     pose_mm: Annotated[
         float,
         typer.Option(
-            min=1e-6, callback=finite, help="how far off poses may be beside what their file tells"
+            min=1e-6,
+            callback=finite,
+            help="standard deviation of positions, added to that of their file",
         ),
     ] = 0.1,
     pose_deg: Annotated[
-        float, typer.Option(min=1e-6, callback=finite, help="their turns, likewise")
+        float,
+        typer.Option(
+            min=1e-6,
+            callback=finite,
+            help="standard deviation of orientations, added to that of their file",
+        ),
     ] = 0.02,
     tilt_deg: Annotated[
         float,
         typer.Option(
-            min=0.0, max=90.0, callback=finite, help="how far the platform will be turned"
+            min=0.0, max=90.0, callback=finite, help="largest rotation of the platform in use"
         ),
     ] = 5.0,
     wanted_mm: WantedOption = 1.0,
-    name: Annotated[str, typer.Option(help="of the result")] = "rig",
+    name: Annotated[str, typer.Option(help="name of the result")] = "rig",
     output: FolderOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
+    """Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.
 
-    How well they are known is told with each.
+    Each is given with its uncertainty.
 
     Exit code 3 where they are not good enough. What cannot be identified stays as in the rig file,
-    and is told.
+    and is reported.
 
     [dim]Examples:[/dim]
 
@@ -154,12 +175,12 @@ def _facts(made: RigOutcome) -> list[tuple[str, str]]:
     facts = [
         (
             "held out",
-            f"{what} at places left out of the fit are {quality.held_out * 1e3:.3f} mm off (RMS),"
-            f" by the rig file {quality.before * 1e3:.3f} mm; {len(result.measured)} places",
+            f"{what} RMS error at held-out samples {quality.held_out * 1e3:.3f} mm;"
+            f" with the rig file {quality.before * 1e3:.3f} mm; {len(result.measured)} samples",
         ),
         (
             "in the workspace",
-            f"within {quality.level * 1e3:.2g} mm, turned within {quality.turned * 1e3:.2g} mm"
+            f"within {quality.level * 1e3:.2g} mm, rotated within {quality.turned * 1e3:.2g} mm"
             " (95 %)",
         ),
     ]

@@ -18,8 +18,7 @@ from cdpr.cli.calibrate.output import (
     WantedOption,
     show_calibration,
 )
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import JsonOption, RigArgument
+from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import Terminal
 from model.rig import load_rig
 
@@ -30,7 +29,9 @@ def tags(
     camera: CameraOption = None,
     fixed_tag: Annotated[
         int | None,
-        typer.Option(min=0, help="this tag is as in the rig file (default: all fit it best)"),
+        typer.Option(
+            min=0, help="keep this tag as in the rig file (default: best fit of all tags)"
+        ),
     ] = None,
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
@@ -39,9 +40,9 @@ def tags(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where the tags are on the platform, from pictures that show two or more at once.
+    """Find the tags' poses on the platform, from images that show two or more at once.
 
-    Turn the platform before the camera, or carry the camera around it: every picture may be taken
+    Turn the platform before the camera, or carry the camera around it: every image may be taken
     from anywhere. Exit code 3 where the result is not good enough.
 
     [dim]Examples:[/dim]
@@ -63,9 +64,12 @@ def tags(
     )
     found = made.found
     facts = [
-        ("pictures", f"{len(found.errors)} used, corners {found.reprojection:.3f} px off (RMS)"),
+        (
+            "pictures",
+            f"{len(found.errors)} used, reprojection error {found.reprojection:.3f} px RMS",
+        ),
         *(
-            (name, f"moved {shift} mm, turned {turn}° against the rig file; {count}")
+            (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
             for name, shift, turn, _, count in change_rows(found)
         ),
     ]

@@ -31,13 +31,14 @@ def print_(
     output: Annotated[Path, typer.Argument(help="file to write (PDF)", metavar="PDF")],
     printed: BoardOptions,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="print this rig's tags, not a board", metavar="RIG")
+        Path | None,
+        typer.Option("--rig", help="print this rig's tags instead of a board", metavar="RIG"),
     ] = None,
-    paper: Annotated[PaperName, typer.Option(help="to print on")] = PaperName.a4,
+    paper: Annotated[PaperName, typer.Option(help="paper size")] = PaperName.a4,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a board, or the tags of a rig, as PDF in exact size, with the white that they need.
+    """Make a calibration board, or the tags of a rig, as a PDF in exact size.
 
     [dim]Examples:[/dim]
 
@@ -50,16 +51,16 @@ def print_(
     """
     if output.suffix.lower() != ".pdf":
         raise BadInput(
-            "prints are PDF files",
+            "the output must be a PDF file",
             where=str(output),
             next_step=f"name it {output.with_suffix('.pdf').name}",
         )
     require_new_file(output, force)
     if rig is not None and printed != BoardOptions():
         raise BadInput(
-            "--rig prints the rig's tags in the sizes of its file",
+            "--rig prints the rig's tags in the sizes given by its file",
             where="--rig",
-            next_step="leave the board's options out, or leave --rig out",
+            next_step="leave out the board's options, or leave out --rig",
         )
     if rig is None and printed == BoardOptions():
         raise BadInput(
@@ -69,9 +70,7 @@ def print_(
     made = printout(printed.made() if rig is None else load_rig(rig), paper.value)
     pages, what = made.pages, made.what
     write_bytes_atomic(output, made.pdf())
-    step = (
-        "print it at 100 %, measure the ruler and the squares, glue it on something flat and stiff"
-    )
+    step = "print at 100 %, measure the ruler and the squares, glue it to a flat, stiff plate"
     if as_json:
         show_json(
             {

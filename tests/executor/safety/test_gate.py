@@ -64,7 +64,7 @@ def test_a_step_may_be_the_limit_and_not_a_count_more(drive, sign):
         good = replace(MOVE, previous=previous, targets=at, actual=previous)
         assert _allowed(good)
         reason = _denied(replace(good, targets=beyond))
-        assert reason == f"cable {drive + 1}: step of {limit + 1} counts, allowed {limit}"
+        assert reason == f"cable {drive + 1}: step of {limit + 1} counts, limit {limit}"
 
 
 @each_drive
@@ -90,7 +90,7 @@ def test_a_target_may_lag_by_the_limit_and_not_a_count_more(drive, sign, request
     assert _allowed(replace(request_, actual=at))
     reason = _denied(replace(request_, actual=beyond))
     assert reason == (
-        f"cable {drive + 1}: target {limit + 1} counts from the actual position, allowed {limit}"
+        f"cable {drive + 1}: target {limit + 1} counts from the actual position, limit {limit}"
     )
 
 
@@ -100,7 +100,7 @@ def test_a_target_may_lag_by_the_limit_and_not_a_count_more(drive, sign, request
         ({"armed": False}, "not armed"),
         ({"enabled": False}, "not all drives are enabled"),
         ({"latched": True}, "a fault is latched"),
-        ({"previous": None}, "no targets were sent before"),
+        ({"previous": None}, "no previous targets"),
         ({"armed": "yes"}, "not armed"),
         ({"armed": None}, "not armed"),
         ({"enabled": 1}, "not all drives are enabled"),
@@ -143,7 +143,7 @@ def test_holding_the_targets_of_before_is_always_allowed(armed, latched, enabled
 def test_a_hold_never_moves_drives_that_follow(drive, previous, enabled):
     targets = _put(HERE, drive, HERE[drive] + 1)
     request = replace(HOLD, targets=targets, previous=previous, enabled=enabled)
-    assert _denied(request) == "a hold would change the targets of drives that follow them"
+    assert _denied(request) == "a hold would change the targets of drives that follow set-points"
 
 
 def test_drives_that_do_not_follow_may_be_given_their_actual_positions():
@@ -171,7 +171,7 @@ def test_what_is_no_whole_number_is_denied_wherever_it_stands(drive, field, valu
         if getattr(request, field) is None:
             continue
         reason = _denied(replace(request, **{field: _put(HERE, drive, value)}))
-        assert reason.endswith("that are not all whole numbers")
+        assert reason.endswith("are not all whole numbers")
 
 
 @given(
@@ -199,12 +199,12 @@ def test_what_is_allowed_to_move_keeps_every_limit(targets, previous, actual):
 
 @pytest.mark.parametrize("field", ["lowest", "highest", "largest_step", "largest_lag"])
 def test_limits_that_miss_a_drive_cannot_be_made(field):
-    with pytest.raises(ValueError, match="one limit of each kind for every drive"):
+    with pytest.raises(ValueError, match="one limit of each kind per drive"):
         replace(LIMITS, **{field: getattr(LIMITS, field)[:2]})
 
 
 def test_limits_for_no_drive_cannot_be_made():
-    with pytest.raises(ValueError, match="one limit of each kind for every drive"):
+    with pytest.raises(ValueError, match="one limit of each kind per drive"):
         Limits((), (), (), ())
 
 
@@ -220,7 +220,7 @@ def test_limits_that_are_no_whole_numbers_cannot_be_made(field, value):
     ("field", "value"), [("largest_step", -1), ("largest_lag", -1), ("highest", -1001)]
 )
 def test_limits_that_allow_nothing_cannot_be_made(drive, field, value):
-    with pytest.raises(ValueError, match="leave nothing"):
+    with pytest.raises(ValueError, match="allow nothing"):
         replace(LIMITS, **{field: _put(getattr(LIMITS, field), drive, value)})
 
 

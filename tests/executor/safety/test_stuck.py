@@ -11,8 +11,8 @@ from executor.safety.stall import Drive, StuckLimits, StuckWatch
 
 HERE = (True, (0, 0), (0, 0), (False, False))
 NAMES = ("cable 1 (drive 11)", "cable 2 (drive 9)")
-NOTE = "{} stood still for 1 cycle while its set-points went on"
-STOP = "{} stood still for {} cycles while its set-points went on"
+NOTE = "{} did not move for 1 cycle while its set-points advanced"
+STOP = "{} did not move for {} cycles while its set-points advanced"
 LIMITS = StuckLimits(least=10, travel=100)
 
 

@@ -51,5 +51,5 @@ def test_a_cycle_in_time_may_always_be_sent(timeout: float) -> None:
 
 @pytest.mark.parametrize("timeout", [1.099, 1.0, 0.5, 0.0, -1.0, NAN])
 def test_a_time_out_that_no_cycle_could_keep_is_an_error(timeout: float) -> None:
-    with pytest.raises(ValueError, match="cannot be kept going"):
+    with pytest.raises(ValueError, match="cannot be kept enabled"):
         SyncAge(timeout)

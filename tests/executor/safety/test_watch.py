@@ -108,14 +108,14 @@ def test_a_following_error_may_be_the_limit_and_not_more(drive, sign):
     (found,) = _look(_with("following_errors", drive, sign * 0.00201))
     assert (found.reaction, found.code) == (StopReaction.QUICK_STOP, "following_error")
     assert found.text == (
-        f"cable {drive + 1} is {sign * 2.01:.2f} mm from its set-point, allowed 2.00 mm"
+        f"cable {drive + 1} is {sign * 2.01:.2f} mm from its set-point, limit 2.00 mm"
     )
 
 
 def test_a_following_error_is_told_in_millimetres():
     wide = Monitor.fresh(replace(LIMITS, following_error=0.5), NAMES)
     (found,) = wide.look(_with("following_errors", 0, 2.5))[1]
-    assert found.text == "cable 1 is 2500.00 mm from its set-point, allowed 500.00 mm"
+    assert found.text == "cable 1 is 2500.00 mm from its set-point, limit 500.00 mm"
 
 
 @each_drive
@@ -169,7 +169,7 @@ def test_three_cycles_without_tension_in_a_row_are_a_quick_stop(drive, tension):
     (found,) = _look(*[none] * 3)
     assert found.drive == drive + 1
     assert found.text == (
-        f"cable {drive + 1} carries {tension:.1f} N, no tension: it is torn or hangs loose"
+        f"cable {drive + 1} carries {tension:.1f} N, no tension: it is broken or slack"
     )
 
 

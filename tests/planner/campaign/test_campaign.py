@@ -223,7 +223,7 @@ def test_tables_have_a_row_for_everything_and_their_keys_tell_arms_apart(results
 
 
 class Reader(HTMLParser):
-    """Collects open tags and pictures."""
+    """Collects open tags and images."""
 
     def __init__(self) -> None:
         super().__init__()

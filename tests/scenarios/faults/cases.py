@@ -346,7 +346,7 @@ TABLE: dict[str, Fault] = {
         outgoing(lambda: spoil(REPLY_4, mirrored)), words=("drive 4", "jumped")
     ),
     "F12 a frozen position": Fault(
-        outgoing(lambda: spoil(REPLY_4, frozen())), words=("(drive 4) stood still",)
+        outgoing(lambda: spoil(REPLY_4, frozen())), words=("(drive 4) did not move",)
     ),
     "F12 a short set-point": Fault(
         incoming(lambda: spoil(SET_POINT_4, lambda d: d[:5], 1)),
@@ -354,7 +354,7 @@ TABLE: dict[str, Fault] = {
         words=("drive 4", "length"),
     ),
     "F13 replies come twice": Fault(
-        outgoing(lambda: repeat(REPLY_4)), words=("(drive 4) answers twice",), within=5.0
+        outgoing(lambda: repeat(REPLY_4)), words=("(drive 4) answered twice",), within=5.0
     ),
     "F13 old replies": Fault(
         outgoing(lambda: delay(REPLY_4, 0.02)), words=("(drive 4) did not answer",)
@@ -370,7 +370,7 @@ TABLE: dict[str, Fault] = {
         broken(1, by=jam),
         within=SEEN_TWICE,
         late=MAY_BE_LATE,
-        words=("(drive 2) stood still",),
+        words=("(drive 2) did not move",),
     ),
     "F17 a winch jams, its drive tells": Fault(
         broken(1, by=jam_seen_by_the_drive),
@@ -382,7 +382,7 @@ TABLE: dict[str, Fault] = {
         broken(1, by=slip),
         within=BELIEVED,
         late=MAY_BE_LATE,
-        words=("cable 2", "allowed 2.00 mm"),
+        words=("cable 2", "limit 2.00 mm"),
     ),
     "F18 a cable slackens": Fault(then(feels(0.05)), within=PATH_STOP, words=("cable 6", "slack")),
     "F18 a cable is overloaded": Fault(
@@ -392,7 +392,7 @@ TABLE: dict[str, Fault] = {
         broken(1, by=at_torque_limit),
         within=SEEN_TWICE,
         late=MAY_BE_LATE,
-        words=("(drive 2) stood still",),
+        words=("(drive 2) did not move",),
     ),
     "F19 a cable breaks": Fault(then(feels(0.0)), within=5.0, words=("cable 6", "no tension")),
     "F20 the operator stops": Fault(

@@ -119,12 +119,12 @@ DRIVES: dict[str, Fault] = {
         "mode-when-enabled", "mode-late=5000", words=("6061h",), profile=ONCE_ENABLED
     ),
     "D position noise of 10 counts": with_drives("position-noise=10"),
-    "D position noise of 20 counts": stopped_by_rule("position-noise=20", words=("stood still",)),
+    "D position noise of 20 counts": stopped_by_rule("position-noise=20", words=("did not move",)),
     "D torque noise of 40 per mille": with_drives("torque-noise=40"),
     "D friction of 100 per mille": with_drives("friction=100"),
     "D friction of 200 per mille": stopped_by_rule("friction=200", words=("it may be slack",)),
     "D stick-slip of 15 counts": with_drives("stick-slip=15"),
-    "D stick-slip of 120 counts": stopped_by_rule("stick-slip=120", words=("stood still",)),
+    "D stick-slip of 120 counts": stopped_by_rule("stick-slip=120", words=("did not move",)),
 }
 
 ROWS: dict[str, Fault] = TABLE | DRIVES

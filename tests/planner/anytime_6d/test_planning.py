@@ -1,0 +1,188 @@
+"""Planning with the platform free to turn: ends, seeds, refusals, and plans that pass."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from cdpr.cli.plan_facts import sentences_of
+from model.errors import BadInput, InvalidFile, NoSolution
+from model.files.plan_file import PlanDocument
+from model.plan import load_plan, plan_from_document, save_plan
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Scene, load_scene
+from model.statics.dexterity import rms_anchor_radius
+from planner.anytime_6d.path import TurningRoute, turning_route
+from planner.check import check_path, verify
+from planner.costs import KinematicCost
+from planner.planning import make_plan
+from planner.settings import TurningSettings
+from tests.planner.anytime_6d.rotating_scenes import (
+    CONFIGS,
+    GACHON,
+    HALL,
+    Judge,
+    quaternion,
+    turning,
+)
+
+ROUNDS = TurningSettings(rounds=60)
+RAMP = load_scene(CONFIGS / "turn.yaml")
+
+
+def routed(
+    scene: Scene, settings: TurningSettings, clock: Callable[[], float] = time.perf_counter
+) -> TurningRoute:
+    return turning_route(
+        GACHON, scene, settings, KinematicCost(GACHON, scene.start.rotation), clock=clock
+    )
+
+
+def proved(rig: Rig, scene: Scene, settings: TurningSettings) -> PlanDocument:
+    """The plan's document, after it passed its check and met its ends."""
+    document = make_plan(rig, scene, settings)
+    plan = verify(plan_from_document(document)).plan
+    for pose, wanted in ((plan.waypoints[0], scene.start), (plan.waypoints[-1], scene.goal)):
+        assert pose.distance_to(wanted) < 1e-6
+        assert pose.angle_to(wanted) < 1e-6
+    return document
+
+
+def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> None:
+    document = proved(GACHON, RAMP, ROUNDS)
+    judge, poses = Judge(GACHON, RAMP), plan_from_document(document).waypoints
+    for start, end in itertools.pairwise(poses):
+        assert judge.fault(start, end, 40) == ""
+    assert document.quality.length_mm < 800.0
+    assert document.planner.name == "turning"
+    told = dict(sentences_of(document))["rotation"]
+    tilt = float(told.removeprefix("tilted up to ").split("°")[0])
+    assert 6.0 <= tilt <= 8.0
+    assert "rotated up to" in told
+    assert document.planner.rounds == [60]
+
+
+def test_the_same_seed_and_rounds_give_the_same_path_and_others_another() -> None:
+    first, again = (routed(RAMP, ROUNDS).route for _ in range(2))
+    assert first.path.tolist() == again.path.tolist()
+    assert first.edge_checks == again.edge_checks
+    other = routed(RAMP, TurningSettings(seed=1, rounds=60)).route
+    assert other.path.tolist() != first.path.tolist()
+
+
+def test_more_rounds_are_never_worse_and_a_plan_with_a_budget_tells_them() -> None:
+    ticks = itertools.count()
+    settings = TurningSettings(budget=0.040)
+    found = routed(RAMP, settings, clock=lambda: 1e-3 * next(ticks))
+    again = routed(RAMP, TurningSettings(rounds=found.rounds))
+    assert again.route.path.tolist() == found.route.path.tolist()
+    lengths = [routed(RAMP, TurningSettings(rounds=rounds)).route.path for rounds in (15, 40, 90)]
+    ways = [_length(path) for path in lengths]
+    assert ways == sorted(ways, reverse=True)
+
+
+def _length(path: np.ndarray) -> float:
+    """Length with the turning in it, by rotation vectors of the model."""
+    poses = [Pose.from_quaternion(row[:3], row[3:]) for row in path]
+    radian = rms_anchor_radius(GACHON.anchors)
+    return sum(
+        float(np.hypot(a.distance_to(b), radian * a.angle_to(b)))
+        for a, b in itertools.pairwise(poses)
+    )
+
+
+def test_where_nothing_is_in_the_way_the_single_move_is_the_path() -> None:
+    goal = {"position_mm": [60, 40, 430], "rotation_wxyz": quaternion(4.0, -3.0)}
+    scene = turning("environment_1", 8.0, 2.0, goal=goal, obstacles=[])
+    route = routed(scene, ROUNDS)
+    assert route.rounds == 1
+    level = make_plan(GACHON, scene.changed(goal=Pose.level([0.06, 0.04, 0.43])), ROUNDS)
+    assert "rotation" not in dict(sentences_of(level))
+    assert len(route.route.path) == 2
+
+
+def test_a_stop_may_be_tilted_otherwise_than_start_and_goal() -> None:
+    stop = {
+        "name": "look",
+        "kind": "pass",
+        "position_mm": [150, 60, 400],
+        "rotation_wxyz": quaternion(-3.0, 2.0),
+    }
+    goal = {"position_mm": [80, -120, 420], "rotation_wxyz": quaternion(0.0, 4.0)}
+    scene = turning("environment_1", 8.0, 2.0, goal=goal, stops=[stop])
+    document = proved(GACHON, scene, ROUNDS)
+    met = plan_from_document(document).waypoints[document.stops[0].waypoint]
+    assert met.angle_to(scene.stops[0].pose) < 1e-6
+    assert len(document.planner.rounds) == 2
+
+
+def test_a_platform_whose_cables_end_off_its_box_turns_on_its_way(open_frame) -> None:
+    document = proved(open_frame, RAMP, ROUNDS)
+    assert document.quality.self_clearance.distance_mm >= 5.0
+
+
+@pytest.mark.slow
+def test_a_robot_with_pulleys_turns_on_its_way_around_the_pillar() -> None:
+    goal = {"position_mm": [-700, 0, 900], "rotation_wxyz": quaternion(0.0, 6.0, 2.0)}
+    document = proved(HALL, turning("hall_pillar", 8.0, 4.0, goal=goal), ROUNDS)
+    assert document.quality.obstacle_clearance is not None
+    assert document.quality.obstacle_clearance.distance_mm >= 40.0
+
+
+def test_without_limits_in_the_scene_the_next_step_is_told() -> None:
+    scene = load_scene(CONFIGS / "environment_1.yaml")
+    with pytest.raises(BadInput, match="does not say how far the platform may turn") as caught:
+        make_plan(GACHON, scene, ROUNDS)
+    assert "rotation_limits: {tilt_deg" in str(caught.value)
+
+
+def test_ends_turned_differently_need_the_option() -> None:
+    with pytest.raises(BadInput, match="differ in orientation by 6 deg") as caught:
+        make_plan(GACHON, RAMP)
+    assert "--free-rotation" in str(caught.value)
+
+
+def test_a_search_that_finds_nothing_tells_what_was_in_the_way() -> None:
+    wall = [{"name": "wall", "box": {"size_mm": [20, 900, 900]}, "position_mm": [0, 0, 400]}]
+    ends = {"start": {"position_mm": [200, 0, 400]}, "goal": {"position_mm": [-200, 0, 400]}}
+    scene = turning("environment_1", 5.0, 2.0, obstacles=wall, **ends)
+    with pytest.raises(NoSolution, match="no path after 3 rounds") as caught:
+        routed(scene, TurningSettings(rounds=3))
+    assert "obstacle clearance" in str(caught.value)
+    assert caught.value.values["rounds"] == 3.0
+
+
+def test_the_check_refuses_a_path_turned_farther_than_the_scene_allows() -> None:
+    far = Pose.from_quaternion([0.0, 0.0, 0.445], quaternion(0.0, 9.0))
+    ends = {"start": {"position_mm": [0, 0, 445]}, "goal": {"position_mm": [0, 0, 445]}}
+    scene = turning("environment_1", 8.0, 2.0, obstacles=[], **ends)
+    report = check_path(GACHON, scene, [scene.start, far, scene.goal], ends=False)
+    said = [violation.sentence() for violation in report.violations]
+    assert any("tilted too far: 9 ° (limit 8 °)" in sentence for sentence in said)
+
+
+def test_a_goal_beyond_the_limits_is_refused_with_its_place(tmp_path) -> None:
+    text = (CONFIGS / "turn.yaml").read_text().replace("tilt_deg: 8", "tilt_deg: 4")
+    path = tmp_path / "scene.yaml"
+    path.write_text(text)
+    with pytest.raises(InvalidFile, match="the goal is tilted by 6 deg") as caught:
+        load_scene(path)
+    assert "goal.rotation_wxyz" in str(caught.value)
+
+
+def test_a_plan_survives_its_file(tmp_path) -> None:
+    document = make_plan(GACHON, RAMP, ROUNDS)
+    save_plan(document, tmp_path / "plan.json")
+    plan = load_plan(tmp_path / "plan.json")
+    assert verify(plan).report.proved_obstacle_clearance >= 0.010
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"budget": 0.0}, {"rounds": 0}])
+def test_settings_that_no_search_can_use_are_refused(wrong) -> None:
+    with pytest.raises(BadInput):
+        TurningSettings(**wrong)

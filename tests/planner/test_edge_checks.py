@@ -1,0 +1,66 @@
+"""The checks together: which reason is given, and that nothing is compiled before it is called."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.edge_checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
+
+ROOT = Path(__file__).parents[2]
+GACHON = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
+SCENE = load_scene(ROOT / "configs" / "environment_1.yaml")
+HOME = GACHON.home.position
+
+
+def checks(**changes: float) -> ExactChecks:
+    limits = {"obstacle_clearance": 0.01, "self_clearance": 0.005, "margin_reserve": 0.2}
+    return ExactChecks(GACHON, SCENE, np.eye(3), **(limits | changes))
+
+
+def test_every_reason_is_told() -> None:
+    aside = HOME + np.array([0.1, 0.0, 0.0])
+    assert checks().problem(HOME, aside) == FREE
+    assert checks().problem(HOME, HOME + np.array([0.0, 0.0, 1.0])) == WORKSPACE
+    assert checks().problem(SCENE.start.position, SCENE.goal.position) == OBSTACLE
+    assert checks(self_clearance=0.05).problem(HOME, aside) == SELF
+    assert checks(margin_reserve=50.0).problem(HOME, aside) == WRENCH
+
+
+def test_many_edges_and_frozen_arrays_are_taken_as_one_by_one() -> None:
+    made = checks()
+    starts = np.stack([SCENE.start.position, HOME])
+    ends = np.stack([SCENE.goal.position, HOME])
+    found = made.problems(starts, ends).tolist()
+    assert found == [made.problem(a, b) for a, b in zip(starts, ends, strict=True)]
+    distance, body, obstacle = made.clearance(SCENE.start.position, SCENE.start.position)
+    assert (round(distance, 4), body, obstacle) == (0.0322, 6, 0)
+
+
+def test_turning_edges_tell_their_reason_too() -> None:
+    made = checks()
+    turned = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
+    assert made.turning_problem(Pose.level(HOME), turned) == FREE
+    assert made.turning_problem(SCENE.start, Pose(SCENE.goal.position, turned.rotation)) == OBSTACLE
+    assert made.turning_problem(Pose.level(HOME), Pose.level([0.0, 0.0, 2.0])) == WORKSPACE
+    assert checks(self_clearance=0.05).turning_problem(Pose.level(HOME), turned) == SELF
+
+
+def test_importing_the_checks_compiles_nothing() -> None:
+    script = (
+        "import sys; import planner.collision; assert 'numba' not in sys.modules\n"
+        "from planner import edge_checks\n"
+        "from planner.collision import edges, rotating_edges, self_collision\n"
+        "from planner.wrench import translation\n"
+        "kernels = [v for m in (edge_checks, edges, self_collision, translation, rotating_edges)"
+        " for v in vars(m).values() if hasattr(v, 'signatures')]\n"
+        "assert len(kernels) > 20\n"
+        "assert not any(k.signatures for k in kernels)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, timeout=120)
