@@ -224,16 +224,16 @@ class DriveGroup(Protocol):
         ...
 
     def send_cycle(
-        self, targets: Sequence[int], may_enable: Callable[[], bool] = lambda: True
+        self, targets: Sequence[int], may_send: Callable[[bool], bool] = lambda _enables: True
     ) -> None:
         """Sends one cycle: all set-points, and what makes them count together where there is such.
 
         Args:
             targets: One position a drive, [counts]. They count in state ENABLED; in every other
                 state each drive is commanded to stay where it is.
-            may_enable: Asked at the last moment, just before the frame that makes set-points count.
-                Where it is false no drive is commanded to follow: such a cycle becomes a
-                quick stop of all drives, for good.
+            may_send: Called at the last moment, just before the frame that makes set-points count,
+                with whether one of them enables a drive. Where it returns false no drive is
+                commanded to follow: such a cycle becomes a quick stop of all drives, for good.
 
         Raises:
             Fault: The bus did not take a frame.

@@ -198,7 +198,7 @@ class Cia402Group(CyclicGroup):
         )
 
     def send_cycle(
-        self, targets: Sequence[int], may_enable: Callable[[], bool] = lambda: True
+        self, targets: Sequence[int], may_send: Callable[[bool], bool] = lambda _enables: True
     ) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
@@ -214,7 +214,7 @@ class Cia402Group(CyclicGroup):
             # Not under power, or held by the drives themselves: the targets follow the drives.
             # Once enabling has begun they stay, so that a sagging drive is not followed down.
             self._targets = list(self._watch.positions)
-        self._send(words, may_enable)
+        self._send(words, may_send)
         self._known = True
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
@@ -240,7 +240,7 @@ class Cia402Group(CyclicGroup):
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
         self._stop()  # first: whatever the bus does now, no later cycle enables the drives again
-        self._send((ControlWord.QUICK_STOP,) * len(self._nodes), lambda: False)
+        self._send((ControlWord.QUICK_STOP,) * len(self._nodes), lambda _enables: True)
 
     def is_monitored(self, *, silent_too: bool) -> bool:
         """Whether drives still watch this master; see `DriveGroup.is_monitored`."""
@@ -286,14 +286,14 @@ class Cia402Group(CyclicGroup):
         self._modes = None
         self._watch.on_answer = self._unwatching.take
 
-    def _send(self, words: tuple[ControlWord, ...], may_enable: Callable[[], bool]) -> None:
+    def _send(self, words: tuple[ControlWord, ...], may_send: Callable[[bool], bool]) -> None:
         """One cycle's frames; what was asked for is remembered even if the bus fails."""
         self._words = words
         self._note_told_to_stop()
         self._watch.begin_cycle()
         try:
             self._cyclic.send(self._frames.set_points(words, self._targets))
-            if not may_enable() and ControlWord.ENABLE_OPERATION in words:
+            if not may_send(ControlWord.ENABLE_OPERATION in words):
                 # The drives have these set-points and act on them at SYNC: the last word counts.
                 self._stop()
                 self._words = (ControlWord.QUICK_STOP,) * len(words)

@@ -178,13 +178,13 @@ class OdriveGroup(CyclicGroup):
         )
 
     def send_cycle(
-        self, targets: Sequence[int], may_enable: Callable[[], bool] = lambda: True
+        self, targets: Sequence[int], may_send: Callable[[bool], bool] = lambda _enables: True
     ) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`.
 
-        A set-point arms no axis that disarmed itself, so that `may_enable` decides nothing here.
+        A set-point arms no axis that disarmed itself, so that `may_send` decides nothing here.
         """
-        may_enable()
+        may_send(False)
         self._online()
         self._discard_stale()
         self._watch.begin_cycle()

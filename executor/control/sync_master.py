@@ -3,7 +3,8 @@
 Whatever else is waited for (the operator's word, a file on disk, a camera), the cycle goes on, so
 that no drive loses its master. No drive is commanded to follow set-points when the SYNC before is
 too old (`executor.safety.sync_age`): that is decided when a cycle begins and once more between its
-set-points and its SYNC, since this process may be suspended in between.
+set-points and its SYNC, since this process may be suspended in between. Where it was suspended
+between that decision and the SYNC, a quick stop follows at once.
 """
 
 from __future__ import annotations
@@ -86,6 +87,7 @@ class SyncMaster:
         self._rig, self._cycle = rig, rig.document.bus.cycle_ms / 1000.0
         self._synced: float | None = None
         self._overdue = 0.0
+        self._enabled_after: float | None = None  # SYNC before one that enables, [s] of the clock
 
     @property
     def age(self) -> float:
@@ -102,8 +104,13 @@ class SyncMaster:
         Raises:
             Fault: The bus failed.
         """
-        self._overdue = 0.0
-        self.group.send_cycle(targets, self._may_enable_now)
+        self._overdue, self._enabled_after = 0.0, None
+        self.group.send_cycle(targets, self._may_send_now)
+        if self._enabled_after is not None:
+            age = (self.clock.now - self._enabled_after) / self._cycle
+            if not self.rule.may_enable(age):
+                self._overdue = age
+                self.stop_now()
         self.status = self.group.receive(self.clock.time_left())
         return self.status
 
@@ -112,10 +119,13 @@ class SyncMaster:
         """Age of the last SYNC [cycles] that made this cycle a stop; 0 when it is none."""
         return self._overdue
 
-    def _may_enable_now(self) -> bool:
+    def _may_send_now(self, enables: bool) -> bool:
         """Asked just before every SYNC."""
-        age, self._synced = self.age, self.clock.now
+        before, age, self._synced = self._synced, self.age, self.clock.now
+        if not enables:
+            return True
         if self.rule.may_enable(age):
+            self._enabled_after = before
             return True
         self._overdue = age
         return False

@@ -32,7 +32,7 @@ class _Group:
     def __init__(self, faults: Sequence[tuple[int, str]]) -> None:
         self.faults = tuple(faults)
 
-    def send_cycle(self, _targets: Sequence[int], _may_enable: object) -> None:
+    def send_cycle(self, _targets: Sequence[int], _may_send: object) -> None:
         """Nobody listens."""
 
     def receive(self, _timeout: float) -> SimpleNamespace:

@@ -53,8 +53,8 @@ class Group:
         self.monitored_for, self.asked = monitored_for, []
         self.left = 0.0
 
-    def send_cycle(self, targets: Sequence[int], may_enable: Callable[[], bool]) -> None:
-        self.sent.append((tuple(targets), may_enable()))
+    def send_cycle(self, targets: Sequence[int], may_send: Callable[[bool], bool]) -> None:
+        self.sent.append((tuple(targets), may_send(True)))
 
     def receive(self, left: float) -> Any:
         self.left = left

@@ -309,9 +309,9 @@ def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
         sent: list[tuple[int, tuple[int, ...]]] = []
         send = stage.group.send_cycle
 
-        def noted(targets: tuple[int, ...], *may_enable: Callable[[], bool]) -> None:
+        def noted(targets: tuple[int, ...], *may_send: Callable[[bool], bool]) -> None:
             sent.append((stage.cycle, tuple(targets)))
-            send(targets, *may_enable)
+            send(targets, *may_send)
 
         monkeypatch.setattr(stage.group, "send_cycle", noted)
         outcome = stage.run()

@@ -143,3 +143,46 @@ def test_no_lateness_enables_a_drive_again(cycle_ms: float, held_up: str) -> Non
         assert went_on[-1] == pytest.approx(1.475, abs=0.03), "1.5 but for rounding"
         assert stopped_by_themselves[0] == pytest.approx(2.0, abs=0.11)
         assert stopped_by_themselves[-1] == LATENESS[-1]
+
+
+@pytest.mark.parametrize("held_up", [1.6, 2.5, 4.0])
+def test_a_master_held_up_after_its_last_look_stops_the_drives_at_once(held_up: float) -> None:
+    """Nothing can be taken back then; the stop follows before another SYNC does."""
+    with enabled_drives(10.0) as late:
+        late.enable()
+        late.cycle()
+        send, passed = late.group._cyclic.send, []  # type: ignore[attr-defined]
+
+        def held_up_before_sync(frames: object) -> None:
+            if frames == (late.group._frames.sync,) and not passed:  # type: ignore[attr-defined]
+                passed.append(held_up)
+                late.rehearsal.pump()
+                late.pass_time(held_up * late.clock.cycle)
+                late.clock.now += held_up * late.clock.cycle
+            send(frames)
+
+        late.group._cyclic.send = held_up_before_sync  # type: ignore[attr-defined]
+        late.cycle()
+        assert passed == [held_up]
+        assert late.master.overdue == pytest.approx(1.0 + held_up)
+        assert {drive.state for drive in late.rehearsal.drives} == {HOLDING}
+        for _ in range(3):
+            late.cycle()
+        assert {drive.state for drive in late.rehearsal.drives} == {HOLDING}
+
+
+def test_lateness_that_enables_nothing_is_no_fault() -> None:
+    """Drives that are only looked at, or hold by themselves, take no harm from a late SYNC."""
+    with enabled_drives(10.0) as late:
+        late.pass_time(2.0 * late.clock.cycle)
+        late.clock.now += 2.0 * late.clock.cycle
+        late.master.rest()
+        assert late.master.overdue == 0.0
+        late.enable()
+        late.group.command(GroupCommand.QUICK_STOP)
+        for _ in range(4):
+            late.cycle()
+        late.clock.now += 2.0 * late.clock.cycle
+        late.master.rest()
+        assert late.master.overdue == 0.0
+        assert {drive.state for drive in late.rehearsal.drives} == {HOLDING}
