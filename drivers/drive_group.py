@@ -74,6 +74,8 @@ class Capabilities:
         sync_timeout: Cycles without SYNC after which a drive stops by itself; None where drives
             know no SYNC.
         master_timeout: Longest time after which a drive acts on the loss of this master, [s].
+        unmonitored_within: Longest time that drives which answer may take to confirm that they
+            monitor this master no more, [s].
         simulated: All drives say that they are simulated; known once they are configured.
     """
 
@@ -85,6 +87,7 @@ class Capabilities:
     watchdog_ms: float | None
     sync_timeout: float | None
     master_timeout: float
+    unmonitored_within: float = 0.0
     simulated: bool = False
 
 

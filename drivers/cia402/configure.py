@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import can
@@ -59,6 +60,20 @@ PDO_OBJECTS = 0xF9FF
 """Makes one of a PDO's communication parameters (1400h, 1800h) and its mapping (1600h, 1A00h)."""
 
 
+@dataclass(frozen=True, slots=True)
+class SetUp:
+    """What `configure_drives` did.
+
+    Attributes:
+        remarks: What drives cannot do although a run would use it.
+        heartbeats: How many entries of 1016h were written, one number a drive: the master's, then
+            its peers'.
+    """
+
+    remarks: tuple[str, ...]
+    heartbeats: tuple[int, ...]
+
+
 def configure_drives(
     rig: Rig,
     bus: can.BusABC,
@@ -67,7 +82,7 @@ def configure_drives(
     max_tension: float | None,
     to_reset: bool,
     on_restarted: OnRestarted,
-) -> tuple[str, ...]:
+) -> SetUp:
     """Writes and reads back every object of every drive, then starts their process data.
 
     Args:
@@ -80,7 +95,7 @@ def configure_drives(
             any more, or never did.
 
     Returns:
-        Remarks: what drives cannot do although a run would use it.
+        What was set up, and what could not be.
 
     Raises:
         HardwareMissing: Drives do not answer; with all their nodes.
@@ -127,7 +142,8 @@ def configure_drives(
     network.take_waiting()
     for remark in left_out(profile):
         absent.setdefault(remark, []).extend(nodes)
-    return (*_absent(absent), *_unwatched_peers(nodes, entries, profile.monitoring))
+    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile.monitoring))
+    return SetUp(remarks, tuple(min(count, rig.cable_count) for count in entries))
 
 
 class WrongObjects:

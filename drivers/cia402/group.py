@@ -18,15 +18,14 @@ from drivers.cia402.read_state import say_simulated
 from drivers.cia402.sdo_jobs import (
     ABSENT,
     ASKED_AGAIN_AFTER,
-    LOOK_TIMEOUT,
     MODE_WAIT,
-    MONITORING_OFF,
     REQUESTS_A_CYCLE,
     STANDING,
     AnswerListener,
     ModeCheck,
     SdoJobs,
     mode_text,
+    monitoring_off,
 )
 from drivers.cia402.state_machine import (
     FAULTED,
@@ -86,6 +85,7 @@ class Cia402Group(CyclicGroup):
         self._max_steps = largest_steps(rig, cycle)
         self._restarted: tuple[int, ...] = ()
         self._simulated = False
+        self._heartbeats = (1,) * rig.cable_count
         self._reset_memory()
 
     def _reset_memory(self) -> None:
@@ -125,8 +125,20 @@ class Cia402Group(CyclicGroup):
             master_timeout=max(
                 heartbeat_timeout(self._cycle_s), self._profile.sync_timeout_periods * self._cycle_s
             ),
+            unmonitored_within=self._unmonitored_within,
             simulated=self._simulated,
         )
+
+    @property
+    def _answer_time(self) -> float:
+        """For an SDO answer, [s]."""
+        return self._profile.sdo_timeout_ms / 1000.0
+
+    @property
+    def _unmonitored_within(self) -> float:
+        """Every request in a cycle of its own, and one slow answer after another, [s]."""
+        jobs = [len(monitoring_off(count)) for count in self._heartbeats]
+        return sum(jobs) * self._cycle_s / REQUESTS_A_CYCLE + max(jobs) * self._answer_time
 
     @property
     def _heard(self) -> DriveMonitor:
@@ -160,7 +172,7 @@ class Cia402Group(CyclicGroup):
             if on_restarted is not None:
                 on_restarted(restarted)
 
-        remarks = configure_drives(
+        done = configure_drives(
             self._rig,
             self._bus,
             self._pump,
@@ -168,9 +180,10 @@ class Cia402Group(CyclicGroup):
             to_reset=to_reset,
             on_restarted=take,
         )
+        self._heartbeats = done.heartbeats
         self._simulated = say_simulated(self._bus, self._pump, self._nodes)
         self._state = GroupState.CONFIGURED
-        return remarks
+        return done.remarks
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
         """Sends SYNC until every drive has reported a position; as `DriveGroup.read_positions`."""
@@ -259,11 +272,15 @@ class Cia402Group(CyclicGroup):
     def look(self, pace: Pace) -> CycleStatus:
         """Asks every drive by SDO how it stands; see `DriveGroup.look`."""
         self._online()
-        jobs = SdoJobs({node: STANDING for node in self._answering}, self._again_after)
+        jobs = SdoJobs(dict.fromkeys(self._nodes, STANDING), self._again_after)
+        silent = set(self._nodes) - self._answering
         self._watch.begin_cycle()
         self._watch.on_answer = jobs.take
-        for _ in range(round(LOOK_TIMEOUT / self._cycle_s)):
-            if not jobs.unfinished():
+        for number in range(round(len(STANDING) * self._answer_time / self._cycle_s)):
+            waited_for = jobs.unfinished()
+            if number * self._cycle_s >= self._answer_time:  # one answer, or it is gone
+                waited_for -= silent - {node for node, _ in jobs.values}
+            if not waited_for:
                 break
             left = pace()
             self._ask(jobs, len(self._nodes))
@@ -282,7 +299,8 @@ class Cia402Group(CyclicGroup):
         """Heartbeat first and SYNC last: what is still watched is still sent."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused("enabled drives must monitor this program", where="drive group")
-        self._unwatching = SdoJobs(dict.fromkeys(self._nodes, MONITORING_OFF), self._again_after)
+        jobs = zip(self._nodes, map(monitoring_off, self._heartbeats), strict=True)
+        self._unwatching = SdoJobs(dict(jobs), self._again_after)
         self._modes = None
         self._watch.on_answer = self._unwatching.take
 
@@ -367,7 +385,7 @@ class Cia402Group(CyclicGroup):
             self._state = GroupState.ENABLED
             return
         if self._modes is None:
-            wait = MODE_WAIT + self._profile.sdo_timeout_ms / 1000.0
+            wait = MODE_WAIT + self._answer_time
             cycles = len(self._nodes) + round(wait / self._cycle_s)
             self._modes = ModeCheck(self._nodes, cycles, self._again_after)
             self._watch.on_answer = self._modes.take

@@ -316,9 +316,9 @@ def _supervision(cycle: float) -> tuple[Setting, ...]:
     return (
         Setting(0x1006, 0, "<I", period_us, "communication cycle period", "the cycle of the rig"),
         Setting(
-            *(0x1007, 0, "<I", period_us, "synchronous window length", "the whole cycle"),
+            *(0x1007, 0, "<I", 0, "synchronous window length", "no window: set-points may be late"),
             optional=True,
-            instead="without it the window is unlimited",
+            instead="a drive without it has no window",
         ),
         Setting(
             0x1017, 0, "<H", produced_ms, "producer heartbeat time", "peers monitor each other"

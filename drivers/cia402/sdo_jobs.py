@@ -21,9 +21,6 @@ ASKED_AGAIN_AFTER = 0.5
 MODE_WAIT = 0.5
 """So long an enabled drive may take to show its mode, beside the time of its SDO answer, [s]."""
 
-LOOK_TIMEOUT = 2.0
-"""For all answers of a look, [s]."""
-
 CSP_MODE = 8
 """Cyclic synchronous position."""
 
@@ -62,13 +59,19 @@ class SdoRequest:
 STANDING = (SdoRequest(0x6041, 0), SdoRequest(0x6064, 0), SdoRequest(0x6077, 0))
 
 
-#: What makes a drive watch its master no more: heartbeat (the first consumer entry), set-points,
-#: and SYNC last. The heartbeats of other drives go on, and so does the watch of them.
-MONITORING_OFF = (
-    SdoRequest(0x1016, 1, bytes(4)),
-    SdoRequest(0x1400, 5, bytes(2)),
-    SdoRequest(0x1006, 0, bytes(4)),
-)
+def monitoring_off(heartbeats: int) -> tuple[SdoRequest, ...]:
+    """What makes a drive monitor nobody any more: heartbeats, set-points, and SYNC last.
+
+    Those of its peers, too: one that fell silent after the end would take the torque off all.
+
+    Args:
+        heartbeats: Entries of 1016h that set-up wrote, the master's first.
+    """
+    return (
+        *(SdoRequest(0x1016, sub, bytes(4)) for sub in range(1, heartbeats + 1)),
+        SdoRequest(0x1400, 5, bytes(2)),
+        SdoRequest(0x1006, 0, bytes(4)),
+    )
 
 
 MODE_DISPLAY = SdoRequest(0x6061, 0)

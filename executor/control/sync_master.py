@@ -60,8 +60,6 @@ class ReplyTimeout:
             raise HardwareMissing(what, where=where, why=why, next_step=next_step)
 
 
-#: Within which drives must have confirmed that they do not watch the master any more, [s].
-UNWATCHED_WITHIN = 3.0
 #: Without an answer to SYNC for so long a drive is not waited for at the end, [s].
 GIVEN_UP_AFTER = 0.5
 
@@ -209,7 +207,7 @@ class SyncMaster:
             Fault: The bus failed.
         """
         self.group.command(GroupCommand.END_MONITORING)
-        for number in range(round(UNWATCHED_WITHIN / self._cycle)):
+        for number in range(round(self.group.capabilities.unmonitored_within / self._cycle)):
             patient = number * self._cycle < GIVEN_UP_AFTER
             if not (self.group.is_monitored(silent_too=patient) and cycle()):
                 break

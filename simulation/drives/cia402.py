@@ -11,6 +11,7 @@ Source: CiA 301 (4.2), CiA 402-2.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 
 from drivers.cia402.pdo import (
     EMCY_BASE,
@@ -56,6 +57,7 @@ Send = Callable[[int, Frame], None]
 OPERATIONAL, BOOT_UP = NmtState.OPERATIONAL, NmtState.BOOT_UP
 
 LIFE_GUARD = 0x8130
+PDO_LATE = 0x8200
 PDO_LENGTH = 0x8210
 SET_POINT_OVERDUE = 0x8250
 SYNC_OVERDUE = 0x8700
@@ -139,6 +141,7 @@ class SimulatedDrive(PowerStage):
         self._deadlines = Deadlines()
         self._watched = self._heartbeat_consumers()
         self._waiting: dict[int, tuple[ReceivePdo, tuple[int, ...]]] = {}
+        self._window_ends = inf
         self._errors: dict[object, int] = {}
         self._own_heartbeat_due = self._now
         if self.behaviour.boot_delay:
@@ -190,6 +193,7 @@ class SimulatedDrive(PowerStage):
         """SYNC: reply with what is, then act on the set-points that were waiting."""
         if self.silent or self.nmt is not OPERATIONAL:
             return
+        self._window_ends = self._now + self._window if self._window else inf
         if self._sync_timeout:
             self._deadlines.expect(_SYNC, self._now + self._sync_timeout)
             if self._errors:
@@ -225,6 +229,11 @@ class SimulatedDrive(PowerStage):
             self._recovered(pdo.number)
         values = pdo.form.unpack(data)
         if pdo.synchronous:
+            if self._now > self._window_ends + TOLERANCE:
+                self._comes_amiss((PDO_LATE, pdo.number), PDO_LATE)
+                return
+            if self._errors:
+                self._recovered((PDO_LATE, pdo.number))
             self._waiting[pdo.number] = pdo, values
         else:
             self._take(pdo, values)
@@ -320,6 +329,7 @@ class SimulatedDrive(PowerStage):
         get = self.objects.get
         self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
         self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6
+        self._window = get((0x1007, 0), 0) / 1e6  # of synchronous RPDOs after SYNC; 0: without end
         if not self._sync_timeout:
             self._deadlines.forget(_SYNC)
 

@@ -59,7 +59,7 @@ def set_up(rig: Rig, bus: ScriptedBus) -> tuple[str, ...]:
         max_tension=None,
         to_reset=False,
         on_restarted=ignored,  # type: ignore[arg-type]
-    )
+    ).remarks
 
 
 def examined(rig: Rig, bus: ScriptedBus) -> Examined:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.sdo_jobs import MONITORING_OFF, ModeCheck, SdoJobs, SdoRequest
+from drivers.cia402.sdo_jobs import ModeCheck, SdoJobs, SdoRequest, monitoring_off
 
 NODE = 5
 NEVER = 1_000_000
@@ -15,13 +15,14 @@ READ, WRITE = SdoRequest(0x6041, 0), SdoRequest(0x1006, 0, bytes(4))
 
 
 def test_requests_are_those_of_cia_301() -> None:
-    jobs = SdoJobs({NODE: (*MONITORING_OFF, READ)}, NEVER)
+    jobs = SdoJobs({NODE: (*monitoring_off(2), READ)}, NEVER)
     sent = []
-    for answer in ("60 16 10 01", "60 00 14 05", "60 06 10 00", "4b 41 60 00 37 02"):
+    for answer in ("60 16 10 01", "60 16 10 02", "60 00 14 05", "60 06 10 00", "4b 41 60 00 37 02"):
         sent += jobs.next_requests(9)
         jobs.take(NODE, bytes.fromhex(answer).ljust(8, b"\0"))
     assert sent == [
         (0x605, bytes.fromhex("23 16 10 01 00 00 00 00")),
+        (0x605, bytes.fromhex("23 16 10 02 00 00 00 00")),
         (0x605, bytes.fromhex("2b 00 14 05 00 00 00 00")),
         (0x605, bytes.fromhex("23 06 10 00 00 00 00 00")),
         (0x605, bytes.fromhex("40 41 60 00 00 00 00 00")),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.drive_group import GroupCommand
-from executor.control.sync_master import GIVEN_UP_AFTER, UNWATCHED_WITHIN, SyncMaster, late_fault
+from executor.control.sync_master import GIVEN_UP_AFTER, SyncMaster, late_fault
 from executor.safety.sync_age import USUAL_TIMEOUT
 from model.errors import Fault, HardwareMissing
 from model.rig import load_rig
@@ -44,7 +44,9 @@ class Group:
     """Drives that are asked, and answer as they are told to here."""
 
     def __init__(self, sync_timeout: float | None = 3.0, monitored_for: float = 0) -> None:
-        self.capabilities = SimpleNamespace(sync_timeout=sync_timeout, master_timeout=0.101)
+        self.capabilities = SimpleNamespace(
+            sync_timeout=sync_timeout, master_timeout=0.101, unmonitored_within=3.0
+        )
         self.targets = np.array(TARGETS)
         self.sent: list[tuple[tuple[int, ...], bool]] = []
         self.told: list[object] = []
@@ -174,7 +176,7 @@ def test_a_monitoring_that_stays_on_is_waited_for_in_silence() -> None:
     master, group, clock = made(monitored_for=10_000)
     cycles: list[None] = []
     master.leave(lambda: cycles.append(None) is None)
-    assert len(cycles) == round(UNWATCHED_WITHIN / CYCLE) == 300
+    assert len(cycles) == 300
     patient = round(GIVEN_UP_AFTER / CYCLE)
     assert patient == 50
     assert group.asked == [True] * patient + [False] * (300 - patient) + [True]

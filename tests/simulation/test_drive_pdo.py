@@ -173,3 +173,14 @@ def test_another_identifier_is_heard_once_it_is_set_up() -> None:
     line.drive.on_pdo(0x333, struct.pack("<Hi", 0x06, 0))
     line.drive.on_sync()
     assert line.drive.status_word & 0x6F == 0x21
+
+
+@pytest.mark.parametrize("window_us", [0, 4000])
+def test_a_set_point_after_the_synchronous_window_is_dropped(window_us: int) -> None:
+    line = ready()
+    line.write(0x1007, 0, "<I", window_us)
+    line.drive.on_sync()
+    line.drive.advance(0.006)
+    line.drive.on_set_point(struct.pack("<Hi", 0x06, 1000))
+    line.drive.on_sync()
+    assert bool(line.take(0x085)) == bool(window_us)
