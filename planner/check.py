@@ -183,7 +183,7 @@ class _Check:
             (ends[0], poses[0], scene.start),
             (ends[1], poses[-1], scene.goal),
         ):
-            what = f"the path does not reach the scene's {name}"
+            what = f"the path does not meet the scene's {name}"
             away, turned = pose.distance_to(wanted), pose.angle_to(wanted)
             if not away <= END_TOLERANCE:
                 self._violation(what, away, END_TOLERANCE, "mm", pose.position)

@@ -22,7 +22,7 @@ def hold(process: _Process = None, as_json: _Json = False) -> None:
 
       cdpr hold
     """
-    _tell("hold", process, as_json)
+    _request("hold", process, as_json)
 
 
 def resume(process: _Process = None, as_json: _Json = False) -> None:
@@ -32,7 +32,7 @@ def resume(process: _Process = None, as_json: _Json = False) -> None:
 
       cdpr resume
     """
-    _tell("resume", process, as_json)
+    _request("resume", process, as_json)
 
 
 def speed(
@@ -49,10 +49,10 @@ def speed(
 
       cdpr speed 25
     """
-    _tell("speed", process, as_json, percent)
+    _request("speed", process, as_json, percent)
 
 
-def _tell(verb: str, process: int | None, as_json: bool, percent: int | None = None) -> None:
+def _request(verb: str, process: int | None, as_json: bool, percent: int | None = None) -> None:
     status = request_run(verb, process, percent)
     if as_json:
         show_json(status)

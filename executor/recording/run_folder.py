@@ -443,5 +443,5 @@ def _not_made(path: Path, why: str) -> BadInput:
         "the run folder cannot be created",
         where=str(path),
         why=why,
-        next_step="name another writable folder with free space with -o",
+        next_step="choose another folder with write permission and free space",
     )

@@ -136,7 +136,7 @@ def test_a_robot_with_pulleys_turns_on_its_way_around_the_pillar() -> None:
 
 def test_without_limits_in_the_scene_the_next_step_is_told() -> None:
     scene = load_scene(CONFIGS / "environment_1.yaml")
-    with pytest.raises(BadInput, match="does not say how far the platform may turn") as caught:
+    with pytest.raises(BadInput, match="has no limits for rotation") as caught:
         make_plan(GACHON, scene, ROUNDS)
     assert "rotation_limits: {tilt_deg" in str(caught.value)
 
