@@ -122,7 +122,7 @@ def calibrate_camera(
 
     Args:
         folder: Of the images, all of one size.
-        board: What they show: `Chessboard`, `Charuco` or `TagGrid`.
+        board: What they show: `Chessboard`, `Charuco`, `CircleGrid` or `TagGrid`.
         name: Of the camera in the rig file.
         wanted: What is good enough, 95 %, [m].
         distance: From which the camera measures, [m]; that of the boards when left out.

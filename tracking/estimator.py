@@ -22,6 +22,10 @@ from tracking.settings import TrackerSettings
 # Why a pose that was found is not believed.
 
 
+UNSHARP = "are too blurred to be measured"
+"""What is said of tags that are read, but whose edges are not found."""
+
+
 def doubt(
     limits: TrackerSettings, views: Sequence[TagView], bundle: BundlePose, prior: Pose | None
 ) -> str:
@@ -181,6 +185,8 @@ class PlatformEstimator:
         return agreeing(self._camera, views, possible)
 
     def _why_nothing(self, seen: tuple[int, ...]) -> str:
+        if mine := [str(number) for number in seen if number in self._platform]:
+            return f"the edges of tags {', '.join(mine)} {UNSHARP}"
         wanted = ", ".join(map(str, self._platform))
         others = [number for number in seen if number not in self._frame]
         also = f"; seen instead: {', '.join(map(str, others))}" if others else ""

@@ -23,6 +23,8 @@ _FAR_OFF, _OFF = 4.0, 0.5
 """A view is left out whose error is so many times the median, and so many pixels at least."""
 _LOOKED_AT = 5
 """So many pictures without the board, spread over all, are looked at for what they show instead."""
+NOT_FOUND = "no board was found in it"
+"""Why most pictures are not used."""
 _MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
 
 
@@ -109,7 +111,7 @@ def fit_camera(
             )
         seen = board.find(image)
         if seen is None:
-            left_out[name] = "does not show the board"
+            left_out[name] = NOT_FOUND
             without.add((name, image))
         elif first := next((n for n, before in views.items() if _same(seen, before)), None):
             left_out[name] = as_in(first)
@@ -226,7 +228,7 @@ def _too_few(
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""
         why += "; " + "; ".join(told[: 4 if more else 5]) + more
     return BadInput(
-        f"the board is to be seen in {len(views)} of {count} pictures; {LEAST_VIEWS} are the least",
+        f"the board was found in {len(views)} of {count} pictures; {LEAST_VIEWS} are the least",
         why=why,
         next_step="check the board's kind and numbers, or take more pictures of it, tilted up to"
         " 40°; 40 are good",

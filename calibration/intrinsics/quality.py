@@ -21,7 +21,12 @@ them."""
 FULL_COVERAGE = 0.9
 """Share of the map beyond which nothing is gained by more of it."""
 EDGES = "bring the board near the edges and corners of the picture"
-MORE = "take more pictures: 40 are good"
+ENOUGH_VIEWS = 40
+MORE = f"take more pictures: {ENOUGH_VIEWS} are good"
+NEARER = "take them again with the board filling more of the picture, sharp and held still"
+"""Where there are pictures enough, others like them gain little."""
+_BENT = 0.2
+"""Share of the squared errors that a bow of the board must explain to be named."""
 _SIDES = (("left", 0, 0), ("right", 0, -1), ("top", 1, 0), ("bottom", 1, -1))
 
 
@@ -39,6 +44,8 @@ class CameraQuality:
         farthest: Greatest distance of a board, [m].
         halves: How far apart two halves of the pictures would see a point there, RMS over the
             picture, [m].
+        bow: How far the board is from flat, highest to lowest, [m].
+        bent: Share of the squared errors of the corners that this bow explains.
     """
 
     verdict: CalibrationVerdict
@@ -48,6 +55,8 @@ class CameraQuality:
     nearest: float
     farthest: float
     halves: float
+    bow: float
+    bent: float
 
     @property
     def covered(self) -> float:
@@ -78,8 +87,10 @@ def judge_camera(
     error = scale * float(np.sqrt(np.mean(np.einsum("pik,kl,pil->p", slopes, grown, slopes))))
     apart = slopes @ result.uncertainty.halves
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    bow, bent = bow_of(result)
     lacks = [
         *_about_pictures(result, coverage, tilts),
+        *_about_the_board(bow, bent),
         *_about_errors(result, coverage, error, halves, wanted, distance),
     ]
     where = f"at {distance:.2g} m"
@@ -87,9 +98,11 @@ def judge_camera(
         where += f", if the boards were {min(away):.2g} to {max(away):.2g} m away"
         if not error / scale <= GOOD_PIXELS:
             what = f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is needed"
-            lacks.append(Issue(what, "take more pictures, or pass --distance-m"))
+            lacks.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
     verdict = CalibrationVerdict.of(error, wanted, where, lacks)
-    return CameraQuality(verdict, coverage, tilts, distance, min(away), max(away), halves)
+    return CameraQuality(
+        verdict, coverage, tilts, distance, min(away), max(away), halves, bow, bent
+    )
 
 
 def _coverage(result: CameraCalibration) -> Array:
@@ -122,6 +135,65 @@ def _slopes(result: CameraCalibration) -> Array:
     return np.asarray(slopes[:, 6:15].reshape(len(pixels), 2, 9))
 
 
+def bow_of(result: CameraCalibration) -> tuple[float, float]:
+    """How far the board is from flat, and how much of the corners' errors that explains.
+
+    The board's height is taken as a square form of its coordinates, one for all pictures, and
+    fitted to first order together with the camera and the board's poses.
+
+    Returns:
+        Highest to lowest, [m], and a share of the squared errors.
+    """
+    points = np.concatenate([seen.points[:, :2] for seen in result.views.values()])
+    middle, half = points.mean(axis=0), np.ptp(points, axis=0) / 2.0
+    numbers = 9
+    information, score, squares = np.zeros((numbers + 3, numbers + 3)), np.zeros(numbers + 3), 0.0
+    for name, seen in result.views.items():
+        pose = result.boards[name]
+        turn = cv2.Rodrigues(pose.rotation)[0]
+        expected, slopes = cv2.projectPoints(
+            seen.points, turn, pose.position, result.matrix, result.distortion
+        )
+        up = np.einsum("pij,j->pi", slopes[:, 3:6].reshape(-1, 2, 3), pose.rotation[:, 2])
+        shape = _bow_shapes((seen.points[:, :2] - middle) / half)
+        by_bow = (up[:, :, None] * shape[:, None, :]).reshape(-1, 3)
+        errors = (seen.corners - expected.reshape(-1, 2)).ravel()
+        base = np.linalg.qr(slopes[:, :6])[0]
+        own = np.column_stack([slopes[:, 6 : 6 + numbers], by_bow])
+        own = own - base @ (base.T @ own)
+        information, score = information + own.T @ own, score + own.T @ errors
+        squares += float(errors @ errors)
+    scale = np.sqrt(np.diag(information))
+    found = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    change = found @ (score / scale) / scale
+    heights = _bow_shapes((points - middle) / half) @ change[numbers:]
+    plane = np.column_stack([np.ones(len(points)), points - middle])
+    heights = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
+    return float(np.ptp(heights)), float(score @ change) / max(squares, 1e-300)
+
+
+def _bow_shapes(places: Array) -> Array:
+    x, y = places.T
+    return np.column_stack([x * x, x * y, y * y])
+
+
+def _about_the_board(bow: float, bent: float) -> list[Issue]:
+    if bent < _BENT:
+        return []
+    what = f"the board is not flat: it bows by {bow * 1e3:.2g} mm"
+    return [Issue(what, "glue the print on glass or another flat, stiff plate")]
+
+
+def _more(result: CameraCalibration) -> str:
+    """What to do where other pictures would help."""
+    return MORE if len(result.views) < ENOUGH_VIEWS else NEARER
+
+
+def is_below(share: float, limit: float) -> bool:
+    """Whether a share is below a limit as people read both, in whole percent."""
+    return round(100.0 * share) < round(100.0 * limit)
+
+
 def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
     """What the set of pictures lacks, and what to add."""
     lacks = []
@@ -129,7 +201,7 @@ def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) ->
         what = f"{len(result.views)} pictures show the board, {GOOD_VIEWS} are needed"
         lacks.append(Issue(what, MORE))
     share = float(np.mean(coverage > 0))
-    if share < GOOD_COVERAGE:
+    if is_below(share, GOOD_COVERAGE):
         empty = [side for side, axis, at in _SIDES if not coverage.take(at, axis=axis).any()]
         place = f", none at the {' and '.join(empty)}" if empty else ""
         what = (
@@ -164,12 +236,12 @@ def _about_errors(
             f"points at {distance:.2g} m are seen within {error * 1e3:.2g} mm,"
             f" {wanted * 1e3:.2g} mm are wanted"
         )
-        lacks.append(Issue(what, MORE))
+        lacks.append(Issue(what, _more(result)))
         share = float(np.mean(coverage > 0))
-        if GOOD_COVERAGE <= share < FULL_COVERAGE:
+        if not is_below(share, GOOD_COVERAGE) and is_below(share, FULL_COVERAGE):
             what = f"the board covered {share:.0%} of the picture, {FULL_COVERAGE:.0%} are good"
             lacks.append(Issue(what, EDGES))
     if not halves <= 2.0 * wanted:
         what = f"two halves of the pictures see them {halves * 1e3:.2g} mm apart"
-        lacks.append(Issue(what, MORE))
+        lacks.append(Issue(what, _more(result)))
     return lacks

@@ -179,6 +179,7 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
             (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
             ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
             ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
+            ("the board's bow", f"{quality.bow * 1e3:.2g} mm, {quality.bent:.0%} of the errors"),
             ("data", result.data_hash[:23]),
         ]
     )

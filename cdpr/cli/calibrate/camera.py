@@ -26,7 +26,10 @@ from model.files.output import make_folder
 @with_option_groups
 def camera(
     folder: Annotated[
-        Path, typer.Argument(help="folder of pictures of the board, or for --live", metavar="DIR")
+        Path,
+        typer.Argument(
+            help="folder of pictures of the board, or a video; or for --live", metavar="DIR"
+        ),
     ],
     printed: BoardOptions,
     live: Annotated[
