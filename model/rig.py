@@ -102,9 +102,10 @@ class Camera:
         width: Picture width, [px].
         height: Picture height, [px].
         matrix: Camera matrix, shape (3, 3), [px].
-        distortion: OpenCV coefficients, shape (k,).
+        distortion: OpenCV coefficients of the lens, shape (k,).
         world_from_camera: Pose; x right, y down, z along the view.
         rate: Pictures a second, [Hz].
+        lens: One of `model.files.documents.LENSES`.
     """
 
     name: str
@@ -114,6 +115,7 @@ class Camera:
     distortion: Array
     world_from_camera: Pose
     rate: float
+    lens: str = "pinhole"
 
 
 class CalibrationResult(Protocol):
@@ -424,4 +426,5 @@ def _camera(document: CameraDocument) -> Camera:
         distortion=read_only(document.distortion),
         world_from_camera=document.world_from_camera.pose(),
         rate=document.rate_hz,
+        lens=document.lens,
     )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from calibration.intrinsics.calibrate import CameraCalibration
+from calibration.intrinsics.lens import LENSES, RADIAL, radial_share
 from calibration.verdict import CalibrationVerdict, Issue
-from model.pose import Array
+from model.pose import Array, rotation_vector_from_matrix
+from tracking.camera_model import rays_of
 
 CELLS = (8, 6)
 """Columns and rows of the map of what is covered."""
@@ -27,6 +28,8 @@ NEARER = "take them again with the board filling more of the picture, sharp and 
 """Where there are pictures enough, others like them gain little."""
 _BENT = 0.2
 """Share of the squared errors that a bow of the board must explain to be named."""
+_SEEN = 0.3
+"""Smaller errors of corners are not worth a word about the lens, RMS, [px]."""
 _SIDES = (("left", 0, 0), ("right", 0, -1), ("top", 1, 0), ("bottom", 1, -1))
 
 
@@ -46,6 +49,7 @@ class CameraQuality:
             picture, [m].
         bow: How far the board is from flat, highest to lowest, [m].
         bent: Share of the squared errors of the corners that this bow explains.
+        radial: Share of them that is a function of the distance from the principal point.
     """
 
     verdict: CalibrationVerdict
@@ -57,6 +61,7 @@ class CameraQuality:
     halves: float
     bow: float
     bent: float
+    radial: float
 
     @property
     def covered(self) -> float:
@@ -88,9 +93,11 @@ def judge_camera(
     apart = slopes @ result.uncertainty.halves
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     bow, bent = bow_of(result)
+    radial = radial_share(*_all_errors(result), result.matrix)
     lacks = [
         *_about_pictures(result, coverage, tilts),
         *_about_the_board(bow, bent),
+        *_about_the_lens(result, radial),
         *_about_errors(result, coverage, error, halves, wanted, distance),
     ]
     where = f"at {distance:.2g} m"
@@ -100,8 +107,9 @@ def judge_camera(
             what = f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is needed"
             lacks.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
     verdict = CalibrationVerdict.of(error, wanted, where, lacks)
+    nearest, farthest = min(away), max(away)
     return CameraQuality(
-        verdict, coverage, tilts, distance, min(away), max(away), halves, bow, bent
+        verdict, coverage, tilts, distance, nearest, farthest, halves, bow, bent, radial
     )
 
 
@@ -126,13 +134,12 @@ def picture_grid(size: tuple[int, int]) -> Array:
 
 
 def _slopes(result: CameraCalibration) -> Array:
-    """Derivatives of pixels by the nine numbers, on a grid of rays, shape (rays, 2, 9)."""
-    pixels = picture_grid(result.size)
-    flat = cv2.undistortPoints(pixels.reshape(-1, 1, 2), result.matrix, result.distortion)
-    rays = np.column_stack([flat.reshape(-1, 2), np.ones(len(pixels))])
-    nothing = np.zeros(3)
-    _, slopes = cv2.projectPoints(rays, nothing, nothing, result.matrix, result.distortion)
-    return np.asarray(slopes[:, 6:15].reshape(len(pixels), 2, 9))
+    """Derivatives of pixels by the camera's n numbers, on a grid of rays, shape (rays, 2, n)."""
+    pixels, lens = picture_grid(result.size), result.lens
+    flat = rays_of(lens.kind, result.matrix, result.distortion, pixels)
+    rays, nothing = np.column_stack([flat, np.ones(len(pixels))]), np.zeros(3)
+    slopes = lens.slopes(rays, nothing, nothing, result.matrix, result.distortion)[2]
+    return np.asarray(slopes.reshape(len(pixels), 2, -1))
 
 
 def bow_of(result: CameraCalibration) -> tuple[float, float]:
@@ -146,20 +153,20 @@ def bow_of(result: CameraCalibration) -> tuple[float, float]:
     """
     points = np.concatenate([seen.points[:, :2] for seen in result.views.values()])
     middle, half = points.mean(axis=0), np.ptp(points, axis=0) / 2.0
-    numbers = 9
+    numbers = len(result.lens.names)
     information, score, squares = np.zeros((numbers + 3, numbers + 3)), np.zeros(numbers + 3), 0.0
     for name, seen in result.views.items():
         pose = result.boards[name]
-        turn = cv2.Rodrigues(pose.rotation)[0]
-        expected, slopes = cv2.projectPoints(
+        turn = rotation_vector_from_matrix(pose.rotation)
+        there, of_pose, of_camera = result.lens.slopes(
             seen.points, turn, pose.position, result.matrix, result.distortion
         )
-        up = np.einsum("pij,j->pi", slopes[:, 3:6].reshape(-1, 2, 3), pose.rotation[:, 2])
+        up = np.einsum("pij,j->pi", of_pose[:, 3:].reshape(-1, 2, 3), pose.rotation[:, 2])
         shape = _bow_shapes((seen.points[:, :2] - middle) / half)
         by_bow = (up[:, :, None] * shape[:, None, :]).reshape(-1, 3)
-        errors = (seen.corners - expected.reshape(-1, 2)).ravel()
-        base = np.linalg.qr(slopes[:, :6])[0]
-        own = np.column_stack([slopes[:, 6 : 6 + numbers], by_bow])
+        errors = (seen.corners - there).ravel()
+        base = np.linalg.qr(of_pose)[0]
+        own = np.column_stack([of_camera, by_bow])
         own = own - base @ (base.T @ own)
         information, score = information + own.T @ own, score + own.T @ errors
         squares += float(errors @ errors)
@@ -182,6 +189,29 @@ def _about_the_board(bow: float, bent: float) -> list[Issue]:
         return []
     what = f"the board is not flat: it bows by {bow * 1e3:.2g} mm"
     return [Issue(what, "glue the print on glass or another flat, stiff plate")]
+
+
+def _all_errors(result: CameraCalibration) -> tuple[Array, Array]:
+    """Corners of all pictures and their errors, shape (n, 2) both, [px]."""
+    corners, errors = [], []
+    for name, seen in result.views.items():
+        turn = rotation_vector_from_matrix(result.boards[name].rotation)
+        place = result.boards[name].position
+        there = result.lens.slopes(seen.points, turn, place, result.matrix, result.distortion)[0]
+        corners.append(seen.corners)
+        errors.append(seen.corners - there)
+    return np.concatenate(corners), np.concatenate(errors)
+
+
+def _about_the_lens(result: CameraCalibration, radial: float) -> list[Issue]:
+    if radial < RADIAL or result.error < _SEEN:
+        return []
+    what = (
+        f"the lens bends otherwise than the model {result.lens.name!r} does: {radial:.0%} of the"
+        " squared errors of corners depend on the distance from the middle of the picture"
+    )
+    others = [name for name in LENSES if name != result.lens.name]
+    return [Issue(what, f"try another model: --lens {', '.join(others[:-1])} or {others[-1]}")]
 
 
 def _more(result: CameraCalibration) -> str:

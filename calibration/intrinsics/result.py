@@ -5,19 +5,18 @@ from __future__ import annotations
 from datetime import date
 from typing import Annotated, ClassVar, Literal, Self
 
-import cv2
 import numpy as np
 from pydantic import Field
 
 from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.quality import CameraQuality, picture_grid
-from calibration.intrinsics.uncertainty import NAMES
 from calibration.report import Section, drawing, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from model.errors import BadInput
-from model.files.documents import AnyNonNegative, AnyNumber, Positive
+from model.files.documents import AnyNonNegative, AnyNumber, LensName, Positive
 from model.files.rig_file import CameraDocument, RigDocument
 from model.pose import Array
+from tracking.camera_model import rays_of
 
 Pixels = Annotated[int, Field(ge=1, le=16384)]
 
@@ -35,6 +34,7 @@ class CameraResult(ResultDocument):
     cx_px: AnyNumber
     cy_px: AnyNumber
     distortion: list[AnyNumber]
+    lens: LensName = "pinhole"
     rms_px: AnyNonNegative
     distance_m: Positive = Field(description="for which error_mm is stated")
     halves_apart_mm: AnyNonNegative = Field(description="as two halves of the pictures see a point")
@@ -61,9 +61,7 @@ class CameraResult(ResultDocument):
                 next_step="compare results for one size of pictures",
             )
         flat = [
-            cv2.undistortPoints(
-                picture_grid(size).reshape(-1, 1, 2), r.matrix, np.array(r.distortion)
-            ).reshape(-1, 2)
+            rays_of(r.lens, r.matrix, np.array(r.distortion), picture_grid(size))
             for r in (self, other)
         ]
         squares = np.sum((flat[1] - flat[0]) ** 2, axis=1)
@@ -83,7 +81,7 @@ class CameraResult(ResultDocument):
                 where=f"calibration {self.kind} {self.name}, {self.date}",
                 next_step="calibrate the camera in the size that it is used in",
             )
-        keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+        keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
 
 
@@ -108,6 +106,7 @@ def camera_result(
         cx_px=float(m[0, 2]),
         cy_px=float(m[1, 2]),
         distortion=[float(x) for x in result.distortion],
+        lens=result.lens.kind,
         rms_px=result.error,
         distance_m=quality.distance,
         halves_apart_mm=quality.halves * 1e3,
@@ -175,6 +174,7 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
     return table_of(
         [
             *interval_rows(result.intervals),
+            ("lens model", f"{result.lens.name}, errors along the radius {quality.radial:.0%}"),
             ("corners off, RMS", f"{result.error:.3f} px"),
             (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
             ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
@@ -226,7 +226,7 @@ def _tilts(quality: CameraQuality) -> str:
 
 def _pictures(result: CameraCalibration) -> str:
     """Error of each picture, and how much of the focal length hangs on it."""
-    change = result.uncertainty.without[:, NAMES.index("fx_px")]
+    change = result.uncertainty.without[:, 0]
     rows = [
         (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+.2f} px")
         for (name, error), seen, without in zip(

@@ -1,7 +1,7 @@
 """How well pictures determine a camera: the fit linearised, picture by picture.
 
-With r the errors of a picture's corners and A, B their derivatives by the camera's nine numbers and
-by the board's pose, what the picture says of the nine is H = AᵀPA and s = AᵀPr, P projecting the
+With r the errors of a picture's corners and A, B their derivatives by the camera's numbers and by
+the board's pose, what the picture says of those numbers is H = AᵀPA and s = AᵀPr, P projecting the
 pose out. From these follow the covariance by the scatter of the corners, the fit without any one
 picture, and the fits of two halves of the pictures, each to first order.
 
@@ -17,28 +17,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.stats import t as student
 
+from calibration.intrinsics.lens import LensModel
 from calibration.statistics import CONFIDENCE
 from calibration.targets.board import Seen
 from model.errors import BadInput
 from model.pose import Array, read_only
 
-NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-"""The camera's numbers, in the order of every array here."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """What is known about the errors of a camera's nine numbers.
+    """What is known about the errors of a camera's n numbers, in the order of its lens model.
 
     Attributes:
-        covariance: Shape (9, 9).
-        half_widths: Of the 95 % intervals, shape (9,).
-        without: How the numbers change when a picture is left out, shape (pictures, 9).
-        halves: How the even pictures' numbers differ from the odd ones', shape (9,).
+        covariance: Shape (n, n).
+        half_widths: Of the 95 % intervals, shape (n,).
+        without: How the numbers change when a picture is left out, shape (pictures, n).
+        halves: How the even pictures' numbers differ from the odd ones', shape (n,).
     """
 
     covariance: Array
@@ -53,6 +50,7 @@ def uncertainty_of(
     places: Sequence[Array],
     matrix: Array,
     distortion: Array,
+    lens: LensModel,
 ) -> Uncertainty:
     """The uncertainty of a fit.
 
@@ -61,16 +59,16 @@ def uncertainty_of(
         turns: Rotation vectors of the board in the camera's frame, shape (3,) each, [rad].
         places: Its origin there, shape (3,) each, [m].
         matrix: Camera matrix, shape (3, 3), [px].
-        distortion: k1, k2, p1, p2, k3; shape (5,).
+        distortion: The lens's coefficients, shape (k,).
+        lens: The lens model.
 
     Raises:
-        BadInput: The pictures leave some of the nine numbers open.
+        BadInput: The pictures leave some of the numbers open.
     """
     parts, scores, squares, residuals = [], [], 0.0, 0
     for seen, turn, place in zip(views, turns, places, strict=True):
-        expected, slopes = cv2.projectPoints(seen.points, turn, place, matrix, distortion)
-        errors = (seen.corners - expected.reshape(-1, 2)).ravel()
-        of_pose, of_camera = slopes[:, :6], slopes[:, 6:15]
+        there, of_pose, of_camera = lens.slopes(seen.points, turn, place, matrix, distortion)
+        errors = (seen.corners - there).ravel()
         base = np.linalg.qr(of_pose)[0]
         left = of_camera - base @ (base.T @ of_camera)
         parts.append(left.T @ left)
@@ -85,7 +83,7 @@ def uncertainty_of(
             why="other numbers would explain them as well",
             next_step="take more pictures, with the board tilted up to 40° every way",
         )
-    by_scatter = np.linalg.inv(information) * squares / max(residuals - 9, 1)
+    by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
     spread = without - without.mean(axis=0)
     by_pictures = (count - 1) / count * spread.T @ spread

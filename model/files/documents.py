@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -366,3 +366,25 @@ def _not_written(path: Path, error: OSError, next_step: str) -> BadInput:
         why=error.strerror or str(error),
         next_step=next_step,
     )
+
+
+# Models of lenses, as rig files name them.
+
+
+FISHEYE = "fisheye"
+LENSES = ("pinhole", FISHEYE)
+"""OpenCV's camera models, by the key `lens`."""
+LensName = Literal["pinhole", "fisheye"]
+
+
+def require_coefficients(lens: str, count: int) -> None:
+    """Refuses numbers of distortion coefficients that OpenCV's model does not have.
+
+    Raises:
+        ValueError: It has no such number.
+    """
+    known = (4,) if lens == FISHEYE else (0, 4, 5, 8, 12, 14)
+    if count not in known:
+        *most, last = map(str, known)
+        listed = f"{', '.join(most)} or {last}" if most else last
+        raise ValueError(f"a {lens} lens needs {listed} coefficients, it has {count}")
