@@ -84,12 +84,9 @@ def judge_camera(
     told = distance is not None
     distance = float(np.median(away)) if distance is None else distance
     coverage, tilts = _coverage(result), _tilts(result)
-    slopes = _slopes(result)
+    slopes = _without_rotation(*_slopes(result))
     scale = distance / float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
-    widths = np.asarray(result.uncertainty.half_widths)
-    deviations = np.sqrt(np.diag(result.uncertainty.covariance))
-    grown = result.uncertainty.covariance * np.outer(widths / deviations, widths / deviations)
-    error = scale * float(np.sqrt(np.mean(np.einsum("pik,kl,pil->p", slopes, grown, slopes))))
+    error = scale * np.sqrt(2.0) * result.uncertainty.half_width_of(slopes)  # of both axes
     apart = slopes @ result.uncertainty.halves
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     bow, bent = bow_of(result)
@@ -133,13 +130,31 @@ def picture_grid(size: tuple[int, int]) -> Array:
     return np.array([(x * size[0], y * size[1]) for x in across for y in across])
 
 
-def _slopes(result: CameraCalibration) -> Array:
-    """Derivatives of pixels by the camera's n numbers, on a grid of rays, shape (rays, 2, n)."""
+def _slopes(result: CameraCalibration) -> tuple[Array, Array]:
+    """Derivatives of pixels on a grid of rays.
+
+    Returns:
+        By the camera's n numbers, shape (rays, 2, n), and by its rotation, shape (rays, 2, 3).
+    """
     pixels, lens = picture_grid(result.size), result.lens
     flat = rays_of(lens.kind, result.matrix, result.distortion, pixels)
     rays, nothing = np.column_stack([flat, np.ones(len(pixels))]), np.zeros(3)
-    slopes = lens.slopes(rays, nothing, nothing, result.matrix, result.distortion)[2]
-    return np.asarray(slopes.reshape(len(pixels), 2, -1))
+    _, pose, camera = lens.slopes(rays, nothing, nothing, result.matrix, result.distortion)
+    return camera.reshape(len(pixels), 2, -1), pose[:, :3].reshape(len(pixels), 2, 3)
+
+
+def _without_rotation(slopes: Array, turns: Array) -> Array:
+    """Derivatives without what a rotation of the camera does as well, shape as ``slopes``.
+
+    The camera's place is found with the same numbers afterwards, and its orientation takes that
+    part up: cx and p2, say, trade against a turn about y. The rotation is the one that fits best
+    over the picture.
+
+    Source: mrcal, "Projection uncertainty and the implied transformation" (documentation), Kogan.
+    """
+    base = np.linalg.qr(turns.reshape(-1, 3))[0]
+    flat = slopes.reshape(-1, slopes.shape[-1])
+    return np.asarray((flat - base @ (base.T @ flat)).reshape(slopes.shape))
 
 
 def bow_of(result: CameraCalibration) -> tuple[float, float]:

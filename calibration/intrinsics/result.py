@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.quality import CameraQuality, picture_grid
@@ -50,6 +51,8 @@ class CameraResult(ResultDocument):
     def apart_mm(self, other: Self) -> float:
         """How far apart points at the distance are seen, RMS over the picture, [mm].
 
+        A rotation between both cameras, as their places take it up, does not count.
+
         Raises:
             BadInput: The pictures are of different sizes.
         """
@@ -64,7 +67,11 @@ class CameraResult(ResultDocument):
             rays_of(r.lens, r.matrix, np.array(r.distortion), picture_grid(size))
             for r in (self, other)
         ]
-        squares = np.sum((flat[1] - flat[0]) ** 2, axis=1)
+        rays = [np.column_stack([part, np.ones(len(part))]) for part in flat]
+        units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
+        turn = Rotation.align_vectors(units[0], units[1])[0].as_matrix()
+        turned = rays[1] @ turn.T
+        squares = np.sum((turned[:, :2] / turned[:, 2:] - flat[0]) ** 2, axis=1)
         return float(np.sqrt(np.mean(squares))) * self.distance_m * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:

@@ -32,7 +32,7 @@ class Uncertainty:
     """What is known about the errors of a camera's n numbers, in the order of its lens model.
 
     Attributes:
-        covariance: Shape (n, n).
+        covariance: By the scatter of the corners alone, shape (n, n).
         half_widths: Of the 95 % intervals, shape (n,).
         without: How the numbers change when a picture is left out, shape (pictures, n).
         halves: How the even pictures' numbers differ from the odd ones', shape (n,).
@@ -42,6 +42,20 @@ class Uncertainty:
     half_widths: Array
     without: Array
     halves: Array
+
+    def half_width_of(self, slopes: Array) -> float:
+        """Half width of the 95 % interval of something that depends on all numbers, RMS.
+
+        Taken as a whole by the scatter and by the jackknife, the larger counts: taken number by
+        number, errors that cancel in the whole would not.
+
+        Args:
+            slopes: Its derivatives by the numbers, shape (..., n).
+        """
+        flat = slopes.reshape(-1, slopes.shape[-1])
+        both = (self.covariance, _by_pictures(self.without))
+        squares = [float(np.einsum("pk,kl,pl->", flat, c, flat)) / len(flat) for c in both]
+        return _quantile(len(self.without)) * float(np.sqrt(max(*squares, 0.0)))
 
 
 def uncertainty_of(
@@ -85,16 +99,20 @@ def uncertainty_of(
         )
     by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
-    spread = without - without.mean(axis=0)
-    by_pictures = (count - 1) / count * spread.T @ spread
+    by_pictures = _by_pictures(without)
     larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures))
-    grown = np.sqrt(larger / np.diag(by_scatter))
     return Uncertainty(
-        covariance=read_only(by_scatter * np.outer(grown, grown)),
+        covariance=read_only(by_scatter),
         half_widths=read_only(_quantile(count) * np.sqrt(larger)),
         without=read_only(without),
         halves=read_only(_half(parts, scores, 1) - _half(parts, scores, 0)),
     )
+
+
+def _by_pictures(without: Array) -> Array:
+    """The covariance by the jackknife over pictures."""
+    spread, count = without - without.mean(axis=0), len(without)
+    return np.asarray((count - 1) / count * spread.T @ spread)
 
 
 def _without(information: Array, part: Array, score: Array) -> Array:

@@ -12,11 +12,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
 
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
 from calibration.intrinsics.exchange import FORMATS, imported_camera, write_rig_with_camera
 from calibration.intrinsics.lens import LENSES, fit_lens, held_out_errors, radial_share
-from calibration.intrinsics.quality import judge_camera
+from calibration.intrinsics.quality import (
+    _slopes,
+    _without_rotation,
+    judge_camera,
+    picture_grid,
+)
 from calibration.targets.board import Seen
 from calibration.targets.chessboard import Chessboard
 from model.errors import BadInput
@@ -27,7 +33,7 @@ from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
 from tests.cli.program import call, one_message
 from tracking.camera_check import CameraMoved
-from tracking.camera_model import WIDEST, ideal_from_pixels, pixels_from_ideal, project
+from tracking.camera_model import WIDEST, ideal_from_pixels, pixels_from_ideal, project, rays_of
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 
@@ -113,6 +119,50 @@ def test_the_radial_share_is_nothing_for_noise_and_all_for_a_pure_pattern() -> N
     away = corners - m[:2, 2]
     pattern = away * (np.linalg.norm(away, axis=1, keepdims=True) / 300.0 - 0.5)
     assert radial_share(corners, pattern, m) > 0.9
+
+
+def apart_without_rotation(found: CameraCalibration, true: str) -> float:
+    """RMS distance of points a metre away, as seen by both cameras turned to agree best, [m]."""
+    focal, lens = TRUTH[true]
+    pixels = picture_grid(SIZE)
+    kind = LENSES[true].kind
+    rays = [
+        np.column_stack([rays_of(*model, pixels), np.ones(len(pixels))])
+        for model in (
+            (kind, matrix_of(focal), np.array(lens)),
+            (found.lens.kind, found.matrix, found.distortion),
+        )
+    ]
+    units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
+    turn = Rotation.align_vectors(*units)[0].as_matrix()
+    turned = rays[1] @ turn.T
+    gaps = turned[:, :2] / turned[:, 2:] - rays[0][:, :2]
+    return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
+
+
+def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
+    """The rotation that the camera's place takes up does not count: cx alone is 0.5 mm off."""
+    good, inside, ratios = 0, 0, []
+    for seed in range(12):
+        found = calibrate_from_views(views("five", 40, 0.05, seed), SIZE)
+        quality = judge_camera(found, 1e-3, 1.0)
+        off = apart_without_rotation(found, "five")
+        ratios.append(off / quality.verdict.error)
+        good += quality.verdict.good
+        inside += ratios[-1] < 1.0
+    assert good == 12
+    assert inside >= 11
+    assert np.median(ratios) > 0.15  # nor are intervals so wide that they say nothing
+
+
+def test_a_rotation_of_the_camera_is_no_error_of_it() -> None:
+    found = calibrate_from_views(views("fisheye"), SIZE, lens="fisheye")
+    slopes, turns = _slopes(found)
+    assert np.abs(_without_rotation(turns, turns)).max() < 1e-9 * np.abs(turns).max()
+    freed = _without_rotation(slopes, turns)
+    assert (np.linalg.norm(freed, axis=(0, 1)) <= np.linalg.norm(slopes, axis=(0, 1))).all()
+    shift = found.lens.names.index("cx_px")
+    assert np.linalg.norm(freed[..., shift]) < 0.6 * np.linalg.norm(slopes[..., shift])
 
 
 def some_camera(name: str) -> Camera:
