@@ -18,9 +18,10 @@ from model.files.rig_file import (
     MotionDocument,
     RigDocument,
     TagDocument,
+    TagsDocument,
     WinchDocument,
 )
-from model.pose import Array, Pose, read_only
+from model.pose import Array, Pose, read_only, skew
 from model.posed_rig import PosedRig, posed_rig
 
 if TYPE_CHECKING:
@@ -93,6 +94,10 @@ class Tag:
     pose: Pose
 
 
+SURE = 1.96
+"""Standard deviations that hold 95 % of a normal error."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A calibrated camera.
@@ -106,6 +111,9 @@ class Camera:
         world_from_camera: Pose; x right, y down, z along the view.
         rate: Pictures a second, [Hz].
         lens: One of `model.files.documents.LENSES`.
+        place_covariance: Of ``world_from_camera``: position [m] and rotation vector [rad] along the
+            world's axes, shape (6, 6); None where the rig file does not say.
+        whole_error: Whether that covariance stands for all that is shared, tags included.
     """
 
     name: str
@@ -116,6 +124,26 @@ class Camera:
     world_from_camera: Pose
     rate: float
     lens: str = "pinhole"
+    place_covariance: Array | None = None
+    whole_error: bool = False
+
+    def shared_covariance(self, world_from_body: Pose) -> Array:
+        """What its place makes every pose that it measures err by alike, shape (6, 6), [m, rad].
+
+        It is common to all pictures: no mean over them makes it smaller.
+
+        Args:
+            world_from_body: The measured pose.
+
+        Returns:
+            Of position and rotation vector along the world's axes; 0 where nothing is stated.
+        """
+        if self.place_covariance is None:
+            return np.zeros((6, 6))
+        arm = world_from_body.position - self.world_from_camera.position
+        by_place = np.eye(6)
+        by_place[:3, 3:] = -skew(arm)
+        return np.asarray(by_place @ self.place_covariance @ by_place.T)
 
 
 class CalibrationResult(Protocol):
@@ -156,6 +184,8 @@ class Rig:
         pulley_radius: [m]; 0 for point exits.
         feed_directions: Travel of the cable entering each pulley, world frame, shape (m, 3).
         half_size: Half extents of the platform box, shape (3,), [m].
+        tag_error: How far off corners of the platform's tags are, 95 %, [m]; None where the rig
+            file does not say.
     """
 
     document: RigDocument
@@ -180,6 +210,7 @@ class Rig:
     platform_tags: tuple[Tag, ...]
     frame_tags: tuple[Tag, ...]
     cameras: tuple[Camera, ...]
+    tag_error: float | None = None
 
     @property
     def name(self) -> str:
@@ -371,6 +402,7 @@ def rig_from_document(document: RigDocument) -> Rig:
         platform_tags=tuple(_tag(t) for t in tags.platform) if tags else (),
         frame_tags=tuple(_tag(t) for t in tags.frame) if tags else (),
         cameras=tuple(_camera(c) for c in document.cameras),
+        tag_error=_tag_error(document.tags),
     )
 
 
@@ -412,6 +444,10 @@ def _tag(document: TagDocument) -> Tag:
     return Tag(id=document.id, size=document.size_mm / 1000.0, pose=document.pose())
 
 
+def _tag_error(tags: TagsDocument | None) -> float | None:
+    return None if tags is None or tags.error_mm is None else tags.error_mm / 1e3
+
+
 def _camera(document: CameraDocument) -> Camera:
     matrix = [
         [document.fx_px, 0.0, document.cx_px],
@@ -427,4 +463,16 @@ def _camera(document: CameraDocument) -> Camera:
         world_from_camera=document.world_from_camera.pose(),
         rate=document.rate_hz,
         lens=document.lens,
+        place_covariance=_place_covariance(document),
+        whole_error=document.pose_covariance is None and document.error_mm is not None,
     )
+
+
+def _place_covariance(document: CameraDocument) -> Array | None:
+    if document.pose_covariance is not None:
+        scales = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
+        return read_only(np.array(document.pose_covariance) * np.outer(scales, scales))
+    if document.error_mm is not None:  # the same everywhere: as of a camera that is shifted
+        deviation = document.error_mm / 1e3 / SURE
+        return read_only(np.diag([deviation**2] * 3 + [0.0] * 3))
+    return None

@@ -26,6 +26,7 @@ class CameraResult(ResultDocument):
     """A camera's matrix and distortion, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 0
+    added: ClassVar[tuple[str, ...]] = ("lens",)
 
     kind: Literal["camera"] = "camera"
     width_px: Pixels

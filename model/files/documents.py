@@ -137,6 +137,19 @@ class Document(BaseModel):
         return [finding for rule in self.rules() for finding in rule()]
 
 
+def _is_covariance(rows: list[list[float]]) -> list[list[float]]:
+    matrix = np.array(rows, dtype=np.float64)
+    if matrix.shape != (6, 6) or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-15):
+        raise ValueError("needs 6 rows of 6 numbers, symmetric")
+    if np.linalg.eigvalsh(matrix)[0] < -1e-9 * np.abs(matrix).max():
+        raise ValueError("is no covariance: it has a negative eigenvalue")
+    return rows
+
+
+PoseCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance)]
+"""Of a pose: position [mm] and turns about the outer frame's axes [deg], 6 x 6."""
+
+
 class PoseDocument(Document):
     """Where something is: position in mm and a unit quaternion (level when left out)."""
 

@@ -16,6 +16,7 @@ from model.files.documents import (
     Name,
     NonNegative,
     Number,
+    PoseCovariance,
     PoseDocument,
     Positive,
     PositiveVector,
@@ -258,6 +259,10 @@ class TagsDocument(Document):
     )
     platform: Annotated[list[TagDocument], Field(min_length=1)]
     frame: list[TagDocument] = []
+    error_mm: NonNegative | None = Field(
+        default=None,
+        description="how far off corners of the platform's tags are, 95 %; calibrations write it",
+    )
 
 
 class CameraDocument(Document):
@@ -277,6 +282,14 @@ class CameraDocument(Document):
         validate_default=True,
     )
     world_from_camera: PoseDocument
+    pose_covariance: PoseCovariance | None = Field(
+        default=None, description="of world_from_camera, mm and deg; calibrations write it"
+    )
+    error_mm: NonNegative | None = Field(
+        default=None,
+        description="how far off the platform is measured, 95 %, all errors that pictures share;"
+        " used where there is no pose_covariance",
+    )
     rate_hz: Positive = 10.0
 
     @field_validator("distortion")
