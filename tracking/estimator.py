@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from model.cameras import SURE
 from model.pose import Array, Pose, read_only, skew
-from model.rig import SURE, Camera, Rig, Tag
+from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, pixels_from_ideal, pixels_of
 from tracking.consensus import Consensus, agreeing
 from tracking.detection.decoder import carries_tag

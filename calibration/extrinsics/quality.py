@@ -12,8 +12,9 @@ from scipy.stats import t as student
 
 from calibration.statistics import CONFIDENCE
 from calibration.verdict import CalibrationVerdict, Issue
+from model.cameras import SURE
 from model.pose import Array, Pose, skew
-from model.rig import SURE, Camera, Rig
+from model.rig import Camera, Rig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
