@@ -19,8 +19,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from calibration.intrinsics.calibrate import fit_camera
+from calibration.intrinsics.lens import LENSES
 from calibration.intrinsics.quality import judge_camera
-from calibration.intrinsics.uncertainty import NAMES
 from calibration.targets.chessboard import Chessboard
 from tests.calibration.board_pictures import (
     DISTORTION,
@@ -66,7 +66,7 @@ def main() -> None:
     inside, errors, peers, verdicts = [], [], [], []
     for trial in range(arguments.trials):
         pictures = rendered(arguments.pictures, 100 + trial)
-        found = fit_camera(pictures, BOARD)
+        found = fit_camera(pictures, BOARD, lens="five")
         off = np.array([interval.value for interval in found.intervals.values()]) - TRUTH
         inside.append(np.abs(off) <= found.uncertainty.half_widths)
         errors.append(off)
@@ -78,7 +78,7 @@ def main() -> None:
     )
     print(f" {sum(verdicts)}")
     print(f"{'':8s}{'in 95 %':>9s}{'RMS error':>12s}{'OpenCV alone':>14s}")
-    for k, name in enumerate(NAMES):
+    for k, name in enumerate(LENSES["five"].names):
         print(f"{name:8s}{np.mean(inside, axis=0)[k]:9.0%}{ours[k]:12.4g}{theirs[k]:14.4g}")
     every = np.mean([row[:4].all() for row in inside])
     print(f"all four of the matrix inside: {every:.0%}; over all numbers: {np.mean(inside):.0%}")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from calibration.tag_map.result import TagsResult
     from calibration.targets.charuco import Charuco
     from calibration.targets.chessboard import Chessboard
+    from calibration.targets.circle_grid import CircleGrid
     from calibration.targets.tag_grid import TagGrid
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "CameraResult",
     "Charuco",
     "Chessboard",
+    "CircleGrid",
     "ExtrinsicsResult",
     "ResultDocument",
     "RigResult",
@@ -47,6 +49,7 @@ if not TYPE_CHECKING:
             "calibration.tag_map.result": "TagsResult",
             "calibration.targets.charuco": "Charuco",
             "calibration.targets.chessboard": "Chessboard",
+            "calibration.targets.circle_grid": "CircleGrid",
             "calibration.targets.tag_grid": "TagGrid",
         },
     )

@@ -47,12 +47,18 @@ class Pictures:
             advance(number)
 
 
+VIDEO_PICTURES = 80
+"""Taken of a video that a camera is calibrated from, spread over it."""
+
+
 def pictures_in(folder: Path) -> Pictures:
-    """The images of a folder, all of one size.
+    """The pictures of a folder, all of one size, or of a video, spread over it.
 
     Raises:
-        BadInput: The folder is missing or has no images.
+        BadInput: The folder is missing or has no pictures, or the file is no video.
     """
+    if folder.is_file():
+        return _spread_over(VideoFile(folder, plain_camera(video_size(folder))), VIDEO_PICTURES)
     images = OneCamerasPictures(folder)
     return Pictures(images, len(images.names), images.unused)
 
@@ -82,12 +88,15 @@ def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: i
         folder = OneCamerasPictures(path, (camera.width, camera.height))
         return Pictures(folder, len(folder.names), folder.unused)
     if path.is_file():
-        video = VideoFile(path, camera)
-        every = max(1, -(-len(video) // most))
-        frames = (frame for number, frame in enumerate(video) if number % every == 0)
-        return Pictures(((f.name, f.image) for f in frames), -(-len(video) // every))
+        return _spread_over(VideoFile(path, camera), most)
     require_camera_source(str(source))
     return Pictures(_live(str(source), camera, most), most)
+
+
+def _spread_over(video: VideoFile, most: int) -> Pictures:
+    every = max(1, -(-len(video) // most))
+    frames = (frame for number, frame in enumerate(video) if number % every == 0)
+    return Pictures(((f.name, f.image) for f in frames), -(-len(video) // every))
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:

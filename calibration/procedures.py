@@ -24,6 +24,7 @@ from calibration.geometry.quality import RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
 from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
+from calibration.intrinsics.lens import AUTO
 from calibration.intrinsics.quality import CameraQuality, judge_camera
 from calibration.intrinsics.result import CameraResult, camera_page, camera_result
 from calibration.pictures import Pictures, pictures_in, pictures_of
@@ -166,6 +167,7 @@ def calibrate_camera(
     name: str = "camera",
     wanted: float = 1e-3,
     distance: float | None = None,
+    lens: str = AUTO,
     to: Destination | None = None,
     listener: Listener = SILENT,
 ) -> CameraOutcome:
@@ -177,6 +179,8 @@ def calibrate_camera(
         name: Of the camera in the rig file.
         wanted: What is good enough, 95 %, [m].
         distance: From which the camera measures, [m]; that of the boards when left out.
+        lens: ``five`` coefficients, ``rational``, ``thin-prism`` or ``fisheye``; the one that fits
+            held-out pictures best when left out.
         to: Where the result is written; nowhere when left out.
         listener: Receives how far it is.
 
@@ -187,8 +191,8 @@ def calibrate_camera(
     source = pictures if isinstance(pictures, Pictures) else pictures_in(pictures)
     to = to or Destination()
     to.require_free("camera", name)
-    with source.reported("detecting the board", listener) as images:
-        found = fit_camera(images, board, source.unused)
+    with source.reported("looking for the board", listener) as images:
+        found = fit_camera(images, board, source.unused, lens)
     quality = judge_camera(found, wanted, distance)
     result = camera_result(found, quality, name, to.on)
     return Calibration(

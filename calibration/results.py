@@ -43,6 +43,8 @@ class ResultDocument(Document, ABC):
 
     order: ClassVar[int]
     """Results of lower order are applied first: those of higher order rest on them."""
+    added: ClassVar[tuple[str, ...]] = ()
+    """Keys that older files lack: left at their defaults they are not part of the hash."""
 
     schema_version: Literal[1] = 1
     kind: str
@@ -67,8 +69,10 @@ class ResultDocument(Document, ABC):
         return result_file_name(self.kind, self.name, self.date)
 
     def sealed(self) -> Self:
-        """The result with its hash, by which an edited one is detected."""
-        return self.model_copy(update={"hash": document_hash(self, {"hash"})})
+        """The result with its hash, by which one that was edited is told."""
+        fields = type(self).model_fields
+        unset = {key for key in self.added if getattr(self, key) == fields[key].default}
+        return self.model_copy(update={"hash": document_hash(self, {"hash"} | unset)})
 
     @property
     def stated(self) -> dict[str, Interval]:

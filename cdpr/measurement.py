@@ -115,6 +115,7 @@ def calibrate_camera(
     name: str = "camera",
     wanted: float = 1e-3,
     distance: float | None = None,
+    lens: str = "auto",
     output: str | Path | None = None,
     listener: Listener = SILENT,
 ) -> CameraOutcome:
@@ -122,10 +123,12 @@ def calibrate_camera(
 
     Args:
         folder: Of the images, all of one size.
-        board: What they show: `Chessboard`, `Charuco` or `TagGrid`.
+        board: What they show: `Chessboard`, `Charuco`, `CircleGrid` or `TagGrid`.
         name: Of the camera in the rig file.
         wanted: What is good enough, 95 %, [m].
         distance: From which the camera measures, [m]; that of the boards when left out.
+        lens: ``five`` coefficients, ``rational``, ``thin-prism`` or ``fisheye``; ``auto`` takes the
+            one that fits held-out images best.
         output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives the progress.
 
@@ -138,6 +141,7 @@ def calibrate_camera(
         name=name,
         wanted=wanted,
         distance=distance,
+        lens=lens,
         to=_destination(output),
         listener=listener,
     )

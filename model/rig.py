@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.cameras import Camera, Tag, camera_from, tag_error_in, tag_from
 from model.display import html_table
 from model.errors import BadInput
 from model.files.documents import document_hash, key_path, load_yaml, millimetres
 from model.files.rig_file import (
-    CameraDocument,
     MotionDocument,
     RigDocument,
-    TagDocument,
     WinchDocument,
 )
 from model.pose import Array, Pose, read_only
@@ -27,6 +26,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from model.scene import Load, Scene
+
+__all__ = [
+    "NOT_IN_PLAN_HASH",
+    "CalibrationResult",
+    "Camera",
+    "Motion",
+    "Rig",
+    "Tag",
+    "Winch",
+    "load_rig",
+    "rig_from_document",
+]
 
 #: Parts of a rig file that a plan's proof does not rest on; they may change under a plan.
 NOT_IN_PLAN_HASH = (
@@ -78,44 +89,6 @@ class Motion:
     stuck_speed: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Tag:
-    """A fiducial tag in the frame of what carries it (x right, y up, z out of the print).
-
-    Attributes:
-        id: Number in its family.
-        size: Side of the black square, [m].
-        pose: ``platform_from_tag`` or ``world_from_tag``.
-    """
-
-    id: int
-    size: float
-    pose: Pose
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Camera:
-    """A calibrated camera.
-
-    Attributes:
-        name: Name in the rig file.
-        width: Image width, [px].
-        height: Image height, [px].
-        matrix: Camera matrix, shape (3, 3), [px].
-        distortion: OpenCV coefficients, shape (k,).
-        world_from_camera: Pose; x right, y down, z along the view.
-        rate: Images a second, [Hz].
-    """
-
-    name: str
-    width: int
-    height: int
-    matrix: Array
-    distortion: Array
-    world_from_camera: Pose
-    rate: float
-
-
 class CalibrationResult(Protocol):
     """What `Rig.with_calibration` takes: a result of `calibration`."""
 
@@ -154,6 +127,8 @@ class Rig:
         pulley_radius: [m]; 0 for point exits.
         feed_directions: Travel of the cable entering each pulley, world frame, shape (m, 3).
         half_size: Half extents of the platform box, shape (3,), [m].
+        tag_error: How far off corners of the platform's tags are, 95 %, [m]; None where the rig
+            file does not say.
     """
 
     document: RigDocument
@@ -178,6 +153,7 @@ class Rig:
     platform_tags: tuple[Tag, ...]
     frame_tags: tuple[Tag, ...]
     cameras: tuple[Camera, ...]
+    tag_error: float | None = None
 
     @property
     def name(self) -> str:
@@ -366,9 +342,10 @@ def rig_from_document(document: RigDocument) -> Rig:
         motion=_motion(document.motion),
         tag_family=tags.family if tags else "",
         tag_detector=tags.detector if tags else "",
-        platform_tags=tuple(_tag(t) for t in tags.platform) if tags else (),
-        frame_tags=tuple(_tag(t) for t in tags.frame) if tags else (),
-        cameras=tuple(_camera(c) for c in document.cameras),
+        platform_tags=tuple(tag_from(t) for t in tags.platform) if tags else (),
+        frame_tags=tuple(tag_from(t) for t in tags.frame) if tags else (),
+        cameras=tuple(camera_from(c) for c in document.cameras),
+        tag_error=tag_error_in(document.tags),
     )
 
 
@@ -403,25 +380,4 @@ def _motion(document: MotionDocument) -> Motion:
         start_tolerance=document.start_tolerance_mm / 1000.0,
         stuck_travel=document.stuck_travel_mm / 1000.0,
         stuck_speed=document.stuck_speed_mm_s / 1000.0,
-    )
-
-
-def _tag(document: TagDocument) -> Tag:
-    return Tag(id=document.id, size=document.size_mm / 1000.0, pose=document.pose())
-
-
-def _camera(document: CameraDocument) -> Camera:
-    matrix = [
-        [document.fx_px, 0.0, document.cx_px],
-        [0.0, document.fy_px, document.cy_px],
-        [0.0, 0.0, 1.0],
-    ]
-    return Camera(
-        name=document.name,
-        width=document.width_px,
-        height=document.height_px,
-        matrix=read_only(matrix),
-        distortion=read_only(document.distortion),
-        world_from_camera=document.world_from_camera.pose(),
-        rate=document.rate_hz,
     )

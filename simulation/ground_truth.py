@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.errors import BadInput
-from model.files.documents import PoseDocument
+from model.files.documents import PoseDocument, require_coefficients
 from model.files.simulation_file import (
     SimulatedCameraDocument,
     SimulatedWinchesDocument,
@@ -116,14 +116,14 @@ def _with_lens(camera: Camera, truth: SimulatedCameraDocument) -> Camera:
     lens = truth.lens
     if lens is None:
         return camera
-    if len(lens.distortion) not in (0, 4, 5, 8, 12, 14):
-        raise BadInput(
-            f"needs 0, 4, 5, 8, 12 or 14 coefficients, it has {len(lens.distortion)}",
-            where=f"simulation.cameras: {truth.name}: lens.distortion",
-        )
+    try:
+        require_coefficients(lens.lens, len(lens.distortion))
+    except ValueError as error:
+        where = f"simulation.cameras: {truth.name}: lens.distortion"
+        raise BadInput(str(error), where=where) from None
     matrix = [[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
     distortion = read_only(np.array(lens.distortion))
-    return replace(camera, matrix=read_only(matrix), distortion=distortion)
+    return replace(camera, matrix=read_only(matrix), distortion=distortion, lens=lens.lens)
 
 
 def _moved(camera: Camera, place: PoseDocument | None) -> Camera:

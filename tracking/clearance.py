@@ -13,8 +13,8 @@ from tracking.measurement import PoseMeasurement
 
 #: How many standard deviations of the pose an uncertainty holds.
 DEVIATIONS = 3.0
-#: What the pose's covariance does not know: print and place of tags, place of the camera, [m].
-ALLOWANCE = 0.5e-3
+#: Added where nobody stated what the camera's place or the tags may be off by, [m].
+UNSTATED = 0.5e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,8 +64,14 @@ class MeasuredClearance:
 
 
 def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
-    """Clearance to every obstacle as a camera sees it; None in a scene without obstacles."""
-    return clearance_at(model, measurement.pose, measurement.covariance, ALLOWANCE)
+    """Clearance to every obstacle as a camera sees it; None in a scene without obstacles.
+
+    What the camera's place and the tags may be off by counts by its covariance, carried to each
+    distance with that of the pose.
+    """
+    covariance = measurement.covariance + measurement.shared
+    allowance = UNSTATED if measurement.unstated else 0.0
+    return clearance_at(model, measurement.pose, covariance, allowance)
 
 
 def clearance_at(

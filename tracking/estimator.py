@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.pose import Pose, read_only
+from model.cameras import SURE
+from model.pose import Array, Pose, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, pixels_from_ideal, pixels_of
 from tracking.consensus import Consensus, agreeing
@@ -20,6 +21,10 @@ from tracking.pnp import BundlePose, TagView, refine_pnp, solve_pnp
 from tracking.settings import TrackerSettings
 
 # Why a pose that was found is not believed.
+
+
+UNSHARP = "are too blurred to be measured"
+"""What is said of tags that are read, but whose edges are not found."""
 
 
 def doubt(
@@ -181,6 +186,8 @@ class PlatformEstimator:
         return agreeing(self._camera, views, possible)
 
     def _why_nothing(self, seen: tuple[int, ...]) -> str:
+        if mine := [str(number) for number in seen if number in self._platform]:
+            return f"the edges of tags {', '.join(mine)} {UNSHARP}"
         wanted = ", ".join(map(str, self._platform))
         others = [number for number in seen if number not in self._frame]
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
@@ -223,15 +230,40 @@ class PlatformEstimator:
             views, start = kept, bundle.camera_from_body
         return None
 
+    def _shared(self, pose: Pose, views: Sequence[TagView]) -> Array:
+        """Covariance of what all pictures have in common: the camera's place and the tags."""
+        shared = self._camera.shared_covariance(pose)
+        if self._camera.whole_error or self._rig.tag_error is None:
+            return read_only(shared)
+        corners = np.concatenate([tag_corners(view.tag) for view in views])
+        reach = float(np.mean(np.sum((corners - corners.mean(axis=0)) ** 2, axis=1)))
+        deviation = self._rig.tag_error / SURE
+        # Errors of corners of a face are alike: no mean over corners makes them smaller.
+        turn = deviation**2 / reach
+        by_tags = np.diag([deviation**2] * 3 + [turn] * 3)
+        arm = skew(pose.rotation @ corners.mean(axis=0))
+        by_tags[:3, :3] += turn * arm @ arm.T
+        return read_only(shared + by_tags)
+
+    @property
+    def _unstated(self) -> bool:
+        """Whether nobody stated what the camera's place or the tags may be off by."""
+        if self._camera.place_covariance is None:
+            return True
+        return not self._camera.whole_error and self._rig.tag_error is None
+
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str
     ) -> PoseMeasurement:
         turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
+        pose = self._camera.world_from_camera.compose(bundle.camera_from_body)
         return PoseMeasurement(
             time,
-            self._camera.world_from_camera.compose(bundle.camera_from_body),
+            pose,
             read_only(turn @ bundle.covariance @ turn.T),
             tuple(sorted(view.tag.id for view in views)),
             bundle.reprojection,
             status,
+            self._shared(pose, views),
+            self._unstated,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,6 +28,9 @@ class PoseMeasurement:
         reprojection: RMS error of their corners, [px].
         status: ``found`` (searched in the whole image), ``tracked`` (where it was expected) or
             ``guided`` (where the drives' positions put it).
+        shared: As `covariance`, of the errors that all pictures have in common: of the camera's
+            place and of the tags, as far as calibrations or the rig file state them.
+        unstated: Whether nobody stated a part of these.
     """
 
     time: float
@@ -36,6 +39,8 @@ class PoseMeasurement:
     tags: tuple[int, ...]
     reprojection: float
     status: str
+    shared: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    unstated: bool = True
 
     @property
     def position_deviation(self) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -136,10 +136,24 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
         covariance=read_only((covariance + covariance.T) / 2.0),
         tags=tuple(sorted({number for one in poses for number in one.tags})),
         reprojection=float(np.sqrt(np.mean([one.reprojection**2 for one in poses]))),
+        shared=_shared(poses, [covariance @ weight for weight in weights]),
+        unstated=any(one.unstated for one in poses),
     )
 
 
-# Which images of several cameras belong to one moment.
+def _shared(poses: Sequence[PoseMeasurement], parts: Sequence[Array]) -> Array:
+    """What the cameras' places and the tags make the mean err by, shape (6, 6).
+
+    Places that were found by the same tags err together, by how much nobody knows: the square of a
+    sum of n errors is n times the sum of their squares at most.
+    """
+    total = np.zeros((6, 6))
+    for one, part in zip(poses, parts, strict=True):
+        total += part @ one.shared @ part.T
+    return read_only(len(poses) * total)
+
+
+# Which pictures of several cameras belong to one moment.
 
 
 def moments(

@@ -15,6 +15,7 @@ from model.errors import BadInput
 from tracking.camera_model import Image
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.diagnostics import what_else_is_seen
+from tracking.estimator import UNSHARP
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.multi_camera import MultiCameraFusion, moments
 from tracking.pose_log import LoggedPicture
@@ -121,11 +122,14 @@ def _nothing_seen(
         "check that the camera sees the platform, that the light suffices, and that the rig file"
         " has the family and numbers of the printed tags"
     )
-    if len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
+    reason = reasons.most_common(1)[0][0]
+    if UNSHARP in reason:
+        next_step = "focus the camera on the platform, and light it so that nothing blurs in motion"
+    elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
     return NoPlatformSeen(
-        f"none of {pictures} image{'s' if pictures != 1 else ''} gives a platform pose:"
-        f" {reasons.most_common(1)[0][0]}",
+        f"none of {pictures} picture{'s' if pictures != 1 else ''} gives a pose of the platform:"
+        f" {reason}",
         where=where,
         why=f"expected {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
         next_step=next_step,

@@ -12,11 +12,9 @@ from scipy.stats import t as student
 
 from calibration.statistics import CONFIDENCE
 from calibration.verdict import CalibrationVerdict, Issue
+from model.cameras import SURE
 from model.pose import Array, Pose, skew
 from model.rig import Camera, Rig
-
-SURE = 1.96
-"""Deviations of a normal error that hold 95 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,10 +51,15 @@ class ExtrinsicCalibration:
         return self.camera.world_from_camera
 
     @property
+    def stated_covariance(self) -> Array:
+        """The covariance whose 1.96 deviations are the half widths, shape (6, 6), [m, rad]."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance * np.outer(*2 * [self.half_widths / SURE / deviations]))
+
+    @property
     def error(self) -> float:
         """How far off points of the work space are seen, 95 %, RMS, [m]."""
-        deviations = np.sqrt(np.diag(self.covariance))
-        grown = self.covariance * np.outer(*2 * [self.half_widths / deviations])
+        grown = SURE**2 * self.stated_covariance
         arms = self.points - self.world_from_camera.position
         slopes = [np.hstack([np.eye(3), -skew(arm)]) for arm in arms]
         return float(np.sqrt(np.mean([np.trace(s @ grown @ s.T) for s in slopes])))

@@ -15,7 +15,7 @@ from calibration.report import Section, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from calibration.statistics import Interval
 from calibration.verdict import CalibrationVerdict
-from model.files.documents import AnyNonNegative, PoseDocument, Vector
+from model.files.documents import AnyNonNegative, PoseCovariance, PoseDocument, Vector
 from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, rotation_vector_from_matrix
 
@@ -28,6 +28,7 @@ class ExtrinsicsResult(ResultDocument):
     """A camera's place, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 2
+    added: ClassVar[tuple[str, ...]] = ("pose_covariance",)
 
     kind: Literal["extrinsics"] = "extrinsics"
     by: Literal["frame tags", "rig motion"]
@@ -37,6 +38,9 @@ class ExtrinsicsResult(ResultDocument):
     )
     tag_errors_px: dict[str, AnyNonNegative] = Field(description="RMS corner error of each tag")
     pictures: int
+    pose_covariance: PoseCovariance | None = Field(
+        default=None, description="of world_from_camera, mm and deg, position before rotation"
+    )
 
     def in_words(self) -> list[tuple[str, str]]:
         """As of every result; rotations are about the stated one: uncertainty only."""
@@ -63,12 +67,12 @@ class ExtrinsicsResult(ResultDocument):
             BadInput: The rig has no such camera, or other tags or camera numbers.
         """
         camera = camera_named(rig, self.name)
-        self.require_basis(
-            _basis(rig, self.name, self.by), f"parameters of the camera or {self.by}"
-        )
-        return with_camera(
-            rig, camera.model_copy(update={"world_from_camera": self.world_from_camera})
-        )
+        self.require_basis(_basis(rig, self.name, self.by), f"numbers of the camera or {self.by}")
+        keys = ("world_from_camera", "pose_covariance")
+        return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
+
+
+_NOT_OF_THE_LENS = ("world_from_camera", "rate_hz", "pose_covariance", "error_mm")
 
 
 def extrinsics_result(
@@ -98,6 +102,7 @@ def extrinsics_result(
         points_mm=[[float(x) * 1e3 for x in point] for point in result.points],
         tag_errors_px={str(k): float(v) for k, v in result.tag_errors.items()},
         pictures=result.pictures,
+        pose_covariance=(result.stated_covariance * np.outer(SCALES, SCALES)).tolist(),
     )
 
 
@@ -122,7 +127,9 @@ def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
 def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
     """What the result takes as known."""
     camera = camera_named(rig, name).model_dump(mode="json")
-    of_camera = {k: v for k, v in camera.items() if k not in ("world_from_camera", "rate_hz")}
+    of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS}
+    if of_camera["lens"] == "pinhole":  # as of results before there was a choice
+        del of_camera["lens"]
     tags = rig.tags.model_dump(mode="json") if rig.tags else {}
     which = "frame" if by == "frame tags" else "platform"
     return {"camera": of_camera, "family": tags.get("family"), "tags": tags.get(which)}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from calibration.intrinsics.uncertainty import NAMES, Uncertainty, uncertainty_of
+from calibration.intrinsics.lens import AUTO, LENSES, LensFit, LensModel, choose_lens, fit_lens
+from calibration.intrinsics.uncertainty import Uncertainty, uncertainty_of
 from calibration.intrinsics.views import EvenSample, as_in, is_duplicate_view
 from calibration.results import data_hash
 from calibration.statistics import Interval
@@ -22,8 +23,10 @@ LEAST_VIEWS = 4
 _FAR_OFF, _OFF = 4.0, 0.5
 """A view is left out whose error is this many times the median, and this many pixels at least."""
 _LOOKED_AT = 5
-"""Number of images without the board, spread over all, that are examined for what they show."""
-_MIRRORED = "its mirror image, so the images or the board's print are mirrored"
+"""So many pictures without the board, spread over all, are looked at for what they show instead."""
+NOT_FOUND = "no board was found in it"
+"""Why most pictures are not used."""
+_MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +36,8 @@ class CameraCalibration:
     Attributes:
         size: Width and height of the images, [px].
         matrix: Camera matrix, shape (3, 3), [px].
-        distortion: k1, k2, p1, p2, k3; shape (5,).
+        distortion: The lens's coefficients, shape (k,).
+        lens: The lens model.
         uncertainty: What is known about their errors.
         views: What was seen of the board in each image used, by name.
         boards: Where the board was in the camera's frame, by name.
@@ -45,6 +49,7 @@ class CameraCalibration:
     size: tuple[int, int]
     matrix: Array
     distortion: Array
+    lens: LensModel
     uncertainty: Uncertainty
     views: Mapping[str, Seen]
     boards: Mapping[str, Pose]
@@ -61,35 +66,28 @@ class CameraCalibration:
 
     @property
     def intervals(self) -> dict[str, Interval]:
-        """The nine numbers by the names of `calibration.intrinsics.uncertainty.NAMES`."""
+        """The camera's numbers by the names of its lens model."""
         m, widths = self.matrix, self.uncertainty.half_widths
         numbers = [m[0, 0], m[1, 1], m[0, 2], m[1, 2], *self.distortion]
         return {
             name: Interval(float(number), float(width))
-            for name, number, width in zip(NAMES, numbers, widths, strict=True)
+            for name, number, width in zip(self.lens.names, numbers, widths, strict=True)
         }
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    matrix: Array
-    distortion: Array
-    turns: dict[str, Array]
-    places: dict[str, Array]
-    errors: dict[str, float] = field(default_factory=dict)
 
 
 def fit_camera(
     pictures: Iterable[tuple[str, Image]],
     board: Board,
     unused: Mapping[str, str] | None = None,
+    lens: str = AUTO,
 ) -> CameraCalibration:
-    """Fits a pinhole with five distortion coefficients.
+    """Fits a camera and its lens.
 
     Args:
         pictures: Names and grey images of one size.
         board: What they show.
-        unused: Images that were left out before, with the reasons.
+        unused: Pictures that were left out before, with the reasons.
+        lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
 
     Raises:
         BadInput: Images of different sizes, or too few that show the board.
@@ -109,7 +107,7 @@ def fit_camera(
             )
         seen = board.find(image)
         if seen is None:
-            left_out[name] = "does not show the board"
+            left_out[name] = NOT_FOUND
             without.add((name, image))
         elif first := next((n for n, before in views.items() if _same(seen, before)), None):
             left_out[name] = as_in(first)
@@ -118,7 +116,7 @@ def fit_camera(
             left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
-    return calibrate_from_views(views, size, left_out)
+    return calibrate_from_views(views, size, left_out, lens)
 
 
 def _same(seen: Seen, before: Seen) -> bool:
@@ -127,7 +125,10 @@ def _same(seen: Seen, before: Seen) -> bool:
 
 
 def calibrate_from_views(
-    views: Mapping[str, Seen], size: tuple[int, int], unused: Mapping[str, str] | None = None
+    views: Mapping[str, Seen],
+    size: tuple[int, int],
+    unused: Mapping[str, str] | None = None,
+    lens: str = AUTO,
 ) -> CameraCalibration:
     """Fits the camera to the board's corners in each image.
 
@@ -137,31 +138,35 @@ def calibrate_from_views(
         BadInput: Too few images are left, or they determine nothing.
     """
     left_out, used = dict(unused or {}), dict(views)
-    fit = _fit(used, size)
-    limit = max(_FAR_OFF * float(np.median(list(fit.errors.values()))), _OFF)
-    bad = {name: error for name, error in fit.errors.items() if error > limit}
+    fit = _fit(used, size, lens)
+    errors = _errors(fit, used)
+    limit = max(_FAR_OFF * float(np.median(list(errors.values()))), _OFF)
+    bad = {name: error for name, error in errors.items() if error > limit}
     if bad and len(used) - len(bad) >= LEAST_VIEWS:
         for name, error in bad.items():
             left_out[name] = f"has a corner error of {error:.2f} px, far more than the others"
             del used[name]
-        fit = _fit(used, size)
+        fit = _fit(used, size, lens)
+        errors = _errors(fit, used)
     return CameraCalibration(
         size=size,
         matrix=read_only(fit.matrix),
         distortion=read_only(fit.distortion),
+        lens=fit.lens,
         uncertainty=uncertainty_of(
             list(used.values()),
             list(fit.turns.values()),
             list(fit.places.values()),
             fit.matrix,
             fit.distortion,
+            fit.lens,
         ),
         views=used,
         boards={
             name: Pose(fit.places[name], matrix_from_rotation_vector(fit.turns[name]))
             for name in used
         },
-        view_errors=fit.errors,
+        view_errors=errors,
         unused=left_out,
         data_hash=data_hash(
             name.encode() + np.round(seen.corners, 6).tobytes() for name, seen in used.items()
@@ -169,24 +174,22 @@ def calibrate_from_views(
     )
 
 
-def _fit(views: Mapping[str, Seen], size: tuple[int, int]) -> _Fit:
-    points = [seen.points.astype(np.float32).reshape(-1, 1, 3) for seen in views.values()]
-    corners = [seen.corners.astype(np.float32).reshape(-1, 1, 2) for seen in views.values()]
+def _fit(views: Mapping[str, Seen], size: tuple[int, int], lens: str) -> LensFit:
     try:
-        _, matrix, distortion, turns, places, _, _, errors = cv2.calibrateCameraExtended(
-            points, corners, size, np.eye(3), np.zeros(0)
-        )
-    except cv2.error:
+        fit = choose_lens(views, size) if lens == AUTO else fit_lens(LENSES[lens], views, size)
+    except (cv2.error, np.linalg.LinAlgError):
         raise _undetermined() from None
-    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all() and matrix[0, 0] > 0.0):
+    if not fit.finite:
         raise _undetermined()
-    return _Fit(
-        matrix=np.asarray(matrix, dtype=np.float64),
-        distortion=np.ravel(distortion)[:5].astype(np.float64),
-        turns={name: np.ravel(turn) for name, turn in zip(views, turns, strict=True)},
-        places={name: np.ravel(place) for name, place in zip(views, places, strict=True)},
-        errors=dict(zip(views, np.ravel(errors).tolist(), strict=True)),
-    )
+    return fit
+
+
+def _errors(fit: LensFit, views: Mapping[str, Seen]) -> dict[str, float]:
+    """RMS distance of each picture's corners, [px]."""
+    return {
+        name: float(np.sqrt(np.mean(np.sum(fit.residuals(name, seen) ** 2, axis=1))))
+        for name, seen in views.items()
+    }
 
 
 def _undetermined() -> BadInput:
@@ -226,7 +229,7 @@ def _too_few(
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""
         why += "; " + "; ".join(told[: 4 if more else 5]) + more
     return BadInput(
-        f"the board is detected in {len(views)} of {count} images; {LEAST_VIEWS} are required",
+        f"the board was found in {len(views)} of {count} pictures; {LEAST_VIEWS} are the least",
         why=why,
         next_step="check the board's kind and dimensions, or take more images of it, tilted up to"
         " 40°; 40 are recommended",

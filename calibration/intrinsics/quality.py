@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from calibration.intrinsics.calibrate import CameraCalibration
+from calibration.intrinsics.lens import LENSES, RADIAL, radial_share
 from calibration.verdict import CalibrationVerdict, Issue
-from model.pose import Array
+from model.pose import Array, rotation_vector_from_matrix
+from tracking.camera_model import rays_of
 
 CELLS = (8, 6)
 """Columns and rows of the map of what is covered."""
@@ -20,8 +21,15 @@ GOOD_PIXELS = 1.0
 them."""
 FULL_COVERAGE = 0.9
 """Share of the map beyond which nothing is gained by more of it."""
-EDGES = "bring the board near the edges and corners of the image"
-MORE = "take more images: 40 are recommended"
+EDGES = "bring the board near the edges and corners of the picture"
+ENOUGH_VIEWS = 40
+MORE = f"take more pictures: {ENOUGH_VIEWS} are good"
+NEARER = "take them again with the board filling more of the picture, sharp and held still"
+"""Where there are pictures enough, others like them gain little."""
+_BENT = 0.2
+"""Share of the squared errors that a bow of the board must explain to be named."""
+_SEEN = 0.3
+"""Smaller errors of corners are not worth a word about the lens, RMS, [px]."""
 _SIDES = (("left", 0, 0), ("right", 0, -1), ("top", 1, 0), ("bottom", 1, -1))
 
 
@@ -37,8 +45,11 @@ class CameraQuality:
         distance: For which the errors are stated, [m].
         nearest: Least distance of a board, [m]; it grows with the stated size of the squares.
         farthest: Greatest distance of a board, [m].
-        halves: How far apart two halves of the images would see a point there, RMS over the
-            image, [m].
+        halves: How far apart two halves of the pictures would see a point there, RMS over the
+            picture, [m].
+        bow: How far the board is from flat, highest to lowest, [m].
+        bent: Share of the squared errors of the corners that this bow explains.
+        radial: Share of them that is a function of the distance from the principal point.
     """
 
     verdict: CalibrationVerdict
@@ -48,6 +59,9 @@ class CameraQuality:
     nearest: float
     farthest: float
     halves: float
+    bow: float
+    bent: float
+    radial: float
 
     @property
     def covered(self) -> float:
@@ -70,26 +84,30 @@ def judge_camera(
     told = distance is not None
     distance = float(np.median(away)) if distance is None else distance
     coverage, tilts = _coverage(result), _tilts(result)
-    slopes = _slopes(result)
+    slopes = _without_rotation(*_slopes(result))
     scale = distance / float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
-    widths = np.asarray(result.uncertainty.half_widths)
-    deviations = np.sqrt(np.diag(result.uncertainty.covariance))
-    grown = result.uncertainty.covariance * np.outer(widths / deviations, widths / deviations)
-    error = scale * float(np.sqrt(np.mean(np.einsum("pik,kl,pil->p", slopes, grown, slopes))))
+    error = scale * np.sqrt(2.0) * result.uncertainty.half_width_of(slopes)  # of both axes
     apart = slopes @ result.uncertainty.halves
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    bow, bent = bow_of(result)
+    radial = radial_share(*_all_errors(result), result.matrix)
     lacks = [
         *_about_pictures(result, coverage, tilts),
+        *_about_the_board(bow, bent),
+        *_about_the_lens(result, radial),
         *_about_errors(result, coverage, error, halves, wanted, distance),
     ]
     where = f"at {distance:.2g} m"
     if not told:
         where += f", if the boards were {min(away):.2g} to {max(away):.2g} m away"
         if not error / scale <= GOOD_PIXELS:
-            what = f"points are within {error / scale:.2g} px; {GOOD_PIXELS:.0f} px is required"
-            lacks.append(Issue(what, "take more images, or pass --distance-m"))
+            what = f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is needed"
+            lacks.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
     verdict = CalibrationVerdict.of(error, wanted, where, lacks)
-    return CameraQuality(verdict, coverage, tilts, distance, min(away), max(away), halves)
+    nearest, farthest = min(away), max(away)
+    return CameraQuality(
+        verdict, coverage, tilts, distance, nearest, farthest, halves, bow, bent, radial
+    )
 
 
 def _coverage(result: CameraCalibration) -> Array:
@@ -112,14 +130,113 @@ def picture_grid(size: tuple[int, int]) -> Array:
     return np.array([(x * size[0], y * size[1]) for x in across for y in across])
 
 
-def _slopes(result: CameraCalibration) -> Array:
-    """Derivatives of pixels by the nine numbers, on a grid of rays, shape (rays, 2, 9)."""
-    pixels = picture_grid(result.size)
-    flat = cv2.undistortPoints(pixels.reshape(-1, 1, 2), result.matrix, result.distortion)
-    rays = np.column_stack([flat.reshape(-1, 2), np.ones(len(pixels))])
-    nothing = np.zeros(3)
-    _, slopes = cv2.projectPoints(rays, nothing, nothing, result.matrix, result.distortion)
-    return np.asarray(slopes[:, 6:15].reshape(len(pixels), 2, 9))
+def _slopes(result: CameraCalibration) -> tuple[Array, Array]:
+    """Derivatives of pixels on a grid of rays.
+
+    Returns:
+        By the camera's n numbers, shape (rays, 2, n), and by its rotation, shape (rays, 2, 3).
+    """
+    pixels, lens = picture_grid(result.size), result.lens
+    flat = rays_of(lens.kind, result.matrix, result.distortion, pixels)
+    rays, nothing = np.column_stack([flat, np.ones(len(pixels))]), np.zeros(3)
+    _, pose, camera = lens.slopes(rays, nothing, nothing, result.matrix, result.distortion)
+    return camera.reshape(len(pixels), 2, -1), pose[:, :3].reshape(len(pixels), 2, 3)
+
+
+def _without_rotation(slopes: Array, turns: Array) -> Array:
+    """Derivatives without what a rotation of the camera does as well, shape as ``slopes``.
+
+    The camera's place is found with the same numbers afterwards, and its orientation takes that
+    part up: cx and p2, say, trade against a turn about y. The rotation is the one that fits best
+    over the picture.
+
+    Source: mrcal, "Projection uncertainty and the implied transformation" (documentation), Kogan.
+    """
+    base = np.linalg.qr(turns.reshape(-1, 3))[0]
+    flat = slopes.reshape(-1, slopes.shape[-1])
+    return np.asarray((flat - base @ (base.T @ flat)).reshape(slopes.shape))
+
+
+def bow_of(result: CameraCalibration) -> tuple[float, float]:
+    """How far the board is from flat, and how much of the corners' errors that explains.
+
+    The board's height is taken as a square form of its coordinates, one for all pictures, and
+    fitted to first order together with the camera and the board's poses.
+
+    Returns:
+        Highest to lowest, [m], and a share of the squared errors.
+    """
+    points = np.concatenate([seen.points[:, :2] for seen in result.views.values()])
+    middle, half = points.mean(axis=0), np.ptp(points, axis=0) / 2.0
+    numbers = len(result.lens.names)
+    information, score, squares = np.zeros((numbers + 3, numbers + 3)), np.zeros(numbers + 3), 0.0
+    for name, seen in result.views.items():
+        pose = result.boards[name]
+        turn = rotation_vector_from_matrix(pose.rotation)
+        there, of_pose, of_camera = result.lens.slopes(
+            seen.points, turn, pose.position, result.matrix, result.distortion
+        )
+        up = np.einsum("pij,j->pi", of_pose[:, 3:].reshape(-1, 2, 3), pose.rotation[:, 2])
+        shape = _bow_shapes((seen.points[:, :2] - middle) / half)
+        by_bow = (up[:, :, None] * shape[:, None, :]).reshape(-1, 3)
+        errors = (seen.corners - there).ravel()
+        base = np.linalg.qr(of_pose)[0]
+        own = np.column_stack([of_camera, by_bow])
+        own = own - base @ (base.T @ own)
+        information, score = information + own.T @ own, score + own.T @ errors
+        squares += float(errors @ errors)
+    scale = np.sqrt(np.diag(information))
+    found = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    change = found @ (score / scale) / scale
+    heights = _bow_shapes((points - middle) / half) @ change[numbers:]
+    plane = np.column_stack([np.ones(len(points)), points - middle])
+    heights = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
+    return float(np.ptp(heights)), float(score @ change) / max(squares, 1e-300)
+
+
+def _bow_shapes(places: Array) -> Array:
+    x, y = places.T
+    return np.column_stack([x * x, x * y, y * y])
+
+
+def _about_the_board(bow: float, bent: float) -> list[Issue]:
+    if bent < _BENT:
+        return []
+    what = f"the board is not flat: it bows by {bow * 1e3:.2g} mm"
+    return [Issue(what, "glue the print on glass or another flat, stiff plate")]
+
+
+def _all_errors(result: CameraCalibration) -> tuple[Array, Array]:
+    """Corners of all pictures and their errors, shape (n, 2) both, [px]."""
+    corners, errors = [], []
+    for name, seen in result.views.items():
+        turn = rotation_vector_from_matrix(result.boards[name].rotation)
+        place = result.boards[name].position
+        there = result.lens.slopes(seen.points, turn, place, result.matrix, result.distortion)[0]
+        corners.append(seen.corners)
+        errors.append(seen.corners - there)
+    return np.concatenate(corners), np.concatenate(errors)
+
+
+def _about_the_lens(result: CameraCalibration, radial: float) -> list[Issue]:
+    if radial < RADIAL or result.error < _SEEN:
+        return []
+    what = (
+        f"the lens bends otherwise than the model {result.lens.name!r} does: {radial:.0%} of the"
+        " squared errors of corners depend on the distance from the middle of the picture"
+    )
+    others = [name for name in LENSES if name != result.lens.name]
+    return [Issue(what, f"try another model: --lens {', '.join(others[:-1])} or {others[-1]}")]
+
+
+def _more(result: CameraCalibration) -> str:
+    """What to do where other pictures would help."""
+    return MORE if len(result.views) < ENOUGH_VIEWS else NEARER
+
+
+def is_below(share: float, limit: float) -> bool:
+    """Whether a share is below a limit as people read both, in whole percent."""
+    return round(100.0 * share) < round(100.0 * limit)
 
 
 def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
@@ -129,7 +246,7 @@ def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) ->
         what = f"{len(result.views)} images show the board; {GOOD_VIEWS} are required"
         lacks.append(Issue(what, MORE))
     share = float(np.mean(coverage > 0))
-    if share < GOOD_COVERAGE:
+    if is_below(share, GOOD_COVERAGE):
         empty = [side for side, axis, at in _SIDES if not coverage.take(at, axis=axis).any()]
         place = f", none at the {' and '.join(empty)}" if empty else ""
         what = f"the board covered {share:.0%} of the image{place}; {GOOD_COVERAGE:.0%} is required"
@@ -162,12 +279,12 @@ def _about_errors(
             f"points at {distance:.2g} m are measured within {error * 1e3:.2g} mm;"
             f" {wanted * 1e3:.2g} mm are required"
         )
-        lacks.append(Issue(what, MORE))
+        lacks.append(Issue(what, _more(result)))
         share = float(np.mean(coverage > 0))
-        if GOOD_COVERAGE <= share < FULL_COVERAGE:
-            what = f"the board covered {share:.0%} of the image; {FULL_COVERAGE:.0%} is recommended"
+        if not is_below(share, GOOD_COVERAGE) and is_below(share, FULL_COVERAGE):
+            what = f"the board covered {share:.0%} of the picture, {FULL_COVERAGE:.0%} are good"
             lacks.append(Issue(what, EDGES))
     if not halves <= 2.0 * wanted:
-        what = f"two halves of the images differ by {halves * 1e3:.2g} mm"
-        lacks.append(Issue(what, MORE))
+        what = f"two halves of the pictures see them {halves * 1e3:.2g} mm apart"
+        lacks.append(Issue(what, _more(result)))
     return lacks

@@ -5,19 +5,19 @@ from __future__ import annotations
 from datetime import date
 from typing import Annotated, ClassVar, Literal, Self
 
-import cv2
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.quality import CameraQuality, picture_grid
-from calibration.intrinsics.uncertainty import NAMES
 from calibration.report import Section, drawing, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from model.errors import BadInput
-from model.files.documents import AnyNonNegative, AnyNumber, Positive
+from model.files.documents import AnyNonNegative, AnyNumber, LensName, Positive
 from model.files.rig_file import CameraDocument, RigDocument
 from model.pose import Array
+from tracking.camera_model import rays_of
 
 Pixels = Annotated[int, Field(ge=1, le=16384)]
 
@@ -26,6 +26,7 @@ class CameraResult(ResultDocument):
     """A camera's matrix and distortion, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 0
+    added: ClassVar[tuple[str, ...]] = ("lens",)
 
     kind: Literal["camera"] = "camera"
     width_px: Pixels
@@ -35,6 +36,7 @@ class CameraResult(ResultDocument):
     cx_px: AnyNumber
     cy_px: AnyNumber
     distortion: list[AnyNumber]
+    lens: LensName = "pinhole"
     rms_px: AnyNonNegative
     distance_m: Positive = Field(description="for which error_mm is stated")
     halves_apart_mm: AnyNonNegative = Field(
@@ -52,6 +54,8 @@ class CameraResult(ResultDocument):
     def apart_mm(self, other: Self) -> float:
         """How far apart points at the distance are seen, RMS over the image, [mm].
 
+        A rotation between both cameras, as their places take it up, does not count.
+
         Raises:
             BadInput: The images are of different sizes.
         """
@@ -63,12 +67,14 @@ class CameraResult(ResultDocument):
                 next_step="compare results for one image size",
             )
         flat = [
-            cv2.undistortPoints(
-                picture_grid(size).reshape(-1, 1, 2), r.matrix, np.array(r.distortion)
-            ).reshape(-1, 2)
+            rays_of(r.lens, r.matrix, np.array(r.distortion), picture_grid(size))
             for r in (self, other)
         ]
-        squares = np.sum((flat[1] - flat[0]) ** 2, axis=1)
+        rays = [np.column_stack([part, np.ones(len(part))]) for part in flat]
+        units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
+        turn = Rotation.align_vectors(units[0], units[1])[0].as_matrix()
+        turned = rays[1] @ turn.T
+        squares = np.sum((turned[:, :2] / turned[:, 2:] - flat[0]) ** 2, axis=1)
         return float(np.sqrt(np.mean(squares))) * self.distance_m * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:
@@ -85,7 +91,7 @@ class CameraResult(ResultDocument):
                 where=f"calibration {self.kind} {self.name}, {self.date}",
                 next_step="calibrate the camera at the image size in use",
             )
-        keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+        keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
 
 
@@ -110,6 +116,7 @@ def camera_result(
         cx_px=float(m[0, 2]),
         cy_px=float(m[1, 2]),
         distortion=[float(x) for x in result.distortion],
+        lens=result.lens.kind,
         rms_px=result.error,
         distance_m=quality.distance,
         halves_apart_mm=quality.halves * 1e3,
@@ -177,10 +184,12 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
     return table_of(
         [
             *interval_rows(result.intervals),
-            ("reprojection error, RMS", f"{result.error:.3f} px"),
+            ("lens model", f"{result.lens.name}, errors along the radius {quality.radial:.0%}"),
+            ("corners off, RMS", f"{result.error:.3f} px"),
             (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
             ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
-            ("two halves of the images", f"differ by {quality.halves * 1e3:.2g} mm there"),
+            ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
+            ("the board's bow", f"{quality.bow * 1e3:.2g} mm, {quality.bent:.0%} of the errors"),
             ("data", result.data_hash[:23]),
         ]
     )
@@ -226,8 +235,8 @@ def _tilts(quality: CameraQuality) -> str:
 
 
 def _pictures(result: CameraCalibration) -> str:
-    """Error of each image, and how much of the focal length hangs on it."""
-    change = result.uncertainty.without[:, NAMES.index("fx_px")]
+    """Error of each picture, and how much of the focal length hangs on it."""
+    change = result.uncertainty.without[:, 0]
     rows = [
         (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+.2f} px")
         for (name, error), seen, without in zip(

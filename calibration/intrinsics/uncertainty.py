@@ -1,7 +1,7 @@
 """How well images determine a camera: the fit linearised, image by image.
 
-With r the errors of an image's corners and A, B their derivatives by the camera's nine numbers and
-by the board's pose, what the image says of the nine is H = AᵀPA and s = AᵀPr, P projecting the
+With r the errors of a picture's corners and A, B their derivatives by the camera's numbers and by
+the board's pose, what the picture says of those numbers is H = AᵀPA and s = AᵀPr, P projecting the
 pose out. From these follow the covariance by the scatter of the corners, the fit without any one
 image, and the fits of two halves of the images, each to first order.
 
@@ -17,34 +17,45 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.stats import t as student
 
+from calibration.intrinsics.lens import LensModel
 from calibration.statistics import CONFIDENCE
 from calibration.targets.board import Seen
 from model.errors import BadInput
 from model.pose import Array, read_only
 
-NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-"""The camera's numbers, in the order of every array here."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """What is known about the errors of a camera's nine numbers.
+    """What is known about the errors of a camera's n numbers, in the order of its lens model.
 
     Attributes:
-        covariance: Shape (9, 9).
-        half_widths: Of the 95 % intervals, shape (9,).
-        without: How the numbers change when an image is left out, shape (pictures, 9).
-        halves: How the even images' numbers differ from the odd ones', shape (9,).
+        covariance: By the scatter of the corners alone, shape (n, n).
+        half_widths: Of the 95 % intervals, shape (n,).
+        without: How the numbers change when a picture is left out, shape (pictures, n).
+        halves: How the even pictures' numbers differ from the odd ones', shape (n,).
     """
 
     covariance: Array
     half_widths: Array
     without: Array
     halves: Array
+
+    def half_width_of(self, slopes: Array) -> float:
+        """Half width of the 95 % interval of something that depends on all numbers, RMS.
+
+        Taken as a whole by the scatter and by the jackknife, the larger counts: taken number by
+        number, errors that cancel in the whole would not.
+
+        Args:
+            slopes: Its derivatives by the numbers, shape (..., n).
+        """
+        flat = slopes.reshape(-1, slopes.shape[-1])
+        both = (self.covariance, _by_pictures(self.without))
+        squares = [float(np.einsum("pk,kl,pl->", flat, c, flat)) / len(flat) for c in both]
+        return _quantile(len(self.without)) * float(np.sqrt(max(*squares, 0.0)))
 
 
 def uncertainty_of(
@@ -53,6 +64,7 @@ def uncertainty_of(
     places: Sequence[Array],
     matrix: Array,
     distortion: Array,
+    lens: LensModel,
 ) -> Uncertainty:
     """The uncertainty of a fit.
 
@@ -61,16 +73,16 @@ def uncertainty_of(
         turns: Rotation vectors of the board in the camera's frame, shape (3,) each, [rad].
         places: Its origin there, shape (3,) each, [m].
         matrix: Camera matrix, shape (3, 3), [px].
-        distortion: k1, k2, p1, p2, k3; shape (5,).
+        distortion: The lens's coefficients, shape (k,).
+        lens: The lens model.
 
     Raises:
-        BadInput: The images leave some of the nine numbers open.
+        BadInput: The pictures leave some of the numbers open.
     """
     parts, scores, squares, residuals = [], [], 0.0, 0
     for seen, turn, place in zip(views, turns, places, strict=True):
-        expected, slopes = cv2.projectPoints(seen.points, turn, place, matrix, distortion)
-        errors = (seen.corners - expected.reshape(-1, 2)).ravel()
-        of_pose, of_camera = slopes[:, :6], slopes[:, 6:15]
+        there, of_pose, of_camera = lens.slopes(seen.points, turn, place, matrix, distortion)
+        errors = (seen.corners - there).ravel()
         base = np.linalg.qr(of_pose)[0]
         left = of_camera - base @ (base.T @ of_camera)
         parts.append(left.T @ left)
@@ -85,18 +97,22 @@ def uncertainty_of(
             why="other parameters would explain them as well",
             next_step="take more images, with the board tilted up to 40° in every direction",
         )
-    by_scatter = np.linalg.inv(information) * squares / max(residuals - 9, 1)
+    by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
-    spread = without - without.mean(axis=0)
-    by_pictures = (count - 1) / count * spread.T @ spread
+    by_pictures = _by_pictures(without)
     larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures))
-    grown = np.sqrt(larger / np.diag(by_scatter))
     return Uncertainty(
-        covariance=read_only(by_scatter * np.outer(grown, grown)),
+        covariance=read_only(by_scatter),
         half_widths=read_only(_quantile(count) * np.sqrt(larger)),
         without=read_only(without),
         halves=read_only(_half(parts, scores, 1) - _half(parts, scores, 0)),
     )
+
+
+def _by_pictures(without: Array) -> Array:
+    """The covariance by the jackknife over pictures."""
+    spread, count = without - without.mean(axis=0), len(without)
+    return np.asarray((count - 1) / count * spread.T @ spread)
 
 
 def _without(information: Array, part: Array, score: Array) -> Array:

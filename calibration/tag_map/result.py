@@ -77,7 +77,8 @@ class TagsResult(ResultDocument):
         assert rig.tags is not None  # or their basis were another
         placed = {tag.id: tag for tag in self.platform}
         tags = [placed.get(tag.id, tag) for tag in rig.tags.platform]
-        return rig.model_copy(update={"tags": rig.tags.model_copy(update={"platform": tags})})
+        changes = {"platform": tags, "error_mm": self.error_mm}
+        return rig.model_copy(update={"tags": rig.tags.model_copy(update=changes)})
 
 
 def tags_result(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -75,7 +75,11 @@ class Charuco:
         return f"a ChArUco board of {self.columns} x {self.rows} squares with {self.dictionary}"
 
     def find(self, image: Image) -> Seen | None:
-        """Its inner corners, as far as they are to be seen."""
+        """Its inner corners, as far as they are to be seen; black and white may be exchanged."""
+        seen = self._seen_in(image)
+        return self._seen_in(np.asarray(255 - image)) if seen is None else seen
+
+    def _seen_in(self, image: Image) -> Seen | None:
         squares, markers, twice = self._markers_in(image)
         if not len(markers):
             return None
@@ -91,7 +95,11 @@ class Charuco:
         return Seen(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
 
     def instead(self, image: Image) -> str:
-        """Tags and markers that the image shows."""
+        """The other pattern of OpenCV, else tags and markers that the picture shows."""
+        if replace(self, legacy=not self.legacy).find(image) is not None:
+            use = "without --legacy" if self.legacy else "with --legacy"
+            drawn = "4.6 and later draw" if self.legacy else "before 4.6 drew"
+            return f"the board as versions of OpenCV {drawn} it: try {use}"
         family = self.dictionary if self.dictionary in FAMILIES else FAMILIES[-1]
         told = what_else_is_seen(image, family, [])
         fours = TagDetector("4X4_1000").detect(image)

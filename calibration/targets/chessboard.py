@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +18,23 @@ _SEARCHED = 1600
 """Longer side of the image in which the board is looked for, [px]."""
 _LARGEST, _SHARE = 11, 120
 """At most this many pixels, or this share of the image width: large images are softer."""
+
+
+def _classic(image: Image, size: tuple[int, int]) -> tuple[bool, object]:
+    return cv2.findChessboardCorners(image, size)
+
+
+def _sectors(flags: int) -> Callable[[Image, tuple[int, int]], tuple[bool, object]]:
+    return lambda image, size: cv2.findChessboardCornersSB(image, size, flags=flags)
+
+
+_FINDERS = (
+    _classic,
+    _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE),
+    _sectors(0),
+    _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY),
+)
+"""OpenCV's finders, the fastest first: each finds boards that another one loses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +85,15 @@ class Chessboard:
         return None if rough is None else Seen(self.points(), self._refined(image, rough))
 
     def _found(self, image: Image) -> Array | None:
-        """Its inner corners roughly, shape (n, 2), [px]."""
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-        try:
-            size = (self.columns, self.rows)
-            found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
-        except cv2.error:  # as for images too small to hold the board
-            return None
-        return np.asarray(corners, dtype=np.float64).reshape(-1, 2) if found else None
+        """Its inner corners roughly, by the first finder that finds all, shape (n, 2), [px]."""
+        for finder in _FINDERS:
+            try:
+                found, corners = finder(image, (self.columns, self.rows))
+            except cv2.error:  # as for pictures too small to hold the board
+                continue
+            if found:
+                return np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        return None
 
     def instead(self, image: Image) -> str:
         """Inner corners of another chessboard that the image shows."""

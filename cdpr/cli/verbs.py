@@ -74,6 +74,16 @@ CALIBRATE = (
         "Write a new rig file with calibration results in place of its own values.",
         "calibrate.apply:apply",
     ),
+    Verb(
+        "export",
+        "Write a camera's matrix and lens for OpenCV (YAML) or ROS (camera_info).",
+        "calibrate.exchange:export",
+    ),
+    Verb(
+        "import",
+        "Write a new rig file with a camera's matrix and lens from OpenCV or ROS.",
+        "calibrate.exchange:import_",
+    ),
 )
 BENCH = (
     Verb(

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -137,6 +137,19 @@ class Document(BaseModel):
     def findings(self) -> list[Finding]:
         """What is wrong between the parts of the document."""
         return [finding for rule in self.rules() for finding in rule()]
+
+
+def _is_covariance(rows: list[list[float]]) -> list[list[float]]:
+    matrix = np.array(rows, dtype=np.float64)
+    if matrix.shape != (6, 6) or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-15):
+        raise ValueError("needs 6 rows of 6 numbers, symmetric")
+    if np.linalg.eigvalsh(matrix)[0] < -1e-9 * np.abs(matrix).max():
+        raise ValueError("is no covariance: it has a negative eigenvalue")
+    return rows
+
+
+PoseCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance)]
+"""Of a pose: position [mm] and turns about the outer frame's axes [deg], 6 x 6."""
 
 
 class PoseDocument(Document):
@@ -368,3 +381,25 @@ def _not_written(path: Path, error: OSError, next_step: str) -> BadInput:
         why=error.strerror or str(error),
         next_step=next_step,
     )
+
+
+# Models of lenses, as rig files name them.
+
+
+FISHEYE = "fisheye"
+LENSES = ("pinhole", FISHEYE)
+"""OpenCV's camera models, by the key `lens`."""
+LensName = Literal["pinhole", "fisheye"]
+
+
+def require_coefficients(lens: str, count: int) -> None:
+    """Refuses numbers of distortion coefficients that OpenCV's model does not have.
+
+    Raises:
+        ValueError: It has no such number.
+    """
+    known = (4,) if lens == FISHEYE else (0, 4, 5, 8, 12, 14)
+    if count not in known:
+        *most, last = map(str, known)
+        listed = f"{', '.join(most)} or {last}" if most else last
+        raise ValueError(f"a {lens} lens needs {listed} coefficients, it has {count}")

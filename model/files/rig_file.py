@@ -8,17 +8,21 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field, ValidationInfo, field_validator
 
 from model.files.documents import (
+    LENSES,
     WHOLE_LARGEST,
     Document,
     Finding,
+    LensName,
     Name,
     NonNegative,
     Number,
+    PoseCovariance,
     PoseDocument,
     Positive,
     PositiveVector,
     UnitVector,
     Vector,
+    require_coefficients,
 )
 from model.files.simulation_file import SimulationDocument
 
@@ -255,10 +259,14 @@ class TagsDocument(Document):
     )
     platform: Annotated[list[TagDocument], Field(min_length=1)]
     frame: list[TagDocument] = []
+    error_mm: NonNegative | None = Field(
+        default=None,
+        description="how far off corners of the platform's tags are, 95 %; calibrations write it",
+    )
 
 
 class CameraDocument(Document):
-    """One camera: intrinsics (OpenCV pinhole) and pose (x right, y down, z along the view)."""
+    """One camera: intrinsics (OpenCV) and pose (x right, y down, z along the view)."""
 
     name: Name
     width_px: Pixels
@@ -267,17 +275,27 @@ class CameraDocument(Document):
     fy_px: Positive
     cx_px: Number
     cy_px: Number
+    lens: LensName = Field(default="pinhole", description="OpenCV's model of the lens")
     distortion: Annotated[list[Number], Field(max_length=14)] = Field(
-        default=[], description="OpenCV order: k1 k2 p1 p2 k3 …"
+        default=[],
+        description="OpenCV order: k1 k2 p1 p2 k3 …; fisheye: k1 k2 k3 k4",
+        validate_default=True,
     )
     world_from_camera: PoseDocument
+    pose_covariance: PoseCovariance | None = Field(
+        default=None, description="of world_from_camera, mm and deg; calibrations write it"
+    )
+    error_mm: NonNegative | None = Field(
+        default=None,
+        description="how far off the platform is measured, 95 %, all errors that pictures share;"
+        " used where there is no pose_covariance",
+    )
     rate_hz: Positive = 10.0
 
     @field_validator("distortion")
     @classmethod
-    def _opencv_count(cls, distortion: list[float]) -> list[float]:
-        if len(distortion) not in (0, 4, 5, 8, 12, 14):
-            raise ValueError(f"needs 0, 4, 5, 8, 12 or 14 coefficients, it has {len(distortion)}")
+    def _opencv_count(cls, distortion: list[float], info: ValidationInfo) -> list[float]:
+        require_coefficients(info.data.get("lens", LENSES[0]), len(distortion))
         return distortion
 
 

@@ -14,6 +14,7 @@ from pydantic import Field
 from model.files.documents import (
     Document,
     Finding,
+    LensName,
     NonNegative,
     Number,
     PoseDocument,
@@ -60,6 +61,7 @@ class LensDocument(Document):
     cx_px: Number
     cy_px: Number
     distortion: Annotated[list[Number], Field(max_length=14)] = []
+    lens: LensName = "pinhole"
 
 
 class SimulatedCameraDocument(Document):

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from model.kinematics import Cables
 from model.pose import Array, Pose
 from model.rig import Camera
-from simulation.camera.rendering import Image8, Image32, pixels_of
+from simulation.camera.rendering import Image8, Image32
+from tracking.camera_model import pixels_of
 
 #: Points along a cable, and how far a point must lie behind a surface to be hidden, [m].
 POINTS, HIDDEN = 96, 3e-3

@@ -30,12 +30,12 @@ from simulation.camera.rendering import (
     draw_background,
     draw_quad,
     draw_tag,
-    pixels_of,
     region_of,
     sample_rays,
     shade,
 )
 from simulation.ground_truth import Optics
+from tracking.camera_model import pixels_of
 
 if TYPE_CHECKING:
     from simulation.camera.rendering import Image8

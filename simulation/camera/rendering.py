@@ -30,6 +30,7 @@ from model.geometry.shapes import (
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
+from tracking.camera_model import pixels_of, rays_of
 
 #: Samples a pixel along x and along y.
 SAMPLES = 2
@@ -65,16 +66,8 @@ def sample_rays(camera: Camera) -> Image32:
     columns = (np.arange(camera.width * SAMPLES) + 0.5) / SAMPLES - 0.5
     rows = (np.arange(camera.height * SAMPLES) + 0.5) / SAMPLES - 0.5
     points = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32)
-    straight = cv2.undistortPoints(points.reshape(-1, 1, 2), camera.matrix, camera.distortion)
+    straight = rays_of(camera.lens, camera.matrix, camera.distortion, points.astype(np.float64))
     return np.asarray(straight, dtype=np.float32).reshape(points.shape)
-
-
-def pixels_of(camera: Camera, points_in_camera: Array) -> Array:
-    """Distorted pixels of points in front of the camera, shape (n, 3), [m]; shape (n, 2)."""
-    zero = np.zeros(3)
-    points = np.ascontiguousarray(points_in_camera, dtype=np.float64)
-    pixels = cv2.projectPoints(points, zero, zero, camera.matrix, camera.distortion)[0]
-    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
 def region_of(camera: Camera, points_in_camera: Array, margin: int = 2) -> CanvasRegion:

@@ -27,6 +27,21 @@ def pages_in(data: bytes) -> list[tuple[Array, Array, list[str]]]:
     return found
 
 
+def discs_in(data: bytes) -> Array:
+    """Centre and radius of the discs of a file's first page, mm from the top left, shape (n, 3).
+
+    A disc is four curves from its rightmost point; their ends are opposite points of it.
+    """
+    text = re.search(rb"stream\n(.*?)\nendstream", data, re.DOTALL).group(1).decode()
+    number = r"[-\d.]+"
+    found = []
+    for disc in re.findall(rf"{number} {number} m\n(?:.* c\n){{4}}", text):
+        ends = np.array([[float(x) for x in line.split()[-3:-1]] for line in disc.splitlines()[1:]])
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        found.append([*(low + high) / 2.0, (high - low).mean() / 2.0])
+    return np.array(found)
+
+
 def drawn(size_mm: Array, rectangles: Array, per_mm: float) -> np.ndarray:
     """A grey image of a page, ink 20 and paper 235."""
     width, height = np.round(size_mm * per_mm).astype(int)

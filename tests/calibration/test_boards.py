@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -16,6 +17,7 @@ from calibration.intrinsics.views import EvenSample
 from calibration.targets.board import mirrored
 from calibration.targets.charuco import Charuco
 from calibration.targets.chessboard import Chessboard
+from calibration.targets.circle_grid import CircleGrid
 from calibration.targets.tag_grid import TagGrid
 from model.errors import BadInput
 from model.pose import Pose
@@ -49,6 +51,108 @@ def tag_print() -> np.ndarray:
         top, left = 24 + row * 104, 24 + column * 104
         sheet[top : top + 80, left : left + 80] = tag
     return sheet
+
+
+KALIBR = TagGrid(5, 4, 0.040, 0.012, "tag36h11", first=20, order="kalibr")
+CIRCLES = CircleGrid(7, 5, 0.030, 0.018)
+SHIFTED = CircleGrid(4, 9, 0.022, 0.018, asymmetric=True)
+MARGIN = 0.025
+
+
+def kalibr_print() -> np.ndarray:
+    """As kalibr_create_target_pdf draws it: wide borders, black squares at all corners."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11)
+    sheet = np.full((4 * 104 + 76, 5 * 104 + 76), 255, np.uint8)
+    for number in range(20):
+        row, column = divmod(number, 5)
+        tag = cv2.aruco.generateImageMarker(dictionary, 20 + number, 80, borderBits=2)
+        top, left = 50 + (3 - row) * 104, 50 + column * 104
+        sheet[top : top + 80, left : left + 80] = tag[::-1, ::-1]
+    for row in range(5):
+        for column in range(6):
+            top, left = 26 + row * 104, 26 + column * 104
+            sheet[top : top + 24, left : left + 24] = 0
+    return sheet
+
+
+def circle_print(board: CircleGrid) -> np.ndarray:
+    """Black circles on white, the first one's middle `MARGIN` from the left and the top."""
+    fine = 4
+    places = (board.points()[:, :2] + MARGIN) / PIXEL
+    width, height = (places.max(axis=0) + MARGIN / PIXEL).astype(int)
+    sheet = np.full((height * fine, width * fine), 255, np.uint8)
+    for place in places:
+        middle = tuple(np.round((place * fine - 0.5) * 16).astype(int).tolist())
+        radius = round(board.diameter / 2.0 / PIXEL * fine * 16)
+        cv2.circle(sheet, middle, radius, 0, -1, cv2.LINE_8, 4)
+    return cv2.resize(sheet, (width, height), interpolation=cv2.INTER_AREA)
+
+
+@cache
+def grid_pictures(board: CircleGrid | TagGrid) -> list[tuple[np.ndarray, Pose]]:
+    if isinstance(board, CircleGrid):
+        sheet, origin = circle_print(board), np.full(2, MARGIN)
+        middle = board.points().mean(axis=0)
+    else:
+        sheet, origin, middle = kalibr_print(), np.full(2, 0.025), np.array([0.12, 0.1, 0.0])
+    poses = poses_before_the_camera(middle, 12, spread=0.03)
+    return [(with_noise(picture_of(sheet, PIXEL, origin, p), k), p) for k, p in enumerate(poses)]
+
+
+def off(board, pictures) -> np.ndarray:
+    errors = []
+    for image, pose in pictures:
+        if (seen := board.find(image)) is not None:
+            turned = cv2.Rodrigues(pose.rotation)[0]
+            truth = cv2.projectPoints(seen.points, turned, pose.position, MATRIX, DISTORTION)[0]
+            errors.append(seen.corners - truth.reshape(-1, 2))
+    return np.concatenate(errors) if errors else np.zeros((0, 2))
+
+
+@pytest.mark.parametrize(
+    ("board", "points", "limit"), [(CIRCLES, 200, 0.04), (SHIFTED, 200, 0.05), (KALIBR, 500, 0.1)]
+)
+def test_centres_and_saddles_are_found_where_they_are(board, points: int, limit: float) -> None:
+    """Middles of ellipses would be 0.1 px and more off where circles are seen aslant."""
+    errors = off(board, grid_pictures(board))
+    assert len(errors) > points
+    assert np.sqrt(np.mean(errors**2)) < limit
+    assert np.abs(errors.mean(axis=0)).max() < 0.02
+
+
+@pytest.mark.parametrize("board", [CIRCLES, SHIFTED, KALIBR, TAGS, CHARUCO])
+def test_boards_with_black_and_white_exchanged_are_found(board) -> None:
+    own = grid_pictures(board) if board in (CIRCLES, SHIFTED, KALIBR) else pictures(board)
+    shown = [(image, pose) for image, pose in own if board.find(image) is not None][:3]
+    inverted = off(board, [(255 - image, pose) for image, pose in shown])
+    assert len(inverted) == len(off(board, shown))
+    assert np.sqrt(np.mean(inverted**2)) < 0.12
+
+
+def test_the_order_of_kalibr_is_named_where_the_numbers_contradict_the_rows() -> None:
+    shown = [image for image, _ in grid_pictures(KALIBR) if KALIBR.find(image) is not None][:4]
+    rows = replace(KALIBR, order="rows")
+    with pytest.raises(BadInput) as caught:
+        fit_camera([(f"{k}", image) for k, image in enumerate(shown)], rows)
+    assert "rows upward, as Kalibr prints them: try --order kalibr" in caught.value.why
+
+
+def test_our_own_tags_told_in_the_order_of_kalibr_are_not_taken() -> None:
+    told = replace(TAGS, order="kalibr")
+    whole = [i for i, _ in pictures(TAGS) if (s := TAGS.find(i)) and len(s.points) > 60]
+    assert whole
+    for image in whole:
+        assert told.find(image) is None
+        assert "--order rows" in told.instead(image)
+
+
+def test_a_charuco_board_of_an_old_opencv_is_named() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    drawn = cv2.aruco.CharucoBoard((5, 6), 0.040, 0.030, dictionary)
+    drawn.setLegacyPattern(True)
+    image = cv2.copyMakeBorder(drawn.generateImage((400, 480)), 40, 40, 40, 40, 0, value=255)
+    assert Charuco(5, 6, 0.040, 0.030, "4X4_50", legacy=True).find(image) is not None
+    assert "try with --legacy" in Charuco(5, 6, 0.040, 0.030, "4X4_50").instead(image)
 
 
 @cache
@@ -115,7 +219,7 @@ def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
     image = next(image for image, _ in pictures(board) if board.find(image) is not None)
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
-    assert "is detected in 0 of 2 images" in caught.value.what
+    assert "was found in 0 of 2 pictures" in caught.value.what
     assert told in caught.value.why
     assert "; a shows " in caught.value.why
 
@@ -178,8 +282,11 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> 
         (lambda: TagGrid(3, 1, 0.03, 0.01, "tag36h11"), "needs 4 tags"),
         (lambda: TagGrid(3, 2, 0.03, 0.0, "tag36h11"), "gap"),
         (lambda: TagGrid(3, 2, 0.03, 0.01, "tag99h1"), "unknown tag family"),
-        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586; .* 580 to 591"),
-        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586; .* -1 to 10"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586, .* 580 to 591"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", order="up"), "unknown order"),
+        (lambda: CircleGrid(2, 6, 0.02, 0.01), "3 circles"),
+        (lambda: CircleGrid(4, 6, 0.02, 0.02), "white between"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586, .* -1 to 10"),
     ],
 )
 def test_boards_that_cannot_be_are_refused(make, named: str) -> None:
@@ -188,6 +295,6 @@ def test_boards_that_cannot_be_are_refused(make, named: str) -> None:
 
 
 def test_pictures_too_small_or_empty_show_no_board() -> None:
-    for board in (Chessboard(9, 6, 0.025), CHARUCO, TAGS):
+    for board in (Chessboard(9, 6, 0.025), CHARUCO, TAGS, CIRCLES, SHIFTED, KALIBR):
         assert board.find(np.zeros((8, 8), np.uint8)) is None
         assert board.find(np.full((480, 640), 128, np.uint8)) is None

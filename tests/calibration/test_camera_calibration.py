@@ -15,7 +15,7 @@ from calibration.intrinsics.calibrate import (
     calibrate_from_views,
     fit_camera,
 )
-from calibration.intrinsics.quality import judge_camera
+from calibration.intrinsics.quality import is_below, judge_camera
 from calibration.intrinsics.result import camera_result
 from calibration.load import load_result
 from calibration.results import write_result
@@ -137,7 +137,7 @@ def test_rendered_pictures_are_calibrated_and_useless_ones_named() -> None:
     pictures.append(("wall.png", np.full((SIZE[1], SIZE[0]), 128, np.uint8)))
     found = fit_camera(pictures, BOARD)
     check_values(found, pixels=4.0)
-    assert found.unused == {"wall.png": "does not show the board"}
+    assert found.unused == {"wall.png": "no board was found in it"}
     assert set(found.view_errors) == {f"{k}.png" for k in range(8)}
     assert found.error < 0.2
 
@@ -177,3 +177,36 @@ def test_other_data_have_another_hash() -> None:
     second = calibrate_from_views(views(8, 0.01), SIZE)
     assert first.data_hash != second.data_hash
     assert first.data_hash.startswith("sha256:")
+
+
+def test_a_bowed_board_is_named_with_its_bow() -> None:
+    """Of 200 mm by 125 mm, its middle 1 mm higher than its corners."""
+    flat = views(14, 0.05)
+    poses = calibrate_from_views(flat, SIZE).boards
+    bent = {}
+    for name, seen in flat.items():
+        middle = seen.points.mean(axis=0)
+        share = (seen.points - middle)[:, :2] / (np.ptp(seen.points[:, :2], axis=0) / 2.0)
+        high = seen.points + np.outer(1e-3 * (1.0 - 0.5 * (share**2).sum(axis=1)), [0, 0, 1.0])
+        turn = cv2.Rodrigues(poses[name].rotation)[0]
+        there = cv2.projectPoints(high, turn, poses[name].position, MATRIX, DISTORTION)[0]
+        noise = np.random.default_rng(len(bent)).normal(scale=0.05, size=seen.corners.shape)
+        bent[name] = Seen(seen.points, there.reshape(-1, 2) + noise)
+    quality = judge_camera(calibrate_from_views(bent, SIZE), 1e-3)
+    assert quality.bow == pytest.approx(1e-3, rel=0.3)
+    assert any("the board is not flat" in reason for reason in quality.verdict.reasons)
+    assert any("glass" in step for step in quality.verdict.next_steps)
+    straight = judge_camera(calibrate_from_views(flat, SIZE), 1e-3)
+    assert not any("flat" in reason for reason in straight.verdict.reasons)
+
+
+def test_no_advice_contradicts_what_is_there_already() -> None:
+    """Neither more pictures where there are enough, nor 90 % where 90 % are covered."""
+    many = views(42, 2.0)
+    verdict = judge_camera(calibrate_from_views(many, SIZE), 1e-4).verdict
+    assert not verdict.good
+    assert not any("40 are good" in step for step in verdict.next_steps)
+    few = judge_camera(calibrate_from_views(views(13, 2.0), SIZE), 1e-4).verdict
+    assert "take more pictures: 40 are good" in few.next_steps
+    assert not is_below(0.896, 0.9)
+    assert is_below(0.894, 0.9)

@@ -14,6 +14,7 @@ import pytest
 from calibration.targets.board import Board
 from calibration.targets.charuco import Charuco
 from calibration.targets.chessboard import Chessboard
+from calibration.targets.circle_grid import CircleGrid
 from calibration.targets.printing import (
     MARGIN_MM,
     PAPERS,
@@ -25,7 +26,7 @@ from calibration.targets.printing import (
 )
 from calibration.targets.tag_grid import TagGrid
 from model.errors import BadInput
-from tests.calibration.pages import drawn, pages_in
+from tests.calibration.pages import discs_in, drawn, pages_in
 from tracking.detection.detector import TagDetector
 
 BOARDS = [
@@ -33,6 +34,7 @@ BOARDS = [
     Charuco(7, 5, 0.035, 0.026, "4X4_50"),
     Charuco(5, 8, 0.030, 0.022, "5X5_100", legacy=True),
     TagGrid(6, 4, 0.030, 0.009, "tag36h11", first=40),
+    TagGrid(6, 4, 0.030, 0.009, "tag36h11", first=40, order="kalibr"),
 ]
 PER_MM = 6.0
 
@@ -53,6 +55,25 @@ def test_a_printed_board_is_found_in_its_size(board: Board) -> None:
     expected = {Chessboard: 54, Charuco: 24 if not getattr(board, "legacy", 0) else 28, TagGrid: 96}
     assert len(points) == expected[type(board)]
     assert any("This side down" in text for text in texts)
+
+
+@pytest.mark.parametrize("asymmetric", [False, True])
+def test_printed_circles_are_found_in_their_size(asymmetric: bool) -> None:
+    board = CircleGrid(4, 11, 0.020, 0.015, True) if asymmetric else CircleGrid(7, 5, 0.03, 0.018)
+    data = pdf_of([sheet_of(board_print(board), "a4")], "a board")
+    size, _, _ = pages_in(data)[0]
+    page = np.full(np.round(size[::-1] * PER_MM).astype(int), 235, np.uint8)
+    for x, y, radius in discs_in(data) * PER_MM:
+        middle, shift = (round((x - 0.5) * 256), round((y - 0.5) * 256)), 8
+        cv2.circle(page, middle, round(radius * 256), 20, -1, cv2.LINE_AA, shift)
+    seen = board.find(page)
+    assert seen is not None
+    on_paper, points = (seen.corners + 0.5) / PER_MM, seen.points[:, :2] * 1e3
+    turn, left = np.linalg.lstsq(
+        np.column_stack([points, np.ones(len(points))]), on_paper, rcond=None
+    )[:2]
+    np.testing.assert_allclose(turn[:2] @ turn[:2].T, np.eye(2), atol=2e-3)
+    assert np.sqrt(left.sum() / len(points)) < 0.02
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=str)

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from datetime import date
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calibration.extrinsics.quality import (
+    ExtrinsicCalibration,
+    judge_extrinsics,
+    workspace_corners,
+)
+from calibration.extrinsics.result import extrinsics_result
 from calibration.load import load_result
 from calibration.results import write_result
 from calibration.statistics import Interval
@@ -104,8 +112,8 @@ def test_files_that_are_no_results_are_told_by_name(tmp_path: Path, text: str, n
 def test_a_result_tells_how_far_it_is_from_another() -> None:
     one, two = camera_result_of(), camera_result_of(fx=908.0)
     assert one.changes_to(two)["fx_px"] == pytest.approx(3.0)
-    assert one.apart_mm(one) == 0.0
-    # Points of an image lie up to 0.7 of the distance off its axis; 3 of 905 px is 0.33 %.
+    assert one.apart_mm(one) < 1e-9
+    # Points of a picture lie up to 0.7 of the distance off its axis; 3 of 905 px is 0.33 %.
     assert 0.5 < one.apart_mm(two) < 3.5
 
 
@@ -123,3 +131,38 @@ def test_a_verdict_says_each_next_step_once() -> None:
     assert verdict.next_steps == ("take more", "tilt")
     assert str(verdict) == "not good enough: few; wide; flat"
     assert str(CalibrationVerdict.of(5e-4, 1e-3, "at 1 m", [])) == "good enough for 0.5 mm at 1 m"
+
+
+def test_a_camera_result_from_before_there_were_lens_models_is_read(tmp_path: Path) -> None:
+    """It has no key `lens`, and its hash knows of none."""
+    path = write_result(tmp_path, camera_result_of())
+    text = path.read_text()
+    assert "lens: pinhole\n" in text
+    path.write_text(text.replace("lens: pinhole\n", ""))
+    assert load_result(path) == camera_result_of().sealed()
+    path.write_text(text.replace("lens: pinhole\n", "lens: fisheye\n"))
+    with pytest.raises(BadInput, match="hash"):
+        load_result(path)
+
+
+def test_what_the_place_of_a_camera_may_be_off_by_goes_into_the_rig(rig: Rig) -> None:
+    deviations = np.array([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4])
+    found = ExtrinsicCalibration(
+        camera=rig.cameras[0],
+        by="frame tags",
+        covariance=np.diag(deviations**2),
+        half_widths=2.0 * 1.96 * deviations,  # twice as wide by leaving tags out
+        points=workspace_corners(rig),
+        tag_errors={},
+        pictures=3,
+        unused={},
+        lacks=(),
+        data_hash="sha256:0",
+    )
+    verdict = judge_extrinsics(found, 1e-3)
+    result = extrinsics_result(found, verdict, rig.document, date(2026, 3, 1))
+    better = rig.with_calibration(result).cameras[0]
+    np.testing.assert_allclose(better.place_covariance, np.diag((2.0 * deviations) ** 2), rtol=1e-9)
+    at_outlets = better.shared_covariance(rig.home)
+    arm = np.linalg.norm(rig.home.position - better.world_from_camera.position)
+    assert np.sqrt(np.trace(at_outlets[:3, :3])) > 1e-3 * arm  # rotations act on their lever

@@ -49,6 +49,15 @@ def test_pictures_are_taken_with_advice_and_then_used(video: Path, tmp_path: Pat
     assert "enough" in answer.err
 
 
+def test_a_video_in_place_of_a_folder_is_used(video: Path) -> None:
+    """Of every view one picture is used, as nothing moved to the next."""
+    answer = call("calibrate", "camera", video, *BOARD, "--json")
+    assert answer.code in (0, 3), answer
+    found = json.loads(answer.out)
+    assert found["pictures_used"] == 9 + len(TURNS)
+    assert all("nothing moved" in why for why in found["unused"].values())
+
+
 def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None:
     other = ("--board", "charuco", "--columns", "5", "--rows", "4", "--square-mm", "25")
     other += ("--marker-mm", "20")

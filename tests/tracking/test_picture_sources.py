@@ -152,6 +152,20 @@ def test_pictures_with_other_tags_say_which(
         list(track([picture], Tracker(replace(rig, platform_tags=others), camera)))
 
 
+def test_a_camera_out_of_focus_is_named_and_no_size_is_doubted(
+    rig: Rig, camera: Camera, synthetic: SyntheticCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tags are read, but no edge of theirs is found."""
+    monkeypatch.setattr(
+        "tracking.estimator.refine", lambda _image, _camera, rough, _m: [None] * len(rough)
+    )
+    picture = Frame(0.0, synthetic.render(TRUTH[0], 0), "first.png")
+    with pytest.raises(NoPlatformSeen, match="too blurred to be measured") as told:
+        list(track([picture], Tracker(rig, camera)))
+    assert "focus" in told.value.next_step
+    assert "size_mm" not in told.value.next_step
+
+
 def test_a_source_without_pictures_and_one_without_an_end_come_to_an_end(
     rig: Rig, camera: Camera
 ) -> None:

@@ -11,6 +11,7 @@ import typer
 from calibration.targets.board import Board
 from calibration.targets.charuco import Charuco
 from calibration.targets.chessboard import Chessboard
+from calibration.targets.circle_grid import CircleGrid
 from calibration.targets.tag_grid import TagGrid
 from model.errors import BadInput
 
@@ -20,15 +21,24 @@ class BoardName(StrEnum):
 
     chessboard = "chessboard"
     charuco = "charuco"
+    circles = "circles"
     tags = "tags"
+
+
+class TagOrder(StrEnum):
+    """How the tags of a grid are numbered."""
+
+    rows = "rows"
+    kalibr = "kalibr"
 
 
 _NEEDED = {
     BoardName.chessboard: ("square_mm",),
     BoardName.charuco: ("square_mm", "marker_mm"),
+    BoardName.circles: ("spacing_mm", "diameter_mm"),
     BoardName.tags: ("tag_mm", "gap_mm"),
 }
-_SIZES = ("square_mm", "marker_mm", "tag_mm", "gap_mm")
+_SIZES = ("square_mm", "marker_mm", "spacing_mm", "diameter_mm", "tag_mm", "gap_mm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +48,9 @@ class BoardOptions:
     board: Annotated[BoardName, typer.Option(help="kind of target")] = BoardName.chessboard
     columns: Annotated[
         int | None,
-        typer.Option(min=1, help="inner corners (chessboard), squares (charuco) or tags per row"),
+        typer.Option(
+            min=1, help="inner corners (chessboard), squares (charuco), circles or tags in a row"
+        ),
     ] = None
     rows: Annotated[int | None, typer.Option(min=1, help="number of rows")] = None
     square_mm: Annotated[
@@ -51,10 +63,21 @@ class BoardOptions:
     legacy: Annotated[
         bool, typer.Option("--legacy", help="charuco layout of OpenCV before 4.6")
     ] = False
+    spacing_mm: Annotated[
+        float | None, typer.Option(help="of neighbouring rows (circles), from centre to centre")
+    ] = None
+    diameter_mm: Annotated[float | None, typer.Option(help="of a circle (circles)")] = None
+    asymmetric: Annotated[
+        bool, typer.Option("--asymmetric", help="every other row is shifted (circles)")
+    ] = False
     tag_mm: Annotated[float | None, typer.Option(help="side of a tag's black square (tags)")] = None
-    gap_mm: Annotated[float | None, typer.Option(help="gap between black squares (tags)")] = None
-    family: Annotated[str, typer.Option(help="tag family (tags)")] = "tag36h11"
-    first: Annotated[int, typer.Option(min=0, help="number of the top left tag (tags)")] = 0
+    gap_mm: Annotated[float | None, typer.Option(help="between black squares (tags)")] = None
+    family: Annotated[str, typer.Option(help="of the tags (tags)")] = "tag36h11"
+    first: Annotated[int, typer.Option(min=0, help="the smallest number (tags)")] = 0
+    order: Annotated[
+        TagOrder,
+        typer.Option(help="numbered from the top left down, or as Kalibr's AprilGrid (tags)"),
+    ] = TagOrder.rows
 
     def made(self) -> Board:
         """The board.
@@ -66,7 +89,7 @@ class BoardOptions:
         if self.columns is None or self.rows is None:
             raise BadInput(
                 "a board needs --columns and --rows",
-                next_step="count inner corners (chessboard), squares (charuco) or tags",
+                next_step="count inner corners (chessboard), squares (charuco), circles or tags",
             )
         count, sides = (self.columns, self.rows), self._sides()
         match self.board:
@@ -74,8 +97,11 @@ class BoardOptions:
                 return Chessboard(*count, sides[0])
             case BoardName.charuco:
                 return Charuco(*count, sides[0], sides[1], self.dictionary, self.legacy)
+            case BoardName.circles:
+                return CircleGrid(*count, sides[0], sides[1], self.asymmetric)
             case BoardName.tags:
-                return TagGrid(*count, sides[0], sides[1], self.family, self.first)
+                order = self.order.value
+                return TagGrid(*count, sides[0], sides[1], self.family, self.first, order)
 
     def _sides(self) -> list[float]:
         """The sizes of this kind of board, [m]."""

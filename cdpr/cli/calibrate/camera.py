@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from calibration.intrinsics.lens import AUTO
 from calibration.intrinsics.quality import FULL_COVERAGE
 from calibration.pictures import take_pictures
 from calibration.procedures import CameraOutcome, Destination, calibrate_camera
@@ -23,12 +25,22 @@ from model.errors import BadInput
 from model.files.output import make_folder
 
 
+class LensChoice(StrEnum):
+    """Models of lenses, and the choice among them."""
+
+    auto = AUTO
+    five = "five"
+    rational = "rational"
+    thin_prism = "thin-prism"
+    fisheye = "fisheye"
+
+
 @with_option_groups
 def camera(
     folder: Annotated[
         Path,
         typer.Argument(
-            help="folder of images of the target; with --live, folder to fill", metavar="DIR"
+            help="folder of pictures of the board, or a video; or for --live", metavar="DIR"
         ),
     ],
     printed: BoardOptions,
@@ -49,6 +61,9 @@ def camera(
         float | None,
         typer.Option(min=0.01, help="working distance of the camera (default: that of the target)"),
     ] = None,
+    lens: Annotated[
+        LensChoice, typer.Option(help="its model; auto: what fits held-out pictures best")
+    ] = LensChoice.auto,
     output: FolderOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -87,6 +102,7 @@ def camera(
         name=name,
         wanted=wanted_mm / 1e3,
         distance=distance_m,
+        lens=lens.value,
         to=to,
         listener=Terminal(quiet=as_json),
     )
@@ -116,7 +132,8 @@ def _facts(made: CameraOutcome) -> list[tuple[str, str]]:
     """What was found beside the numbers, for people."""
     result, quality = made.found, made.quality
     return [
-        ("corners", f"{result.error:.3f} px RMS error in {len(result.views)} images"),
+        ("lens", f"model {result.lens.name}, {len(result.distortion)} coefficients"),
+        ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
         (
             "boards were",
             f"{quality.nearest:.3g} to {quality.farthest:.3g} m away; if not, the sizes are wrong",

@@ -1,0 +1,85 @@
+"""`cdpr calibrate export` and `import`: camera files of OpenCV and ROS."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibration.intrinsics.exchange import FORMATS, write_rig_with_camera
+from calibration.intrinsics.result import camera_named
+from cdpr.cli.calibrate.output import CameraOption
+from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
+from cdpr.cli.options import JsonOption
+from cdpr.cli.output import show_facts, show_json
+from model.files.documents import write_atomic
+from model.files.output import require_new_file
+from model.rig import load_rig
+
+RigArgument = Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")]
+
+
+class FormatName(StrEnum):
+    """Formats of camera files."""
+
+    opencv = "opencv"
+    ros = "ros"
+
+
+def export(
+    rig: RigArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", help="file to write (YAML)")],
+    to: Annotated[FormatName, typer.Option(help="whose format")] = FormatName.opencv,
+    camera: CameraOption = None,
+    calibration: CalibrationOption = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a camera's matrix and lens for OpenCV (YAML) or ROS (camera_info).
+
+    [dim]Examples:[/dim]
+
+      cdpr calibrate export configs/gachon_8_6.yaml -o front.yaml --to ros
+
+      cdpr calibrate export rig.yaml -o front.yaml --calibration
+      calibration_camera_front_2026-03-01.yaml
+    """
+    loaded = calibrated_rig(load_rig(rig), calibration)
+    document = camera_named(loaded.document, loaded.camera(camera).name)
+    require_new_file(output, force)
+    write_atomic(output, FORMATS[to.value](document))
+    if as_json:
+        show_json({"file": str(output), "format": to.value, "camera": document.name})
+    else:
+        facts = [("camera", document.name), ("format", to.value), ("file", str(output))]
+        show_facts("export", facts)
+
+
+def import_(
+    rig: RigArgument,
+    file: Annotated[Path, typer.Argument(help="of OpenCV or ROS", metavar="CAMERA")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="rig file to write; it must not exist yet")
+    ],
+    camera: CameraOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a new rig file with a camera's matrix and lens from OpenCV or ROS.
+
+    CAMERA is OpenCV's YAML or a camera_info. How sure its numbers are it does not say; `cdpr
+    calibrate camera` does.
+
+    [dim]Example:[/dim]
+
+      cdpr calibrate import rig.yaml camera_info.yaml --camera front -o rig_with_lens.yaml
+    """
+    loaded = load_rig(rig)
+    found = write_rig_with_camera(output, loaded, loaded.camera(camera).name, file)
+    if as_json:
+        show_json({"rig": str(output), "camera": found.name, "lens": found.lens})
+        return
+    lens = f"{found.lens}, {len(found.distortion)} coefficients"
+    size = f"{found.width_px} x {found.height_px} px, fx {found.fx_px:.6g} px"
+    show_facts(f"camera {found.name}", [("size", size), ("lens", lens), ("rig file", str(output))])

@@ -1,0 +1,303 @@
+"""Lens models: found with their uncertainty, chosen by held-out pictures, used everywhere alike."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
+from calibration.intrinsics.exchange import FORMATS, imported_camera, write_rig_with_camera
+from calibration.intrinsics.lens import LENSES, fit_lens, held_out_errors, radial_share
+from calibration.intrinsics.quality import (
+    _slopes,
+    _without_rotation,
+    judge_camera,
+    picture_grid,
+)
+from calibration.targets.board import Seen
+from calibration.targets.chessboard import Chessboard
+from model.errors import BadInput
+from model.files.rig_file import CameraDocument
+from model.pose import Pose, matrix_from_rotation_vector, read_only
+from model.rig import Camera, Rig, load_rig
+from model.scene import load_scene
+from simulation.camera.camera import SyntheticCamera
+from tests.cli.program import call, one_message
+from tracking.camera_check import CameraMoved
+from tracking.camera_model import WIDEST, ideal_from_pixels, pixels_from_ideal, project, rays_of
+from tracking.measurement import PoseMeasurement
+from tracking.tracker import Tracker
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+BOARD = Chessboard(9, 6, 0.025)
+SIZE = (960, 600)
+TRUTH = {
+    "five": (600.0, [-0.12, 0.05, 0.0008, -0.0006, 0.01]),
+    "rational": (330.0, [0.42, 0.01, 0.001, -0.001, 0.0, 0.73, 0.07, 0.0]),
+    "fisheye": (300.0, [0.03, -0.02, 0.015, -0.005]),
+}
+
+
+def matrix_of(focal: float) -> np.ndarray:
+    return np.array([[focal, 0.0, 470.0], [0.0, focal * 1.002, 305.0], [0.0, 0.0, 1.0]])
+
+
+def views(name: str, count: int = 30, noise: float = 0.08, seed: int = 3) -> dict[str, Seen]:
+    """A board that is held all over the picture, near to its corners too."""
+    rng, found = np.random.default_rng(seed), {}
+    focal, lens = TRUTH[name]
+    middle, tries = BOARD.points().mean(axis=0), 0
+    while len(found) < count and (tries := tries + 1) < 5000:
+        turn = matrix_from_rotation_vector(rng.uniform(-0.6, 0.6, 3))
+        away = rng.uniform(0.15, 0.35) * focal / 300.0
+        side = np.array([*(rng.uniform(-1.6, 1.6, 2) * [0.5, 0.32] * SIZE[0] / focal), 1.0])
+        pose = Pose(side * away - turn @ middle, turn)
+        points = pose.apply(BOARD.points())
+        if points[:, 2].min() < 0.03:
+            continue
+        corners = project(LENSES[name].kind, matrix_of(focal), np.array(lens), points)
+        if (corners < 2.0).any() or (corners > np.array(SIZE) - 2.0).any():
+            continue
+        noisy = corners + noise * rng.standard_normal(corners.shape)
+        found[f"{len(found)}"] = Seen(BOARD.points(), noisy)
+    assert len(found) == count
+    return found
+
+
+@pytest.mark.parametrize("name", TRUTH)
+def test_a_lens_comes_back_within_its_intervals(name: str) -> None:
+    """Of three trials at least nine in ten numbers, each within its 95 % interval."""
+    focal, lens = TRUTH[name]
+    m = matrix_of(focal)
+    truth = np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *lens])
+    inside = []
+    for seed in range(3):
+        found = calibrate_from_views(views(name, seed=seed), SIZE, lens=name)
+        assert found.error == pytest.approx(0.08 * math.sqrt(2.0), rel=0.1)
+        assert list(found.intervals) == list(LENSES[name].names)
+        inside.append(np.abs([i.value for i in found.intervals.values()] - truth)
+                      <= found.uncertainty.half_widths)  # fmt: skip
+    assert np.mean(inside) >= 0.85
+
+
+@pytest.mark.parametrize(
+    ("true", "accepted"),
+    [("five", {"five"}), ("rational", {"rational"}), ("fisheye", {"fisheye", "rational"})],
+)
+def test_the_model_is_chosen_by_pictures_held_out(true: str, accepted: set[str]) -> None:
+    found = calibrate_from_views(views(true), SIZE)
+    assert found.lens.name in accepted
+    assert found.error < 0.13
+    held_out = held_out_errors(found.lens, views(true), SIZE)
+    assert np.sqrt(np.mean(list(held_out.values()))) < 0.13
+
+
+@pytest.mark.parametrize("true", ["rational", "fisheye"])
+def test_the_advice_names_the_lens_where_errors_run_along_the_radius(true: str) -> None:
+    told = judge_camera(calibrate_from_views(views(true), SIZE, lens="five"), 1e-3)
+    assert told.radial > 0.02
+    assert any("the lens bends otherwise" in reason for reason in told.verdict.reasons)
+    assert any("--lens" in step and "fisheye" in step for step in told.verdict.next_steps)
+    right = judge_camera(calibrate_from_views(views(true), SIZE), 1e-3)
+    assert not any("lens" in reason for reason in right.verdict.reasons)
+
+
+def test_the_radial_share_is_nothing_for_noise_and_all_for_a_pure_pattern() -> None:
+    rng = np.random.default_rng(1)
+    corners = rng.uniform(0.0, 600.0, (2000, 2))
+    m = matrix_of(300.0)
+    assert radial_share(corners, rng.normal(size=(2000, 2)), m) < 0.015
+    away = corners - m[:2, 2]
+    pattern = away * (np.linalg.norm(away, axis=1, keepdims=True) / 300.0 - 0.5)
+    assert radial_share(corners, pattern, m) > 0.9
+
+
+def apart_without_rotation(found: CameraCalibration, true: str) -> float:
+    """RMS distance of points a metre away, as seen by both cameras turned to agree best, [m]."""
+    focal, lens = TRUTH[true]
+    pixels = picture_grid(SIZE)
+    kind = LENSES[true].kind
+    rays = [
+        np.column_stack([rays_of(*model, pixels), np.ones(len(pixels))])
+        for model in (
+            (kind, matrix_of(focal), np.array(lens)),
+            (found.lens.kind, found.matrix, found.distortion),
+        )
+    ]
+    units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
+    turn = Rotation.align_vectors(*units)[0].as_matrix()
+    turned = rays[1] @ turn.T
+    gaps = turned[:, :2] / turned[:, 2:] - rays[0][:, :2]
+    return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
+
+
+def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
+    """The rotation that the camera's place takes up does not count: cx alone is 0.5 mm off."""
+    good, inside, ratios = 0, 0, []
+    for seed in range(12):
+        found = calibrate_from_views(views("five", 40, 0.05, seed), SIZE)
+        quality = judge_camera(found, 1e-3, 1.0)
+        off = apart_without_rotation(found, "five")
+        ratios.append(off / quality.verdict.error)
+        good += quality.verdict.good
+        inside += ratios[-1] < 1.0
+    assert good == 12
+    assert inside >= 11
+    assert np.median(ratios) > 0.15  # nor are intervals so wide that they say nothing
+
+
+def test_a_rotation_of_the_camera_is_no_error_of_it() -> None:
+    found = calibrate_from_views(views("fisheye"), SIZE, lens="fisheye")
+    slopes, turns = _slopes(found)
+    assert np.abs(_without_rotation(turns, turns)).max() < 1e-9 * np.abs(turns).max()
+    freed = _without_rotation(slopes, turns)
+    assert (np.linalg.norm(freed, axis=(0, 1)) <= np.linalg.norm(slopes, axis=(0, 1))).all()
+    shift = found.lens.names.index("cx_px")
+    assert np.linalg.norm(freed[..., shift]) < 0.6 * np.linalg.norm(slopes[..., shift])
+
+
+def some_camera(name: str) -> Camera:
+    focal, lens = TRUTH[name]
+    kind = LENSES[name].kind
+    level = Pose.level([0.0, 0.0, 0.0])
+    return Camera("c", *SIZE, matrix_of(focal), read_only(lens), level, 10.0, kind)
+
+
+@pytest.mark.parametrize("name", TRUTH)
+def test_pixels_come_back_from_ideal_ones(name: str) -> None:
+    camera = some_camera(name)
+    across = np.stack(np.meshgrid(np.linspace(120, 820, 9), np.linspace(60, 540, 7)), axis=-1)
+    ideal = ideal_from_pixels(camera, across)
+    np.testing.assert_allclose(pixels_from_ideal(camera, ideal), across, atol=1e-5)
+
+
+def test_rays_beside_and_behind_a_fisheye_are_put_at_its_rim() -> None:
+    """Not on the other side of the picture, where OpenCV's iteration puts them."""
+    camera = some_camera("fisheye")
+    corners = np.array([[5.0, 5.0], [955.0, 5.0], [5.0, 595.0], [955.0, 595.0]])
+    ideal = ideal_from_pixels(camera, corners) - camera.matrix[:2, 2]
+    assert (np.sign(ideal) == np.sign(corners - camera.matrix[:2, 2])).all()
+    reach = np.linalg.norm(ideal / [camera.matrix[0, 0], camera.matrix[1, 1]], axis=1)
+    np.testing.assert_allclose(np.arctan(reach), WIDEST, atol=1e-3)
+
+
+@given(
+    angle=st.floats(0.05, 1.3),
+    around=st.floats(0.0, 6.28),
+    lens=st.lists(st.floats(-0.02, 0.02), min_size=4, max_size=4),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_fisheye_is_kannala_and_brandt(angle: float, around: float, lens: list[float]) -> None:
+    """θ (1 + k₁θ² + k₂θ⁴ + k₃θ⁶ + k₄θ⁸) is the radius, written out here."""
+    point = np.array([[math.sin(angle) * math.cos(around), math.sin(angle) * math.sin(around),
+                       math.cos(angle)]])  # fmt: skip
+    m = matrix_of(300.0)
+    seen = project("fisheye", m, np.array(lens), point)[0]
+    radius = angle * (1.0 + sum(k * angle ** (2 * n + 2) for n, k in enumerate(lens)))
+    expected = radius * np.array([math.cos(around), math.sin(around)])
+    np.testing.assert_allclose((seen - m[:2, 2]) / [m[0, 0], m[1, 1]], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["rational", "fisheye"])
+def test_a_synthetic_camera_of_any_lens_is_tracked_to_a_millimetre(name: str) -> None:
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml")
+    plain = rig.cameras[0]
+    lens = {
+        "rational": ("pinhole", [0.35, 0.05, 0.0005, -0.0004, 0.0, 0.55, 0.06, 0.0]),
+        "fisheye": ("fisheye", [0.03, -0.02, 0.015, -0.005]),
+    }[name]
+    camera = replace(plain, lens=lens[0], distortion=read_only(lens[1]))
+    bent = replace(rig, cameras=(camera, *rig.cameras[1:]))
+    truth = bent.home
+    picture = SyntheticCamera(bent, load_scene(CONFIGS / "environment_1.yaml"), camera, 1).render(
+        truth, 0
+    )
+    found = Tracker(bent, camera).observe(picture, 0.0)
+    assert isinstance(found, PoseMeasurement)
+    assert np.linalg.norm(found.pose.position - truth.position) < 1e-3
+    with pytest.raises(CameraMoved):  # the lens is left out
+        Tracker(rig, plain).observe(picture, 0.0)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+def with_lens(rig: Rig, kind: str, lens: list[float]) -> CameraDocument:
+    plain = rig.document.cameras[0].model_dump(mode="json")
+    return CameraDocument.model_validate(plain | {"lens": kind, "distortion": lens, "cx_px": 651.3})
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("name", TRUTH)
+def test_a_camera_comes_back_from_the_files_of_others(rig, tmp_path, form, name) -> None:
+    own = with_lens(rig, LENSES[name].kind, TRUTH[name][1])
+    file = tmp_path / "camera.yaml"
+    file.write_text(FORMATS[form](own))
+    plain = rig.document.cameras[0]
+    back = imported_camera(file, plain)
+    assert back.lens == own.lens
+    assert back.distortion == pytest.approx(own.distortion, abs=1e-15)
+    assert (back.fx_px, back.cx_px, back.width_px) == (own.fx_px, 651.3, own.width_px)
+    assert back.world_from_camera == plain.world_from_camera
+
+
+def test_opencv_itself_reads_what_is_written(rig, tmp_path) -> None:
+    own = with_lens(rig, "fisheye", TRUTH["fisheye"][1])
+    file = tmp_path / "camera.yml"
+    file.write_text(FORMATS["opencv"](own))
+    storage = cv2.FileStorage(str(file), cv2.FileStorage_READ)
+    np.testing.assert_allclose(storage.getNode("camera_matrix").mat()[0, 2], 651.3)
+    assert storage.getNode("distortion_coefficients").mat().size == 4
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "a: 1", "%YAML:1.0\n---\nimage_width: 640\n", "%YAML:1.0\n---\n{[", "- 1",
+     "image_width: 640\nimage_height: 480\ndistortion_model: odd\n"
+     "camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_coefficients: {data: []}"],
+)  # fmt: skip
+def test_files_that_hold_no_camera_are_refused_in_one_message(rig, tmp_path, text: str) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text(text)
+    with pytest.raises(BadInput):
+        imported_camera(file, rig.document.cameras[0])
+
+
+def test_a_rig_file_with_an_imported_lens_is_written_and_never_replaced(rig, tmp_path) -> None:
+    file, new = tmp_path / "camera.yaml", tmp_path / "new.yaml"
+    file.write_text(FORMATS["ros"](with_lens(rig, "fisheye", TRUTH["fisheye"][1])))
+    path = CONFIGS / "gachon_8_6.yaml"
+    assert call("calibrate", "import", path, file, "-o", new).code == 0
+    assert load_rig(new).cameras[0].lens == "fisheye"
+    one_message(call("calibrate", "import", path, file, "-o", new), 2, "exists already")
+    with pytest.raises(BadInput, match="exists"):
+        write_rig_with_camera(new, rig, rig.cameras[0].name, file)
+
+
+def test_ros_has_no_thin_prism(rig) -> None:
+    with pytest.raises(BadInput, match="12 coefficients"):
+        FORMATS["ros"](with_lens(rig, "pinhole", [0.01] * 12))
+
+
+@pytest.mark.parametrize(("kind", "count"), [("fisheye", 5), ("fisheye", 0), ("pinhole", 3)])
+def test_numbers_of_coefficients_that_a_lens_does_not_have_are_refused(rig, kind, count) -> None:
+    with pytest.raises(ValidationError, match=f"{kind} lens needs .* it has {count}"):
+        with_lens(rig, kind, [0.01] * count)
+
+
+def test_a_fit_of_a_few_pictures_is_no_choice() -> None:
+    few = dict(list(views("fisheye").items())[:6])
+    found: CameraCalibration = calibrate_from_views(few, SIZE)
+    assert found.lens.name == "five"
+    assert fit_lens(LENSES["fisheye"], few, SIZE).finite
