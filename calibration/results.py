@@ -69,7 +69,7 @@ class ResultDocument(Document, ABC):
         return result_file_name(self.kind, self.name, self.date)
 
     def sealed(self) -> Self:
-        """The result with its hash, by which one that was edited is told."""
+        """The result with its hash, which reveals an edited one."""
         fields = type(self).model_fields
         unset = {key for key in self.added if getattr(self, key) == fields[key].default}
         return self.model_copy(update={"hash": document_hash(self, {"hash"} | unset)})

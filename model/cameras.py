@@ -83,7 +83,7 @@ def tag_from(document: TagDocument) -> Tag:
 
 
 def tag_error_in(tags: TagsDocument | None) -> float | None:
-    """How far off corners of the platform's tags are, 95 %, [m]; None where nobody says."""
+    """How far off corners of the platform's tags are, 95 %, [m]; None where not stated."""
     return None if tags is None or tags.error_mm is None else tags.error_mm / 1e3
 
 

@@ -19,7 +19,7 @@ from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
 _CONVERGES = 5
-"""OpenCV's iteration reaches its limit with so many coefficients."""
+"""OpenCV's iteration reaches its limit with that number of coefficients."""
 _NEWTON_STEPS, _LONGEST_STEP, _AT_ONCE = 30, 0.3, 100_000
 """Of the rays of other lenses: iterations, length of a step, and how many at once."""
 WIDEST = 1.5

@@ -247,7 +247,7 @@ class PlatformEstimator:
 
     @property
     def _unstated(self) -> bool:
-        """Whether nobody stated what the camera's place or the tags may be off by."""
+        """Whether the error of the camera's place or of the tags is not stated."""
         if self._camera.place_covariance is None:
             return True
         return not self._camera.whole_error and self._rig.tag_error is None

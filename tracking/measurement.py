@@ -30,7 +30,7 @@ class PoseMeasurement:
             ``guided`` (where the drives' positions put it).
         shared: As `covariance`, of the errors that all pictures have in common: of the camera's
             place and of the tags, as far as calibrations or the rig file state them.
-        unstated: Whether nobody stated a part of these.
+        unstated: Whether a part of these is not stated.
     """
 
     time: float

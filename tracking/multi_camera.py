@@ -144,7 +144,7 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
 def _shared(poses: Sequence[PoseMeasurement], parts: Sequence[Array]) -> Array:
     """What the cameras' places and the tags make the mean err by, shape (6, 6).
 
-    Places that were found by the same tags err together, by how much nobody knows: the square of a
+    Places that were found by the same tags err together, by an unknown amount: the square of a
     sum of n errors is n times the sum of their squares at most.
     """
     total = np.zeros((6, 6))

@@ -23,7 +23,7 @@ LEAST_VIEWS = 4
 _FAR_OFF, _OFF = 4.0, 0.5
 """A view is left out whose error is this many times the median, and this many pixels at least."""
 _LOOKED_AT = 5
-"""So many pictures without the board, spread over all, are looked at for what they show instead."""
+"""Images without the board, spread over all, that are searched for what they show instead."""
 NOT_FOUND = "no board was found in it"
 """Why most pictures are not used."""
 _MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"

@@ -45,7 +45,7 @@ def ros_text(camera: CameraDocument) -> str:
     """The YAML form of a ROS camera_info message.
 
     Raises:
-        BadInput: ROS has no model with so many coefficients.
+        BadInput: ROS has no model with that number of coefficients.
     """
     lens = [*camera.distortion, *([0.0] * (5 - len(camera.distortion)))]
     if camera.lens == FISHEYE:
@@ -80,7 +80,7 @@ FORMATS: dict[str, Callable[[CameraDocument], str]] = {"opencv": opencv_text, "r
 
 
 def imported_camera(path: Path, camera: CameraDocument) -> CameraDocument:
-    """A camera with the numbers of an OpenCV or ROS file, told apart by their content.
+    """A camera with the numbers of an OpenCV or ROS file, distinguished by their content.
 
     Args:
         path: The file.

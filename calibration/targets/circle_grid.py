@@ -24,7 +24,7 @@ _SEARCHED = 1600
 _LEAST_AREA, _LEAST_APART = 12.0, 4.0
 """Of the circles in that picture, [px²] and [px]."""
 _WINDOW, _CORE = 1.3, 0.6
-"""Radii of the window around a circle and of its surely dark part, in radii of the circle."""
+"""Radii of the window around a circle and of its dark part, in radii of the circle."""
 
 
 @dataclass(frozen=True, slots=True)

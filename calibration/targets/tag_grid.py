@@ -34,7 +34,7 @@ ORDERS = {
 _SADDLE = 0.12
 """Half of the window a corner is refined in where black squares touch it, in sides of a tag."""
 _BETTER, _OFF = 3.0, 0.05
-"""The other order is right where it fits so many times better, and ours misfits by that share of a
+"""The other order is right where it fits better by this factor, and ours misfits by that share of a
 tag's side."""
 
 

@@ -16,7 +16,6 @@ from drivers.cia402.pdo import CyclicFrames
 from drivers.cia402.profile import profile_of
 from drivers.cia402.read_state import say_simulated
 from drivers.cia402.sdo_jobs import (
-    ABSENT,
     ASKED_AGAIN_AFTER,
     MODE_WAIT,
     REQUESTS_A_CYCLE,
@@ -26,6 +25,7 @@ from drivers.cia402.sdo_jobs import (
     SdoJobs,
     mode_text,
     monitoring_off,
+    time_to_end,
 )
 from drivers.cia402.state_machine import (
     FAULTED,
@@ -78,6 +78,7 @@ class Cia402Group(CyclicGroup):
         self._signs = winding_signs(rig)
         cycle = rig.document.bus.cycle_ms / 1000.0
         self._cycle_s, self._profile = cycle, profile_of(rig)
+        self._answer_time = self._profile.sdo_timeout_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
         self._again_after = max(1, round(ASKED_AGAIN_AFTER / cycle))
@@ -125,20 +126,9 @@ class Cia402Group(CyclicGroup):
             master_timeout=max(
                 heartbeat_timeout(self._cycle_s), self._profile.sync_timeout_periods * self._cycle_s
             ),
-            unmonitored_within=self._unmonitored_within,
+            unmonitored_within=time_to_end(self._heartbeats, self._cycle_s, self._answer_time),
             simulated=self._simulated,
         )
-
-    @property
-    def _answer_time(self) -> float:
-        """For an SDO answer, [s]."""
-        return self._profile.sdo_timeout_ms / 1000.0
-
-    @property
-    def _unmonitored_within(self) -> float:
-        """Every request in a cycle of its own, and one slow answer after another, [s]."""
-        jobs = [len(monitoring_off(count)) for count in self._heartbeats]
-        return sum(jobs) * self._cycle_s / REQUESTS_A_CYCLE + max(jobs) * self._answer_time
 
     @property
     def _heard(self) -> DriveMonitor:
@@ -259,11 +249,8 @@ class Cia402Group(CyclicGroup):
         """Whether drives still watch this master; see `DriveGroup.is_monitored`."""
         if self._unwatching is None:
             return True
-        refused = {
-            node for (node, _), code in self._unwatching.failed.items() if code not in ABSENT
-        }
-        watching = self._unwatching.unfinished() | (refused if silent_too else set())
-        return bool(watching if silent_too else watching & self._answering)
+        left = self._unwatching.unfinished()
+        return bool(left | self._unwatching.refused() if silent_too else left & self._answering)
 
     @property
     def _answering(self) -> set[int]:
@@ -397,12 +384,9 @@ class Cia402Group(CyclicGroup):
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
 
     def _late(self, wanted: tuple[DriveState, ...]) -> list[tuple[int, str]]:
-        names = self._rig.drive_names
-        return [
-            (node, f"{names[node]} stays in {state.value} on the way to {wanted[-1].value}")
-            for node, state in zip(self._nodes, self._watch.states, strict=True)
-            if state not in wanted
-        ]
+        names, way = self._rig.drive_names, f"on the way to {wanted[-1].value}"
+        states = zip(self._nodes, self._watch.states, strict=True)
+        return [(n, f"{names[n]} stays in {s.value} {way}") for n, s in states if s not in wanted]
 
     def _status(self) -> CycleStatus:
         watch = self._watch

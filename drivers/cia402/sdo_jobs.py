@@ -59,8 +59,20 @@ class SdoRequest:
 STANDING = (SdoRequest(0x6041, 0), SdoRequest(0x6064, 0), SdoRequest(0x6077, 0))
 
 
+def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:
+    """Longest time that the end of all monitoring takes, [s].
+
+    Args:
+        heartbeats: As for `monitoring_off`, one number a drive.
+        cycle: [s].
+        answer: For one SDO answer, [s].
+    """
+    jobs = [len(monitoring_off(count)) for count in heartbeats]
+    return sum(jobs) * cycle / REQUESTS_A_CYCLE + max(jobs) * answer
+
+
 def monitoring_off(heartbeats: int) -> tuple[SdoRequest, ...]:
-    """What makes a drive monitor nobody any more: heartbeats, set-points, and SYNC last.
+    """What ends all monitoring by a drive: heartbeats, set-points, and SYNC last.
 
     Those of its peers, too: one that fell silent after the end would take the torque off all.
 
@@ -103,6 +115,10 @@ class SdoJobs:
     def unfinished(self) -> set[int]:
         """Nodes that have not answered everything."""
         return {node for node, waiting in self._waiting.items() if waiting} | set(self._asked)
+
+    def refused(self) -> set[int]:
+        """Nodes that refused a request, other than for an object that is absent."""
+        return {node for (node, _), code in self.failed.items() if code not in ABSENT}
 
     @property
     def is_asking(self) -> bool:

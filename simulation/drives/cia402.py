@@ -193,7 +193,7 @@ class SimulatedDrive(PowerStage):
         """SYNC: reply with what is, then act on the set-points that were waiting."""
         if self.silent or self.nmt is not OPERATIONAL:
             return
-        self._window_ends = self._now + self._window if self._window else inf
+        self._window_ends = self._now + self._sync_window if self._sync_window else inf
         if self._sync_timeout:
             self._deadlines.expect(_SYNC, self._now + self._sync_timeout)
             if self._errors:
@@ -329,7 +329,8 @@ class SimulatedDrive(PowerStage):
         get = self.objects.get
         self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
         self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6
-        self._window = get((0x1007, 0), 0) / 1e6  # of synchronous RPDOs after SYNC; 0: without end
+        #: Of synchronous RPDOs after SYNC, [s]; 0: without end.
+        self._sync_window = get((0x1007, 0), 0) / 1e6
         if not self._sync_timeout:
             self._deadlines.forget(_SYNC)
 

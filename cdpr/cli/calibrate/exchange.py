@@ -11,8 +11,7 @@ import typer
 from calibration.intrinsics.exchange import FORMATS, write_rig_with_camera
 from calibration.intrinsics.result import camera_named
 from cdpr.cli.calibrate.output import CameraOption
-from cdpr.cli.calibrations import CalibrationOption, calibrated_rig
-from cdpr.cli.options import JsonOption
+from cdpr.cli.options import CalibrationOption, JsonOption, calibrated_rig
 from cdpr.cli.output import show_facts, show_json
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
