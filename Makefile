@@ -6,6 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 PIP := install --quiet --disable-pip-version-check
+QUICK := -q -n 2 -m "not slow" --ignore tests/repository
 PACKAGES := cdpr calibration executor simulation planner drivers tracking model
 COMPILE_REST := from executor.kernels import ready_to_measure, ready_to_simulate; ready_to_measure(); ready_to_simulate()
 
@@ -16,7 +17,7 @@ export NO_MKDOCS_2_WARNING := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo docs-run wheel test test-root test-quiet test-lowest check-arm64 mutation fuzz hil hil-runs hil-table hil-makers hil-subset lint docs schema clean distclean
+.PHONY: help install demo docs-run wheel test test-root test-quiet test-lowest test-python check-arm64 mutation fuzz hil hil-runs hil-table hil-makers hil-subset lint docs schema clean distclean
 
 help:  ## Show this help
 	@echo "cdpr: plan, prove, run and measure paths of cable-driven parallel robots"
@@ -72,14 +73,22 @@ test-quiet: install  ## Run the tests in real time at 100 Hz, on a computer that
 test-root: install  ## Run the tests that act for two users, which only root may
 	"$(BIN)/python" -m pytest -q -m root
 
-# Only what must be installed is pinned to its lowest version; the tools of the tests are the newest that go with it.
-test-lowest:  ## Run the quick tests in .venv-lowest, with the lowest version of every dependency
-	"$(PYTHON)" -m venv .venv-lowest
+# Only what must be installed is pinned to its lowest version; the rest is the newest that goes with it. So what an old
+# library does that a newer one under it deprecates is no failure.
+test-lowest:  ## Run the quick tests in .venv-lowest, with the lowest version of every dependency (TESTS=tests/model)
+	"$(PYTHON)" -m venv --clear .venv-lowest
 	"$(PYTHON)" tools/lowest.py > .venv-lowest/constraints.txt
 	.venv-lowest/bin/python -m pip $(PIP) --only-binary :all: -c .venv-lowest/constraints.txt hatchling
 	.venv-lowest/bin/python -m pip $(PIP) --only-binary :all: --no-build-isolation -c .venv-lowest/constraints.txt -e ".[dev]"
 	.venv-lowest/bin/python -m pip check --disable-pip-version-check
-	.venv-lowest/bin/python -m pytest -n 2 -m "not slow" --ignore tests/repository
+	.venv-lowest/bin/python -m pytest $(QUICK) -W ignore::DeprecationWarning $(TESTS)
+
+test-python:  ## Run the quick tests in .venv-python, with another Python (PYTHON=python3.13 TESTS=tests/model)
+	"$(PYTHON)" -m venv --clear .venv-python
+	.venv-python/bin/python -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling
+	.venv-python/bin/python -m pip $(PIP) --only-binary :all: --no-build-isolation -c constraints.txt -e ".[dev]"
+	.venv-python/bin/python -m pip check --disable-pip-version-check
+	.venv-python/bin/python -m pytest $(QUICK) $(TESTS)
 
 # Nothing is downloaded but what tells the versions apart. Left out: the extra `apriltag`, which has no wheel there.
 check-arm64:  ## Check that every pinned package has a wheel for 64-bit ARM (Raspberry Pi, Jetson)
@@ -104,8 +113,8 @@ hil-makers: install  ## Its third part: rigs of three makes from doctor to relea
 hil-subset: install  ## Run those of them that take a few minutes, as .ci/run does
 	"$(BIN)/python" tools/hil/run.py --limit-s 1200 -m "hil and not slow"
 
-fuzz: install  ## Feed every reader and verb mutated files and odd arguments for an hour; FUZZ="--seed 2" for other ones
-	"$(BIN)/python" tools/fuzz/run.py --minutes 60 --seed 1 $(FUZZ)
+fuzz: install  ## Feed every reader and verb mutated files and odd arguments for an hour (MINUTES=10 FUZZ="--seed 2")
+	"$(BIN)/python" tools/fuzz/run.py --minutes $(or $(MINUTES),60) --seed 1 $(FUZZ)
 
 lint: install  ## Check style, types, import contracts, and that the docs build without a warning
 	"$(BIN)/python" -m ruff check
@@ -133,4 +142,4 @@ clean:  ## Remove build output and caches (never .venv or your runs)
 	find $(PACKAGES) tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## Remove .venv too
-	rm -rf "$(VENV)" .venv-lowest
+	rm -rf "$(VENV)" .venv-lowest .venv-python
