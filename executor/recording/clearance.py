@@ -17,6 +17,9 @@ from model.winches import WinchMap
 from tracking.clearance import MeasuredClearance, clearance_at
 
 _MM = 1e3
+_FACTS = 8
+"""Columns before those of the obstacles, which are known by place: one may be called ``planned_x``
+and another ``x``."""
 
 
 def source_of(camera: str) -> str:
@@ -124,8 +127,6 @@ class ClearanceTable:
             BadInput: The file is missing, cut short or has other columns.
         """
         table = TableFile(path)
-        # By place, not by name: one obstacle may be called "x" and another "planned_x".
-        own = range(8, len(table.names), 2)
         return cls(
             time=table.floats("time_s"),
             source=table.texts("source"),
@@ -135,9 +136,9 @@ class ClearanceTable:
             body=table.texts("body"),
             obstacle=table.texts("obstacle"),
             planned_distance=table.floats("planned_distance_mm", _MM),
-            obstacles=tuple(table.names[i].removesuffix("_mm") for i in own),
-            distances=table.matrix_at(own, _MM),
-            planned_distances=table.matrix_at(range(9, len(table.names), 2), _MM),
+            obstacles=tuple(table.names[i].removesuffix("_mm") for i in table.pairs_from(_FACTS)),
+            distances=table.matrix_at(table.pairs_from(_FACTS), _MM),
+            planned_distances=table.matrix_at(range(_FACTS + 1, len(table.names), 2), _MM),
         )
 
 

@@ -109,6 +109,16 @@ class TableFile:
         """How many columns have a name that fully matches a regular expression."""
         return sum(1 for name in self.names if re.fullmatch(pattern, name))
 
+    def pairs_from(self, first: int) -> range:
+        """Places of the first columns of pairs that begin at the place ``first``.
+
+        Raises:
+            BadInput: The last column is alone.
+        """
+        if (len(self.names) - first) % 2:
+            raise self._bad(f"the last column {self.names[-1]!r} lacks its partner")
+        return range(first, len(self.names), 2)
+
     def texts(self, name: str) -> tuple[str, ...]:
         """A column of texts.
 

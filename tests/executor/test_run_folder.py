@@ -156,6 +156,11 @@ def test_a_discarded_folder_is_gone(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+CLEARANCE_FACTS = (
+    "time_s,source,distance_mm,uncertainty_mm,at_most_mm,body,obstacle,planned_distance_mm"
+)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "what"),
     [
@@ -163,6 +168,7 @@ def test_a_discarded_folder_is_gone(tmp_path: Path) -> None:
         ("cycles.csv", "cycle,time_s\n0,0.0\n", "'set_1_counts'|'state'|missing"),
         ("cycles.csv", "cycle,time_s\n0,0.0\n1\n", "line 3 has 1 values for 2 columns"),
         ("clearance.csv", "time_s\nsoon\n", "'time_s' holds a text"),
+        ("clearance.csv", f"{CLEARANCE_FACTS},pillar_mm\n", "'pillar_mm' lacks its partner"),
         ("summary.json", "{", "not valid JSON"),
         ("summary.json", '{"schema_version": 2}', "schema_version 1"),
         ("rig.json", "{}", "this key is missing"),
