@@ -132,16 +132,20 @@ class DriveMonitor:
             self._dropped.append((node, f"{text}; {cause}" if cause else text))
 
     def _judge(self, node: int, state: DriveState) -> None:
-        """What a drive reported before this SYNC is a warning if the drive is still enabled."""
+        """What a drive reported before this SYNC is a warning if the drive is still enabled.
+
+        What its maker lists as a mere warning is one in every state but a fault.
+        """
         own = [warning for warning in self._to_judge if warning.node == node]
         self._to_judge = [warning for warning in self._to_judge if warning.node != node]
-        if state is DriveState.OPERATION_ENABLED:
-            self._warnings += own
+        if state is not DriveState.OPERATION_ENABLED:
+            own = [warning for warning in own if not warning.stops and state not in FAULTED]
+        self._warnings += own
 
     def warnings(self) -> tuple[DriveWarning, ...]:
-        """Emergencies of drives that were still enabled at the SYNC after, since the last call.
+        """Emergencies that were no fault of the drive at the SYNC after, since the last call.
 
-        Such a drive follows its set-points. One that stops for what it reports has left the state
+        An enabled drive follows its set-points on. One that stops for what it reports has left the state
         by then and is a fault (`dropped`, `state_faults`).
         """
         warnings, self._warnings = tuple(self._warnings), []
@@ -232,10 +236,11 @@ class DriveMonitor:
     def _take_emergency(self, node: int, code: int, text: str) -> None:
         self._emergencies[node] = text
         told = f"{self._names[node]}: {text}"
-        if self.states[self.nodes.index(node)] is not DriveState.OPERATION_ENABLED:
-            self._news.append((node, told))
-        elif self._is_warning(code):
+        state = self.states[self.nodes.index(node)]
+        if self._is_warning(code) and state not in FAULTED:
             self._reported.append(DriveWarning(node, f"{told}, a warning", stops=False))
+        elif state is not DriveState.OPERATION_ENABLED:
+            self._news.append((node, told))
         else:
             self._reported.append(DriveWarning(node, told, stops=True))
 

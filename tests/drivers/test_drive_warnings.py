@@ -55,6 +55,15 @@ def test_a_drive_that_leaves_the_state_is_a_fault_with_its_reason(code: int) -> 
     assert f"{code:04X}h" in text
 
 
+def test_a_mere_warning_is_none_other_while_a_drive_is_being_enabled() -> None:
+    watch = watch_of(0x0233, ENABLED)
+    watch.take(EMCY_BASE + 3, make_emergency(MILD, 1))
+    assert not watch.news()
+    cycle(watch, ENABLED, ENABLED)
+    ((node, stops),) = [(warning.node, warning.stops) for warning in watch.warnings()]
+    assert (node, stops) == (3, False)
+
+
 def test_an_emergency_of_a_drive_that_is_not_enabled_is_news() -> None:
     watch = watch_of(0x0233, ENABLED)
     watch.take(EMCY_BASE + 3, make_emergency(HOT, 1))
