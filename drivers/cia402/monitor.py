@@ -145,8 +145,8 @@ class DriveMonitor:
     def warnings(self) -> tuple[DriveWarning, ...]:
         """Emergencies that were no fault of the drive at the SYNC after, since the last call.
 
-        An enabled drive follows its set-points on. One that stops for what it reports has left the state
-        by then and is a fault (`dropped`, `state_faults`).
+        An enabled drive follows its set-points on. One that stops for what it reports has left the
+        state by then and is a fault (`dropped`, `state_faults`).
         """
         warnings, self._warnings = tuple(self._warnings), []
         return warnings

@@ -101,6 +101,14 @@ class Day:
         assert is_held_up(out + err), (code, out, err)
         raise HeldUp(out + err)
 
+    def doctor(self) -> None:
+        """Nothing is missing; a virtual machine may have one processor only."""
+        answer = call("doctor", self.rig, "--drives")
+        missing = [line for line in answer.out.splitlines() if line.startswith("miss")]
+        assert all("processors" in line for line in missing), answer
+        assert answer.code == (4 if missing else 0), answer
+        self.is_quiet("doctor")
+
     def home(self) -> None:
         pose = [f"{x:.6f}" for x in self.rehearsal.pose.position * 1000.0]
         self.does(0, "home", self.rig, "--pose-mm", *pose, "--speed-mm-s", "10", *_YES)
@@ -131,7 +139,7 @@ def a_day(day: Day, prepared: PreparedRun, plan: Path, back: Path) -> Iterator[s
     rehearsal = day.rehearsal
     loss = PowerLoss.drawn(prepared.rig, 4, 0.0005, on_a_stand=True)
     loss.happen_to(prepared.rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
-    day.does(0, "doctor", day.rig, "--drives")
+    day.doctor()
     yield "doctor"
     start = [f"{x:.6f}" for x in prepared.scene.start.position * 1000.0]
     day.does(0, "home", day.rig, "--pose-mm", *start, "--speed-mm-s", "10", *_YES)
