@@ -14,9 +14,9 @@ from drivers.cia402 import configure
 from drivers.cia402 import inspection as examine
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.inspection import Examined, examine_drives
-from drivers.cia402.object_dictionary import settings_for
+from drivers.cia402.object_dictionary import UNUSED_PDOS, settings_for
 from drivers.cia402.profile import load_profile, profile_names
-from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.factory import make_drive_group
 from drivers.stopping_distance import lost_master, require_stopping_room
 from model.errors import BadInput, CdprError, InvalidFile, Refused
@@ -165,11 +165,11 @@ def test_a_mode_that_never_shows_is_refused(rig: Rig) -> None:
 
 
 OPTIONAL = [(0x1007, 0), (0x1029, 1), (0x605C, 0), (0x605E, 0)]
+NOT_THERE = (0x06020000, 0x06090011)
+ABORTS = [*NOT_THERE, 0x06010000, 0x06010002, 0x06040041, 0x06040047, 0x06090030, 0x08000000]
 
 
-@pytest.mark.parametrize(
-    "code", [0x06020000, 0x06090011, 0x06010000, 0x06010002, 0x08000000, 0x06090030, 0x06040047]
-)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
 def test_an_optional_object_that_is_refused_is_a_remark(rig: Rig, code: int) -> None:
     bus = eight_of("cia402")
     for node, key in enumerate(OPTIONAL, start=1):
@@ -178,8 +178,33 @@ def test_an_optional_object_that_is_refused_is_a_remark(rig: Rig, code: int) -> 
     for node, (index, sub) in enumerate(OPTIONAL, start=1):
         (remark,) = (each for each in remarks if each.startswith(f"drive {node}: "))
         assert f"{index:04X}h:{sub:02X}" in remark
-        assert (f"{code:08X}h" in remark) == (code not in (0x06020000, 0x06090011))
+        assert (f"{code:08X}h" in remark) == (code not in NOT_THERE)
     assert len(remarks) == len(OPTIONAL)
+
+
+@pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_a_pdo_that_is_not_used_may_be_refused_with_any_code(
+    rig: Rig, index: int, code: int
+) -> None:
+    """Only its absence by the book needs no remark."""
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[index, 1] = code
+    remarks = set_up(rig, bus)
+    assert len(remarks) == (code not in NOT_THERE)
+    for remark in remarks:
+        assert remark.startswith(f"drive 3: the drive refuses {index:04X}h:01")
+        assert f"{code:08X}h" in remark
+
+
+@pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
+@pytest.mark.parametrize("code", sorted(NOT_NOW), ids=hex)
+def test_a_pdo_that_is_there_but_not_now_is_refused(rig: Rig, index: int, code: int) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[index, 1] = code
+    with pytest.raises(Refused) as caught:
+        set_up(rig, bus)
+    assert f"drive 3, object {index:04X}h:01" in caught.value.where
 
 
 def test_a_slow_drive_is_set_up_all_the_same(rig: Rig) -> None:
