@@ -236,6 +236,30 @@ def test_doctor_finds_nothing_wrong_with_the_right_profile(rig: Rig, name: str) 
     assert found.good, [(row.object, row.found) for row in found.rows if row.verdict == "wrong"]
 
 
+def test_doctor_reads_the_mode_that_a_set_up_waits_for(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    bus.drives[5].aborts[0x6061, 0] = 0x06020000
+    found = examined(rig, bus)
+    assert [row.object[:8] for row in found.rows if row.verdict == "wrong"] == ["6061h:00"]
+    assert not found.good
+    with pytest.raises(Refused, match="6061h"):
+        set_up(rig, bus)
+
+
+@pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_doctor_reads_the_pdos_that_a_set_up_switches_off(rig: Rig, index: int, code: int) -> None:
+    """It says what the set-up will say: a remark, or nothing."""
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[index, 1] = code
+    found = examined(rig, bus)
+    (row,) = (row for row in found.rows if row.object.startswith(f"{index:04X}h:01"))
+    assert found.good
+    assert row.verdict == ("ok" if code in NOT_THERE else "remark")
+    (told,) = (text for text, nodes in row.found.items() if 3 in nodes)
+    assert told.startswith("absent" if code in NOT_THERE else "refused: ")
+
+
 def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
     bus = eight_of("cia402")
     del bus.drives[2]
