@@ -25,7 +25,7 @@ from model.rig import Rig, rig_from_document
 from model.winches import WinchMap
 from tests.drivers.sdo_server import ScriptedBus, ScriptedDrive, downloads, eds_of
 
-MAKERS = ("akd", "elmo-gold", "epos4", "nanotec-c5-e")
+MAKERS = ("akd", "elmo-gold", "epos4", "nanotec-c5e")
 
 
 def with_profile(rig: Rig, profile: str) -> Rig:
@@ -67,7 +67,7 @@ def examined(rig: Rig, bus: ScriptedBus) -> Examined:
 
 
 def test_the_profiles_are_those_of_the_documentation() -> None:
-    assert profile_names() == ("akd", "cia402", "elmo-gold", "epos4", "nanotec-c5-e")
+    assert profile_names() == ("akd", "cia402", "elmo-gold", "epos4", "nanotec-c5e")
 
 
 @pytest.mark.parametrize("name", ["cia402", *MAKERS])
@@ -89,13 +89,13 @@ def test_drives_of_a_profile_are_set_up_with_it(rig: Rig, name: str) -> None:
         assert values.get((0x1800, 3), 0) == 0
 
 
-@pytest.mark.parametrize("name", ["akd", "epos4", "nanotec-c5-e"])
+@pytest.mark.parametrize("name", ["akd", "epos4", "nanotec-c5e"])
 def test_with_another_profile_everything_wrong_is_told_at_once(rig: Rig, name: str) -> None:
     bus = eight_of("cia402" if name == "akd" else name)
     if name == "akd":
         for drive in bus.drives.values():
             drive.aborts |= {(0x1006, 0): 0x06020000, (0x6072, 0): 0x06020000}
-    elif name == "nanotec-c5-e":
+    elif name == "nanotec-c5e":
         for drive in bus.drives.values():
             drive.aborts[0x6072, 0] = 0x06090030
             drive.aborts[0x6007, 0] = 0x06010002
@@ -126,17 +126,17 @@ def test_epos4_gets_its_limits_in_its_own_units(rig: Rig) -> None:
 
 
 def test_a_cycle_that_the_drives_cannot_take_is_refused(rig: Rig) -> None:
-    document = with_profile(rig, "nanotec-c5-e").document.model_dump()
+    document = with_profile(rig, "nanotec-c5e").document.model_dump()
     document["bus"]["cycle_ms"] = 4.5
     with pytest.raises(BadInput, match="interpolate"):
-        set_up(rig_from_document(RigDocument.model_validate(document)), eight_of("nanotec-c5-e"))
+        set_up(rig_from_document(RigDocument.model_validate(document)), eight_of("nanotec-c5e"))
 
 
 def test_another_unit_of_position_is_refused_before_anything_is_written(rig: Rig) -> None:
-    bus = eight_of("nanotec-c5-e")
+    bus = eight_of("nanotec-c5e")
     bus.drives[4].values[0x60A8, 0] = 0xFF410000  # as it leaves the maker: tenths of a degree
     with pytest.raises(Refused, match="FF410000h"):
-        set_up(with_profile(rig, "nanotec-c5-e"), bus)
+        set_up(with_profile(rig, "nanotec-c5e"), bus)
     assert not downloads(bus)
 
 
