@@ -31,6 +31,7 @@ from executor.recording.run_folder import (
     EVENTS,
     FUSED,
     MCAP,
+    PICTURES,
     POSES,
     POSES_OF,
     REPORT,
@@ -40,9 +41,9 @@ from executor.recording.run_folder import (
 )
 from executor.recording.summary import RunContext, summarize
 from executor.recording.tables import OK, CycleTable, PoseTable, no_poses
-from executor.recording.verdict import NOT_ENDED, judge_without_tables
+from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
-from executor.state_machine import SIMULATED
+from executor.state_machine import SIMULATED, State
 from executor.trajectory.prepare import PreparedRun
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, Fault
@@ -118,12 +119,35 @@ def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
     cycles = folder.cycles_cut_short(rig.cable_count)
     poses = folder.poses() if folder.has(POSES) else no_poses()
     clearance = _clearance(rig, plan.scene, cycles, CameraRecords())
-    course = replace(course, final_state=course.final_state or NOT_ENDED)
+    events = folder.events()
+    if not course.final_state:
+        course = _ended_by_events(course, cycles, events)
     lost = course.cycles - len(cycles)
     troubles = [f"Of {course.cycles} cycles the last {lost} are not on record"] if lost > 0 else []
-    context = _context_of(plan, rig, course, cycles, folder.events(), (), troubles)
+    looked = any((folder.path / PICTURES).glob("**/*.jpg"))  # the first image of each is kept
+    if looked and not folder.has(POSES):
+        troubles.append("What the cameras measured is not on record")
+    context = _context_of(plan, rig, course, cycles, events, (), troubles)
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, folder.poses_by_camera(), clearance, summary)
+
+
+def _ended_by_events(
+    course: RunCourse, cycles: CycleTable, events: Sequence[RunEvent]
+) -> RunCourse:
+    """How a run ended that was killed after its end, before that was in ``run.json``.
+
+    Only what cannot be mistaken counts: the drives held, the cycles reach up to there, and nothing
+    was reported but a run that goes well or the operator's stop.
+    """
+    codes = {event.code for event in events}
+    at_rest = len(cycles) and cycles.state[-1] == State.SECURING.value
+    if not (at_rest and "held" in codes and codes <= ORDINARY | HARMLESS):
+        return replace(course, final_state=NOT_ENDED)
+    stops = [event.text for event in events if event.code == "stop"]
+    if stops:
+        return replace(course, final_state=State.STOPPED.value, cause=stops[0])
+    return replace(course, final_state=State.FINISHED.value)
 
 
 def _context_of(

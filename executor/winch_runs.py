@@ -183,7 +183,7 @@ def _mover(motion: WinchMotion, board: LocalRequests | SharedRequests) -> Iterat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _EventSink:
-    """Forwards what happens to the status, the record and the listener."""
+    """Forwards what happens to the status, the listener and the record."""
 
     status: WinchStatus
     kept: WinchRecord | None
@@ -192,16 +192,16 @@ class _EventSink:
 
     def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
         self.status.take_cycle(record)
-        if self.kept is not None:
-            self.kept.take_cycle(record)
         if record.cycle % 10 == 0:
             self.advance(record.index)
+        if self.kept is not None:
+            self.kept.take_cycle(record)
 
     def take_event(self, event: LoopEvent) -> None:
         self.status.take_event(event)
-        if self.kept is not None:
-            self.kept.take_event(event)
         if event.code == "no_real_time":
             self.listener.remark(event.text)
         elif event.code not in _OF_COURSE:
             self.listener.note(f"{event.code}: {event.text}")
+        if self.kept is not None:  # last: what a full disk does not take is told all the same
+            self.kept.take_event(event)

@@ -131,7 +131,10 @@ def configure_drives(
         for remark in _write_all(network, node, settings[drive], wrong):
             absent.setdefault(remark, []).append(node)
         entries.append(_watch_heartbeats(network, node, rig, drive, wrong))
-        wrong.note(_switch_off_unused, network, node)
+        refused: list[str] = []
+        wrong.note(_switch_off_unused, network, node, refused)
+        for remark in refused:
+            absent.setdefault(remark, []).append(node)
     wrong.refuse()  # a mode that was not taken is not waited for
     if not profile.mode_display_when_enabled:
         for node in nodes:
@@ -375,12 +378,24 @@ def _switch_off_used(network: SetupNetwork, node: int) -> None:
             _switch_off(network, node, index, value)
 
 
-def _switch_off_unused(network: SetupNetwork, node: int) -> None:
-    """Process data that is not used would only fill the bus."""
+def _switch_off_unused(network: SetupNetwork, node: int, remarks: list[str]) -> None:
+    """Process data that is not used would only fill the bus; drives need not have it."""
     for index in UNUSED_PDOS:
-        data = network.client(node).read_if_there(index, 1, "PDO identifier")
-        if data is not None and not int.from_bytes(data, "little") & PDO_INVALID:
-            _switch_off(network, node, index, int.from_bytes(data, "little"))
+        try:
+            data = network.client(node).read(index, 1, "PDO identifier")
+        except Refused as error:
+            code = error.values.get("abort_code")
+            if code is None or code in NOT_NOW:
+                raise
+            if code not in OBJECT_DOES_NOT_EXIST:
+                remarks.append(
+                    f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"
+                    " if it has this PDO, it stays as it is"
+                )
+            continue
+        value = int.from_bytes(data, "little")
+        if not value & PDO_INVALID:
+            _switch_off(network, node, index, value)
 
 
 def _switch_off(network: SetupNetwork, node: int, index: int, value: int) -> None:

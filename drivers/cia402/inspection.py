@@ -13,6 +13,8 @@ from drivers.cia402.error_codes import abort_text
 from drivers.cia402.object_dictionary import (
     BEFORE,
     HEARTBEAT_CONSUMERS,
+    MODE_DISPLAY,
+    UNUSED_PDOS,
     Expectation,
     Setting,
     expected_by,
@@ -41,6 +43,7 @@ _PROCESS_DATA = (
     (0x607A, "<i", "target position", "set-points"),
     (0x6064, "<i", "position actual value", "replies"),
     (0x6077, "<h", "torque actual value", "tension of the cable"),
+    (MODE_DISPLAY.index, "<b", MODE_DISPLAY.name, MODE_DISPLAY.why),
 )
 
 
@@ -132,6 +135,8 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         look.at_heartbeats(profile.heartbeat_entries, rig.cable_count)
         for setting in _last_of_each(settings_for(rig, drive, winch_map, None)):
             look.at_setting(setting, _needed(setting))
+        for index in UNUSED_PDOS:
+            look.at_unused(index)
     answered = tuple(node for node in all_nodes if node not in silent)
     return Examined(answered, tuple(silent), tuple(rows.values()))
 
@@ -227,6 +232,14 @@ class _Look:
                 change = "" if value else "enter the motor data with the maker's tool"
                 rated.note(self._node, str(value), "ok" if value else "wrong", change)
 
+    def at_unused(self, index: int) -> None:
+        """A PDO that is switched off at set-up where it is there."""
+        row = self._row(index, 1, "PDO identifier", "none required: switched off where it is there")
+        row.meaning = "other process data would only fill the bus"
+        data = self._read(index, 1, row, optional=True)
+        if data is not None:
+            row.note(self._node, f"{int.from_bytes(data, 'little'):X}h")
+
     def _row(self, index: int, sub: int, name: str, needed: str) -> ObjectRow:
         text = name if name.startswith(f"{index:04X}h") else f"{object_name(index, sub)} {name}"
         return self._rows.setdefault((index, sub), ObjectRow(text, needed, ""))
@@ -247,7 +260,8 @@ class _Look:
         absent = code in OBJECT_DOES_NOT_EXIST
         text = "absent" if absent else f"refused: {abort_text(int(code))}"
         if optional:
-            row.note(self._node, text, "remark" if instead else "ok", instead)
+            good = absent and not instead
+            row.note(self._node, text, "ok" if good else "remark", instead or "none required")
         else:
             row.note(self._node, text, "wrong", _how_without(index, sub))
         return None

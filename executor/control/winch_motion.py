@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -102,9 +103,10 @@ class _LastCycles:
         self._records.take_event(event)
 
     def tell(self, code: str, text: str) -> None:
-        """Records an event that happened after the last cycle."""
+        """Records an event after the last cycle; the caller raises or returns it in any case."""
         cycle, at = (self.cycles[-1].cycle, self.cycles[-1].at) if self.cycles else (0, 0.0)
-        self._records.take_event(LoopEvent(cycle, at, code, text))
+        with suppress(CdprError):  # a disk that is full then changes nothing of how it ended
+            self._records.take_event(LoopEvent(cycle, at, code, text))
 
 
 def move_winches(
@@ -206,11 +208,52 @@ def _kept(
 #
 # ``events.jsonl`` is as in a run folder. ``winches.csv`` has one row a cycle: ``cycle``,
 # ``time_s``, ``state``, and per cable ``set_counts_K``, ``counts_K`` and ``torque_per_mille_K`` (of
-# rated torque, positive where it pulls the cable in). Both are written while the winches move,
-# without waiting for the disk: what a killed program had written is there.
+# rated torque, positive where it pulls the cable in). Both are written while the winches move: what
+# a killed program had written is there, and of a power cut what is older than about a second.
 
 
 WINCHES = "winches.csv"
+FSYNC_EVERY = 1.0
+"""Both files are forced to disk at most this often, [s]; a thread waits for that."""
+
+
+class _Lines:
+    """A file that lines are added to, without a buffer: closing it has nothing left to write."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._failed = path, ""
+        self._stream = path.open("wb", buffering=0)
+
+    def add(self, line: str) -> None:
+        """Adds one; after one that failed, none: it may be there in part.
+
+        Raises:
+            Fault: The disk is full or gone.
+        """
+        try:
+            data = memoryview(f"{line}\n".encode())
+            while data and not self._failed:
+                data = data[self._stream.write(data) :]
+        except OSError as error:
+            self._failed = error.strerror or str(error)
+        if self._failed:
+            raise Fault(
+                f"{self._path.name} cannot be written: {self._failed}",
+                where=str(self._path),
+                next_step="free some space or choose another folder",
+            )
+
+    def fsync(self) -> None:
+        """What was added is on disk when this returns, unless the disk fails."""
+        try:
+            os.fsync(self._stream.fileno())
+        except OSError as error:
+            self._failed = self._failed or error.strerror or str(error)
+
+    def close(self) -> None:
+        """Ends it; never raises."""
+        with suppress(OSError):
+            self._stream.close()
 
 
 class WinchRecord:
@@ -221,29 +264,48 @@ class WinchRecord:
         cycles: How many were taken in.
     """
 
-    def __init__(self, folder: Path, events: TextIO, winches: TextIO) -> None:
-        """Takes open files; they stay the caller's."""
+    def __init__(
+        self, folder: Path, events: _Lines, winches: _Lines, flusher: ThreadPoolExecutor
+    ) -> None:
+        """Takes open files and a thread that waits for the disk; they stay the caller's."""
         self.folder, self.cycles = folder, 0
-        self._events, self._winches = events, winches
+        self._events, self._winches, self._flusher = events, winches, flusher
         self._began = float("inf")  # until there is a cycle
+        self._flushed, self._flushing = float("-inf"), Future[None]()
+        self._flushing.set_result(None)
 
     def take_cycle(self, record: CycleRecord) -> None:
-        """A cycle is over."""
-        if self.cycles == 0:
+        """A cycle is over.
+
+        Raises:
+            Fault: The disk is full or gone.
+        """
+        self.cycles += 1
+        if self.cycles == 1:
+            self._began = record.at
             columns = ("set_counts", "counts", "torque_per_mille")
             cables = range(1, len(record.actual) + 1)
             names = [f"{column}_{cable}" for column in columns for cable in cables]
-            self._winches.write(f"cycle,time_s,state,{','.join(names)}\n")
-            self._began = record.at
-        self.cycles += 1
+            self._winches.add(f"cycle,time_s,state,{','.join(names)}")
         numbers = (*record.targets, *record.actual, *record.torques)
         row = (record.cycle, f"{self._time(record.at):.6f}", record.state.value, *numbers)
-        self._winches.write(",".join(map(str, row)) + "\n")
+        self._winches.add(",".join(map(str, row)))
+        if record.at - self._flushed >= FSYNC_EVERY and self._flushing.done():
+            self._flushed = record.at
+            self._flushing = self._flusher.submit(self._flush)
 
     def take_event(self, event: LoopEvent) -> None:
-        """Something happened."""
+        """Something happened.
+
+        Raises:
+            Fault: The disk is full or gone.
+        """
         told = {"time_s": round(self._time(event.at), 6), "code": event.code, "text": event.text}
-        self._events.write(json.dumps(told, ensure_ascii=False) + "\n")
+        self._events.add(json.dumps(told, ensure_ascii=False))
+
+    def _flush(self) -> None:
+        self._winches.fsync()
+        self._events.fsync()
 
     def _time(self, at: float) -> float:
         """Since the first cycle, [s]; 0 before it."""
@@ -260,11 +322,8 @@ def recording(folder: Path) -> Iterator[WinchRecord]:
     with ExitStack() as files:
         try:
             folder.mkdir(parents=True)
-            events = files.enter_context((folder / EVENTS).open("w", buffering=1, encoding="utf-8"))
-            # A line at a time: nothing is left that could fail to be written when it is closed.
-            winches = files.enter_context(
-                (folder / WINCHES).open("w", buffering=1, encoding="utf-8")
-            )
+            events = files.enter_context(closing(_Lines(folder / EVENTS)))
+            winches = files.enter_context(closing(_Lines(folder / WINCHES)))
         except OSError as error:
             raise BadInput(
                 "the record of the motion cannot be written",
@@ -272,7 +331,8 @@ def recording(folder: Path) -> Iterator[WinchRecord]:
                 why=error.strerror or str(error),
                 next_step="change to a writable folder; nothing was moved",
             ) from None
-        record = WinchRecord(folder, events, winches)
+        flusher = files.enter_context(ThreadPoolExecutor(1, "cdpr-record"))
+        record = WinchRecord(folder, events, winches, flusher)
         try:
             yield record
         finally:

@@ -22,7 +22,7 @@ from executor.recording.record_files import AGAIN, read_events, read_summary
 from executor.recording.run_course import RunCourse
 from executor.recording.tables import CycleTable, PoseTable, no_cycles
 from model.errors import BadInput, Fault, InvalidFile
-from model.files.documents import problems_of, write_atomic
+from model.files.documents import keep_names, problems_of, write_atomic
 from model.files.plan_file import PlanDocument
 from model.files.reading import PICTURE_LIMIT, read_bytes, read_json, read_text
 from model.files.rig_file import RigDocument
@@ -409,6 +409,8 @@ class RunFolder:
                         data = data[stream.write(data) :]
                     if fsync:
                         os.fsync(stream.fileno())
+                        if before == 0:  # the file may be new
+                            keep_names(self.path)
                 except OSError:
                     with suppress(OSError):
                         stream.truncate(before)  # the next line would be added to half a line

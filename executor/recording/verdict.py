@@ -328,6 +328,8 @@ ORDINARY = frozenset(
         *("pass", "pick", "place", "leaving", "simulated", "traceback"),
     }
 )
+#: Codes of events that stop no run, although each has a page.
+HARMLESS = frozenset({"reply_lost", "no_real_time"})
 
 
 def page_of(code: str) -> str:

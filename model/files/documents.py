@@ -188,6 +188,7 @@ __all__ = [
     "check_version",
     "content_hash",
     "document_hash",
+    "keep_names",
     "key_path",
     "load_yaml",
     "problems_of",
@@ -358,15 +359,19 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
             os.fsync(handle)  # or a power cut could leave the new name on an empty file
         Path(temporary).chmod(0o644)
         Path(temporary).replace(path)
-        _keep_names(path.parent)
+        keep_names(path.parent)
     except OSError as error:
         raise _not_written(path, error, "free some space or choose another folder") from None
     finally:
         Path(temporary).unlink(missing_ok=True)  # gone already when all went well
 
 
-def _keep_names(folder: Path) -> None:
-    """A new name outlives a power cut only once its folder is on disk."""
+def keep_names(folder: Path) -> None:
+    """Forces a folder to disk: a new name outlives a power cut only from then on.
+
+    Raises:
+        OSError: The folder is gone, or the disk fails.
+    """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(handle)

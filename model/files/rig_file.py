@@ -43,7 +43,7 @@ class Cia402Document(Document):
     type: Literal["cia402"]
     profile: FileName = Field(
         default="cia402",
-        description="what the drives have: cia402, epos4, nanotec-c5-e, akd, elmo-gold, or the path"
+        description="what the drives have: cia402, epos4, nanotec-c5e, akd, elmo-gold, or the path"
         " of a YAML file",
     )
     vendor_id: Identity | None = Field(

@@ -15,7 +15,7 @@ def test_drives_with_too_few_heartbeat_entries_are_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """As Nanotec's, which have one."""
-    drives = Cia402Document(type="cia402", profile="nanotec-c5-e")
+    drives = Cia402Document(type="cia402", profile="nanotec-c5e")
     document = load_rig(RIG).document.model_copy(update={"drives": drives})
     rig = rig_from_document(document)
     with open_drives(rig, rig.home, free_scene(START_MM, GOAL_MM).load, listener=Terminal()):

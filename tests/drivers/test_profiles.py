@@ -14,9 +14,9 @@ from drivers.cia402 import configure
 from drivers.cia402 import inspection as examine
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.inspection import Examined, examine_drives
-from drivers.cia402.object_dictionary import settings_for
+from drivers.cia402.object_dictionary import UNUSED_PDOS, settings_for
 from drivers.cia402.profile import load_profile, profile_names
-from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.factory import make_drive_group
 from drivers.stopping_distance import lost_master, require_stopping_room
 from model.errors import BadInput, CdprError, InvalidFile, Refused
@@ -25,7 +25,7 @@ from model.rig import Rig, rig_from_document
 from model.winches import WinchMap
 from tests.drivers.sdo_server import ScriptedBus, ScriptedDrive, downloads, eds_of
 
-MAKERS = ("akd", "elmo-gold", "epos4", "nanotec-c5-e")
+MAKERS = ("akd", "elmo-gold", "epos4", "nanotec-c5e")
 
 
 def with_profile(rig: Rig, profile: str) -> Rig:
@@ -67,7 +67,7 @@ def examined(rig: Rig, bus: ScriptedBus) -> Examined:
 
 
 def test_the_profiles_are_those_of_the_documentation() -> None:
-    assert profile_names() == ("akd", "cia402", "elmo-gold", "epos4", "nanotec-c5-e")
+    assert profile_names() == ("akd", "cia402", "elmo-gold", "epos4", "nanotec-c5e")
 
 
 @pytest.mark.parametrize("name", ["cia402", *MAKERS])
@@ -89,13 +89,13 @@ def test_drives_of_a_profile_are_set_up_with_it(rig: Rig, name: str) -> None:
         assert values.get((0x1800, 3), 0) == 0
 
 
-@pytest.mark.parametrize("name", ["akd", "epos4", "nanotec-c5-e"])
+@pytest.mark.parametrize("name", ["akd", "epos4", "nanotec-c5e"])
 def test_with_another_profile_everything_wrong_is_told_at_once(rig: Rig, name: str) -> None:
     bus = eight_of("cia402" if name == "akd" else name)
     if name == "akd":
         for drive in bus.drives.values():
             drive.aborts |= {(0x1006, 0): 0x06020000, (0x6072, 0): 0x06020000}
-    elif name == "nanotec-c5-e":
+    elif name == "nanotec-c5e":
         for drive in bus.drives.values():
             drive.aborts[0x6072, 0] = 0x06090030
             drive.aborts[0x6007, 0] = 0x06010002
@@ -126,17 +126,17 @@ def test_epos4_gets_its_limits_in_its_own_units(rig: Rig) -> None:
 
 
 def test_a_cycle_that_the_drives_cannot_take_is_refused(rig: Rig) -> None:
-    document = with_profile(rig, "nanotec-c5-e").document.model_dump()
+    document = with_profile(rig, "nanotec-c5e").document.model_dump()
     document["bus"]["cycle_ms"] = 4.5
     with pytest.raises(BadInput, match="interpolate"):
-        set_up(rig_from_document(RigDocument.model_validate(document)), eight_of("nanotec-c5-e"))
+        set_up(rig_from_document(RigDocument.model_validate(document)), eight_of("nanotec-c5e"))
 
 
 def test_another_unit_of_position_is_refused_before_anything_is_written(rig: Rig) -> None:
-    bus = eight_of("nanotec-c5-e")
+    bus = eight_of("nanotec-c5e")
     bus.drives[4].values[0x60A8, 0] = 0xFF410000  # as it leaves the maker: tenths of a degree
     with pytest.raises(Refused, match="FF410000h"):
-        set_up(with_profile(rig, "nanotec-c5-e"), bus)
+        set_up(with_profile(rig, "nanotec-c5e"), bus)
     assert not downloads(bus)
 
 
@@ -165,11 +165,11 @@ def test_a_mode_that_never_shows_is_refused(rig: Rig) -> None:
 
 
 OPTIONAL = [(0x1007, 0), (0x1029, 1), (0x605C, 0), (0x605E, 0)]
+NOT_THERE = (0x06020000, 0x06090011)
+ABORTS = [*NOT_THERE, 0x06010000, 0x06010002, 0x06040041, 0x06040047, 0x06090030, 0x08000000]
 
 
-@pytest.mark.parametrize(
-    "code", [0x06020000, 0x06090011, 0x06010000, 0x06010002, 0x08000000, 0x06090030, 0x06040047]
-)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
 def test_an_optional_object_that_is_refused_is_a_remark(rig: Rig, code: int) -> None:
     bus = eight_of("cia402")
     for node, key in enumerate(OPTIONAL, start=1):
@@ -178,8 +178,33 @@ def test_an_optional_object_that_is_refused_is_a_remark(rig: Rig, code: int) -> 
     for node, (index, sub) in enumerate(OPTIONAL, start=1):
         (remark,) = (each for each in remarks if each.startswith(f"drive {node}: "))
         assert f"{index:04X}h:{sub:02X}" in remark
-        assert (f"{code:08X}h" in remark) == (code not in (0x06020000, 0x06090011))
+        assert (f"{code:08X}h" in remark) == (code not in NOT_THERE)
     assert len(remarks) == len(OPTIONAL)
+
+
+@pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_a_pdo_that_is_not_used_may_be_refused_with_any_code(
+    rig: Rig, index: int, code: int
+) -> None:
+    """Only its absence by the book needs no remark."""
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[index, 1] = code
+    remarks = set_up(rig, bus)
+    assert len(remarks) == (code not in NOT_THERE)
+    for remark in remarks:
+        assert remark.startswith(f"drive 3: the drive refuses {index:04X}h:01")
+        assert f"{code:08X}h" in remark
+
+
+@pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
+@pytest.mark.parametrize("code", sorted(NOT_NOW), ids=hex)
+def test_a_pdo_that_is_there_but_not_now_is_refused(rig: Rig, index: int, code: int) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[index, 1] = code
+    with pytest.raises(Refused) as caught:
+        set_up(rig, bus)
+    assert f"drive 3, object {index:04X}h:01" in caught.value.where
 
 
 def test_a_slow_drive_is_set_up_all_the_same(rig: Rig) -> None:
@@ -209,6 +234,30 @@ def test_doctor_tells_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -> 
 def test_doctor_finds_nothing_wrong_with_the_right_profile(rig: Rig, name: str) -> None:
     found = examined(with_profile(rig, name), eight_of(name))
     assert found.good, [(row.object, row.found) for row in found.rows if row.verdict == "wrong"]
+
+
+def test_doctor_reads_the_mode_that_a_set_up_waits_for(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    bus.drives[5].aborts[0x6061, 0] = 0x06020000
+    found = examined(rig, bus)
+    assert [row.object[:8] for row in found.rows if row.verdict == "wrong"] == ["6061h:00"]
+    assert not found.good
+    with pytest.raises(Refused, match="6061h"):
+        set_up(rig, bus)
+
+
+@pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_doctor_reads_the_pdos_that_a_set_up_switches_off(rig: Rig, index: int, code: int) -> None:
+    """It says what the set-up will say: a remark, or nothing."""
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[index, 1] = code
+    found = examined(rig, bus)
+    (row,) = (row for row in found.rows if row.object.startswith(f"{index:04X}h:01"))
+    assert found.good
+    assert row.verdict == ("ok" if code in NOT_THERE else "remark")
+    (told,) = (text for text, nodes in row.found.items() if 3 in nodes)
+    assert told.startswith("absent" if code in NOT_THERE else "refused: ")
 
 
 def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:

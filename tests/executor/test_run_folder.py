@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,26 @@ def test_an_existing_path_is_never_written_into(tmp_path: Path, kind: str) -> No
     assert "another folder" in caught.value.next_step
     assert not (tmp_path / "nowhere").exists()
     assert kind != "folder" or not list(path.iterdir())
+
+
+def test_the_name_of_a_file_that_is_appended_to_outlives_a_power_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new file is on disk only once its folder is, too."""
+    folder = RunFolder.create(tmp_path / "run")
+    forced: list[Path] = []
+    fsync = os.fsync
+
+    def noted(handle: int) -> None:
+        forced.append(Path(os.readlink(f"/proc/self/fd/{handle}")))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    folder.append_cycles("time_s\n0.0\n", fsync=True)
+    folder.append_cycles("0.1\n", fsync=True)
+    cycles = folder.path / "cycles.csv"
+    assert forced == [cycles, folder.path, cycles]
+    assert cycles.read_text() == "time_s\n0.0\n0.1\n"
 
 
 def test_folders_above_a_run_are_made(tmp_path: Path) -> None:
@@ -167,7 +188,7 @@ CLEARANCE_FACTS = (
         ("cycles.csv", "", "empty"),
         ("cycles.csv", "cycle,time_s\n0,0.0\n", "'set_1_counts'|'state'|missing"),
         ("cycles.csv", "cycle,time_s\n0,0.0\n1\n", "line 3 has 1 values for 2 columns"),
-        ("clearance.csv", "time_s\nsoon\n", "'time_s' holds a text"),
+        ("clearance.csv", "time_s\nsoon\n", "'time_s' has a value that is not a number"),
         ("clearance.csv", f"{CLEARANCE_FACTS},pillar_mm\n", "'pillar_mm' lacks its partner"),
         ("summary.json", "{", "not valid JSON"),
         ("summary.json", '{"schema_version": 2}', "schema_version 1"),

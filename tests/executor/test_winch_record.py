@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import threading
+from concurrent.futures import wait
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from executor.control.winch_motion import recording
 from executor.state_machine import CycleRecord, LoopEvent, State
-from model.errors import BadInput
+from model.errors import BadInput, Fault
 
 
 def record(cycle: int) -> CycleRecord:
@@ -40,6 +45,71 @@ def test_every_cycle_and_event_is_there(tmp_path: Path) -> None:
         "set_counts_1": "10", "set_counts_2": "20", "counts_1": "11", "counts_2": "-21",
         "torque_per_mille_1": "30", "torque_per_mille_2": "40",
     }  # fmt: skip
+
+
+def full_from_the_start(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """The file of this name is on a disk without space."""
+    opened = Path.open
+
+    def opens(path: Path, *arguments: Any, **options: Any) -> Any:
+        return opened(Path("/dev/full") if path.name == name else path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", opens)
+
+
+def full_disk(full: str, name: str) -> AbstractContextManager[object]:
+    """Writing to this file is refused if it is the full one."""
+    if full != name:
+        return nullcontext()
+    return pytest.raises(Fault, match=f"{name} cannot be written: No space left on device")
+
+
+@pytest.mark.parametrize("name", ["winches.csv", "events.jsonl"])
+def test_a_full_disk_is_told_and_changes_nothing_of_how_the_motion_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Closing the files raised once more, in place of the result of the motion."""
+    full_from_the_start(monkeypatch, name)
+    event = LoopEvent(0, 100.0, "stop", "stop requested")
+    with recording(tmp_path / "home") as kept:
+        for _ in range(2):
+            with full_disk(name, "winches.csv"):
+                kept.take_cycle(record(0))
+            with full_disk(name, "events.jsonl"):
+                kept.take_event(event)
+
+
+def test_what_was_written_is_forced_to_disk_once_a_second_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forced: list[str] = []
+    monkeypatch.setattr(
+        os, "fsync", lambda handle: forced.append(os.readlink(f"/proc/self/fd/{handle}"))
+    )
+    with recording(tmp_path / "home") as kept:
+        for cycle in range(300):  # 3 s
+            kept.take_cycle(record(cycle))
+            wait([kept._flushing])
+    assert [Path(file).name for file in forced] == ["winches.csv", "events.jsonl"] * 3
+
+
+def test_a_disk_that_hangs_holds_no_cycle_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs = threading.Event()
+    forced: list[int] = []
+
+    def fsync(handle: int) -> None:
+        forced.append(handle)
+        hangs.wait(10.0)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with recording(tmp_path / "home") as kept:
+        for cycle in range(500):
+            kept.take_cycle(record(cycle))
+        assert len((tmp_path / "home/winches.csv").read_text().splitlines()) == 501
+        assert len(forced) <= 1, "none waits behind another"
+        hangs.set()
 
 
 def test_nothing_is_left_of_what_did_not_move(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from tests.scenarios.faults.samples import WatchedRehearsal, emergencies
 from tests.scenarios.test_processes import program
 from tests.scenarios.test_real_time import told
 
-MAKERS = ("epos4", "nanotec-c5-e", "akd")
+MAKERS = ("epos4", "nanotec-c5e", "akd")
 STEPS = ["doctor", "home", "run", "stop", "fault", "reset", "home again", "release"]
 HOLDING = DriveState.QUICK_STOP_ACTIVE
 OVERCURRENT = 0x2310

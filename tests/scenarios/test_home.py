@@ -522,6 +522,32 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
         assert reference.stands_at != list(begin)
 
 
+def test_a_record_that_is_full_by_then_leaves_the_cause_and_the_latch() -> None:
+    """An event that cannot be kept takes the place of neither."""
+    full = Fault("events.jsonl cannot be written: No space left on device")
+
+    class Full(list[LoopEvent]):
+        def append(self, event: LoopEvent) -> None:
+            super().append(event)
+            if event.code == "not_held":
+                raise full
+
+    rig = load_rig(RIG)
+    bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can8"})
+    custody = MotionInterlock(rig_from_document(rig.document.model_copy(update={"bus": bus})))
+    with after_power_loss(lost(1, on_a_stand=True)) as place:
+
+        def at_rest(_stand: WinchesStand) -> None:
+            loses_all_torque(place)
+
+        place.custody, place.at_rest, place.events = custody, at_rest, Full()
+        with pytest.raises(CdprError, match="not all drives still hold"):
+            place.take_up()
+        assert place.events[-1].code == "not_held"
+    with pytest.raises(Refused, match="not all drives still hold"):
+        custody.require_free()
+
+
 def test_a_stop_before_anything_is_enabled_leaves_all_as_it_was() -> None:
     with after_power_loss(lost(1, on_a_stand=True)) as place:
         place.board.ask_stop()

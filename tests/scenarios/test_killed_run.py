@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -127,6 +128,74 @@ def test_cycles_that_are_not_on_record_are_told_of_a_run_whose_end_is(
     assert f"Of {there + 7} cycles the last 7 are not on record." in summary["reasons"]
     folder.write_end_of_course(replace(course, cycles=there))
     assert evaluate_cut_short(folder).summary["verdict"] == "PASSED"
+
+
+STOP = RunEvent(98.0, "stop", "stop requested; slowing down along the path")
+HELD = RunEvent(99.0, "held", "at rest; the drives hold under torque")
+
+
+@pytest.fixture
+def at_rest(killed: RunFolder, tmp_path: Path) -> RunFolder:
+    """Its cycles reach up to its end, its ``run.json`` does not."""
+    folder = cut(killed, tmp_path / "run")
+    cycles = folder.cycles()
+    folder.write_cycles(replace(cycles, state=(*cycles.state[:-1], "securing")))
+    folder.write_events([RunEvent(0.0, "enabled", "all hold"), RunEvent(0.1, "moving", "moving")])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("events", "verdict", "state"),
+    [
+        ([HELD], "PASSED", "finished"),
+        ([RunEvent(50.0, "reply_lost", "drive 4: one"), HELD], "PASSED", "finished"),
+        ([STOP, HELD], "STOPPED", "stopped"),
+        ([], "FAILED", "not_ended"),
+        ([STOP], "FAILED", "not_ended"),
+        ([RunEvent(50.0, "drive_warning", "drive 4: hot"), HELD], "FAILED", "not_ended"),
+        ([HELD, RunEvent(99.1, "recorder", "the latch cannot be written")], "FAILED", "not_ended"),
+    ],
+)
+def test_a_kill_after_the_verdict_changes_it_in_no_report(
+    at_rest: RunFolder, events: list[RunEvent], verdict: str, state: str
+) -> None:
+    """Between the printed verdict and the end of ``run.json``."""
+    for event in events:
+        at_rest.append_event(event)
+    answer = call("report", at_rest.path, "--json")
+    assert answer.code == 0, answer
+    summary = json.loads(answer.out)
+    assert (summary["verdict"], summary["final_state"]) == (verdict, state), summary["reasons"]
+    if verdict == "STOPPED":
+        assert STOP.text in " ".join(summary["reasons"])
+
+
+def test_held_counts_only_with_the_cycles_up_to_it(killed: RunFolder, tmp_path: Path) -> None:
+    folder = cut(killed, tmp_path / "run")
+    folder.write_events([HELD])
+    assert evaluate_cut_short(folder).summary["final_state"] == "not_ended"
+
+
+def test_a_run_does_not_pass_without_what_its_cameras_measured(at_rest: RunFolder) -> None:
+    at_rest.append_event(HELD)
+    at_rest.write_picture(0, np.zeros((4, 4), dtype=np.uint8))
+    summary = evaluate_cut_short(at_rest).summary
+    assert (summary["verdict"], summary["final_state"]) == ("FAILED", "finished")
+    assert "What the cameras measured is not on record." in summary["reasons"]
+
+
+def test_a_program_that_is_killed_once_the_verdict_is_out_leaves_that_verdict(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("executor.runner.write_end", lambda *_: {})
+    run = tmp_path / "run"
+    answer = call("run", short_plan, "--rig", RIG, "--fast", "--no-camera", "-o", run)
+    assert "\nPASSED " in answer.out, answer
+    assert RunFolder(run).course().final_state == ""
+    again = call("report", run, "--json")
+    assert again.code == 0, again
+    summary = json.loads(again.out)
+    assert (summary["verdict"], summary["final_state"]) == ("PASSED", "finished")
 
 
 def test_the_end_of_a_run_has_room_on_a_full_disk(

@@ -1,0 +1,111 @@
+"""Drives that let go when they are left after a run, and a bus that is gone by then."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import can
+import pytest
+
+from drivers.can_bus import BusSettings
+from drivers.cia402.state_machine import DriveState
+from executor.interlock.fault_latch import FaultLatch
+from executor.recording.run_folder import RunFolder
+from executor.state_machine import State
+from executor.trajectory.prepare import PreparedRun
+from model.errors import Fault, Refused
+from simulation.drives.cia402 import SimulatedDrive
+from tests.cli.program import call
+from tests.scenarios.stage import Stage, at, staged
+from tests.scenarios.test_bus_faults import PASSIVE
+from tests.scenarios.test_real_time import drives_on
+
+CRUISING = 150
+FIFTH, SIXTH = 4, 5
+
+
+def fails_once_left(drive: SimulatedDrive) -> None:
+    """It takes the end of SYNC as a fault, and is asked only then: nothing is seen in a cycle."""
+    asked = drive.on_sdo
+
+    def fails(data: bytes) -> None:
+        reads_status = data[0] & 0xE0 == 0x40 and data[1:3] == b"\x41\x60"
+        if reads_status and drive.state is DriveState.QUICK_STOP_ACTIVE:
+            drive.fail(0x8130)
+        asked(data)
+
+    drive.on_sdo = fails  # type: ignore[method-assign, assignment]
+
+
+@pytest.mark.slow
+def test_a_drive_that_lets_go_after_a_run_is_latched_and_told_with_exit_code_1(
+    slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
+) -> None:
+    channel = f"239.74.163.41:{20000 + (os.getpid() * 31) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    rest = ("--no-camera", "--yes", "--without-real-time")
+    with drives_on(channel, slow_run) as rehearsal:
+        fails_once_left(rehearsal.drives[SIXTH])
+        answer = call("run", short_plan, "--rig", slow_rig, "-o", tmp_path / "run", *bus, *rest)
+        states = [drive.state for drive in rehearsal.drives]
+    assert answer.code == 1, answer
+    assert "\nFAILED " in answer.out
+    told = "cable 6 (drive 6) went from quick stop active to fault"
+    assert told in answer.out
+    assert states.count(DriveState.QUICK_STOP_ACTIVE) == 7, "the others hold"
+    summary = RunFolder.open(tmp_path / "run").summary()
+    assert (summary["verdict"], summary["final_state"]) == ("FAILED", "latched")
+    (event,) = (each for each in summary["events"] if each["code"] == "not_held")
+    assert told in event["text"]
+    assert "held" not in [each["code"] for each in summary["events"]]
+    with pytest.raises(Refused, match="went from quick stop active to fault"):
+        FaultLatch(BusSettings("udp_multicast", channel)).require_disengaged()
+
+
+def test_a_drive_that_lets_go_after_a_fault_is_told_beside_its_cause(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    def fault(stage: Stage) -> None:
+        PASSIVE(stage)
+        fails_once_left(stage.drives[SIXTH])
+
+    with staged(prepared, tmp_path / "run", at(CRUISING, fault)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+    assert outcome.state is State.LATCHED
+    assert "error-passive" in outcome.cause, "what the stop was for remains the cause"
+    assert not outcome.holding
+    assert events[-1].code == "not_held"
+    assert "cable 6 (drive 6) went from quick stop active to fault" in events[-1].text
+    assert "cable 4" not in events[-1].text
+
+
+THREE_LINES = Fault("frames cannot be sent", where="can0", why="it is down", next_step="set it up")
+OF_THE_LIBRARY = can.CanOperationError("Network is down [Error Code 100]")
+
+
+@pytest.mark.parametrize("error", [THREE_LINES, OF_THE_LIBRARY])
+def test_a_bus_that_is_gone_after_the_stop_is_told_in_one_line(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def gone(*_: object) -> None:
+        raise error
+
+    def fault(stage: Stage) -> None:
+        if stage.cycle == CRUISING:
+            stage.drives[FIFTH].fail(0x2310)
+        if stage.cycle == CRUISING + 5:
+            monkeypatch.setattr(stage.group, "receive", gone)
+
+    with staged(prepared, tmp_path / "run", fault) as stage:
+        outcome = stage.run()
+        events = stage.events()
+    assert outcome.state is State.LATCHED
+    assert "drive 5" in outcome.cause
+    assert events[-1].code == "bus_lost"
+    assert "\n" not in events[-1].text
+    said = error.what if isinstance(error, Fault) else str(error)
+    assert said in events[-1].text
+    assert events[-1].text.endswith("the drives stop on loss of the master")
+    assert "stop_not_sent" not in [event.code for event in events]
