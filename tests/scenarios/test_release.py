@@ -136,7 +136,7 @@ def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
     assert "cable 4 (drive 4) stays in" in answer.err
     latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
-    assert "being released" in latched.cause
+    assert "while releasing the drives" in latched.cause
 
 
 @pytest.mark.slow
