@@ -191,7 +191,7 @@ def calibrate_camera(
     source = pictures if isinstance(pictures, Pictures) else pictures_in(pictures)
     to = to or Destination()
     to.require_free("camera", name)
-    with source.reported("looking for the board", listener) as images:
+    with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused, lens)
     quality = judge_camera(found, wanted, distance)
     result = camera_result(found, quality, name, to.on)

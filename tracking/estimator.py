@@ -154,7 +154,7 @@ class PlatformEstimator:
         expected: Pose | None,
         status: str,
     ) -> Observation:
-        agreed = self._agreed(views)
+        agreed, measured = self._agreed(views), len(views) > 0
         if agreed.ambiguous:
             twice = ", ".join(map(str, agreed.ambiguous))
             return NoPose(time, f"tags {twice} are detected at inconsistent positions", seen)
@@ -163,7 +163,7 @@ class PlatformEstimator:
         first = solve_pnp(self._camera, views, prior) if views else None
         start = prior if first is None else first.camera_from_body
         if start is None:
-            return NoPose(time, self._why_nothing(seen), seen)
+            return NoPose(time, self._why_nothing(seen, measured), seen)
         views = views + self._looked_for(image, start, {v.tag.id for v in views})
         fitted = self._fitted(views, start)
         if fitted is None:
@@ -185,9 +185,12 @@ class PlatformEstimator:
 
         return agreeing(self._camera, views, possible)
 
-    def _why_nothing(self, seen: tuple[int, ...]) -> str:
+    def _why_nothing(self, seen: tuple[int, ...], measured: bool) -> str:
         if mine := [str(number) for number in seen if number in self._platform]:
-            return f"the edges of tags {', '.join(mine)} {UNSHARP}"
+            tags = ", ".join(mine)
+            if measured:
+                return f"no pose within the workspace fits tags {tags}"
+            return f"the edges of tags {tags} {UNSHARP}"
         wanted = ", ".join(map(str, self._platform))
         others = [number for number in seen if number not in self._frame]
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""

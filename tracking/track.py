@@ -128,7 +128,7 @@ def _nothing_seen(
     elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
     return NoPlatformSeen(
-        f"none of {pictures} picture{'s' if pictures != 1 else ''} gives a pose of the platform:"
+        f"none of {pictures} image{'s' if pictures != 1 else ''} gives a pose of the platform:"
         f" {reason}",
         where=where,
         why=f"expected {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",

@@ -67,7 +67,9 @@ class ExtrinsicsResult(ResultDocument):
             BadInput: The rig has no such camera, or other tags or camera numbers.
         """
         camera = camera_named(rig, self.name)
-        self.require_basis(_basis(rig, self.name, self.by), f"numbers of the camera or {self.by}")
+        self.require_basis(
+            _basis(rig, self.name, self.by), f"parameters of the camera or {self.by}"
+        )
         keys = ("world_from_camera", "pose_covariance")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
 

@@ -23,7 +23,7 @@ FULL_COVERAGE = 0.9
 """Share of the map beyond which nothing is gained by more of it."""
 EDGES = "bring the board near the edges and corners of the picture"
 ENOUGH_VIEWS = 40
-MORE = f"take more pictures: {ENOUGH_VIEWS} are good"
+MORE = f"take more images: {ENOUGH_VIEWS} are recommended"
 NEARER = "take them again with the board filling more of the picture, sharp and held still"
 """Where there are pictures enough, others like them gain little."""
 _BENT = 0.2
@@ -101,7 +101,9 @@ def judge_camera(
     if not told:
         where += f", if the boards were {min(away):.2g} to {max(away):.2g} m away"
         if not error / scale <= GOOD_PIXELS:
-            what = f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is needed"
+            what = (
+                f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is required"
+            )
             lacks.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
     verdict = CalibrationVerdict.of(error, wanted, where, lacks)
     nearest, farthest = min(away), max(away)
@@ -282,7 +284,7 @@ def _about_errors(
         lacks.append(Issue(what, _more(result)))
         share = float(np.mean(coverage > 0))
         if not is_below(share, GOOD_COVERAGE) and is_below(share, FULL_COVERAGE):
-            what = f"the board covered {share:.0%} of the picture, {FULL_COVERAGE:.0%} are good"
+            what = f"the board covered {share:.0%} of the image, {FULL_COVERAGE:.0%} are required"
             lacks.append(Issue(what, EDGES))
     if not halves <= 2.0 * wanted:
         what = f"two halves of the pictures see them {halves * 1e3:.2g} mm apart"

@@ -219,7 +219,7 @@ def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
     image = next(image for image, _ in pictures(board) if board.find(image) is not None)
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
-    assert "was found in 0 of 2 pictures" in caught.value.what
+    assert "was found in 0 of 2 images" in caught.value.what
     assert told in caught.value.why
     assert "; a shows " in caught.value.why
 
@@ -282,11 +282,11 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> 
         (lambda: TagGrid(3, 1, 0.03, 0.01, "tag36h11"), "needs 4 tags"),
         (lambda: TagGrid(3, 2, 0.03, 0.0, "tag36h11"), "gap"),
         (lambda: TagGrid(3, 2, 0.03, 0.01, "tag99h1"), "unknown tag family"),
-        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586, .* 580 to 591"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586; .* 580 to 591"),
         (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", order="up"), "unknown order"),
         (lambda: CircleGrid(2, 6, 0.02, 0.01), "3 circles"),
         (lambda: CircleGrid(4, 6, 0.02, 0.02), "white between"),
-        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586, .* -1 to 10"),
+        (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586; .* -1 to 10"),
     ],
 )
 def test_boards_that_cannot_be_are_refused(make, named: str) -> None:

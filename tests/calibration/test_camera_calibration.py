@@ -207,6 +207,6 @@ def test_no_advice_contradicts_what_is_there_already() -> None:
     assert not verdict.good
     assert not any("40 are good" in step for step in verdict.next_steps)
     few = judge_camera(calibrate_from_views(views(13, 2.0), SIZE), 1e-4).verdict
-    assert "take more pictures: 40 are good" in few.next_steps
+    assert "take more images: 40 are recommended" in few.next_steps
     assert not is_below(0.896, 0.9)
     assert is_below(0.894, 0.9)

@@ -510,7 +510,7 @@ def test_too_few_places_and_nothing_to_look_for_are_refused(rig: Rig, turned: Tr
     few = turned.measured.part(np.arange(60) < 9)
     with pytest.raises(BadInput, match="only 9 stationary samples"):
         fit_rig(rig, few, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    with pytest.raises(BadInput, match="nothing to look for"):
+    with pytest.raises(BadInput, match="nothing to calibrate"):
         fit_rig(rig, turned.measured, {}, LENGTH_DEVIATION)
 
 

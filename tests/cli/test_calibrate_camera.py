@@ -122,7 +122,7 @@ def test_one_picture_many_times_is_never_good_enough(tmp_path) -> None:
     for k, image in enumerate(pictures(1, 0.0) * 8):
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
-    one_message(answer, 2, "found in 1 of 8 pictures", "1.png shows the same as 0.png")
+    one_message(answer, 2, "found in 1 of 8 images", "1.png duplicates 0.png")
     assert "tilt" in answer.said
 
 
@@ -164,4 +164,4 @@ def test_three_pictures_are_too_few(tmp_path) -> None:
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
     assert answer.code == 2
-    assert "found in 3 of 3 pictures; 4 are the least" in answer.err
+    assert "found in 3 of 3 images; at least 4 are required" in answer.err

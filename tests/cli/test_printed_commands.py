@@ -69,6 +69,7 @@ NOT_RUN = {
     "calibrate apply": "a result's name has its date: tests/cli/test_calibration_option.py",
     "calibrate camera": "needs photographs: tests/cli/test_calibrate_camera.py",
     "calibrate diff": "needs two cameras' results: tests/calibration/test_comparison.py",
+    "calibrate export": "needs a result of a calibration: tests/calibration/test_lens_models.py",
     "calibrate import": "needs another program's file: tests/calibration/test_lens_models.py",
     "calibrate extrinsics": "needs photographs: tests/cli/test_calibrate_extrinsics.py",
     "calibrate tags": "needs photographs: tests/cli/test_calibrate_tags.py",

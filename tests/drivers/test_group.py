@@ -295,7 +295,7 @@ def test_a_cycle_that_may_not_enable_becomes_a_stop_of_all(bench: Bench) -> None
     bench.enable()
     bench.rehearsal.advance(0.05)  # no SYNC for five cycles
     assert [d.state for d in bench.drives] == [HOLDING] * 8
-    bench.group.send_cycle(bench.group.targets.tolist(), lambda: False)
+    bench.group.send_cycle(bench.group.targets.tolist(), lambda _enables: False)
     bench.rehearsal.pump()
     assert [d.state for d in bench.drives] == [HOLDING] * 8
     bench.group.receive(0.0)

@@ -277,7 +277,7 @@ REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]]
     "already enabled": (
         lambda b: setattr(b.drives[1], "state", AxisState.CLOSED_LOOP_CONTROL),
         Refused,
-        "drive 2 is enabled already",
+        "drive 2 is already enabled",
     ),
     "in fault": (lambda b: b.drives[1].fail(0x100), Refused, "supply over-voltage"),
     "no motor supply": (

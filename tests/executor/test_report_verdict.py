@@ -203,7 +203,7 @@ def test_a_clearance_fails_only_when_too_small_beyond_its_uncertainty(
     check = distances(rows(source, distance, uncertainty, distance), 0.010)[0]
     assert check.passed is passed
     assert "cable 3 to box" in check.text
-    assert "asks for 10 mm" in check.text
+    assert "required 10 mm" in check.text
 
 
 @pytest.mark.parametrize(("distance", "passed"), [(39.01, True), (38.99, False), (60.0, True)])

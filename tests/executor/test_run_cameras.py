@@ -220,7 +220,7 @@ def test_live_figures_are_those_of_the_newest_pictures() -> None:
     assert (front["pictures_per_second"], side["pictures_per_second"]) == (10.0, 5.0)
     assert front["measuring_ms"] == 5.0
     assert camera_line(side) == (
-        "side (here), 5.0 pictures/s, 5.0 ms, 2 tags, 14 of 14 with a pose, 15 dropped"
+        "side (here), 5.0 images/s, 5.0 ms, 2 tags, 14 of 14 with a pose, 15 dropped"
     )
 
 
@@ -286,7 +286,7 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
     finally:
         for process in processes:
             process.close()
-    assert told == ["camera side gave no answer for 2 s; clearance is measured by front"]
+    assert told == ["camera side did not answer for 2 s; clearance is measured by front"]
     front, side = seen.cameras
     assert front.poses == front.pictures > 20
     assert side.poses == side.pictures - 1 >= 3

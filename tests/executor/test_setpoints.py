@@ -224,7 +224,7 @@ def _refused(name: str, table: Trajectory) -> str:
 )
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_value_that_is_no_number_is_refused_wherever_it_stands(name, field, value):
-    assert f"row 3 holds {field}" in _refused(name, _spoilt(name, field, 3, 0, value))
+    assert f"row 3 has {field}" in _refused(name, _spoilt(name, field, 3, 0, value))
 
 
 @names

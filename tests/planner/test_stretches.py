@@ -91,5 +91,5 @@ def test_shifted_bodies_reach_as_far_as_the_robot_at_any_of_the_positions(gachon
 def test_a_distance_that_is_no_number_proves_nothing(gachon, scene_with, monkeypatch) -> None:
     model, track, _ = random_case(gachon, scene_with, 1)
     monkeypatch.setattr(ClearanceModel, "smallest", lambda _model, _pose: None)
-    with pytest.raises(Fault, match="not known"):
+    with pytest.raises(Fault, match="unknown"):
         smallest_over_stretches(model, track, 0.0, TOLERANCE)
