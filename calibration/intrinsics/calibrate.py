@@ -229,7 +229,8 @@ def _too_few(
         more = f" and {len(told) - 4} more" if len(told) > 5 else ""
         why += "; " + "; ".join(told[: 4 if more else 5]) + more
     return BadInput(
-        f"the board was found in {len(views)} of {count} images; at least {LEAST_VIEWS} are required",
+        f"the board was found in {len(views)} of {count} images;"
+        f" at least {LEAST_VIEWS} are required",
         why=why,
         next_step="check the board's kind and dimensions, or take more images of it, tilted up to"
         " 40°; 40 are recommended",
