@@ -217,7 +217,7 @@ FSYNC_EVERY = 1.0
 """Both files are forced to disk at most this often, [s]; a thread waits for that."""
 
 
-class _Lines:
+class _RecordFile:
     """A file that lines are added to, without a buffer: closing it has nothing left to write."""
 
     def __init__(self, path: Path) -> None:
@@ -265,7 +265,7 @@ class WinchRecord:
     """
 
     def __init__(
-        self, folder: Path, events: _Lines, winches: _Lines, flusher: ThreadPoolExecutor
+        self, folder: Path, events: _RecordFile, winches: _RecordFile, flusher: ThreadPoolExecutor
     ) -> None:
         """Takes open files and a thread that waits for the disk; they stay the caller's."""
         self.folder, self.cycles = folder, 0
@@ -322,8 +322,8 @@ def recording(folder: Path) -> Iterator[WinchRecord]:
     with ExitStack() as files:
         try:
             folder.mkdir(parents=True)
-            events = files.enter_context(closing(_Lines(folder / EVENTS)))
-            winches = files.enter_context(closing(_Lines(folder / WINCHES)))
+            events = files.enter_context(closing(_RecordFile(folder / EVENTS)))
+            winches = files.enter_context(closing(_RecordFile(folder / WINCHES)))
         except OSError as error:
             raise BadInput(
                 "the record of the motion cannot be written",
