@@ -36,7 +36,8 @@ from drivers.cia402.object_dictionary import (
 )
 from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import profile_of
-from drivers.cia402.sdo import NOT_NOW, OBJECT_DOES_NOT_EXIST, SetupNetwork, silent
+from drivers.cia402.sdo import NOT_NOW, SetupNetwork, silent
+from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import OnRestarted, Pump
 from model.errors import HardwareMissing, Refused

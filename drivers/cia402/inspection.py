@@ -22,7 +22,8 @@ from drivers.cia402.object_dictionary import (
     settings_for,
 )
 from drivers.cia402.profile import load_profile, profile_names, profile_of
-from drivers.cia402.sdo import OBJECT_DOES_NOT_EXIST, SetupNetwork
+from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 from model.errors import Refused

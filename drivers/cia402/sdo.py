@@ -22,6 +22,7 @@ from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
 from drivers.cia402.cob_ids import foreign_text, set_up_ids
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import NMT_ID, SDO_REPLY_BASE, SDO_REQUEST_BASE, NmtCommand, make_nmt
+from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import Pump
 from model.errors import CdprError, Fault, HardwareMissing, Refused
 
@@ -36,9 +37,6 @@ CONTACT_REPEAT = 0.5
 
 ECHO_WAIT = 0.05
 """A second device with the same node id answers within this time of the first, [s]."""
-
-OBJECT_DOES_NOT_EXIST = frozenset({0x06020000, 0x06090011})
-"""There is no such object; there is no such sub-index."""
 
 NOT_NOW = frozenset({0x08000020, 0x08000021, 0x08000022})
 """The drive has the object, and does not transfer it in its present state."""

@@ -30,8 +30,8 @@ _DOWNLOADED, _ABORTED = 0x60, 0x80
 _UPLOADED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4}
 _LENGTH = 8
 
-#: Abort codes that say that there is no such object.
-ABSENT = frozenset({0x06020000, 0x06090011})
+#: Abort codes: there is no such object; there is no such sub-index.
+OBJECT_DOES_NOT_EXIST = frozenset({0x06020000, 0x06090011})
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,9 @@ class SdoJobs:
 
     def refused(self) -> set[int]:
         """Nodes that refused a request, other than for an object that is absent."""
-        return {node for (node, _), code in self.failed.items() if code not in ABSENT}
+        return {
+            node for (node, _), code in self.failed.items() if code not in OBJECT_DOES_NOT_EXIST
+        }
 
     @property
     def is_asking(self) -> bool:
