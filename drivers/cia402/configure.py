@@ -205,7 +205,7 @@ def _unwatched_peers(
     instead = (
         "the master's heartbeat stops the drive"
         if monitoring == "heartbeat"
-        else "SYNC and set-point time-outs stop the drive"
+        else "the SYNC time-out stops the drive"
     )
     for count in sorted(set(entries)):
         if count >= len(nodes):
