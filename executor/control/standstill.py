@@ -113,6 +113,7 @@ class Standstill(ABC):
             HardwareMissing: Drives fell silent.
         """
         lateness = self._master.begin()
+        self._require_in_time(lateness)
         status = self._master.exchange(self._group.targets.tolist())
         self._record(status, lateness)
         if self._master.overdue:
@@ -120,6 +121,13 @@ class Standstill(ABC):
         self._silence.take(status)
         self._require_heard(self._silence)
         return status
+
+    def _require_in_time(self, lateness: float) -> None:
+        """Drives that may be under command must not have stopped by themselves meanwhile."""
+        status = self._master.status
+        following = status is not None and not status.stopped
+        if following and not self._master.rule.may_enable(1.0 + lateness):
+            raise late_fault(1.0 + lateness)
 
     @abstractmethod
     def _require_heard(self, silence: ReplyTimeout) -> None:

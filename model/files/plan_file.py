@@ -121,7 +121,7 @@ class PlanDocument(Document):
     """A path from start to goal; `hash` is over everything else in the file."""
 
     kind: Literal["cdpr-plan"] = "cdpr-plan"
-    schema_version: Literal[1] = 1
+    schema_version: Literal[1]
     hash: str
     rig_hash: str
     scene_hash: str

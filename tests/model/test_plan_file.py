@@ -189,7 +189,7 @@ def test_a_plan_with_a_key_less_or_more_is_refused(
 
 
 def _stands_at_its_default(path: tuple[Any, ...]) -> bool:
-    if path[-1] in ("kind", "schema_version"):  # they say what the file is
+    if path[-1] in ("kind", "schema_version", "type"):  # they say what the file, or a part, is
         return False
     try:
         return path[-1] not in holder_of(SAID, path)

@@ -129,8 +129,9 @@ def test_a_camera_that_never_gave_a_picture_or_another_size_is_let_go_of(
 
 
 def test_who_closes_nothing_leaves_no_thread(queue: Queue, camera: Camera) -> None:
-    queue.take(2)
+    queue.take(1)
     live = LiveCamera("0", camera, queue.clock)
+    queue.take(1)
     assert int(next(iter(live)).image[0, 0]) <= 1
     queue.unplug()
     del live
