@@ -108,7 +108,7 @@ def plan_from_document(document: PlanDocument) -> Plan:
 
 def sealed(fields: dict[str, Any]) -> PlanDocument:
     """A plan document with its hash, from all of its other fields."""
-    unsealed = PlanDocument(**{"schema_version": 1, "hash": "", **fields})
+    unsealed = PlanDocument(**{"schema_version": 1, **fields, "hash": ""})
     return unsealed.model_copy(update={"hash": _digest(unsealed)})
 
 
