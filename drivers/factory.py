@@ -24,6 +24,22 @@ def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
     return tuple(state_of(word).value for word in status_words)
 
 
+def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
+    """Whether drives are as they should be once their master is lost.
+
+    Of CiA 402 drives, in quick stop under torque. ODrives are disarmed then, and a brake holds.
+
+    Args:
+        rig: The robot.
+        status_words: As drives report them, one each.
+    """
+    if rig.document.drives.type == "odrive":
+        return (True,) * len(status_words)
+    from drivers.cia402.state_machine import DriveState, state_of
+
+    return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
+
+
 def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSnapshot:
     """Reads the state of drives at rest; changes nothing, not even their configuration.
 

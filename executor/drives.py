@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
@@ -12,18 +13,21 @@ from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
 from drivers.drive_group import DriveSnapshot
-from drivers.factory import make_drive_group, read_drives
+from drivers.factory import drive_states, make_drive_group, read_drives, stop_alone
 from executor.control.preconditions import counted_here, require_below, set_up_here
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
 from executor.kernels import ready_to_simulate
 from executor.realtime.job import ReadyDrives
-from model.errors import BadInput
+from model.errors import BadInput, CdprError
 from model.files.rig_file import RigDocument
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
 from model.scene import Load, nothing_in_the_way
+
+#: Within this time drives that lost their master have noticed it and come to rest, [s].
+ALONE = 1.0
 
 if TYPE_CHECKING:  # a real bus loads no simulator
     from simulation.ground_truth import PowerLoss
@@ -109,6 +113,30 @@ def look_at(rig: Rig, simulated_start: Pose, load: Load) -> DriveSnapshot:
     """What the drives report; nothing of them is changed. Arguments and errors as `open_drives`."""
     with _reached(rig, simulated_start, load) as drives:
         return read_drives(rig, drives.bus, drives.pump)
+
+
+def left_alone(document: RigDocument) -> str:
+    """How drives stand whose master is gone; what is wrong with it, empty where all hold.
+
+    Those that are simulated in the process that is gone are gone, too.
+
+    Args:
+        document: The rig file.
+    """
+    rig = rig_from_document(document)
+    if is_simulated(rig):
+        return ""
+    time.sleep(ALONE)
+    try:
+        told = look_at(rig, rig.home, nothing_in_the_way(rig).load)
+    except CdprError as error:
+        return f"it is not known whether the drives hold: {error.what}"
+    words = told.status_words.tolist()
+    rows = zip(
+        rig.drive_names.values(), drive_states(rig, words), stop_alone(rig, words), strict=True
+    )
+    wrong = [f"{name} is in {state}" for name, state, good in rows if not good]
+    return f"drives do not hold by themselves: {', '.join(wrong)}" if wrong else ""
 
 
 @contextmanager

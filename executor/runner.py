@@ -18,7 +18,7 @@ from executor.cameras.multi_camera import CameraRecords, RunWatch
 from executor.cameras.open import asked_rate, open_cameras, require_no_stop
 from executor.cameras.sources import CameraChoice, require_simulated_pictures, resolve_cameras
 from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
-from executor.drives import drives_of, is_simulated, open_drives, require_own_time
+from executor.drives import drives_of, is_simulated, left_alone, open_drives, require_own_time
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_for_simulating_process
@@ -385,6 +385,7 @@ def _move_in_real_time(
         recorder,
         pose_every=recorder.every if simulated else 0,
         need_real_time=options.need_real_time_rights and not simulated,
+        look_again=partial(left_alone, prepared.rig.document),
         before_motion=armed,
         listener=options.listener,
     )

@@ -15,7 +15,7 @@ from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
 from executor.control.standstill import FaultReset, Release, StandstillMotion
 from executor.current_pose import standing_pose
-from executor.drives import require_other_process, resting_drives_of
+from executor.drives import left_alone, require_other_process, resting_drives_of
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
@@ -277,7 +277,12 @@ def reset(
         with (
             closing(SharedRequests()) as board,
             real_time_process(
-                motion, make_drives, board, need_real_time=False, listener=listener
+                motion,
+                make_drives,
+                board,
+                need_real_time=False,
+                look_again=partial(left_alone, rig.document),
+                listener=listener,
             ) as process,
         ):
             done = reset_drives(interlock, process)
@@ -389,6 +394,7 @@ def _released(
                 partial(resting_drives_of, rig.document),
                 board,
                 need_real_time=need_real_time_rights,
+                look_again=partial(left_alone, rig.document),
                 listener=listener,
             )
         )

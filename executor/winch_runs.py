@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from executor.control.winch_loop import LawMotion, MakeLaw, WinchesHere, WinchMover
 from executor.control.winch_motion import WinchesStand, WinchRecord, move_winches, recording
-from executor.drives import is_simulated, unreferenced_drives_of
+from executor.drives import is_simulated, left_alone, unreferenced_drives_of
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
@@ -176,7 +176,12 @@ def _mover(motion: WinchMotion, board: LocalRequests | SharedRequests) -> Iterat
         ready_for_simulating_process(listener)
     needed = motion.need_real_time_rights and not simulated
     with real_time_process(
-        law, make_drives, board, need_real_time=needed, listener=listener
+        law,
+        make_drives,
+        board,
+        need_real_time=needed,
+        look_again=partial(left_alone, document),
+        listener=listener,
     ) as process:
         yield process
 

@@ -32,6 +32,7 @@ from drivers.cia402.object_dictionary import (
     heartbeat_consumers,
     identity,
     left_out,
+    no_heartbeat_consumers,
     settings_for,
 )
 from drivers.cia402.pdo import NmtCommand
@@ -41,6 +42,7 @@ from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import OnRestarted, Pump
 from model.errors import HardwareMissing, Refused
+from model.files.drive_profile_file import ProfileDocument
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -146,7 +148,7 @@ def configure_drives(
     network.take_waiting()
     for remark in left_out(profile):
         absent.setdefault(remark, []).extend(nodes)
-    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile.monitoring))
+    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))
     return SetUp(remarks, tuple(min(count, rig.cable_count) for count in entries))
 
 
@@ -199,12 +201,18 @@ def _absent(absent: dict[str, list[int]]) -> Iterator[str]:
 
 
 def _unwatched_peers(
-    nodes: Sequence[int], entries: Sequence[int], monitoring: str
+    nodes: Sequence[int], entries: Sequence[int], profile: ProfileDocument
 ) -> Iterator[str]:
     """One remark for all drives that have the same number of heartbeat entries too few."""
+    if profile.heartbeat_loss == "fault":
+        yield (
+            f"{profile.name} drives take a lost heartbeat as a fault, so they monitor none; the"
+            " SYNC time-out alone stops them when the master is lost"
+        )
+        return
     instead = (
         "the master's heartbeat stops the drive"
-        if monitoring == "heartbeat"
+        if profile.monitoring == "heartbeat"
         else "the SYNC time-out stops the drive"
     )
     for count in sorted(set(entries)):
@@ -350,20 +358,24 @@ def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
 def _watch_heartbeats(
     network: SetupNetwork, node: int, rig: Rig, drive: int, wrong: WrongObjects
 ) -> int:
-    """Sets the heartbeat consumer up; returns how many producers it can watch."""
+    """Sets the heartbeat consumer up; returns how many producers it watches, or could watch."""
     entries: list[int] = []
-    if not wrong.note(_count_heartbeats, network, node, profile_of(rig).heartbeat_entries, entries):
+    profile = profile_of(rig)
+    if not wrong.note(_count_heartbeats, network, node, profile, entries):
+        return 0
+    if profile.heartbeat_loss == "fault":
+        _write_all(network, node, no_heartbeat_consumers(entries[0]), wrong)
         return 0
     _write_all(network, node, heartbeat_consumers(rig, drive, entries[0]), wrong)
     return entries[0]
 
 
 def _count_heartbeats(
-    network: SetupNetwork, node: int, most: int | None, entries: list[int]
+    network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
 ) -> None:
     data = network.client(node).read(HEARTBEAT_CONSUMERS, 0, "consumer heartbeat entries")
-    count = int.from_bytes(data, "little")
-    if count < 1:
+    count, most = int.from_bytes(data, "little"), profile.heartbeat_entries
+    if count < 1 and profile.heartbeat_loss == "quick stop":
         raise _wrong(
             node, "1016h:00 consumer heartbeat entries", "0", "1 or more", "watch the master"
         )

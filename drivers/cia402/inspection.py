@@ -27,7 +27,7 @@ from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 from model.errors import Refused
-from model.files.drive_profile_file import object_name
+from model.files.drive_profile_file import ProfileDocument, object_name
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -133,7 +133,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         look.at_state()
         for index, form, name, why in _PROCESS_DATA:
             look.at_setting(Setting(index, 0, form, 0, name, why), "readable")
-        look.at_heartbeats(profile.heartbeat_entries, rig.cable_count)
+        look.at_heartbeats(profile, rig.cable_count)
         for setting in _last_of_each(settings_for(rig, drive, winch_map, None)):
             look.at_setting(setting, _needed(setting))
         for index in UNUSED_PDOS:
@@ -190,23 +190,32 @@ class _Look:
         else:
             row.note(self._node, state.value)
 
-    def at_heartbeats(self, most: int | None, drives: int) -> None:
+    def at_heartbeats(self, profile: ProfileDocument, drives: int) -> None:
         """How many producers the drive can watch."""
-        name = "1016h:00 consumer heartbeat entries"
-        row = self._row(HEARTBEAT_CONSUMERS, 0, name, f"1; {drives} to monitor every peer as well")
-        row.meaning = "stop when the master or a peer is lost"
+        name, needed = "consumer heartbeat entries", f"1; {drives} to monitor every peer as well"
+        used = profile.heartbeat_loss == "quick stop"
+        row = self._row(
+            HEARTBEAT_CONSUMERS, 0, f"1016h:00 {name}", needed if used else "any, not used"
+        )
+        row.meaning = (
+            "stop when the master or a peer is lost"
+            if used
+            else "a lost heartbeat would take the torque off"
+        )
         data = self._read(HEARTBEAT_CONSUMERS, 0, row, optional=False)
         if data is None:
             return
         count = int.from_bytes(data, "little")
-        if count < 1:
+        if not used:
+            row.note(self._node, str(count))
+        elif count < 1:
             row.note(
                 self._node,
                 "0",
                 "wrong",
                 "a drive that cannot monitor its master is not safe to run",
             )
-        elif min(count, most or count) < drives:
+        elif min(count, profile.heartbeat_entries or count) < drives:
             row.note(self._node, str(count), "remark", "none required: not every peer is monitored")
         else:
             row.note(self._node, str(count))

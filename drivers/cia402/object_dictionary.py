@@ -213,6 +213,18 @@ def _within(setting: Setting, profile: ProfileDocument) -> Setting:
     )
 
 
+def no_heartbeat_consumers(entries: int) -> tuple[Setting, ...]:
+    """No heartbeat is watched, whatever a program before this one wrote.
+
+    Args:
+        entries: How many producers the drive can watch (1016h:00).
+    """
+    name, why = "consumer heartbeat time", "a lost heartbeat would take the torque off"
+    return tuple(
+        Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why) for sub in range(1, entries + 1)
+    )
+
+
 def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ...]:
     """Whose heartbeat the drive watches: the master's, then its peers', as far as it has entries.
 

@@ -275,7 +275,9 @@ class Loop:
         try:
             tell()
         except Exception as error:
-            self._listener_error = self._listener_error or f"recording failed: {error}"
+            self._listener_error = (
+                self._listener_error or f"recording failed: {_in_one_line(error)}"
+            )
 
     def _judge(self, findings: tuple[Alarm, ...], lost: str) -> None:
         """Reacts to what the watch saw, and to the loss of those who watch over this loop."""
@@ -360,9 +362,12 @@ class Loop:
             text = f"{_in_one_line(error)}; the drives stop on loss of the master"
             self._tell("bus_lost", text)
             return
-        if before is not None and before.holding and not left.holding:
-            self.holding = not self._taken_over
-            self._tell("not_held", left_otherwise(self._course.rig, before, left))
+        if before is None or left.holding:
+            return
+        self.holding = not self._taken_over
+        silent = np.flatnonzero(before.missing).tolist()
+        if otherwise := left_otherwise(self._course.rig, before, left, silent):
+            self._tell("not_held", otherwise)
 
     def _one_more_latched(self) -> bool:
         """A cycle after a fault; false when the gate denies it, as it will every later one."""

@@ -107,6 +107,7 @@ def run_in_real_time(
     *,
     pose_every: int,
     need_real_time: bool,
+    look_again: Callable[[], str],
     before_motion: Callable[[str], None],
     listener: Listener = SILENT,
 ) -> Outcome:
@@ -119,6 +120,7 @@ def run_in_real_time(
         recorder: Takes in what happens.
         pose_every: Cycles from one true pose of the simulated platform to the next; 0 for none.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
+        look_again: As for `executor.realtime.process.real_time_process`.
         before_motion: Called when all is armed, with what was denied; what it raises prevents the
             motion.
         listener: Receives what the drives cannot do.
@@ -137,7 +139,12 @@ def run_in_real_time(
         reference=reference,
     )
     with real_time_process(
-        motion, make_drives, board, need_real_time=need_real_time, listener=listener
+        motion,
+        make_drives,
+        board,
+        need_real_time=need_real_time,
+        look_again=look_again,
+        listener=listener,
     ) as process:
         denied = process.arm(recorder).denied
         custody.begin(recorder.folder.path, reference)

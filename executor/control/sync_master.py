@@ -10,9 +10,11 @@ between that decision and the SYNC, a quick stop follows at once.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import TypeVar
+
+import numpy as np
 
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
 from drivers.factory import drive_states
@@ -242,19 +244,22 @@ class SyncMaster:
             self.leave(cycle)
 
 
-def left_otherwise(rig: Rig, before: CycleStatus, after: CycleStatus) -> str:
+def left_otherwise(
+    rig: Rig, before: CycleStatus, after: CycleStatus, but: Collection[int] = ()
+) -> str:
     """Which drives report another state after the last SYNC than before it; empty when none does.
 
     Args:
         rig: The robot.
         before: What the drives reported before they were left.
         after: What they reported after the last SYNC.
+        but: Drives, from 0, whose silence is nothing new.
     """
     rows = zip(
         rig.drive_names.values(),
         drive_states(rig, before.status_words.tolist()),
         drive_states(rig, after.status_words.tolist()),
-        after.missing.tolist(),
+        (after.missing & ~np.isin(np.arange(rig.cable_count), list(but))).tolist(),
         strict=True,
     )
     changed = [

@@ -47,6 +47,7 @@ def real_time_process(
     board: SharedRequests,
     *,
     need_real_time: bool,
+    look_again: Callable[[], str],
     listener: Listener = SILENT,
 ) -> Iterator[RealTimeProcess]:
     """A process for one motion; it has ended when the block is left.
@@ -56,11 +57,13 @@ def real_time_process(
         make_drives: Opens and configures the drives; called in that process; picklable.
         board: What the operator wants.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
+        look_again: Asks drives whose process is gone how they stand; what is wrong with it, empty
+            where they hold.
         listener: Receives what the drives cannot do.
     """
     job = Job.of(motion, board.memory, make_drives, need_real_time=need_real_time)
     try:
-        process = RealTimeProcess(job, board, listener)
+        process = RealTimeProcess(job, board, look_again, listener)
         try:
             yield process
         finally:
@@ -72,9 +75,11 @@ def real_time_process(
 class RealTimeProcess:
     """One motion in a process of its own; a `WinchMover`."""
 
-    def __init__(self, job: Job, board: SharedRequests, listener: Listener) -> None:
+    def __init__(
+        self, job: Job, board: SharedRequests, look_again: Callable[[], str], listener: Listener
+    ) -> None:
         """Starts it; it opens the drives."""
-        self._board, self._listener = board, listener
+        self._board, self._look_again, self._listener = board, look_again, listener
         self._wire = CycleRecordCodec(job.motion.cables)
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
         self._records: Records | None = None
@@ -138,8 +143,11 @@ class RealTimeProcess:
         error = said.error if isinstance(said, Failed) else self._died() if over else self._hung()
         self._take_in(self._records)
         self.tell("real_time_lost", error.what)
-        # They hold by themselves, as SYNC stays away.
-        return Ended(State.LATCHED, error.what, holding=True, true_pose=None)
+        doubt = self._look_again()  # they should hold by themselves, as SYNC stays away
+        if doubt:
+            self.tell("not_held", doubt)
+        cause = f"{error.what}; {doubt}" if doubt else error.what
+        return Ended(State.LATCHED, cause, holding=not doubt, true_pose=None)
 
     def stands_now(self) -> CycleStatus:
         """State of the drives after the motion.

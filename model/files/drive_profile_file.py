@@ -123,6 +123,11 @@ class ProfileDocument(Document):
         description="periods of 1006h without SYNC after which a drive stops by itself; with"
         " monitoring heartbeat, the age of SYNC from which on nothing is enabled",
     )
+    heartbeat_loss: Literal["quick stop", "fault"] = Field(
+        default="quick stop",
+        description="what a drive does whose heartbeat producer is lost; fault: it takes its torque"
+        " off whatever 6007h says, so it is given no heartbeat to monitor",
+    )
     acceleration_unit: Literal["counts/s^2", "rpm/s"] = Field(
         default="counts/s^2", description="of 6085h; rpm is of the motor shaft"
     )
@@ -145,6 +150,9 @@ class ProfileDocument(Document):
         return (self._monitoring, self._torque, self._needed)
 
     def _monitoring(self) -> list[Finding]:
+        if self.monitoring == "heartbeat" and self.heartbeat_loss == "fault":
+            what = "drives that take their torque off when the master is lost cannot be run safely"
+            return [(("heartbeat_loss",), what)]
         absent = "1006h:00" in self.absent
         if absent == (self.monitoring == "heartbeat"):
             return []

@@ -305,6 +305,24 @@ def test_a_sync_time_out_that_no_cycle_can_keep_is_refused(tmp_path: Path, perio
         load_profile(str(path))
 
 
+@pytest.mark.parametrize("entries", [0, 1, 8])
+def test_drives_that_let_go_without_a_heartbeat_are_given_none(
+    tmp_path: Path, rig: Rig, entries: int
+) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text("name: Ours\nsources: [our bench]\nheartbeat_loss: fault\n")
+    rig, bus = with_profile(rig, str(path)), eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x1016, 0] = entries
+        for sub in range(1, entries + 1):
+            drive.values[0x1016, sub] = 0x7F0064
+    assert examined(rig, bus).good
+    (remark,) = set_up(rig, bus)
+    assert "monitor none" in remark
+    for drive in bus.drives.values():
+        assert [drive.values[0x1016, sub] for sub in range(1, entries + 1)] == [0] * entries
+
+
 def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
     with pytest.raises(BadInput) as caught:
         settings_for(with_profile(rig, "epos5"), 0, WinchMap(rig))
@@ -318,6 +336,7 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
         ("abscent: []", "absent"),
         ('absent: ["605Ah:00"]', "required for a safe run"),
         ('absent: ["1006h:00"]', "heartbeat"),
+        ('heartbeat_loss: fault\nmonitoring: heartbeat\nabsent: ["1006h:00"]', "torque off"),
         ('absent: ["6072h:00"]', "torque_limit"),
         ('warnings: ["31"]', "3180h"),
         ('ranges: {"60C3h:02": {low: 0, high: 1}}', "60C2h:02"),

@@ -41,7 +41,9 @@ def test_a_motion_that_is_over_leaves_no_stop_behind_on_the_board(
     board, nobody_listens = SharedRequests(), SimpleNamespace()
     motion_on_board: Any = (Still(), print, board)
     try:
-        with real_time_process.real_time_process(*motion_on_board, need_real_time=False) as process:
+        with real_time_process.real_time_process(
+            *motion_on_board, need_real_time=False, look_again=str
+        ) as process:
             process.arm(nobody_listens)  # type: ignore[arg-type]
             if goes:
                 assert process.run().state is State.FINISHED

@@ -81,6 +81,36 @@ def test_a_drive_that_lets_go_after_a_fault_is_told_beside_its_cause(
     assert "cable 4" not in events[-1].text
 
 
+def test_a_second_drive_that_lets_go_after_a_fault_is_told_although_the_first_does_not_hold(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    def fault(stage: Stage) -> None:
+        stage.drives[FIFTH].fail(0x2310)
+        fails_once_left(stage.drives[SIXTH])
+
+    with staged(prepared, tmp_path / "run", at(CRUISING, fault)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+    assert "drive 5" in outcome.cause
+    assert not outcome.holding
+    assert events[-1].code == "not_held"
+    assert "cable 6 (drive 6) went from quick stop active to fault" in events[-1].text
+    assert "drive 5" not in events[-1].text
+
+
+def test_a_drive_that_died_before_the_stop_is_not_told_again_at_the_end(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    def fault(stage: Stage) -> None:
+        stage.drives[FIFTH].silent = True
+
+    with staged(prepared, tmp_path / "run", at(CRUISING, fault)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+    assert "drive 5" in outcome.cause
+    assert "not_held" not in [event.code for event in events]
+
+
 THREE_LINES = Fault("frames cannot be sent", where="can0", why="it is down", next_step="set it up")
 OF_THE_LIBRARY = can.CanOperationError("Network is down [Error Code 100]")
 

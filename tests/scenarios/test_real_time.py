@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,6 +27,7 @@ from tests.scenarios.test_processes import finished, program, told, waited_for
 pytestmark = pytest.mark.slow
 
 AWAY_S = 20.0
+SIXTH = 5
 
 Drives = TypeVar("Drives", bound=SimulatedCia402Rig)
 
@@ -145,6 +146,43 @@ def test_the_death_of_the_real_time_process_is_told_and_the_drives_stop_by_thems
     assert any("killed by signal 9" in reason for reason in summary["reasons"])
     assert [event["code"] for event in summary["events"]][-1] == "real_time_lost"
     assert len(folder.cycles()) == summary["cycles"] > 0
+
+
+def lets_go(rehearsal: SimulatedCia402Rig) -> None:
+    """The loss of the master is a fault of the sixth drive, whatever it was set up to do."""
+    rehearsal.drives[SIXTH]._connection_lost = lambda code: rehearsal.drives[SIXTH].fail(code)  # type: ignore[method-assign]
+
+
+def falls_silent(rehearsal: SimulatedCia402Rig) -> None:
+    """The sixth drive is gone together with the master."""
+    rehearsal.drives[SIXTH].silent = True
+
+
+@pytest.mark.parametrize(
+    ("breaks", "number", "words"),
+    [(lets_go, 5, "(drive 6) is in fault"), (falls_silent, 6, "drive 6")],
+)
+def test_drives_are_asked_how_they_stand_once_their_process_has_died(
+    slow_run: PreparedRun,
+    slow_rig: Path,
+    short_plan: Path,
+    tmp_path: Path,
+    breaks: Callable[[SimulatedCia402Rig], None],
+    number: int,
+    words: str,
+) -> None:
+    run = tmp_path / "run"
+    with moving_over_udp(slow_run, slow_rig, short_plan, run, number) as (process, rehearsal):
+        child = real_time_process(process.pid)
+        os.kill(child, signal.SIGSTOP)
+        breaks(rehearsal)
+        os.kill(child, signal.SIGKILL)
+        out, err = process.communicate()
+    assert process.returncode == 1, (out, err)
+    summary = RunFolder.open(run).summary()
+    assert [event["code"] for event in summary["events"]][-2:] == ["real_time_lost", "not_held"]
+    assert words in summary["events"][-1]["text"]
+    assert any(words in reason for reason in summary["reasons"])
 
 
 def test_a_real_time_process_that_hangs_is_ended_and_told(

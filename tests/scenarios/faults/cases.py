@@ -434,11 +434,11 @@ def complaints(
 
 
 def _said_or_left(fault: Fault, bench: Bench) -> list[str]:
-    """No EMCY before the fault, and none at all of a run that finishes; then all drives hold."""
+    """No EMCY before the fault, and none at all of a run that finishes; whole drives then hold."""
     finishes = fault.ends is State.FINISHED
     until = float("inf") if finishes or bench.since is None else bench.since
     found = emergencies(bench.rehearsal, until, bench.rehearsal.behaviour.warning)
-    return [*found, *left_holding(bench.rehearsal)] if finishes else found
+    return [*found, *left_holding(bench.rehearsal, bench.lost)]
 
 
 HELD_UP = {"drive_silent", "late"}

@@ -20,6 +20,8 @@ WHOLE_RUN = 500.0
 
 IMPATIENT = {"sync_timeout_periods": 1.5}
 ONCE_ENABLED = {"mode_display_when_enabled": True}
+LETS_GO = ("heartbeat-loss-is-fault",)
+UNWATCHED = {"heartbeat_loss": "fault"}
 
 
 def nothing(_bench: Bench) -> None:
@@ -85,7 +87,14 @@ DRIVES: dict[str, Fault] = {
         behaviour=("sync-periods=1.5",),
         profile=IMPATIENT,
     ),
-    "D a lost heartbeat is a fault": with_drives("heartbeat-loss-is-fault"),
+    "D a lost heartbeat is a fault": with_drives(*LETS_GO),
+    "D a lost heartbeat is a fault, as in the profile": with_drives(*LETS_GO, profile=UNWATCHED),
+    **{
+        f"D a lost heartbeat is a fault, {name}": replace(
+            TABLE[name], behaviour=LETS_GO, profile=UNWATCHED, live=False
+        )
+        for name in ("F1 kill -9", "F7 a drive falls silent", "F9 a drive starts anew")
+    },
     "D PDOs mapped when operational": with_drives("maps-when-operational"),
     # In real time their set-up takes minutes, in turn.
     "D SDO answers take 300 ms": replace(with_drives("sdo-delay=300"), live=False),
