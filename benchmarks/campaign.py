@@ -22,8 +22,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from cdpr.cli.demo import RIG
-from cdpr.cli.examples import configs
+from cdpr.cli.plan.demo import RIG
+from cdpr.cli.plan.examples import configs
 from executor import runner
 from executor.recording.run_folder import RunFolder
 from model.errors import CdprError

@@ -29,8 +29,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from cdpr.cli.demo import RIG
-from cdpr.cli.examples import configs
+from cdpr.cli.plan.demo import RIG
+from cdpr.cli.plan.examples import configs
 from drivers.can_load import SLOWEST_TENTHS_MS, TESTED_HZ, check_bus_load
 from executor.control.path_runs import run_in_real_time
 from executor.drives import drives_of

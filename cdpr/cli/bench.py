@@ -10,10 +10,10 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from cdpr.cli.demo import RIG
-from cdpr.cli.examples import configs
 from cdpr.cli.options import DaskOption, WorkersOption
 from cdpr.cli.output import Terminal, out, show_json
+from cdpr.cli.plan.demo import RIG
+from cdpr.cli.plan.examples import configs
 from model.files.output import make_folder
 from model.rig import load_rig
 from model.scene import load_scene

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from cdpr.cli.output import err, out, show_facts, show_json
-from cdpr.cli.plan_facts import stop_facts
+from cdpr.cli.plan.facts import stop_facts
 from drivers.can_bus import IN_PROCESS
 from executor.cameras.sources import describe_cameras
 from executor.homing import ForgetProposal, HomeResult, HomingProposal

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -17,7 +18,6 @@ from cdpr.cli.options import (
     rig_on_bus,
 )
 from cdpr.cli.output import Terminal, out
-from cdpr.cli.supervision import stop_requests
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
 from executor.kernels import ready_to_simulate
 from executor.operator_requests import LocalRequests

@@ -11,9 +11,9 @@ import numpy as np
 import typer
 
 from cdpr.cli.arguments import refuse_overwriting
+from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import Terminal, show_facts, show_json
-from cdpr.cli.supervision import stop_requests
 from executor.cameras.sources import parse_camera_sources
 from executor.operator_requests import LocalRequests
 from executor.track import TrackResult, own_drawing, own_file, require_plan_used, track_sources

@@ -96,59 +96,76 @@ PLAN = (
     Verb(
         "demo",
         "Plan, check, run on simulated drives, track with a synthetic camera, and report.",
+        "plan.demo:demo",
     ),
-    Verb("examples", "List the ready rigs, scenes and recorded sessions, or copy some of them."),
-    Verb("new", "Ask for the essentials of a rig, and write a commented rig file."),
-    Verb("plan", "Plan a collision-free path and write it to a file."),
+    Verb(
+        "examples",
+        "List the ready rigs, scenes and recorded sessions, or copy some of them.",
+        "plan.examples:examples",
+    ),
+    Verb("new", "Ask for the essentials of a rig, and write a commented rig file.", "plan.new:new"),
+    Verb("plan", "Plan a collision-free path and write it to a file.", "plan.search:plan"),
     Verb(
         "check",
         "Check a plan with an independent method: distances at dense poses, with bounds.",
+        "plan.check:check",
     ),
 )
 OPERATE = (
     Verb(
         "run",
         "Run a plan: check it, compute set-points, arm the drives, move, measure, report.",
+        "operate.run:run",
     ),
     Verb(
         "stop",
         "Stop every run of this user: all drives slow down together along the path, then hold.",
+        "operate.stop:stop",
     ),
     Verb(
         "hold",
         "Feed hold: the platform slows down along the path and waits there under tension.",
-        "operate:hold",
+        "operate.feed:hold",
     ),
     Verb(
         "resume",
         "Continue after `cdpr hold`, at the last requested speed.",
-        "operate:resume",
+        "operate.feed:resume",
     ),
     Verb(
         "speed",
         "Scale the speed along the path to a percentage of the planned one.",
-        "operate:speed",
+        "operate.feed:speed",
     ),
     Verb(
         "monitor",
         "Show a run live: state, drives, tensions, lateness, progress and events.",
+        "operate.monitor:monitor",
     ),
     Verb(
         "status",
         "Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.",
+        "operate.status:status",
     ),
     Verb(
         "reset",
         "Release a latched fault once its cause is removed: resets drives in fault, moves nothing.",
+        "operate.reset:reset",
     ),
     Verb(
         "home",
         "Pretension all cables, then set the encoder reference at a known pose.",
+        "operate.home:home",
     ),
-    Verb("jog", "Move the platform straight slowly by a few millimetres from its present pose."),
+    Verb(
+        "jog",
+        "Move the platform straight slowly by a few millimetres from its present pose.",
+        "operate.jog:jog",
+    ),
     Verb(
         "release",
         "Release the drives with the platform on a support: close brakes, remove torque.",
+        "operate.release:release",
     ),
 )
 SET_UP = (

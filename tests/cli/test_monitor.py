@@ -11,7 +11,7 @@ import pytest
 import typer
 from rich.console import Console
 
-from cdpr.cli.monitor import _lines, _plain, _view
+from cdpr.cli.operate.monitor import _lines, _plain, _view
 from executor.operator_requests import LocalRequests
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State

@@ -12,8 +12,8 @@ import pytest
 
 from calibration.results import write_result
 from cdpr.cli.facts import show_summary
+from cdpr.cli.operate.status import _next_step
 from cdpr.cli.output import progress_bar
-from cdpr.cli.status import _next_step
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as told
 from model.errors import Fault

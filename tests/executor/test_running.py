@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.cli.supervision import STOP_SIGNALS, stop_requests
+from cdpr.cli.operate.supervision import STOP_SIGNALS, stop_requests
 from executor.operator_requests import LocalRequests
 from executor.remote.registry import advertised, find_runs
 from model.errors import Refused
@@ -23,7 +23,7 @@ from model.errors import Refused
 #: A run as the command line makes one: tells that it is advertised, ends when it was asked to.
 RUN = """
 import signal
-from cdpr.cli.supervision import stop_requests
+from cdpr.cli.operate.supervision import stop_requests
 from executor.remote.registry import advertised
 from executor.operator_requests import LocalRequests
 board = LocalRequests()

@@ -33,7 +33,7 @@ NODES = range(1, 9)
 # What the programs import inside their functions: once here, before they are forked, since an
 # import takes long where instructions are counted.
 for module in (
-    "cdpr.cli.run",
+    "cdpr.cli.operate.run",
     "cdpr.cli.sim",
     "cv2",
     "drivers.cia402.group",

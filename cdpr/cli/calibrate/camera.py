@@ -16,9 +16,9 @@ from calibration.results import require_file_name
 from calibration.targets.board import Board
 from cdpr.cli.calibrate.board_options import BoardOptions
 from cdpr.cli.calibrate.output import FolderOption, ForceOption, WantedOption, show_calibration
+from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import JsonOption, with_option_groups
 from cdpr.cli.output import Terminal, err
-from cdpr.cli.supervision import stop_requests
 from executor.cameras.sources import require_camera_source
 from executor.operator_requests import LocalRequests
 from model.errors import BadInput

@@ -18,7 +18,7 @@ from cdpr.cli.options import (
     calibrated_rig,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
-from cdpr.cli.plan_facts import facts_of, sentences_of
+from cdpr.cli.plan.facts import facts_of, sentences_of
 from model.files.output import require_new_file
 from model.plan import save_plan
 from model.rig import load_rig

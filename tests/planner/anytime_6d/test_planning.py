@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from cdpr.cli.plan_facts import sentences_of
+from cdpr.cli.plan.facts import sentences_of
 from model.errors import BadInput, InvalidFile, NoSolution
 from model.files.plan_file import PlanDocument
 from model.plan import load_plan, plan_from_document, save_plan

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from cdpr.cli.facts import show_forgotten, show_home, show_homing
+from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -21,7 +22,6 @@ from cdpr.cli.options import (
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, out, show_json
-from cdpr.cli.supervision import SignalSupervisor, confirmation
 from executor import homing
 from executor.drives import is_simulated, require_own_time
 from executor.homing import (

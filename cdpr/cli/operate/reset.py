@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from cdpr.cli.facts import reference_dict, reference_text, show_reset
+from cdpr.cli.operate.supervision import confirmation
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -13,7 +14,6 @@ from cdpr.cli.options import (
     rig_on_bus,
 )
 from cdpr.cli.output import Terminal, out, show_json
-from cdpr.cli.supervision import confirmation
 from executor import service
 
 

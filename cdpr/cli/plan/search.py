@@ -23,8 +23,8 @@ from cdpr.cli.options import (
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
-from cdpr.cli.plan_facts import facts_of, sentences_of
-from cdpr.cli.plan_options import DEFAULT_SEARCH, SearchOptions
+from cdpr.cli.plan.facts import facts_of, sentences_of
+from cdpr.cli.plan.options import DEFAULT_SEARCH, SearchOptions
 from executor.recording.resume import require_room, scene_after
 from model.errors import BadInput
 from model.files.documents import millimetres

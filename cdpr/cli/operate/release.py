@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from cdpr.cli.facts import reference_dict, reference_text, show_release
+from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -14,7 +15,6 @@ from cdpr.cli.options import (
     rig_on_bus,
 )
 from cdpr.cli.output import Terminal, out, show_json
-from cdpr.cli.supervision import SignalSupervisor, confirmation
 from executor import service
 
 

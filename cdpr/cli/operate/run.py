@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from cdpr.cli.facts import show_missing, show_prepared, show_summary
+from cdpr.cli.operate.supervision import RunSupervisor, confirmation, say
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -22,7 +23,6 @@ from cdpr.cli.options import (
     rig_on_bus,
 )
 from cdpr.cli.output import Terminal, out
-from cdpr.cli.supervision import RunSupervisor, confirmation, say
 from drivers.can_bus import IN_PROCESS
 from executor import runner
 from executor.drives import is_simulated

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from cdpr.cli.facts import show_cable
+from cdpr.cli.operate.run import agreement, show, show_files
+from cdpr.cli.operate.supervision import RunSupervisor, SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -23,8 +25,6 @@ from cdpr.cli.options import (
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, out, show_json
-from cdpr.cli.run import agreement, show, show_files
-from cdpr.cli.supervision import RunSupervisor, SignalSupervisor, confirmation
 from executor import jogging
 from executor.drives import is_simulated, require_own_time
 from executor.jogging import FASTEST, SPEED

@@ -10,7 +10,7 @@ import typer
 
 from cdpr.cli.options import JsonOption
 from cdpr.cli.output import Terminal, out, show_facts, show_json
-from cdpr.cli.plan_facts import stop_facts
+from cdpr.cli.plan.facts import stop_facts
 from model.plan import load_plan, require_same_rig
 from model.rig import load_rig
 from planner.check import check_path

@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.examples import configs
+from cdpr.cli.operate.run import agreement, show, show_files
+from cdpr.cli.operate.supervision import RunSupervisor
 from cdpr.cli.output import Terminal, out, show_facts
-from cdpr.cli.plan_facts import sentences_of
-from cdpr.cli.run import agreement, show, show_files
-from cdpr.cli.supervision import RunSupervisor
+from cdpr.cli.plan.examples import configs
+from cdpr.cli.plan.facts import sentences_of
 from executor import runner
 from executor.recording.run_course import free_folder
 from executor.recording.run_folder import RunFolder

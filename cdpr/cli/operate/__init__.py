@@ -1,0 +1,1 @@
+"""The verbs of panel "Operate"; each is imported when it is called."""
