@@ -269,9 +269,9 @@ class CyclicGroup(ABC):
             )
 
     @property
-    @abstractmethod
     def stopping(self) -> bool:
-        """A stop is under way that needs more cycles."""
+        """A stop is under way that needs more cycles; never where drives finish it themselves."""
+        return False
 
     def _refuse_latched(self, wish: str) -> None:
         """After a fault nothing is done to the drives but stopping and resetting them.

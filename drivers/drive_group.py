@@ -278,12 +278,14 @@ class DriveGroup(Protocol):
         """
         ...
 
-    def is_monitored(self, *, silent_too: bool) -> bool:
-        """Whether drives still watch this master, as far as they have confirmed the contrary.
+    @property
+    def ending(self) -> frozenset[int]:
+        """Drives, from 0, that have not answered all that ends their monitoring of this master."""
+        ...
 
-        Args:
-            silent_too: Drives that do not answer any more count as well.
-        """
+    @property
+    def is_monitored(self) -> bool:
+        """Whether drives still watch this master, as far as they have confirmed the contrary."""
         ...
 
     def look(self, pace: Pace) -> CycleStatus:

@@ -32,7 +32,6 @@ from drivers.cia402.object_dictionary import (
     heartbeat_consumers,
     identity,
     left_out,
-    no_heartbeat_consumers,
     settings_for,
 )
 from drivers.cia402.pdo import NmtCommand
@@ -115,25 +114,26 @@ def configure_drives(
     require_answers(network, nodes)
     _refuse_duplicates(network)
     wrong = WrongObjects()
+    entries: list[int] = []
     for drive, node in enumerate(nodes):
         for expected in (*BEFORE, *identity(rig), *expected_by(profile)):
             wrong.note(_expect, network, node, expected)
         wrong.note(_check_idle, network, node, to_reset)
         for setting in settings[drive]:
             wrong.note(_require_there, network, node, setting)
+        wrong.note(_count_heartbeats, network, node, profile, entries)
     wrong.refuse()
     _refuse_duplicates(network)
     on_restarted(
         tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
     )
-    entries = []
     absent: dict[str, list[int]] = {}
     for drive, node in enumerate(nodes):
         network.command(NmtCommand.PRE_OPERATIONAL, node)
         wrong.note(_switch_off_used, network, node)
         for remark in _write_all(network, node, settings[drive], wrong):
             absent.setdefault(remark, []).append(node)
-        entries.append(_watch_heartbeats(network, node, rig, drive, wrong))
+        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), wrong)
         refused: list[str] = []
         wrong.note(_switch_off_unused, network, node, refused)
         for remark in refused:
@@ -149,7 +149,10 @@ def configure_drives(
     for remark in left_out(profile):
         absent.setdefault(remark, []).extend(nodes)
     remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))
-    return SetUp(remarks, tuple(min(count, rig.cable_count) for count in entries))
+    watched = (
+        min(count, rig.cable_count) if profile.watches_heartbeats else 0 for count in entries
+    )
+    return SetUp(remarks, tuple(watched))
 
 
 class WrongObjects:
@@ -184,7 +187,7 @@ def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting
     """Whether it holds what only a set-up gives it: a drive that starts again forgets it."""
     client = network.client(node)
     return all(
-        client.read(setting.index, setting.sub, setting.name) == setting.data()
+        client.read(setting.index, setting.sub, setting.name, setting.size) == setting.data()
         for setting in settings
         if setting.index in FORGOTTEN
     )
@@ -204,10 +207,15 @@ def _unwatched_peers(
     nodes: Sequence[int], entries: Sequence[int], profile: ProfileDocument
 ) -> Iterator[str]:
     """One remark for all drives that have the same number of heartbeat entries too few."""
-    if profile.heartbeat_loss == "fault":
+    if not profile.watches_heartbeats:
+        reason = (
+            "take a lost heartbeat as a fault"
+            if profile.heartbeat_loss == "fault"
+            else "have no heartbeat consumer"
+        )
         yield (
-            f"{profile.name} drives take a lost heartbeat as a fault, so they monitor none; the"
-            " SYNC time-out alone stops them when the master is lost"
+            f"{profile.name} drives {reason}, so they monitor none; the SYNC time-out alone stops"
+            " them when the master is lost"
         )
         return
     instead = (
@@ -266,7 +274,7 @@ def _require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
     if setting.optional or setting.transient:
         return
     try:
-        network.client(node).read(setting.index, setting.sub, setting.name)
+        network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused as error:
         if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
             raise
@@ -276,7 +284,7 @@ def _await_mode(network: SetupNetwork, node: int) -> None:
     """The mode that was written shows within `MODE_WAIT`; drives need not follow at once."""
     deadline = network.clock() + MODE_WAIT
     for _ in range(MODE_ASKED):
-        data = network.client(node).read(MODE_DISPLAY.index, 0, MODE_DISPLAY.name)
+        data = network.client(node).read(MODE_DISPLAY.index, 0, MODE_DISPLAY.name, 1)
         if int.from_bytes(data, "little") == MODE_DISPLAY.expected or network.clock() >= deadline:
             break
         network.wait(MODE_WAIT / MODE_ASKED)
@@ -288,7 +296,7 @@ _STATUS_WORD = "object 6041h:00 status word"
 
 def _check_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
     """A drive that is enabled belongs to somebody; one that holds in quick stop may be taken."""
-    data = network.client(node).read(0x6041, 0, "status word")
+    data = network.client(node).read(0x6041, 0, "status word", 2)
     state = state_of(int.from_bytes(data, "little"))
     if state in FAULTED and not to_reset:
         why = "it stopped itself; see its display or maker's tool for the cause"
@@ -340,7 +348,7 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         return
     if setting.transient:
         return
-    kept = client.read(setting.index, setting.sub, setting.name)
+    kept = client.read(setting.index, setting.sub, setting.name, setting.size)
     if not setting.is_kept(kept):
         found = _number(kept, setting.form)
         raise _wrong(node, str(setting), found, str(setting.value), setting.why)
@@ -349,36 +357,26 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
 def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
     """Whether an object that cannot be written holds what it must anyway."""
     try:
-        kept = network.client(node).read(setting.index, setting.sub, setting.name)
+        kept = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused:
         return False
     return setting.is_kept(kept)
 
 
-def _watch_heartbeats(
-    network: SetupNetwork, node: int, rig: Rig, drive: int, wrong: WrongObjects
-) -> int:
-    """Sets the heartbeat consumer up; returns how many producers it watches, or could watch."""
-    entries: list[int] = []
-    profile = profile_of(rig)
-    if not wrong.note(_count_heartbeats, network, node, profile, entries):
-        return 0
-    if profile.heartbeat_loss == "fault":
-        _write_all(network, node, no_heartbeat_consumers(entries[0]), wrong)
-        return 0
-    _write_all(network, node, heartbeat_consumers(rig, drive, entries[0]), wrong)
-    return entries[0]
-
-
 def _count_heartbeats(
     network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
 ) -> None:
-    data = network.client(node).read(HEARTBEAT_CONSUMERS, 0, "consumer heartbeat entries")
-    count, most = int.from_bytes(data, "little"), profile.heartbeat_entries
-    if count < 1 and profile.heartbeat_loss == "quick stop":
-        raise _wrong(
-            node, "1016h:00 consumer heartbeat entries", "0", "1 or more", "watch the master"
-        )
+    """How many entries of 1016h the drive has, as far as the profile uses them."""
+    name, client, needed = (
+        "consumer heartbeat entries",
+        network.client(node),
+        profile.watches_heartbeats,
+    )
+    read = client.read if needed else client.read_if_there
+    data = read(HEARTBEAT_CONSUMERS, 0, name, 1) if profile.has(HEARTBEAT_CONSUMERS, 1) else None
+    count, most = int.from_bytes(data or b"", "little"), profile.heartbeat_entries
+    if count < 1 and needed:
+        raise _wrong(node, f"1016h:00 {name}", "0", "1 or more", "watch the master")
     entries.append(count if most is None else min(count, most))
 
 

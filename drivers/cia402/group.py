@@ -29,6 +29,7 @@ from drivers.cia402.sdo_jobs import (
 )
 from drivers.cia402.state_machine import (
     FAULTED,
+    HOLDS,
     ControlWord,
     DriveState,
     Goal,
@@ -49,9 +50,6 @@ from drivers.drive_group import (
 from drivers.plausibility import largest_steps, require_within_limits, winding_signs
 from model.errors import HardwareMissing, Refused
 from model.rig import Rig
-
-STEP_TIMEOUT = 1.0
-"""For enabling and for releasing, [s]: a brake takes a few tenths to open or close."""
 
 RESET_CYCLES = 10
 """Cycles a drive has to leave the state FAULT after a reset."""
@@ -80,13 +78,12 @@ class Cia402Group(CyclicGroup):
         self._cycle_s, self._profile = cycle, profile_of(rig)
         self._answer_time = self._profile.sdo_timeout_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
-        self._patience = max(3, round(STEP_TIMEOUT / cycle))
+        self._patience = max(3, round(self._profile.enable_timeout_ms / 1000.0 / cycle))
         self._again_after = max(1, round(ASKED_AGAIN_AFTER / cycle))
         self._max_tension = max_tension
         self._max_steps = largest_steps(rig, cycle)
         self._restarted: tuple[int, ...] = ()
-        self._simulated = False
-        self._heartbeats = (1,) * rig.cable_count
+        self._simulated, self._heartbeats = False, (1,) * rig.cable_count
         self._reset_memory()
 
     def _reset_memory(self) -> None:
@@ -140,11 +137,6 @@ class Cia402Group(CyclicGroup):
         return self._restarted
 
     @property
-    def stopping(self) -> bool:
-        """Never: the drives finish a stop by themselves."""
-        return False
-
-    @property
     def targets(self) -> Counts:
         """Targets last sent, shape (m,), [counts]."""
         return np.array(self._targets, dtype=np.int64)
@@ -190,10 +182,9 @@ class Cia402Group(CyclicGroup):
             agreed += 1
             if agreed == FIRST_READINGS:
                 return status
-        silent = [n for n, missing in zip(self._nodes, status.missing, strict=True) if missing]
-        names = ", ".join(str(node) for node in silent)
+        names = ", ".join(str(self._nodes[drive]) for drive in np.flatnonzero(status.missing))
         raise HardwareMissing(
-            f"no position from drive{'s' if len(silent) > 1 else ''} {names}",
+            f"no position from drive{'s' if ',' in names else ''} {names}",
             where="reading the drives' positions",
             why="the drive lost power or the bus after it was configured",
             next_step="check power and wiring, then start again",
@@ -206,8 +197,12 @@ class Cia402Group(CyclicGroup):
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
         self._discard_stale()
+        if self._goal is not Goal.RESET_FAULT:  # what has come since the last cycle stops this one
+            self._latch(self._news())
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._told_to_stop)
+        if self._goal in (Goal.ENABLE, Goal.RELEASE) and self._watch.is_unjudged:
+            words = self._words  # no further step before it is known whether a drive is in fault
         if ControlWord.ENABLE_OPERATION in words:
             self._left_stop = True
         self._demands = self._targets if self._known else list(self._watch.positions)
@@ -245,22 +240,24 @@ class Cia402Group(CyclicGroup):
         self._stop()  # first: whatever the bus does now, no later cycle enables the drives again
         self._send((ControlWord.QUICK_STOP,) * len(self._nodes), lambda _enables: True)
 
-    def is_monitored(self, *, silent_too: bool) -> bool:
-        """Whether drives still watch this master; see `DriveGroup.is_monitored`."""
+    @property
+    def ending(self) -> frozenset[int]:
+        """Drives whose monitoring is being switched off; see `DriveGroup.ending`."""
         if self._unwatching is None:
-            return True
-        left = self._unwatching.unfinished()
-        return bool(left | self._unwatching.refused() if silent_too else left & self._answering)
+            return frozenset()
+        return frozenset(map(self._nodes.index, self._unwatching.unfinished()))
 
     @property
-    def _answering(self) -> set[int]:
-        return {n for n, heard in zip(self._nodes, self._watch.answered, strict=True) if heard}
+    def is_monitored(self) -> bool:
+        """Whether drives still watch this master; see `DriveGroup.is_monitored`."""
+        jobs = self._unwatching
+        return jobs is None or bool(jobs.unfinished() | jobs.refused())
 
     def look(self, pace: Pace) -> CycleStatus:
         """Asks every drive by SDO how it stands; see `DriveGroup.look`."""
         self._online()
         jobs = SdoJobs(dict.fromkeys(self._nodes, STANDING), self._again_after)
-        silent = set(self._nodes) - self._answering
+        silent = {self._nodes[i] for i, heard in enumerate(self._watch.answered) if not heard}
         self._watch.begin_cycle()
         self._watch.on_answer = jobs.take
         for number in range(round(len(STANDING) * self._answer_time / self._cycle_s)):
@@ -317,29 +314,34 @@ class Cia402Group(CyclicGroup):
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
         warnings = self._watch.warnings()
         self._warnings = warnings if powered else ()
-        found = self._watch.news()
-        if not powered:  # an emergency of a drive that moves nothing becomes its state's reason
-            found = [(node, text) for node, text in found if node in self._watch.restarted]
-        found += self._stopped_by_themselves()
+        found = [*self._news(), *self._stopped_by_themselves()]
         told = {text for _, text in (*self._faults, *found)}
         found += self._watch.state_faults(told, powered=powered)
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
 
+    def _news(self) -> list[tuple[int, str]]:
+        """What drives sent since the last call that is a fault whatever they reply."""
+        found = self._watch.news()
+        if self._goal in (Goal.ENABLE, Goal.RELEASE):
+            return found
+        # An emergency of a drive that moves nothing becomes its state's reason.
+        return [(node, text) for node, text in found if node in self._watch.restarted]
+
     def _stopped_by_themselves(self) -> list[tuple[int, str]]:
-        """Drives that left OPERATION ENABLED without being commanded to; not those in fault.
+        """Drives that left a state without being commanded to; not those in fault.
 
         On the way to a release they leave it for SWITCHED ON; one that is back in quick stop after
         it was enabled must not be enabled again.
         """
-        dropped = self._watch.dropped()
+        dropped, let_go = self._watch.dropped(), self._watch.let_go()
         states = dict(zip(self._nodes, self._watch.states, strict=True))
         if self._goal is Goal.ENABLE:
             return [fault for fault in dropped if states[fault[0]] not in FAULTED]
         if self._goal is Goal.RELEASE and self._left_stop:
             back = DriveState.QUICK_STOP_ACTIVE
             return [fault for fault in dropped if states[fault[0]] is back]
-        return []
+        return let_go if self._goal in (Goal.STOP, Goal.IDLE) else []
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:
@@ -384,9 +386,10 @@ class Cia402Group(CyclicGroup):
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
 
     def _late(self, wanted: tuple[DriveState, ...]) -> list[tuple[int, str]]:
-        names, way = self._rig.drive_names, f"on the way to {wanted[-1].value}"
+        seconds = f"{self._patience * self._cycle_s:g} s (enable_timeout_ms of its profile)"
+        names, way = self._rig.drive_names, f"on the way to {wanted[-1].value} after {seconds}"
         states = zip(self._nodes, self._watch.states, strict=True)
-        return [(n, f"{names[n]} stays in {s.value} {way}") for n, s in states if s not in wanted]
+        return [(n, f"{names[n]} is in {s.value} {way}") for n, s in states if s not in wanted]
 
     def _status(self) -> CycleStatus:
         watch = self._watch
@@ -405,10 +408,7 @@ class Cia402Group(CyclicGroup):
             missing=missing,
             faults=tuple(self._faults),
             state=self._state,
-            holding=all(
-                s in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
-                for s in watch.states
-            ),
+            holding=all(s in HOLDS for s in watch.states),
             stopped=DriveState.OPERATION_ENABLED not in watch.states and not missing.any(),
             rejected=watch.rejected,
             error_frames=self._cyclic.error_frames,

@@ -193,7 +193,7 @@ class _Look:
     def at_heartbeats(self, profile: ProfileDocument, drives: int) -> None:
         """How many producers the drive can watch."""
         name, needed = "consumer heartbeat entries", f"1; {drives} to monitor every peer as well"
-        used = profile.heartbeat_loss == "quick stop"
+        used = profile.watches_heartbeats
         row = self._row(
             HEARTBEAT_CONSUMERS, 0, f"1016h:00 {name}", needed if used else "any, not used"
         )
@@ -202,7 +202,7 @@ class _Look:
             if used
             else "a lost heartbeat would take the torque off"
         )
-        data = self._read(HEARTBEAT_CONSUMERS, 0, row, optional=False)
+        data = self._read(HEARTBEAT_CONSUMERS, 0, row, optional=not used, size=1)
         if data is None:
             return
         count = int.from_bytes(data, "little")
@@ -226,11 +226,13 @@ class _Look:
         row.meaning = setting.why
         if row.needed != needed:
             row.needed = "its own value, written at set-up"
-        data = self._read(setting.index, setting.sub, row, setting.optional, setting.instead)
+        data = self._read(
+            setting.index, setting.sub, row, setting.optional, setting.instead, setting.size
+        )
         if data is None:
             return
-        if len(data) != struct.calcsize(setting.form):
-            text = f"{len(data)} bytes, not {struct.calcsize(setting.form)}"
+        if len(data) != setting.size:
+            text = f"{len(data)} bytes, not {setting.size}"
             row.note(self._node, text, "wrong", "compare with the drive's manual")
         else:
             row.note(self._node, str(struct.unpack(setting.form, data)[0]))
@@ -255,11 +257,17 @@ class _Look:
         return self._rows.setdefault((index, sub), ObjectRow(text, needed, ""))
 
     def _read(
-        self, index: int, sub: int, row: ObjectRow, optional: bool, instead: str = ""
+        self,
+        index: int,
+        sub: int,
+        row: ObjectRow,
+        optional: bool,
+        instead: str = "",
+        size: int = 4,
     ) -> bytes | None:
         """The object; None where it cannot be read, which is noted."""
         try:
-            return self._client.read(index, sub, row.object)
+            return self._client.read(index, sub, row.object, size)
         except Refused as error:
             code = error.values.get("abort_code")
             if code is None:

@@ -17,7 +17,7 @@ from drivers.cia402.pdo import (
     parse_reply,
 )
 from drivers.cia402.sdo_jobs import STANDING, SdoRequest
-from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState, state_of
+from drivers.cia402.state_machine import FAULTED, HOLDS, TORQUE_ON, DriveState, state_of
 from drivers.drive_group import DriveWarning
 from drivers.plausibility import ReplyCheck
 from model.errors import Refused
@@ -64,7 +64,9 @@ class DriveMonitor:
         self._warnings: list[DriveWarning] = []
         self._news: list[tuple[int, str]] = []
         self._dropped: list[tuple[int, str]] = []
+        self._let_go: list[tuple[int, str]] = []
         self._emergencies: dict[int, str] = {}
+        self._over: set[int] = set()
         self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
         self._others = {EMCY_BASE + node: self._emergency for node in nodes}
         self._others |= {HEARTBEAT_BASE + node: self._heartbeat for node in nodes}
@@ -126,10 +128,15 @@ class DriveMonitor:
         self.states[drive] = state
         self._judge(self.nodes[drive], state)
         if before is DriveState.OPERATION_ENABLED and state is not before:
-            node = self.nodes[drive]
-            cause = self._emergencies.get(node)
-            text = f"{self._names[node]} stopped on its own: {state.value}"
-            self._dropped.append((node, f"{text}; {cause}" if cause else text))
+            self._dropped.append(self._with_cause(drive, f"stopped on its own: {state.value}"))
+        if before in HOLDS and state not in TORQUE_ON and state not in FAULTED:
+            self._let_go.append(self._with_cause(drive, f"lost its torque: {state.value}"))
+
+    def _with_cause(self, drive: int, what: str) -> tuple[int, str]:
+        node = self.nodes[drive]
+        cause = None if node in self._over else self._emergencies.get(node)
+        text = f"{self._names[node]} {what}"
+        return node, f"{text}; {cause}" if cause else text
 
     def _judge(self, node: int, state: DriveState) -> None:
         """What a drive reported before this SYNC is a warning if the drive is still enabled.
@@ -171,6 +178,16 @@ class DriveMonitor:
         dropped, self._dropped = self._dropped, []
         return dropped
 
+    def let_go(self) -> list[tuple[int, str]]:
+        """Drives that held and are without torque, but for those in fault; since the last call."""
+        let_go, self._let_go = self._let_go, []
+        return let_go
+
+    @property
+    def is_unjudged(self) -> bool:
+        """An enabled drive sent an emergency, and its next reply says whether it is a fault."""
+        return any(warning.stops for warning in (*self._reported, *self._to_judge))
+
     def state_faults(self, known: Container[str], *, powered: bool) -> list[tuple[int, str]]:
         """What is wrong with the drives as they stand, by node.
 
@@ -185,12 +202,11 @@ class DriveMonitor:
         for node, state in zip(self.nodes, self.states, strict=True):
             if state not in FAULTED:
                 continue
-            name, cause = (
-                self._names[node],
-                self._emergencies.get(node, "no emergency message received"),
-            )
+            name = self._names[node]
+            cause = self._emergencies.get(node, "no emergency message received")
             if f"{name}: {cause}" not in known:
-                found.append((node, f"{name} is in {state.value}: {cause}"))
+                since = ", reported as over since" if node in self._over else ""
+                found.append((node, f"{name} is in {state.value}: {cause}{since}"))
         return found + (self._check.faults() if powered else [])
 
     def require_resettable(self) -> list[int]:
@@ -220,6 +236,7 @@ class DriveMonitor:
     def forget_emergencies(self) -> None:
         """After a reset by the operator."""
         self._emergencies.clear()
+        self._over.clear()
         self._news.clear()
         self._reported, self._to_judge, self._warnings = [], [], []
 
@@ -230,11 +247,12 @@ class DriveMonitor:
         elif message.code & 0xFF00:
             text = emergency_text(message.code)
             self._take_emergency(node, message.code, text)
-        else:
-            self._emergencies.pop(node, None)  # "no error": what it reported before is over
+        elif node in self._emergencies:  # over, and still the best reason there is for a fault
+            self._over.add(node)
 
     def _take_emergency(self, node: int, code: int, text: str) -> None:
         self._emergencies[node] = text
+        self._over.discard(node)
         told = f"{self._names[node]}: {text}"
         state = self.states[self.nodes.index(node)]
         if self._is_warning(code) and state not in FAULTED:

@@ -76,6 +76,11 @@ class Setting:
                 next_step="check the winches, the cycle and the drive profile of the rig file",
             ) from None
 
+    @property
+    def size(self) -> int:
+        """Of the value, [bytes]."""
+        return struct.calcsize(self.form)
+
     def is_kept(self, data: bytes) -> bool:
         """Whether what the drive holds is what was to be written."""
         if len(data) != struct.calcsize(self.form) or not self.mask:
@@ -170,7 +175,7 @@ def settings_for(
     tension = rig.max_tension if max_tension is None else max_tension
     settings = (
         *_process_data(rig.winches[drive].node_id),
-        *_supervision(cycle),
+        *_supervision(cycle, profile.monitoring == "sync"),
         *_mode(cycle, profile),
         *_reactions(rig, drive, cycle, profile),
         *_limits(rig, drive, winch_map, tension, profile),
@@ -213,26 +218,21 @@ def _within(setting: Setting, profile: ProfileDocument) -> Setting:
     )
 
 
-def no_heartbeat_consumers(entries: int) -> tuple[Setting, ...]:
-    """No heartbeat is watched, whatever a program before this one wrote.
-
-    Args:
-        entries: How many producers the drive can watch (1016h:00).
-    """
-    name, why = "consumer heartbeat time", "a lost heartbeat would take the torque off"
-    return tuple(
-        Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why) for sub in range(1, entries + 1)
-    )
-
-
 def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ...]:
     """Whose heartbeat the drive watches: the master's, then its peers', as far as it has entries.
+
+    None where its loss would take the torque off, whatever a program before this one wrote.
 
     Args:
         rig: The robot.
         drive: Place of the winch in the rig file, from 0.
         entries: How many producers the drive can watch (1016h:00).
     """
+    if not profile_of(rig).watches_heartbeats:
+        name, why = "consumer heartbeat time", "a lost heartbeat would take the torque off"
+        return tuple(
+            Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why) for sub in range(1, entries + 1)
+        )
     time_ms = math.ceil(1000 * heartbeat_timeout(rig.document.bus.cycle_ms / 1000.0))
     peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
     return tuple(
@@ -322,11 +322,12 @@ def _mapped(
     )
 
 
-def _supervision(cycle: float) -> tuple[Setting, ...]:
-    period_us = round(1e6 * cycle)
+def _supervision(cycle: float, sync: bool = True) -> tuple[Setting, ...]:
+    period_us = round(1e6 * cycle) if sync else 0
+    why = "the cycle of the rig" if sync else "a missed SYNC would take the torque off"
     produced_ms = round(1000 * cycle * heartbeat_cycles(cycle))
     return (
-        Setting(0x1006, 0, "<I", period_us, "communication cycle period", "the cycle of the rig"),
+        Setting(0x1006, 0, "<I", period_us, "communication cycle period", why),
         Setting(
             *(0x1007, 0, "<I", 0, "synchronous window length", "no window: set-points may be late"),
             optional=True,

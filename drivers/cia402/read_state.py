@@ -27,14 +27,15 @@ def look(rig: Rig, bus: can.BusABC, pump: Pump | None) -> DriveSnapshot:
     require_answers(network, nodes)
     winch_map = WinchMap(rig)
 
-    def read(index: int, name: str) -> list[int]:
-        data = [network.client(node).read(index, 0, name) for node in nodes]
+    def read(index: int, name: str, size: int) -> list[int]:
+        data = [network.client(node).read(index, 0, name, size) for node in nodes]
         return [int.from_bytes(value, "little", signed=True) for value in data]
 
-    words = [word & 0xFFFF for word in read(0x6041, "status word")]
+    words = [word & 0xFFFF for word in read(0x6041, "status word", 2)]
     return DriveSnapshot(
-        positions=np.array(read(0x6064, "position actual value"), dtype=np.int64),
-        torques=np.array(read(0x6077, "torque actual value"), dtype=np.int64) * winding_signs(rig),
+        positions=np.array(read(0x6064, "position actual value", 4), dtype=np.int64),
+        torques=np.array(read(0x6077, "torque actual value", 2), dtype=np.int64)
+        * winding_signs(rig),
         status_words=np.array(words, dtype=np.int64),
         restarted=tuple(
             node

@@ -45,6 +45,7 @@ Key = tuple[int, int, int]
 """Kind of an answer, index and sub-index."""
 
 _UPLOAD, _DOWNLOAD, _SEGMENT = 0x40, 0x60, 0x00
+_SEGMENTS = (_SEGMENT, _SEGMENT | 0x10)
 _ABORT = 0x80
 _KIND = 0xE0
 _HEAD = struct.Struct("<BHB")
@@ -232,7 +233,10 @@ class Client:
             return
         command, index, sub = _HEAD.unpack_from(data)
         known = [key for key in self._asked if _answers(key, command, index, sub)]
-        self._answered.update(known)
+        segments = [key for key in known if key[0] in _SEGMENTS]
+        # A segment names no object: it counts for the one that is asked for, or for any of them.
+        own = [key for key in segments if key == self._wanted]
+        self._answered.update((own or segments)[:1] or known)
         self._strange += not known
         if self.waits and self._wanted is not None and _answers(self._wanted, command, index, sub):
             self._answer = data
@@ -245,24 +249,31 @@ class Client:
         """The answer to the open request is not waited for any longer; it may still come."""
         self._wanted = None
 
-    def read(self, index: int, sub: int, name: str) -> bytes:
+    def read(self, index: int, sub: int, name: str, size: int = 4) -> bytes:
         """Reads an object.
+
+        Args:
+            index: Its index.
+            sub: Its sub-index.
+            name: For messages.
+            size: Of its value, [bytes]; counts where the drive's answer does not state it.
 
         Raises:
             HardwareMissing: The drive does not answer.
             Refused: It will not read the object.
         """
-        return self._attempt(lambda: self._read(index, sub), f"{index:04X}h:{sub:02X} {name}")
+        place = f"{index:04X}h:{sub:02X} {name}"
+        return self._attempt(lambda: self._read(index, sub, size), place)
 
-    def read_if_there(self, index: int, sub: int, name: str) -> bytes | None:
-        """Reads an object that not every drive has; None where it has not.
+    def read_if_there(self, index: int, sub: int, name: str, size: int = 4) -> bytes | None:
+        """Reads an object that not every drive has; None where it has not; as `read`.
 
         Raises:
             HardwareMissing: The drive does not answer.
             Refused: It has the object and will not read it.
         """
         try:
-            return self.read(index, sub, name)
+            return self.read(index, sub, name, size)
         except Refused as error:
             if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
                 return None
@@ -279,11 +290,12 @@ class Client:
         request = _HEAD.pack(0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
         self._attempt(lambda: self._exchange(request, (_DOWNLOAD, index, sub)), place)
 
-    def _read(self, index: int, sub: int) -> bytes:
+    def _read(self, index: int, sub: int, size: int) -> bytes:
         reply = self._exchange(_upload(index, sub), (_UPLOAD, index, sub))
         command = reply[0]
         if command & 0x02:  # expedited: the data are in this frame
-            return reply[4 : 8 - (command >> 2 & 0x03)] if command & 0x01 else reply[4:]
+            stated = 4 - (command >> 2 & 0x03) if command & 0x01 else size
+            return reply[4 : 4 + stated]
         return self._read_segments(index, sub)
 
     def _read_segments(self, index: int, sub: int) -> bytes:
@@ -359,7 +371,7 @@ def _answers(wanted: Key, command: int, index: int, sub: int) -> bool:
     kind, wanted_index, wanted_sub = wanted
     if command == _ABORT:
         return (index, sub) == (wanted_index, wanted_sub)
-    if kind in (_SEGMENT, _SEGMENT | 0x10):
+    if kind in _SEGMENTS:
         return command & (_KIND | 0x10) == kind
     return command & _KIND == kind and (index, sub) == (wanted_index, wanted_sub)
 

@@ -1,7 +1,7 @@
 """SDO requests to many drives at once, beside the cycle: one at a time for each. No bus, no clock.
 
 `drivers.cia402.sdo` waits for every answer, which a loop that keeps SYNC going cannot do. Values of
-up to four bytes only; source: CiA 301, 7.2.4 (expedited transfer).
+up to four bytes only; source: CiA 301, 7.2.4.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ _DOWNLOAD = {1: 0x2F, 2: 0x2B, 4: 0x23}
 _UPLOAD = 0x40
 _DOWNLOADED, _ABORTED = 0x60, 0x80
 _UPLOADED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4}
+_SIZE_NOT_STATED = 0x42
+_SEGMENTS_FOLLOW = frozenset({0x40, 0x41})
+_ASK_FOR_SEGMENT = bytes((0x60, *bytes(7)))
 _LENGTH = 8
 
 #: Abort codes: there is no such object; there is no such sub-index.
@@ -42,11 +45,13 @@ class SdoRequest:
         index: Object index.
         sub: Sub-index.
         data: To write, 1, 2 or 4 bytes; empty to read.
+        size: Of what is read, [bytes]; counts where the drive's answer does not state it.
     """
 
     index: int
     sub: int
     data: bytes = b""
+    size: int = 4
 
     def frame(self) -> bytes:
         """The request."""
@@ -56,7 +61,7 @@ class SdoRequest:
 
 
 #: What a drive says of itself: status word, position [counts] and torque [per mille].
-STANDING = (SdoRequest(0x6041, 0), SdoRequest(0x6064, 0), SdoRequest(0x6077, 0))
+STANDING = (SdoRequest(0x6041, 0, size=2), SdoRequest(0x6064, 0), SdoRequest(0x6077, 0, size=2))
 
 
 def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:
@@ -86,7 +91,7 @@ def monitoring_off(heartbeats: int) -> tuple[SdoRequest, ...]:
     )
 
 
-MODE_DISPLAY = SdoRequest(0x6061, 0)
+MODE_DISPLAY = SdoRequest(0x6061, 0, size=1)
 
 
 class SdoJobs:
@@ -108,7 +113,9 @@ class SdoJobs:
         self._again_after = again_after
         self._turns: dict[int, int] = {}
         self._waiting = {node: deque(of_node) for node, of_node in jobs.items()}
+        self._order = deque(self._waiting)
         self._asked: dict[int, SdoRequest] = {}
+        self._frames: dict[int, bytes] = {}
         self.values: dict[tuple[int, SdoRequest], int] = {}
         self.failed: dict[tuple[int, SdoRequest], int] = {}
 
@@ -130,22 +137,26 @@ class SdoJobs:
     def next_requests(self, most: int) -> list[tuple[int, bytes]]:
         """Identifier and data of requests to send in this turn, one a drive at most.
 
+        All drives get their first request before one of them gets its second.
+
         Args:
             most: How many.
         """
+        for node in self._asked:
+            self._turns[node] += 1
         requests: list[tuple[int, bytes]] = []
-        for node, waiting in self._waiting.items():
+        for _ in range(len(self._order)):
             if len(requests) == most:
                 break
-            if node in self._asked:
-                self._turns[node] += 1
-                if self._turns[node] % self._again_after:
-                    continue
-            elif waiting:
-                self._asked[node], self._turns[node] = waiting.popleft(), 0
-            else:
+            node = self._order[0]
+            self._order.rotate(-1)
+            if node not in self._asked and self._waiting[node]:
+                self._asked[node] = self._waiting[node].popleft()
+                self._frames[node] = self._asked[node].frame()
+            elif self._turns.get(node, 0) < self._again_after or node not in self._asked:
                 continue
-            requests.append((SDO_REQUEST_BASE + node, self._asked[node].frame()))
+            self._turns[node] = 0
+            requests.append((SDO_REQUEST_BASE + node, self._frames[node]))
         return requests
 
     def take(self, node: int, data: bytes | bytearray) -> None:
@@ -153,14 +164,25 @@ class SdoJobs:
         job = self._asked.get(node)
         if job is None or len(data) != _LENGTH:
             return
-        if int.from_bytes(data[1:3], "little") != job.index or data[3] != job.sub:
-            return
+        if self._frames[node] == _ASK_FOR_SEGMENT and not data[0] & 0xF0:
+            # A segment has up to seven bytes, so the first one is the last.
+            self.values[node, job] = int.from_bytes(data[1 : 8 - (data[0] >> 1 & 7)], "little")
+            del self._asked[node]
+        elif int.from_bytes(data[1:3], "little") == job.index and data[3] == job.sub:
+            self._take_answer(node, job, data)
+
+    def _take_answer(self, node: int, job: SdoRequest, data: bytes | bytearray) -> None:
+        """Of a frame that names the object."""
         if data[0] == _ABORTED:
             self.failed[node, job] = int.from_bytes(data[4:8], "little")
         elif job.data and data[0] == _DOWNLOADED:
             pass
-        elif not job.data and data[0] in _UPLOADED:
-            self.values[node, job] = int.from_bytes(data[4 : 4 + _UPLOADED[data[0]]], "little")
+        elif not job.data and (data[0] in _UPLOADED or data[0] == _SIZE_NOT_STATED):
+            size = _UPLOADED.get(data[0], job.size)
+            self.values[node, job] = int.from_bytes(data[4 : 4 + size], "little")
+        elif not job.data and data[0] in _SEGMENTS_FOLLOW:
+            self._frames[node], self._turns[node] = _ASK_FOR_SEGMENT, self._again_after
+            return
         else:
             return
         del self._asked[node]

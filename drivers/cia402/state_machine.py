@@ -63,6 +63,9 @@ TORQUE_ON = frozenset(
     }
 )
 
+HOLDS = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE})
+"""States in which a drive holds its cable, with torque and without a fault."""
+
 FAULTED = frozenset({DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT})
 
 

@@ -229,8 +229,14 @@ class OdriveGroup(CyclicGroup):
         if self._stop is _Stop.HOLDING:
             self._cyclic.send(self._frames.set_points(self._last(), self._last()))
 
-    def is_monitored(self, *, silent_too: bool) -> bool:
-        """Never at rest: only an armed axis has a watchdog; see `DriveGroup.is_monitored`."""
+    @property
+    def ending(self) -> frozenset[int]:
+        """None at rest: only an armed axis has a watchdog; see `DriveGroup.ending`."""
+        return frozenset()
+
+    @property
+    def is_monitored(self) -> bool:
+        """Never at rest; see `DriveGroup.is_monitored`."""
         return False
 
     def look(self, pace: Pace) -> CycleStatus:

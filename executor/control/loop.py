@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
+from drivers.factory import stop_alone
 from executor.control.cycle import Cycle, CycleResult
 from executor.control.feed import Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
@@ -365,8 +366,9 @@ class Loop:
         if before is None or left.holding:
             return
         self.holding = not self._taken_over
-        silent = np.flatnonzero(before.missing).tolist()
-        if otherwise := left_otherwise(self._course.rig, before, left, silent):
+        rig = self._course.rig
+        held = np.array(stop_alone(rig, before.status_words.tolist())) & ~before.missing
+        if otherwise := left_otherwise(rig, before, left, np.flatnonzero(~held).tolist()):
             self._tell("not_held", otherwise)
 
     def _one_more_latched(self) -> bool:

@@ -62,7 +62,7 @@ class ReplyTimeout:
             raise HardwareMissing(what, where=where, why=why, next_step=next_step)
 
 
-#: Without an answer to SYNC for so long a drive is not waited for at the end, [s].
+#: Without any answer to SYNC for so long a drive is not waited for at the end, [s].
 GIVEN_UP_AFTER = 0.5
 
 Word = TypeVar("Word")
@@ -209,11 +209,14 @@ class SyncMaster:
             Fault: The bus failed.
         """
         self.group.command(GroupCommand.END_MONITORING)
-        for number in range(round(self.group.capabilities.unmonitored_within / self._cycle)):
-            patient = number * self._cycle < GIVEN_UP_AFTER
-            if not (self.group.is_monitored(silent_too=patient) and cycle()):
+        given_up = round(GIVEN_UP_AFTER / self._cycle)
+        silent = np.zeros(self._rig.cable_count, dtype=np.int64)
+        for _ in range(round(self.group.capabilities.unmonitored_within / self._cycle)):
+            if all(silent[drive] >= given_up for drive in self.group.ending) or not cycle():
                 break
-        if self.group.is_monitored(silent_too=True):
+            if self.status is not None:
+                silent = np.where(self.status.missing, silent + 1, 0)
+        if self.group.is_monitored:
             for _ in range(math.ceil(self.group.capabilities.master_timeout / self._cycle) + 1):
                 self.clock.next_cycle()
         return self.look()
@@ -253,19 +256,19 @@ def left_otherwise(
         rig: The robot.
         before: What the drives reported before they were left.
         after: What they reported after the last SYNC.
-        but: Drives, from 0, whose silence is nothing new.
+        but: Drives, from 0, that are left out: what became of them is known.
     """
     rows = zip(
         rig.drive_names.values(),
         drive_states(rig, before.status_words.tolist()),
         drive_states(rig, after.status_words.tolist()),
-        (after.missing & ~np.isin(np.arange(rig.cable_count), list(but))).tolist(),
+        after.missing.tolist(),
         strict=True,
     )
     changed = [
         f"{name} {'does not answer' if silent else f'went from {old} to {new}'}"
-        for name, old, new, silent in rows
-        if silent or old != new
+        for drive, (name, old, new, silent) in enumerate(rows)
+        if (silent or old != new) and drive not in but
     ]
     return f"drives left the state they held in: {', '.join(changed)}" if changed else ""
 

@@ -38,7 +38,16 @@ OBJECTS: Mapping[str, str] = {
 }
 """What a profile may say something about: the objects that are set up, less the PDOs' mapping."""
 
-NEEDED = ("1017h:00", "6007h:00", "605Ah:00", "6060h:00", "6065h:00", "607Dh:01", "607Dh:02")
+NEEDED = (
+    "1017h:00",
+    "6007h:00",
+    "605Ah:00",
+    "6060h:00",
+    "6065h:00",
+    "607Dh:01",
+    "607Dh:02",
+    "6085h:00",
+)
 """Without these no run is safe, whatever a profile says."""
 
 _OBJECT = re.compile(r"[0-9A-F]{4}h:[0-9A-F]{2}")
@@ -116,7 +125,8 @@ class ProfileDocument(Document):
     )
     monitoring: Literal["sync", "heartbeat"] = Field(
         default="sync",
-        description="what stops a drive whose master is gone; heartbeat: it has no 1006h",
+        description="what stops a drive whose master is gone; heartbeat: it has no 1006h, or must"
+        " not use it, since it takes its torque off without SYNC",
     )
     sync_timeout_periods: Annotated[float, Field(ge=1.1, le=10.0)] = Field(
         default=3.0,
@@ -141,6 +151,9 @@ class ProfileDocument(Document):
     mode_display_when_enabled: bool = Field(
         default=False, description="6061h shows the mode only once the drive is enabled"
     )
+    enable_timeout_ms: Annotated[int, Field(ge=100, le=30_000)] = Field(
+        default=1000, description="the longest that enabling or releasing takes, brake included"
+    )
     sdo_timeout_ms: Annotated[int, Field(ge=50, le=30_000)] = Field(
         default=2000, description="the longest that one SDO answer takes"
     )
@@ -153,11 +166,12 @@ class ProfileDocument(Document):
         if self.monitoring == "heartbeat" and self.heartbeat_loss == "fault":
             what = "drives that take their torque off when the master is lost cannot be run safely"
             return [(("heartbeat_loss",), what)]
-        absent = "1006h:00" in self.absent
-        if absent == (self.monitoring == "heartbeat"):
-            return []
-        what = "monitoring must be heartbeat where 1006h:00 is absent, and sync where it is there"
-        return [(("absent",) if absent else ("monitoring",), what)]
+        by_heartbeat = self.monitoring == "heartbeat"
+        if "1006h:00" in self.absent and not by_heartbeat:
+            return [(("absent",), "monitoring must be heartbeat where 1006h:00 is absent")]
+        if "1016h:01" in self.absent and by_heartbeat:
+            return [(("absent",), "monitoring heartbeat needs 1016h:01")]
+        return []
 
     def _torque(self) -> list[Finding]:
         absent = "6072h:00" in self.absent
@@ -172,6 +186,11 @@ class ProfileDocument(Document):
             for place, name in enumerate(self.absent)
             if name in NEEDED
         ]
+
+    @property
+    def watches_heartbeats(self) -> bool:
+        """Drives are given heartbeats to monitor."""
+        return self.heartbeat_loss == "quick stop" and "1016h:01" not in self.absent
 
     def has(self, index: int, sub: int) -> bool:
         """Whether the drive has an object, as far as the profile says."""

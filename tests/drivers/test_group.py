@@ -275,6 +275,57 @@ def test_a_drive_that_restarts_is_not_armed_again(bench: Bench) -> None:
     bench.until(GroupState.ENABLED)
 
 
+def test_a_restart_between_two_cycles_stops_the_others_in_the_next_frames(bench: Bench) -> None:
+    """Seven drives were sent one more set-point, although the boot-up had come."""
+    bench.enable()
+    bench.drives[1].power_on()
+    bench.rehearsal.pump()
+    bench.control_words()
+    bench.cycle(bench.lifted(0.0005))
+    assert set(bench.control_words()) == {0x02}
+    assert [d.state for d in bench.drives].count(HOLDING) == 7
+
+
+def test_no_torque_is_taken_off_before_an_emergency_is_judged(bench: Bench) -> None:
+    """The others were released before the reply that said that one was in fault."""
+    bench.enable()
+    bench.group.command(GroupCommand.QUICK_STOP)
+    bench.cycle()
+    bench.group.command(GroupCommand.RELEASE)
+    for _ in range(10):
+        words = bench.cycle().status_words.tolist()
+        if all(state_of(word) is DriveState.OPERATION_ENABLED for word in words):
+            break
+    bench.drives[3].fail(0x3210)
+    bench.rehearsal.pump()
+    bench.control_words()
+    bench.cycle()
+    assert set(bench.control_words()) == {0x0F}, "as before: nothing is known yet"
+    assert bench.group.state is GroupState.FAULT
+    for _ in range(5):
+        bench.cycle()
+    assert [d.state for d in bench.drives].count(HOLDING) == 7
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_torque_that_goes_while_drives_hold_is_a_fault_of_that_cycle(
+    bench: Bench, stopped: bool
+) -> None:
+    """Safe torque off after the stop, or before anything was enabled: the drive is named."""
+    bench.enable()
+    bench.group.command(GroupCommand.QUICK_STOP)
+    for _ in range(3):
+        bench.cycle()
+    if not stopped:
+        bench.group.configure()
+        bench.group.read_positions()
+    bench.drives[6].state = DriveState.SWITCH_ON_DISABLED
+    bench.cycle()
+    told = ((7, "cable 7 (drive 7) lost its torque: switch on disabled"),)
+    assert bench.status.faults == told
+    assert bench.group.state is GroupState.FAULT
+
+
 def test_a_drive_that_stopped_by_itself_stops_all_at_the_next_sync(bench: Bench) -> None:
     """How late 0Fh may be is the executor's to say; what a drive reports is heard in any case."""
     bench.enable()

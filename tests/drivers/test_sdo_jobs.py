@@ -31,6 +31,47 @@ def test_requests_are_those_of_cia_301() -> None:
     assert jobs.values == {(NODE, READ): 0x237}
 
 
+def test_every_drive_gets_its_first_request_before_any_gets_its_second() -> None:
+    """The master's heartbeat is the first to be watched no longer, by all drives."""
+    jobs = SdoJobs({node: (WRITE, READ) for node in (1, 2, 3)}, NEVER)
+    asked = []
+    for _ in range(6):
+        ((can_id, data),) = jobs.next_requests(1)
+        asked.append((can_id - 0x600, data[0]))
+        jobs.take(
+            can_id - 0x600,
+            bytes.fromhex(
+                "60 06 10 00 00 00 00 00" if data[0] == 0x23 else "4b 41 60 00 37 02 00 00"
+            ),
+        )
+    assert asked == [(1, 0x23), (2, 0x23), (3, 0x23), (1, 0x40), (2, 0x40), (3, 0x40)]
+    assert jobs.unfinished() == set()
+
+
+@pytest.mark.parametrize(
+    ("answers", "size", "value"),
+    [
+        (("42 41 60 00 37 02 99 99",), 2, 0x237),
+        (("42 41 60 00 37 02 99 99",), 4, 0x99990237),
+        (("41 41 60 00 02 00 00 00", "0b 37 02 00 00 00 00 00"), 2, 0x237),
+        (("40 41 60 00 00 00 00 00", "07 37 02 00 00 00 00 00"), 2, 0x237),
+    ],
+)
+def test_the_other_legal_answers_are_understood(
+    answers: tuple[str, ...], size: int, value: int
+) -> None:
+    """Expedited without a size, and in segments. Source: CiA 301, 7.2.4.3.6."""
+    request = SdoRequest(0x6041, 0, size=size)
+    jobs = SdoJobs({NODE: (request,)}, NEVER)
+    sent = []
+    for answer in answers:
+        sent += [data.hex() for _, data in jobs.next_requests(1)]
+        jobs.take(NODE, bytes.fromhex(answer))
+    assert sent == ["4041600000000000", "6000000000000000"][: len(answers)]
+    assert jobs.values == {(NODE, request): value}
+    assert jobs.unfinished() == set()
+
+
 def test_a_drive_is_asked_one_thing_at_a_time_and_all_at_once() -> None:
     jobs = SdoJobs({1: (READ, WRITE), 2: (READ,)}, NEVER)
     assert [can_id for can_id, _ in jobs.next_requests(1)] == [0x601]

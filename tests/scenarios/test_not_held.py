@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -109,6 +110,31 @@ def test_a_drive_that_died_before_the_stop_is_not_told_again_at_the_end(
         events = stage.events()
     assert "drive 5" in outcome.cause
     assert "not_held" not in [event.code for event in events]
+
+
+@pytest.mark.parametrize("later", [1, 20, 60, 75])
+def test_a_cycle_without_replies_does_not_cut_the_end_short(
+    prepared: PreparedRun, tmp_path: Path, later: int
+) -> None:
+    """SYNC and heartbeat ceased while drives still watched them; some let go for that."""
+    ending: list[int] = []
+
+    def deaf_once(stage: Stage) -> None:
+        if stage.group.ending:
+            ending.append(stage.cycle)
+        for drive in stage.drives:
+            drive.silent = len(ending) == later
+
+    with staged(prepared, tmp_path / "run", deaf_once) as stage:
+        for drive in stage.drives:
+            drive.behaviour = replace(drive.behaviour, heartbeat_loss_is_fault=True)
+        outcome = stage.run()
+        stage.rehearsal.advance(0.5)
+        stage.rehearsal.pump()
+        states = {drive.state for drive in stage.drives}
+    assert len(ending) > later, "the end went on"
+    assert outcome.state is State.FINISHED, outcome.cause
+    assert states == {DriveState.QUICK_STOP_ACTIVE}
 
 
 THREE_LINES = Fault("frames cannot be sent", where="can0", why="it is down", next_step="set it up")
