@@ -100,7 +100,7 @@ def advertised() -> Iterator[list[socket.socket]]:
         listeners = []
         for folder in folders:
             listeners.append(stop_events.enter_context(_listening(folder, name)))
-            stop_events.callback(_removed, folder, name)
+            stop_events.callback(_left, folder, name)
         yield listeners
 
 
@@ -126,6 +126,12 @@ def _place(folder: int, name: str) -> str:
 
 def _removed(folder: int, name: str) -> None:
     with contextlib.suppress(FileNotFoundError):
+        os.unlink(name, dir_fd=folder)
+
+
+def _left(folder: int, name: str) -> None:
+    """What cannot be removed was left by a run that ended: nobody listens there."""
+    with contextlib.suppress(OSError):
         os.unlink(name, dir_fd=folder)
 
 

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from drivers.drive_group import GroupCommand
-from executor.control.sync_master import GIVEN_UP_AFTER, SyncMaster, late_fault
+from executor.control.sync_master import (
+    GIVEN_UP_AFTER,
+    ReplyTimeout,
+    SyncMaster,
+    late_fault,
+    left_otherwise,
+)
 from executor.safety.sync_age import USUAL_TIMEOUT
 from model.errors import Fault, HardwareMissing
 from model.rig import load_rig
@@ -272,3 +278,93 @@ def test_lateness_counts_from_when_the_cycle_was_due() -> None:
     error = late_fault(2.6)
     assert error.what == "a cycle began 1.6 cycles late"
     assert "cdpr reset" in error.next_step
+
+
+def test_a_frame_that_goes_out_too_late_after_all_is_a_stop_at_once() -> None:
+    """This process may be suspended between its decision and SYNC."""
+    master, group, clock = made()
+    master.begin()
+    master.exchange(TARGETS)
+    send = group.send_cycle
+
+    def suspended(targets: Sequence[int], may_send: Callable[[bool], bool]) -> None:
+        send(targets, may_send)
+        clock.now += held_up * CYCLE
+
+    group.send_cycle = suspended
+    held_up = 1.4
+    master.begin()
+    master.exchange(TARGETS)
+    assert (master.overdue, group.told) == (0.0, [])
+    clock.now -= held_up * CYCLE
+    held_up = 1.6
+    master.begin()
+    master.exchange(TARGETS)
+    assert group.sent[-1][1] is True
+    assert group.told == ["stop"]
+    assert master.overdue == pytest.approx(2.6)
+
+
+def test_what_enables_nothing_is_sent_however_late() -> None:
+    master, group, clock = made()
+    group.send_cycle = lambda _targets, may_send: group.sent.append(may_send(False))
+    for _ in range(2):
+        clock.now += 50.0 * CYCLE
+        master.begin()
+        master.exchange(TARGETS)
+    assert group.sent == [True, True]
+    assert (master.overdue, group.told) == (0.0, [])
+
+
+@pytest.mark.parametrize(("age", "cycles"), [(0.0, 0), (0.9, 0), (1.0, 1), (1.7, 1)])
+def test_a_cycle_is_kept_where_the_last_one_is_over(age: float, cycles: int) -> None:
+    master, group, clock = made()
+    clock.now = 0.0
+    master.stop_now()
+    clock.now = age * CYCLE
+    master.freshen()
+    assert len(group.sent) == cycles
+
+
+@pytest.mark.parametrize(
+    ("missed", "silent"),
+    [([], False), ([0], False), ([0, 2, 4], False), ([3, 4], True), ([0, 1], True)],
+)
+def test_silence_counts_in_a_row_and_stays(missed: list[int], silent: bool) -> None:
+    timeout = ReplyTimeout(THE_RIG)
+    for cycle in range(6):
+        missing = np.zeros(8, dtype=bool)
+        missing[6] = cycle in missed
+        timeout.take(SimpleNamespace(missing=missing))  # type: ignore[arg-type]
+    words = {"where": "here", "why": "so", "next_step": "look"}
+    if silent:
+        with pytest.raises(HardwareMissing, match=r"^here: cable 7 \(drive 7\) stopped answering"):
+            timeout.require_none("meanwhile", **words)
+    else:
+        timeout.require_none("meanwhile", **words)
+
+
+HELD, FAILED = 0x0607, 0x0218
+
+
+def reported(words: Sequence[int], silent: Sequence[int] = ()) -> Any:
+    missing = np.array([drive in silent for drive in range(8)])
+    return SimpleNamespace(status_words=np.array(words), missing=missing)
+
+
+@pytest.mark.parametrize(
+    ("words", "silent", "but", "told"),
+    [
+        ([HELD] * 8, [], [], ""),
+        ([HELD] * 7 + [FAILED], [], [], "cable 8 (drive 8) went from quick stop active to fault"),
+        ([HELD] * 8, [1], [], "cable 2 (drive 2) does not answer"),
+        ([HELD] * 7 + [FAILED], [1], [7], "cable 2 (drive 2) does not answer"),
+        ([HELD] * 7 + [FAILED], [1], [1, 7], ""),
+        ([FAILED] + [HELD] * 7, [0], [], "cable 1 (drive 1) does not answer"),
+    ],
+)
+def test_drives_that_are_not_as_they_were_left_are_named(
+    words: list[int], silent: list[int], but: list[int], told: str
+) -> None:
+    said = left_otherwise(THE_RIG, reported([HELD] * 8), reported(words, silent), but)
+    assert said == (f"drives left the state they held in: {told}" if told else "")

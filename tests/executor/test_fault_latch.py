@@ -1,0 +1,164 @@
+"""The latch of a bus: who holds it, what a second program sees, and what cannot be kept."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from drivers.can_bus import BusSettings
+from executor.interlock import fault_latch, locks
+from executor.interlock.fault_latch import FaultLatch
+from executor.state_machine import State
+from model.errors import Refused
+
+BUS = BusSettings("udp_multicast", "239.74.163.62")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(locks, "SHARED", tmp_path / "absent")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setattr(fault_latch, "LOOKS_WITHIN", 0.02)
+    return tmp_path / "cdpr"
+
+
+def two() -> tuple[FaultLatch, FaultLatch]:
+    """Of two programs; locks of two open files keep each other out in one process, too."""
+    return FaultLatch(BUS), FaultLatch(BUS)
+
+
+def test_the_state_folder_is_the_users_own(folder: Path) -> None:
+    FaultLatch(BUS).engage("a rig", folder)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_nothing_is_latched_at_first() -> None:
+    mine, _ = two()
+    assert mine.read() is None
+    mine.require_disengaged()
+    mine.require_no_run()
+    assert not mine.held_by_another()
+
+
+def test_while_a_motion_is_under_way_others_are_refused_by_its_process(folder: Path) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    assert not mine.held_by_another(), "it is held by this one"
+    assert other.held_by_another()
+    mine.require_no_run()
+    for refused in (other.require_no_run, other.require_disengaged):
+        with pytest.raises(Refused, match=f"in progress.*|process {os.getpid()}"):
+            refused()
+    with pytest.raises(Refused):
+        other.engage("a rig", folder)
+    assert mine.read() is not None
+
+
+def test_an_engaged_latch_is_not_engaged_again(folder: Path) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    mine.settle("a rig", State.LATCHED, "a drive failed", folder)
+    for latch in (mine, other):
+        with pytest.raises(Refused, match="a drive failed"):
+            latch.engage("a rig", folder)
+        assert not latch.held_by_another(), "a refusal holds nothing"
+    latched = other.read()
+    assert latched is not None
+    assert (latched.rig, latched.cause, latched.process) == ("a rig", "a drive failed", os.getpid())
+    other.require_no_run()
+
+
+@pytest.mark.parametrize("state", [State.FINISHED, State.STOPPED])
+def test_a_good_end_disengages_and_lets_go(folder: Path, state: State) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    mine.settle("a rig", state, "", folder)
+    assert other.read() is None
+    other.engage("a rig", folder)
+    other.disengage()
+    other.disengage()  # again does no harm
+
+
+def test_a_reset_keeps_runs_off_the_bus_and_ends_disengaged(folder: Path) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    mine.settle("a rig", State.LATCHED, "a drive failed", folder)
+    with mine.held_for_reset("a rig", mine.read()):
+        assert other.held_by_another()
+        assert other.read() is not None, "latched to its end"
+    assert other.read() is None
+    assert not other.held_by_another()
+
+
+@pytest.mark.parametrize("latched", [True, False])
+def test_a_reset_that_fails_leaves_the_latch_as_it_was(folder: Path, latched: bool) -> None:
+    mine, other = two()
+    if latched:
+        mine.engage("a rig", folder)
+        mine.settle("a rig", State.LATCHED, "a drive failed", folder)
+    shown = mine.read()
+    reset = mine.held_for_reset("a rig", shown)
+    reset.__enter__()
+    assert other.held_by_another()
+    assert not reset.__exit__(ZeroDivisionError, ZeroDivisionError(), None), "it is raised on"
+    assert other.read() == shown
+    assert not other.held_by_another()
+
+
+def test_a_latch_that_changed_since_it_was_shown_is_not_reset(folder: Path) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    mine.settle("a rig", State.LATCHED, "a drive failed", folder)
+    shown = mine.read()
+    assert shown is not None
+    before = dataclasses.replace(shown, cause="another one")
+    with pytest.raises(Refused, match="changed"), other.held_for_reset("a rig", before):
+        pytest.fail("drives would be reset")
+    assert other.read() == shown
+    assert not mine.held_by_another()
+
+
+def test_a_file_that_is_no_latch_counts_as_engaged(folder: Path) -> None:
+    mine, _ = two()
+    folder.mkdir()
+    mine.path.write_text("[]")
+    latched = mine.read()
+    assert latched is not None
+    assert latched.process == 0
+    with pytest.raises(Refused, match="cannot be read"):
+        mine.require_disengaged()
+
+
+def test_a_state_folder_that_cannot_be_made_engages_nothing(folder: Path) -> None:
+    folder.write_text("a file")
+    mine, _ = two()
+    with pytest.raises(Refused, match=r"Not a directory|File exists"):
+        mine.engage("a rig", folder)
+
+
+@pytest.mark.parametrize("what", ["lock", "latch"])
+def test_what_cannot_be_written_is_refused_with_its_reason(folder: Path, what: str) -> None:
+    mine, other = two()
+    folder.mkdir()
+    (mine.path.with_suffix(".lock") if what == "lock" else mine.path).mkdir()
+    with pytest.raises(Refused, match=r"directory|regular file"):
+        mine.engage("a rig", folder)
+    if what == "latch":
+        assert not other.held_by_another()
+    else:
+        with pytest.raises(Refused, match=r"directory|regular file"):
+            other.held_by_another()
+
+
+def test_a_latch_that_cannot_be_removed_is_told_and_stays_held(folder: Path) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    mine.path.unlink()
+    mine.path.mkdir()
+    with pytest.raises(Refused, match="directory"):
+        mine.disengage()
+    assert other.held_by_another()
