@@ -30,6 +30,7 @@ from drivers.cia402.object_dictionary import (
     Setting,
     expected_by,
     heartbeat_consumers,
+    identifiers,
     identity,
     left_out,
     settings_for,
@@ -116,7 +117,7 @@ def configure_drives(
     wrong = WrongObjects()
     entries: list[int] = []
     for drive, node in enumerate(nodes):
-        for expected in (*BEFORE, *identity(rig), *expected_by(profile)):
+        for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
             wrong.note(_expect, network, node, expected)
         wrong.note(_check_idle, network, node, to_reset)
         for setting in settings[drive]:
@@ -258,7 +259,12 @@ def require_answers(network: SetupNetwork, nodes: Sequence[int]) -> None:
 
 
 def _expect(network: SetupNetwork, node: int, expected: Expectation) -> None:
-    data = network.client(node).read(expected.index, expected.sub, expected.name)
+    try:
+        data = network.client(node).read(expected.index, expected.sub, expected.name)
+    except Refused as error:
+        if expected.optional and error.values.get("abort_code") not in (None, *NOT_NOW):
+            return
+        raise
     value = int.from_bytes(data, "little")
     if value & expected.mask != expected.expected:
         found, wanted = f"{value:X}h", f"{expected.expected:X}h"

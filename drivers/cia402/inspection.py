@@ -18,6 +18,7 @@ from drivers.cia402.object_dictionary import (
     Expectation,
     Setting,
     expected_by,
+    identifiers,
     identity,
     settings_for,
 )
@@ -128,7 +129,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         if node in silent:
             continue
         look = _Look(network, node, rows)
-        for expected in (*BEFORE, *identity(rig), *expected_by(profile)):
+        for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
             look.at_expected(expected)
         look.at_state()
         for index, form, name, why in _PROCESS_DATA:
@@ -165,7 +166,7 @@ class _Look:
         """An object that must hold a value which is not written."""
         row = self._row(expected.index, expected.sub, str(expected), f"{expected.expected:X}h")
         row.meaning = expected.why
-        data = self._read(expected.index, expected.sub, row, optional=False)
+        data = self._read(expected.index, expected.sub, row, expected.optional)
         if data is None:
             return
         value = int.from_bytes(data, "little")

@@ -98,7 +98,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """One object to read: ``value & mask`` must be ``expected``."""
+    """One object to read: ``value & mask`` must be ``expected``; optional ones may be absent."""
 
     index: int
     sub: int
@@ -106,6 +106,7 @@ class Expectation:
     expected: int
     name: str
     why: str
+    optional: bool = False
 
     def __str__(self) -> str:
         """Index, sub-index and name."""
@@ -120,6 +121,19 @@ BEFORE = (
         "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
     ),
 )
+
+
+def identifiers(node: int) -> tuple[Expectation, ...]:
+    """On what identifiers a drive hears SYNC and sends its emergencies; CiA 301, 7.5.2."""
+    sync, emergency = (
+        "SYNC goes out as 80h, without a counter",
+        "emergencies are heard as 80h + node",
+    )
+    return (
+        Expectation(0x1005, 0, 0x7FF, 0x80, "COB-ID SYNC", sync, optional=True),
+        Expectation(0x1014, 0, 0x800007FF, 0x80 + node, "COB-ID EMCY", emergency, optional=True),
+        Expectation(0x1019, 0, 0xFF, 0, "synchronous counter overflow", sync, optional=True),
+    )
 
 
 def identity(rig: Rig) -> tuple[Expectation, ...]:

@@ -25,6 +25,8 @@ NOT_ENDED = "not_ended"
 _ON_PATH = {state.value for state in ON_PATH}
 #: What the rounding of the tables may cost, [m].
 ROUNDING = 2e-9
+#: Of set-points from the goal at which the platform counts as there, [m].
+AT_GOAL = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +123,18 @@ def judge(
         end = Check("finished", False, f"Its record ends {at}. {_KILLED}")
         return Verdict(FAILED, "The run did not finish.", (end, *measured))
     told = cause.rstrip(".") or f"the final state is {final_state!r}"
-    end = Check("finished", False, f"The run ended {at}, before the goal: {told}.")
+    where = "at the goal" if _is_at_goal(cycles, scene) else "before the goal"
+    end = Check("finished", False, f"The run ended {at}, {where}: {told}.")
     if final_state == "stopped" and not failures and not too_near:
-        return Verdict(STOPPED, "The run was stopped before the goal.", (end, *measured))
+        return Verdict(STOPPED, f"The run was stopped {where}.", (end, *measured))
     word = "was stopped" if final_state == "stopped" else "ended with a fault"
-    return Verdict(FAILED, f"The run {word} before the goal.", (end, *measured))
+    return Verdict(FAILED, f"The run {word} {where}.", (end, *measured))
+
+
+def _is_at_goal(cycles: CycleTable, scene: Scene) -> bool:
+    """The last set-points were those of the goal."""
+    left = cycles.planned[-1:] - scene.goal.position
+    return bool(len(left)) and float(np.linalg.norm(left)) < AT_GOAL
 
 
 _KILLED = (

@@ -305,6 +305,45 @@ def test_a_sync_time_out_that_no_cycle_can_keep_is_refused(tmp_path: Path, perio
         load_profile(str(path))
 
 
+@pytest.mark.parametrize(
+    ("index", "value"), [(0x1005, 0x81), (0x1014, 0x8000_0083), (0x1014, 0x84)]
+)
+def test_a_drive_that_hears_another_sync_or_warns_elsewhere_is_refused(
+    rig: Rig, index: int, value: int
+) -> None:
+    """Its positions would never come, its emergencies be unseen."""
+    bus = eight_of("cia402")
+    bus.drives[3].values[index, 0] = value
+    assert not examined(rig, bus).good
+    with pytest.raises(Refused, match=f"{value:X}h"):
+        set_up(rig, bus)
+
+
+def test_monitoring_of_sync_is_off_where_its_loss_would_be_a_fault(
+    tmp_path: Path, rig: Rig
+) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text("name: Ours\nsources: [our bench]\nmonitoring: heartbeat\n")
+    bus = eight_of("cia402")
+    set_up(with_profile(rig, str(path)), bus)
+    assert {drive.values[0x1006, 0] for drive in bus.drives.values()} == {0}
+    assert {drive.values[0x1016, 1] for drive in bus.drives.values()} == {0x7F0064}
+
+
+def test_a_drive_without_heartbeat_consumer_is_stopped_by_sync_alone(
+    tmp_path: Path, rig: Rig
+) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text('name: Ours\nsources: [our bench]\nabsent: ["1016h:01"]\n')
+    rig, bus = with_profile(rig, str(path)), eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.aborts[0x1016, 0] = 0x06020000
+    assert examined(rig, bus).good
+    (remark,) = set_up(rig, bus)
+    assert "SYNC time-out alone" in remark
+    assert not [d for d in downloads(bus) if d.data[1:3] == b"\x16\x10"]
+
+
 @pytest.mark.parametrize("entries", [0, 1, 8])
 def test_drives_that_let_go_without_a_heartbeat_are_given_none(
     tmp_path: Path, rig: Rig, entries: int
@@ -338,6 +377,8 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
         ('absent: ["1006h:00"]', "heartbeat"),
         ('heartbeat_loss: fault\nmonitoring: heartbeat\nabsent: ["1006h:00"]', "torque off"),
         ('absent: ["6072h:00"]', "torque_limit"),
+        ('absent: ["6085h:00"]', "required for a safe run"),
+        ('absent: ["1006h:00", "1016h:01"]\nmonitoring: heartbeat', "needs 1016h:01"),
         ('warnings: ["31"]', "3180h"),
         ('ranges: {"60C3h:02": {low: 0, high: 1}}', "60C2h:02"),
     ],

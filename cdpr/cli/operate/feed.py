@@ -8,6 +8,10 @@ import typer
 
 from cdpr.cli.output import out, show_json
 from executor.remote.client import request_run
+from executor.state_machine import State
+
+#: The path is over, or the run is about to end.
+OVER = {State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED}
 
 _Process = Annotated[
     int | None, typer.Option("--process", help="process number, if several runs are in progress")
@@ -56,6 +60,9 @@ def _request(verb: str, process: int | None, as_json: bool, percent: int | None 
     status = request_run(verb, process, percent)
     if as_json:
         show_json(status)
+        return
+    if State(status["state"]) in OVER:
+        out.print(f"too late: process {status['process']} is {status['state']}", soft_wrap=True)
         return
     wish = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
     out.print(
