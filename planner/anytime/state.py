@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
+from numba.experimental import structref
 from numpy.typing import NDArray
 
 from planner.anytime.connect import NODES
@@ -60,6 +62,22 @@ class AnytimeSearch(NamedTuple):
     totals: Integers
     first: Array
     state: State
+
+
+@structref.register  # type: ignore[untyped-decorator]
+class _HandleType(types.StructRef):  # type: ignore[misc]
+    """What compiled code takes a handle for."""
+
+
+class Handle(structref.StructRefProxy):  # type: ignore[misc]
+    """A problem and the state of a search in it (``problem``, ``search``), as one reference.
+
+    At every call from Python Numba looks at each array that it is given; the fifty of a problem and
+    a search take longer than many a search. `planner.anytime.rounds.handle_of` makes a handle.
+    """
+
+
+structref.define_proxy(Handle, _HandleType, ["problem", "search"])
 
 
 def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:
