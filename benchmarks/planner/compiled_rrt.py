@@ -49,8 +49,17 @@ def new_trees(start: Array, goal: Array, seed: int) -> Trees:
 
 
 @kernel
+def trees_handle(problem: PathProblem, trees: Trees) -> Handle:
+    """Both as one reference.
+
+    Not by `planner.anytime.rounds.handle_of`: its kept code would then name a type of this module.
+    """
+    return Handle(problem, trees)
+
+
+@kernel
 def trees_met(handle: Handle, longest: float, samples: int) -> bool:
-    """`connected`, of a handle of the problem and the trees."""
+    """`connected`, with the problem and the trees as one reference."""
     return connected(handle.problem, handle.search, longest, samples)
 
 

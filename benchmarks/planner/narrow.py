@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import ompl_runs
 from checkers import EdgeCheck, exact_edges
-from compiled_rrt import new_trees, trees_met
+from compiled_rrt import new_trees, trees_handle, trees_met
 from ompl import base, geometric
 from ours import first_path
 from passages import Passage, passages
@@ -114,7 +114,7 @@ def _ours(problem: PathProblem, passage: Passage, seed: int, limit: float) -> fl
 
 
 def _rrt(problem: PathProblem, passage: Passage, longest: float, seed: int, limit: float) -> float:
-    trees = handle_of(problem, new_trees(passage.path[0], passage.path[-1], seed))
+    trees = trees_handle(problem, new_trees(passage.path[0], passage.path[-1], seed))
     begin, spent, met = time.process_time(), 0.0, False
     while not met and spent < limit:
         met = trees_met(trees, longest, _CHUNK)
