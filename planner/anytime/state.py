@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -64,20 +64,23 @@ class AnytimeSearch(NamedTuple):
     state: State
 
 
-@structref.register  # type: ignore[untyped-decorator]
-class _HandleType(types.StructRef):  # type: ignore[misc]
+@structref.register
+class _HandleType(types.StructRef):
     """What compiled code takes a handle for."""
 
 
-class Handle(structref.StructRefProxy):  # type: ignore[misc]
+class Handle(structref.StructRefProxy):
     """A problem and the state of a search in it (``problem``, ``search``), as one reference.
 
     At every call from Python Numba looks at each array that it is given; the fifty of a problem and
     a search take longer than many a search. `planner.anytime.rounds.handle_of` makes a handle.
     """
 
+    problem: Any
+    search: Any
 
-structref.define_proxy(Handle, _HandleType, ["problem", "search"])
+
+structref.define_proxy(Handle, _HandleType, ["problem", "search"])  # type: ignore[no-untyped-call]
 
 
 def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:
