@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from planner.anytime.problem import PathProblem, edge_allowed
 from planner.anytime.random import State, seeded, uniform
+from planner.anytime.state import Handle
 from planner.collision.edges import row_of
-from planner.kernels.jit import leaf
+from planner.kernels.jit import inlined, kernel, leaf
 from planner.kernels.primitives import Vector, along, minus, norm
 
 Array = NDArray[np.float64]
@@ -45,6 +46,21 @@ def new_trees(start: Array, goal: Array, seed: int) -> Trees:
     nodes = np.zeros((2, _NODES, 3))
     nodes[0, 0], nodes[1, 0] = start, goal
     return Trees(nodes, np.array([1, 1, 0]), seeded(seed))
+
+
+@kernel
+def trees_handle(problem: PathProblem, trees: Trees) -> Handle:
+    """Both as one reference.
+
+    Not by `planner.anytime.rounds.handle_of`: its kept code would then name a type of this module.
+    """
+    return Handle(problem, trees)
+
+
+@kernel
+def trees_met(handle: Handle, longest: float, samples: int) -> bool:
+    """`connected`, with the problem and the trees as one reference."""
+    return connected(handle.problem, handle.search, longest, samples)
 
 
 @leaf
@@ -90,7 +106,7 @@ def _many(problem: PathProblem, trees: Trees, longest: float, times: int) -> int
     return found
 
 
-@leaf
+@inlined
 def _extended(problem: PathProblem, trees: Trees, tree: int, wanted: Vector, longest: float) -> int:
     nodes, counts = trees.nodes[tree], trees.counts
     if counts[tree] == len(nodes):

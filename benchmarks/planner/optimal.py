@@ -31,7 +31,7 @@ from model.scene import load_scene
 from planner.anytime.path import best_path
 from planner.anytime.prepare import problem_of
 from planner.anytime.problem import PathProblem
-from planner.anytime.rounds import advance
+from planner.anytime.rounds import advance, handle_of
 from planner.anytime.state import new_search
 from planner.check import check_path
 from planner.costs import KinematicCost
@@ -105,12 +105,13 @@ def _paths(
 ) -> list[Array | None]:
     """The best path that was there at each mark."""
     problem = _problem(asked, weights)
-    advance(problem, new_search(*asked.ends, 0), 1)  # machine code is loaded when first called
+    # Machine code is loaded when first called.
+    advance(handle_of(problem, new_search(*asked.ends, 0)), 1)
     search, paths = new_search(*asked.ends, seed), list[Array | None]()
-    path = None
+    path, handle = None, handle_of(problem, search)
     begin = time.process_time()
     while len(paths) < len(marks_ms):
-        advance(problem, search, 1)
+        advance(handle, 1)
         spent = (time.process_time() - begin) * 1e3
         while len(paths) < len(marks_ms) and spent >= marks_ms[len(paths)]:
             paths.append(path)

@@ -7,25 +7,20 @@ from collections.abc import Sequence
 
 import compiled_rrt
 import numpy as np
-from numpy.typing import NDArray
 from result import Result
 
 from model.rig import Rig
 from model.scene import Scene
-from planner.anytime.connect import connect
 from planner.anytime.prepare import problem_of
-from planner.anytime.problem import PathProblem
-from planner.anytime.random import State
-from planner.anytime.rounds import advance
-from planner.anytime.state import BEST, AnytimeSearch, new_search
+from planner.anytime.rounds import advance, handle_of, sampled_path
+from planner.anytime.state import BEST, AnytimeSearch, Handle, new_search
 from planner.costs import KinematicCost
 from planner.kernels.jit import kernel
 from planner.settings import Weights
 
 NAME = "optimal"
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-_SAMPLES = 100_000
+_TRIES = 10
+"""Turns of trees and roadmap in a call."""
 _MANY = 2000
 
 
@@ -41,17 +36,17 @@ class Contestant:
         cost = KinematicCost(rig, scene.start.rotation)
         self._problem = problem_of(rig, scene, Weights(length=1.0), cost)
         self._start, self._goal = (np.array(p.position) for p in (scene.start, scene.goal))
-        advance(self._problem, new_search(self._start, self._goal, 0), 1)
+        advance(handle_of(self._problem, new_search(self._start, self._goal, 0)), 1)
         self._first(0)
 
     def run(self, seed: int, marks_s: Sequence[float]) -> Result:
         """Runs until the last mark."""
         first = self._first(seed)
         search = new_search(self._start, self._goal, seed)
-        lengths: list[float] = []
+        handle, lengths = handle_of(self._problem, search), list[float]()
         begin = time.process_time()
         while len(lengths) < len(marks_s):
-            length = advance(self._problem, search, 1)
+            length = advance(handle, 1)
             spent = time.process_time() - begin
             while len(lengths) < len(marks_s) and spent >= marks_s[len(lengths)]:
                 lengths.append(float(length))
@@ -67,8 +62,9 @@ class Contestant:
     def rounds_us(self, rounds: int, seed: int) -> float:
         """Processor time of so many rounds of the search, [µs]; not a number without a path."""
         search = new_search(self._start, self._goal, seed)
+        handle = handle_of(self._problem, search)
         begin = time.process_time()
-        length = advance(self._problem, search, rounds)
+        length = advance(handle, rounds)
         spent = time.process_time() - begin
         return spent * 1e6 if np.isfinite(length) else float("nan")
 
@@ -77,12 +73,10 @@ class Contestant:
 
         Without what one call from Python costs, which OMPL pays at every check instead.
         """
-        search = new_search(self._start, self._goal, 0)
-        args = (self._problem, search.ends, search.state, search.trees)
-        rest = (search.parents, search.grown, search.points[0])
-        _many(*args, *rest, 1)
+        handle = handle_of(self._problem, new_search(self._start, self._goal, 0))
+        _many(handle, 1)
         begin = time.process_time()
-        found = _many(*args, *rest, _MANY)
+        found = _many(handle, _MANY)
         spent = time.process_time() - begin
         return spent / _MANY * 1e6 if found == _MANY else np.inf
 
@@ -94,28 +88,35 @@ class Contestant:
 
     def _first(self, seed: int) -> float:
         """Processor time to the first path, [s]."""
-        search = new_search(self._start, self._goal, seed)
-        path = search.points[0]
+        handle = handle_of(self._problem, new_search(self._start, self._goal, seed))
         begin = time.process_time()
-        found = connect(
-            self._problem, search.ends, search.state, search.trees, search.parents, search.grown,
-            _SAMPLES, path,
-        )  # fmt: skip
+        found = first_path(handle)
         spent = time.process_time() - begin
         return spent if found else np.inf
 
 
 @kernel
-def _many(
-    problem: PathProblem, ends: Array, state: State, trees: Array, parents: Integers, grown:
-        Integers,
-    path: Array, times: int,
-) -> int:  # fmt: skip
+def first_path(handle: Handle) -> int:
+    """What a round begins with: the two trees and the roadmap, without the polishing after it.
+
+    Called again it goes on. Returns the number of vertices; 0 where there is no path yet.
+    """
+    search = handle.search
+    for _ in range(_TRIES):
+        found = sampled_path(handle.problem, search, search.points[0])
+        if found > 0:
+            return found  # type: ignore[no-any-return]
+    return 0
+
+
+@kernel
+def _many(handle: Handle, times: int) -> int:
     """Searches for a first path so many times; returns how often there was one."""
     found = 0
     for _ in range(times):
-        grown[:] = 0
-        if connect(problem, ends, state, trees, parents, grown, _SAMPLES, path) > 0:
+        handle.search.grown[:] = 0
+        handle.search.made[:] = 0
+        if first_path(handle) > 0:
             found += 1
     return found
 

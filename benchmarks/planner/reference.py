@@ -21,7 +21,7 @@ from planner.anytime.local_search import MOST_VERTICES, Polyline, measure, polis
 from planner.anytime.prepare import problem_of
 from planner.anytime.problem import KINEMATIC, LENGTH, UNIT, VERTEX, PathProblem
 from planner.anytime.random import seeded
-from planner.anytime.rounds import advance
+from planner.anytime.rounds import advance, handle_of
 from planner.anytime.state import BEST, new_search
 from planner.costs import KinematicCost
 from planner.settings import Weights
@@ -167,7 +167,7 @@ def _from_long_searches(asked: Question, fine: PathProblem, effort: Effort) -> l
     coarse = asked.problem._replace(terms=fine.terms.copy())
     for seed in range(effort.searches):
         search = new_search(*asked.ends, 10_000 + seed)
-        if np.isfinite(advance(coarse, search, effort.rounds)):
+        if np.isfinite(advance(handle_of(coarse, search), effort.rounds)):
             found.append(search.points[BEST, : search.counts[BEST, 0]].copy())
     return found
 

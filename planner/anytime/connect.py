@@ -3,6 +3,8 @@
 An exact test of a whole edge costs about as much as one of a point, so edges have no step: a sample
 is joined to the nearest node of one tree by one edge, and where that is allowed to the nearest of
 the other. A sample that both reach is the path.
+
+What is called for every sample is inlined: handing over a problem takes as long as an edge test.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from planner.anytime.problem import PathProblem, edge_allowed
 from planner.anytime.random import State, uniform
 from planner.collision.edges import row_of
-from planner.kernels.jit import leaf
+from planner.kernels.jit import inlined, leaf
 from planner.kernels.primitives import Vector
 
 Array = NDArray[np.float64]
@@ -77,7 +79,7 @@ def connect(
     return 0
 
 
-@leaf
+@inlined
 def _sample(problem: PathProblem, state: State) -> Vector:
     """A point of the workspace, most often on its walls, edges or in its corners.
 
@@ -93,13 +95,13 @@ def _sample(problem: PathProblem, state: State) -> Vector:
     )
 
 
-@leaf
+@inlined
 def _drawn(state: State, wide: float, low: float, high: float) -> float:
     share = 0.5 + wide * (uniform(state) - 0.5)
     return low + min(max(share, 0.0), 1.0) * (high - low)
 
 
-@leaf
+@inlined
 def _extended(
     problem: PathProblem,
     trees: Array,
@@ -122,7 +124,7 @@ def _extended(
     return nearest
 
 
-@leaf
+@inlined
 def _nearest(trees: Array, tree: int, count: int, wanted: Vector) -> int:
     best, least = 0, np.inf
     for i in range(count):
@@ -162,6 +164,6 @@ def _joined(
     return length + 1 + other
 
 
-@leaf
+@inlined
 def _put(points: Array, place: int, point: Vector) -> None:
     points[place, 0], points[place, 1], points[place, 2] = point

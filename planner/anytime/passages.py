@@ -5,7 +5,10 @@ every obstacle keeps a body behind planes (`planner.collision.separating_planes`
 is too near to something is drawn before one of its planes, then before one of what is too near
 there, until it is free: it then lies at the side of a gap, if there is one nearby. From there
 straight ways along the planes it touches lead out at both mouths. Each such way is a part of its
-own, joined to those next to it by straight edges, until start and goal are of one part.
+own, joined to those next to it by straight edges, until start and goal are of one part. What the
+two trees of `planner.anytime.connect` reached by then belongs to the parts of start and goal.
+
+Nearly all functions are inlined: handing over a problem takes as long as several edge tests.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from numpy.typing import NDArray
 from planner.anytime.problem import PathProblem, edge_allowed
 from planner.anytime.random import State, below, direction, uniform
 from planner.collision.edges import row_of
-from planner.kernels.jit import leaf
+from planner.kernels.jit import inlined, leaf
 from planner.kernels.primitives import Vector, along, cross, dot, minus, norm
 from planner.kernels.scene_arrays import World
 
@@ -27,18 +30,20 @@ Integers = NDArray[np.int64]
 
 PLACES = 1024
 """Room for nodes; a full roadmap is restarted."""
-_IN_GAPS, _NEAR_NODES = 0.6, 0.3
+_IN_GAPS, _NEAR_NODES = 0.8, 0.15
 """Shares of the samples: drawn into gaps, and near a node; the rest is from all the workspace."""
 _DRAWN, _OTHER_PLANE = 24, 0.3
 """How often a point is drawn before a plane, and how often not before that which is nearest."""
 _ROOM = 1e-7
 """By which it is drawn farther, [m]: more than round-off, less than any gap worth finding."""
-_NEIGHBOURS = 6
-"""Nodes of other parts that a new node is joined to, beside those of start and goal."""
-_BISECTIONS = 12
+_FROM_TREES = 200
+"""Nodes of each tree that the roadmap begins with at most."""
+_BISECTIONS = 4
 _NEAREST, _FARTHEST = 5e-5, 0.2
 """Of samples near a node, [m]."""
 _START, _GOAL = 0, 1
+_ANY_OTHER = -1
+"""As a part: any but the node's own."""
 
 
 @leaf
@@ -50,6 +55,9 @@ def through_passages(
     above: Integers,
     parts: Integers,
     made: Integers,
+    trees: Array,
+    parents: Integers,
+    counts: Integers,
     samples: int,
     path: Array,
 ) -> int:
@@ -63,6 +71,9 @@ def through_passages(
         above: Of each node the next toward the root of its part, -1 for that, shape (PLACES,).
         parts: Of each node the part that it belongs to, shape (PLACES,), written.
         made: Nodes and edge tests so far, shape (2,); zeros at first.
+        trees: Of start and goal, see `planner.anytime.connect.connect`, shape (2, k, 3), [m].
+        parents: Likewise, shape (2, k).
+        counts: Likewise; of nodes in both.
         samples: How many to draw at most.
         path: From start to goal, shape (k, 3), written.
 
@@ -72,25 +83,26 @@ def through_passages(
     for _ in range(samples):
         if made[0] == 0 or made[0] + 3 > len(places):
             _begin(ends, places, above, parts, made)
-        new = made[0]
+            _add_trees(places, above, parts, made, trees, parents, counts)
+        node, touched, other = made[0], -1, -1
         choice = uniform(state)
-        if choice < _IN_GAPS:
-            at, touched, other = _in_gap(problem.world, state)
-            if not _allowed(problem, made, at, at):
-                continue
-            _add(places, above, parts, made, at, -1)
-            _add_ways(problem, state, places, above, parts, made, new, touched, other)
-        elif choice < _IN_GAPS + _NEAR_NODES:
-            node = below(state, made[0])
+        if _IN_GAPS <= choice < _IN_GAPS + _NEAR_NODES:
+            near = below(state, made[0])
             size = _NEAREST * math.exp(uniform(state) * math.log(_FARTHEST / _NEAREST))
-            _add_way(problem, places, above, parts, made, node, direction(state), size)
+            _add_way(problem, places, above, parts, made, near, direction(state), size)
         else:
             at = _anywhere(problem.world, state)
+            if choice < _IN_GAPS:
+                at, touched, other = _out_of_obstacles(problem.world, state, at)
             if not _allowed(problem, made, at, at):
                 continue
             _add(places, above, parts, made, at, -1)
-        for node in range(new, made[0]):
+        while node < made[0] and parts[_START] != parts[_GOAL]:
             _join(problem, places, above, parts, made, node)
+            if touched >= 0 and parts[_START] != parts[_GOAL]:
+                _add_ways(problem, state, places, above, parts, made, node, touched, other)
+                touched = -1
+            node += 1
         if parts[_START] == parts[_GOAL]:
             count = _path(places, above, path)
             made[0] = 0
@@ -107,6 +119,25 @@ def _begin(ends: Array, places: Array, above: Integers, parts: Integers, made: I
 
 
 @leaf
+def _add_trees(
+    places: Array,
+    above: Integers,
+    parts: Integers,
+    made: Integers,
+    trees: Array,
+    parents: Integers,
+    counts: Integers,
+) -> None:
+    """Adds the nodes of both trees, which hang together with start or goal."""
+    for tree in range(2):
+        first = made[0]
+        for i in range(1, min(counts[tree], _FROM_TREES)):
+            parent = parents[tree, i]  # before its child, hence added
+            below_it = tree if parent == 0 else first + parent - 1
+            _add(places, above, parts, made, row_of(trees[tree, i]), below_it)
+
+
+@inlined
 def _allowed(problem: PathProblem, made: Integers, start: Vector, end: Vector) -> bool:
     made[1] += 1
     return edge_allowed(problem, start, end)
@@ -124,7 +155,7 @@ def _add(
     made[0] = new + 1
 
 
-@leaf
+@inlined
 def _anywhere(world: World, state: State) -> Vector:
     low, high = world.limits[0], world.limits[1]
     return (
@@ -134,13 +165,13 @@ def _anywhere(world: World, state: State) -> Vector:
     )
 
 
-@leaf
-def _in_gap(world: World, state: State) -> tuple[Vector, int, int]:
+@inlined
+def _out_of_obstacles(world: World, state: State, at: Vector) -> tuple[Vector, int, int]:
     """A point drawn out of what it is too near to, and the last two planes it was drawn before.
 
     Planes are those of `World.planes`, -1 for none. The point may still be too near to something.
     """
-    at, touched, other = _anywhere(world, state), -1, -1
+    touched, other = -1, -1
     for _ in range(_DRAWN):
         plane, room = _worst(world, state, at)
         if plane < 0:
@@ -158,7 +189,7 @@ def _in_gap(world: World, state: State) -> tuple[Vector, int, int]:
     return at, touched, other
 
 
-@leaf
+@inlined
 def _worst(world: World, state: State, at: Vector) -> tuple[int, float]:
     """A plane of the pair that is proved least at a position, and the room before it, [m].
 
@@ -183,13 +214,13 @@ def _worst(world: World, state: State, at: Vector) -> tuple[int, float]:
     return worst, least
 
 
-@leaf
+@inlined
 def _room(world: World, k: int, at: Vector) -> float:
     normal = (world.planes[k, 0], world.planes[k, 1], world.planes[k, 2])
     return world.planes[k, 3] - dot(normal, at)  # type: ignore[no-any-return]
 
 
-@leaf
+@inlined
 def _add_ways(
     problem: PathProblem,
     state: State,
@@ -202,8 +233,6 @@ def _add_ways(
     other: int,
 ) -> None:
     """Adds the ends of the straight way through a node along the planes that it touches."""
-    if touched < 0:
-        return
     planes = problem.world.planes
     normal = row_of(planes[touched, :3])
     second = direction(state)
@@ -222,7 +251,7 @@ def _add_ways(
         _add_way(problem, places, above, parts, made, node, one, reach)
 
 
-@leaf
+@inlined
 def _add_way(
     problem: PathProblem,
     places: Array,
@@ -249,7 +278,7 @@ def _add_way(
         _add(places, above, parts, made, along(start, way, low * reach), node)
 
 
-@leaf
+@inlined
 def _to_the_wall(world: World, start: Vector, way: Vector) -> float:
     """How far it is from a point along a unit vector to the wall of the workspace, [m]."""
     least = math.inf
@@ -261,21 +290,18 @@ def _to_the_wall(world: World, start: Vector, way: Vector) -> float:
     return max(least, 0.0)
 
 
-@leaf
+@inlined
 def _join(
     problem: PathProblem, places: Array, above: Integers, parts: Integers, made: Integers, node: int
 ) -> None:
-    """Joins a node to the parts of start and goal, and to the nearest nodes of others."""
-    for end in (_START, _GOAL):
-        _try_to_join(problem, places, above, parts, made, node, parts[end], -1.0)
-    farther = -1.0
-    for _ in range(_NEIGHBOURS):
-        farther = _try_to_join(problem, places, above, parts, made, node, -1, farther)
-        if farther == math.inf:
-            break
+    """Joins a node to the parts of start and goal, and to the nearest node of any other."""
+    for k in range(3):
+        part = parts[_START] if k == 0 else (parts[_GOAL] if k == 1 else _ANY_OTHER)
+        if part != parts[node]:
+            _try_to_join(problem, places, above, parts, made, node, part)
 
 
-@leaf
+@inlined
 def _try_to_join(
     problem: PathProblem,
     places: Array,
@@ -284,25 +310,18 @@ def _try_to_join(
     made: Integers,
     node: int,
     part: int,
-    farther: float,
-) -> float:
-    """Tries an edge to the node of a part (-1: any other) next beyond a squared distance.
-
-    Returns its squared distance; infinite without such a node.
-    """
+) -> None:
+    """Tries an edge to the nearest node of a part, or of any but the node's own."""
     own, best, least = parts[node], -1, math.inf
-    if own == part:
-        return math.inf
     x, y, z = places[node, 0], places[node, 1], places[node, 2]
     for i in range(made[0]):
-        if parts[i] == own or (part >= 0 and parts[i] != part):
+        if parts[i] == own or part not in (_ANY_OTHER, parts[i]):
             continue
         squared = (places[i, 0] - x) ** 2 + (places[i, 1] - y) ** 2 + (places[i, 2] - z) ** 2
-        if farther < squared < least:
+        if squared < least:
             best, least = i, squared
     if best >= 0 and _allowed(problem, made, row_of(places[best]), row_of(places[node])):
         _merge(above, parts, made, best, node)
-    return least
 
 
 @leaf

@@ -16,7 +16,7 @@ from planner.anytime.infeasibility import no_path
 from planner.anytime.local_search import measure, polyline_of
 from planner.anytime.prepare import problem_of, set_weights
 from planner.anytime.problem import ASK_PROOF, LEAST_MARGIN, UNIT, PathProblem
-from planner.anytime.rounds import advance, measure_again
+from planner.anytime.rounds import advance, handle_of, measure_again
 from planner.anytime.state import BEST, AnytimeSearch, new_search
 from planner.costs import KinematicCost
 from planner.path import LEAST_ROUNDS_WITH_LIMIT, LengthLimit, Progress, Route
@@ -92,7 +92,7 @@ def optimal_route(
 
 def _load(problem: PathProblem, search: AnytimeSearch) -> None:
     """Calls what the rounds call: machine code is made, or loaded, when it is called first."""
-    advance(problem, search, 0)
+    advance(handle_of(problem, search), 0)
     measure_again(problem, search)
     measure(problem, polyline_of(search.ends))
 
@@ -109,9 +109,10 @@ def _improved(
     limit = None
     if settings.longest < math.inf:
         limit = LengthLimit(settings.longest, problem.terms[UNIT])
+    handle = handle_of(problem, search)
     spent, told = 0.0, 0.0
     while not _is_over(problem, settings, search, spent):
-        cost = advance(problem, search, 1)
+        cost = advance(handle, 1)
         if limit is not None:
             _limited(problem, search, settings, limit)
         elif cost <= _least(search, settings):

@@ -27,15 +27,15 @@ from planner.anytime.problem import (
     PathProblem,
 )
 from planner.anytime.random import uniform
-from planner.anytime.state import BEST, KEPT, AnytimeSearch
-from planner.kernels.jit import kernel
+from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle
+from planner.kernels.jit import kernel, leaf
 from planner.wrench.translation import edge_held
 
 Array = NDArray[np.float64]
 
 _TRIALS, _SLOW_TRIALS = 400, 100
 """Changes tried in a round; the second where clearances are asked for or edges have pulleys."""
-_TURNS = ((100, 30), (300, 90), (600, 180))
+_TURNS = ((20, 8), (40, 15), (100, 30), (300, 90), (600, 180))
 """Samples of the two trees and of the roadmap in a round without a path, taking turns."""
 _SAMPLES_OF_TREES = 4000
 """After this many without a path the two trees are restarted."""
@@ -57,13 +57,20 @@ _PATIENCE = 8
 
 
 @kernel
-def advance(problem: PathProblem, search: AnytimeSearch, rounds: int) -> float:
+def handle_of(problem: PathProblem, search: AnytimeSearch) -> Handle:
+    """Both as one reference; what is changed in them later is changed for it, too."""
+    return Handle(problem, search)  # type: ignore[no-untyped-call]
+
+
+@kernel
+def advance(handle: Handle, rounds: int) -> float:
     """Does some rounds; returns the cost of the best path so far, infinite without one.
 
     Where the grid's margins mislead, `PathProblem.terms` is changed: where they leave no path they
     are no longer asked, which shows whether obstacles do; and where a path is found that is not
     proved to hold the wrenches, proofs are asked for from then on.
     """
+    problem, search = handle.problem, handle.search
     for _ in range(rounds):
         begun = search.totals[0]
         search.totals[0] += 1
@@ -205,12 +212,13 @@ def _begin(problem: PathProblem, search: AnytimeSearch, kept: int) -> int:
     return kept
 
 
-@kernel
+@leaf
 def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> int:
     """A path by two trees, or by a roadmap where they miss a gap: its vertices, 0 for none."""
     if search.grown[3] >= _SAMPLES_OF_TREES:
         search.totals[2] += search.grown[2]
-        search.grown[:] = 0
+        for i in range(len(search.grown)):
+            search.grown[i] = 0
     for in_trees, in_passages in _TURNS:
         found = connect(
             problem,
@@ -231,6 +239,9 @@ def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> 
                 search.above,
                 search.parts,
                 search.made,
+                search.trees,
+                search.parents,
+                search.grown,
                 in_passages,
                 points,
             )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
+from numba.experimental import structref
 from numpy.typing import NDArray
 
 from planner.anytime.connect import NODES
@@ -60,6 +62,25 @@ class AnytimeSearch(NamedTuple):
     totals: Integers
     first: Array
     state: State
+
+
+@structref.register
+class _HandleType(types.StructRef):
+    """What compiled code takes a handle for."""
+
+
+class Handle(structref.StructRefProxy):
+    """A problem and the state of a search in it (``problem``, ``search``), as one reference.
+
+    At every call from Python Numba looks at each array that it is given; the fifty of a problem and
+    a search take longer than many a search. `planner.anytime.rounds.handle_of` makes a handle.
+    """
+
+    problem: Any
+    search: Any
+
+
+structref.define_proxy(Handle, _HandleType, ["problem", "search"])  # type: ignore[no-untyped-call]
 
 
 def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:

@@ -13,7 +13,7 @@ from model.scene import Scene
 from planner.anytime.local_search import Polyline
 from planner.anytime.prepare import problem_of
 from planner.anytime.problem import PathProblem
-from planner.anytime.rounds import advance
+from planner.anytime.rounds import advance, handle_of
 from planner.anytime.state import BEST, AnytimeSearch, new_search
 from planner.costs import KinematicCost
 from planner.endpoints import require_usable_ends
@@ -37,7 +37,7 @@ def ends_of(scene: Scene) -> Array:
 def searched(asked: PathProblem, scene: Scene, rounds: int, seed: int = 0) -> AnytimeSearch:
     """A search after so many rounds."""
     search = new_search(*ends_of(scene), seed)
-    advance(asked, search, rounds)
+    advance(handle_of(asked, search), rounds)
     return search
 
 

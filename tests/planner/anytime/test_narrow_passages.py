@@ -13,7 +13,7 @@ from model.pose import Pose
 from planner.anytime.path import best_path, optimal_route
 from planner.anytime.prepare import problem_of
 from planner.anytime.problem import PathProblem
-from planner.anytime.rounds import advance
+from planner.anytime.rounds import advance, handle_of
 from planner.anytime.state import new_search
 from planner.check import check_path
 from planner.costs import KinematicCost
@@ -32,7 +32,7 @@ def problem(passage: Passage) -> PathProblem:
 
 def found(passage: Passage, seed: int) -> np.ndarray | None:
     search = new_search(passage.path[0], passage.path[-1], seed)
-    advance(problem(passage), search, ROUNDS)
+    advance(handle_of(problem(passage), search), ROUNDS)
     return best_path(search)
 
 

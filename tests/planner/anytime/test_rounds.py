@@ -13,7 +13,7 @@ import pytest
 from model.pose import Pose
 from model.scene import scene_from_document
 from planner.anytime.problem import ASK_PROOF, LEAST_MARGIN, NO_MARGIN
-from planner.anytime.rounds import advance
+from planner.anytime.rounds import advance, handle_of
 from planner.anytime.state import BEST, KEPT, new_search
 from planner.check import check_path
 from planner.costs import capacity_margins
@@ -58,7 +58,7 @@ def test_rounds_one_by_one_are_the_same_as_all_at_once(asked) -> None:
     question, scene = asked(3)
     step_by_step = new_search(*ends_of(scene), 9)
     for _ in range(20):
-        advance(question, step_by_step, 1)
+        advance(handle_of(question, step_by_step), 1)
     assert best_points(step_by_step).tobytes() == best_points(searched(*asked(3), 20, 9)).tobytes()
 
 
@@ -87,7 +87,7 @@ def test_more_rounds_never_give_a_worse_path(asked, name, seed) -> None:
     unit = OBJECTIVES[name].length + OBJECTIVES[name].kinematic * float(question.kinematic.mean())
     straight = float(np.linalg.norm(np.subtract(*ends_of(scene))))
     for _ in range(40):
-        cost = advance(question, search, 1)
+        cost = advance(handle_of(question, search), 1)
         worth = cost + LAST_VERTEX_PRICE * straight * unit * search.counts[BEST, 0]
         assert worth <= last + 1e-12
         last = worth
