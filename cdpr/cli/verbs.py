@@ -76,12 +76,12 @@ CALIBRATE = (
     ),
     Verb(
         "export",
-        "Write a camera's matrix and lens for OpenCV (YAML) or ROS (camera_info).",
+        "Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.",
         "calibrate.exchange:export",
     ),
     Verb(
         "import",
-        "Write a new rig file with a camera's matrix and lens from OpenCV or ROS.",
+        "Write a new rig file with a camera's matrix and lens from another program.",
         "calibrate.exchange:import_",
     ),
 )
