@@ -23,6 +23,8 @@ from tracking.settings import TrackerSettings
 # Why a pose that was found is not believed.
 
 
+UNCERTAIN = "the position's uncertainty is"
+"""What is said of a pose by edges that are too soft, too few or too far away."""
 UNSHARP = "are too blurred to be measured"
 """What is said of tags that are read, but whose edges are not found."""
 
@@ -51,7 +53,7 @@ def doubt(
     largest = float(np.sqrt(np.linalg.norm(bundle.covariance[:3, :3], 2)))
     if not largest <= limits.position_deviation:
         return (
-            f"the position's uncertainty is {largest * 1e3:.1f} mm,"
+            f"{UNCERTAIN} {largest * 1e3:.1f} mm,"
             f" the limit is {limits.position_deviation * 1e3:g} mm"
         )
     return ""
