@@ -166,7 +166,7 @@ def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
 
 def test_a_rotation_of_the_camera_is_no_error_of_it() -> None:
     found = calibrate_from_views(views("fisheye"), SIZE, lens="fisheye")
-    slopes, turns = _slopes(found)
+    slopes, turns = _slopes(found, picture_grid(SIZE))
     assert np.abs(_without_rotation(turns, turns)).max() < 1e-9 * np.abs(turns).max()
     freed = _without_rotation(slopes, turns)
     assert (np.linalg.norm(freed, axis=(0, 1)) <= np.linalg.norm(slopes, axis=(0, 1))).all()
