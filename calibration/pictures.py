@@ -11,8 +11,8 @@ import cv2
 
 from calibration.intrinsics.capture import CaptureGuide
 from calibration.targets.board import Board, plain_camera
-from drivers.cameras.files import OneCamerasPictures
-from drivers.cameras.live import LiveCamera, VideoFile, video_size
+from drivers.cameras.files import ImageFolder, OneCamerasPictures
+from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
 from model.errors import BadInput
 from model.files.documents import write_bytes_atomic
@@ -91,6 +91,37 @@ def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: i
         return _spread_over(VideoFile(path, camera), most)
     require_camera_source(str(source))
     return Pictures(_live(str(source), camera, most), most)
+
+
+def timed_pictures(source: Path, camera: Camera, rate: float | None) -> Pictures:
+    """All images of a folder or a video, which know when they were taken.
+
+    Args:
+        source: The folder, or the file.
+        camera: The rig's camera that took them.
+        rate: Images a second of a folder; the camera's when left out.
+
+    Returns:
+        The images; their names are times in seconds since the first, such as ``0.100 s a.png``.
+
+    Raises:
+        BadInput: It is neither, or its images are of another size.
+    """
+    if source.is_dir():
+        folder = ImageFolder(source, camera, rate)
+        return Pictures(_named_by_time(folder), len(folder), folder.unused)
+    if rate is not None:
+        raise BadInput(
+            "--rate-hz is for a folder of images",
+            where=str(source),
+            next_step="leave it out: a video states its rate",
+        )
+    video = VideoFile(source, camera)
+    return Pictures(_named_by_time(video), len(video))
+
+
+def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
+    return ((f"{frame.time:.6f} s {frame.name}", frame.image) for frame in frames)
 
 
 def _spread_over(video: VideoFile, most: int) -> Pictures:

@@ -26,8 +26,16 @@ from calibration.geometry.result import RigResult, rig_result
 from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
 from calibration.intrinsics.lens import AUTO
 from calibration.intrinsics.quality import CameraQuality, judge_camera
+from calibration.intrinsics.readout import (
+    ReadoutCalibration,
+    ReadoutResult,
+    fit_readout,
+    judge_readout,
+    readout_page,
+    readout_result,
+)
 from calibration.intrinsics.result import CameraResult, camera_page, camera_result
-from calibration.pictures import Pictures, pictures_in, pictures_of
+from calibration.pictures import Pictures, pictures_in, pictures_of, timed_pictures
 from calibration.results import ResultDocument, require_file_name, result_file_name, write_result
 from calibration.run_data import poses_by_picture, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
@@ -157,6 +165,7 @@ class Destination:
 CameraOutcome = Calibration[CameraResult, CameraCalibration, CameraQuality]
 ExtrinsicsOutcome = Calibration[ExtrinsicsResult, ExtrinsicCalibration, CalibrationVerdict]
 TagsOutcome = Calibration[TagsResult, TagLayout, CalibrationVerdict]
+ReadoutOutcome = Calibration[ReadoutResult, ReadoutCalibration, CalibrationVerdict]
 RigOutcome = Calibration[RigResult, RigCalibration, RigQuality]
 
 
@@ -285,6 +294,49 @@ def locate_tags(
     return Calibration(result, tags_page(found, result, verdict), found, verdict).saved_in(
         to.folder
     )
+
+
+def measure_readout(
+    rig: Rig,
+    camera: Camera,
+    source: Path,
+    *,
+    rate: float | None = None,
+    speed: float | None = None,
+    wanted: float = 0.1e-3,
+    to: Destination | None = None,
+    listener: Listener = SILENT,
+) -> ReadoutOutcome:
+    """Finds how long a camera takes from its top row to its bottom row (rolling shutter).
+
+    Args:
+        rig: The robot; its platform moves in the images and carries tags.
+        camera: Its matrix and distortion hold; it stands still.
+        source: A video, or a folder of images one after the other.
+        rate: Images a second of a folder; the camera's when left out.
+        speed: Of the platform, for which the error is stated, [m/s]; the rig's when left out.
+        wanted: What is good enough, 95 %, [m].
+        to: Where the result is written; nowhere when left out.
+        listener: Receives how far it is.
+
+    Raises:
+        BadInput: There are no tags, or the images do not determine the readout.
+    """
+    require_file_name(camera.name, "cameras")
+    require_tags(rig, None)
+    pictures, to = timed_pictures(source, camera, rate), to or Destination()
+    to.require_free("readout", camera.name)
+    ready_to_measure(listener)
+    with pictures.reported("detecting tags", listener) as images:
+        numbers = [tag.id for tag in rig.platform_tags]
+        sights = sights_of(images, rig, camera, numbers, pictures.unused)
+    times = {name: float(name.split(" s ")[0]) for name in sights.squares}
+    found = fit_readout(rig, camera, sights, times)
+    speed = rig.motion.speed if speed is None else speed
+    verdict = judge_readout(found, wanted, speed)
+    result = readout_result(found, verdict, speed, to.on)
+    page = readout_page(found, verdict, result.date)
+    return Calibration(result, page, found, verdict).saved_in(to.folder)
 
 
 def _pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:

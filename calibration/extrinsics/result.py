@@ -74,7 +74,7 @@ class ExtrinsicsResult(ResultDocument):
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
 
 
-_NOT_OF_THE_LENS = ("world_from_camera", "rate_hz", "pose_covariance", "error_mm")
+_NOT_OF_THE_LENS = ("world_from_camera", "rate_hz", "pose_covariance", "error_mm", "readout_ms")
 
 
 def extrinsics_result(

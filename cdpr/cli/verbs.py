@@ -45,6 +45,11 @@ CALIBRATE = (
         "calibrate.extrinsics:extrinsics",
     ),
     Verb(
+        "readout",
+        "Measure a rolling shutter, from images of the platform while it moves.",
+        "calibrate.readout:readout",
+    ),
+    Verb(
         "tags",
         "Find the tags' poses on the platform, from images that show two or more at once.",
         "calibrate.tags:tags",
