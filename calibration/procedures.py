@@ -50,7 +50,7 @@ from model.files.documents import write_atomic
 from model.files.output import make_place, require_new_file
 from model.files.rig_file import RigDocument
 from model.kinematics import NoCable
-from model.pose import Pose
+from model.pose import Pose, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 
@@ -355,6 +355,7 @@ def calibrate_rig(
     length_deviation: float = 0.1e-3,
     pose_deviations: tuple[float, float] = (0.1e-3, radians(0.02)),
     without_poses: bool = False,
+    reflector: Sequence[float] = (0.0, 0.0, 0.0),
     tilt: float = radians(5.0),
     wanted: float = 1e-3,
     name: str = "rig",
@@ -372,6 +373,8 @@ def calibrate_rig(
         length_deviation: Of a cable's length from the encoders, [m].
         pose_deviations: Of poses, added to that of their file, [m] and [rad].
         without_poses: Drive positions alone, as without a camera.
+        reflector: The point whose positions were measured where no rotation was, platform frame,
+            [m].
         tilt: How far the platform will be rotated, [rad].
         wanted: What is good enough, 95 %, [m].
         name: Of the result.
@@ -385,7 +388,10 @@ def calibrate_rig(
     require_file_name(name, "--name")
     counted, measured = rig_measurements(rig, data)
     length, turn = pose_deviations
-    measured = measured.with_doubt(np.array([length] * 3 + [turn] * 3))
+    measured = replace(
+        measured.with_doubt(np.array([length] * 3 + [turn] * 3)),
+        reflector=read_only(reflector),
+    )
     if without_poses:
         measured = measured.without_poses()
     to = to or Destination()
