@@ -23,7 +23,7 @@ from calibration.geometry.model import DEFAULT_DEVIATIONS
 from calibration.geometry.quality import RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
-from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
+from calibration.intrinsics.calibrate import CameraCalibration, fit_camera, fit_corners
 from calibration.intrinsics.lens import AUTO
 from calibration.intrinsics.quality import CameraQuality, judge_camera
 from calibration.intrinsics.readout import (
@@ -41,7 +41,7 @@ from calibration.run_data import poses_by_picture, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
 from calibration.tag_map.observations import sights_of
 from calibration.tag_map.result import TagsResult, judge_layout, tags_page, tags_result
-from calibration.targets.board import Board
+from calibration.targets.board import Board, read_corners
 from calibration.verdict import CalibrationVerdict
 from executor.kernels import ready_to_measure
 from model.display import html_table
@@ -202,6 +202,43 @@ def calibrate_camera(
     to.require_free("camera", name)
     with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused, lens)
+    return _judged_camera(found, name, wanted, distance, to)
+
+
+def calibrate_camera_from_corners(
+    corners: Path,
+    size: tuple[int, int],
+    *,
+    name: str = "camera",
+    wanted: float = 1e-3,
+    distance: float | None = None,
+    lens: str = AUTO,
+    to: Destination | None = None,
+) -> CameraOutcome:
+    """Finds a camera's matrix and lens distortion from corners that another program detected.
+
+    Args:
+        corners: A CSV file (docs/data-formats.md).
+        size: Width and height of the images, [px].
+        name: As the others of `calibrate_camera`.
+        wanted: So is this, [m].
+        distance: And this, [m].
+        lens: And this.
+        to: And this.
+
+    Raises:
+        BadInput: The file cannot be read, corners are outside the images, or too few.
+    """
+    require_file_name(name, "--name")
+    to = to or Destination()
+    to.require_free("camera", name)
+    found = fit_corners(read_corners(corners), size, lens, str(corners))
+    return _judged_camera(found, name, wanted, distance, to)
+
+
+def _judged_camera(
+    found: CameraCalibration, name: str, wanted: float, distance: float | None, to: Destination
+) -> CameraOutcome:
     quality = judge_camera(found, wanted, distance)
     result = camera_result(found, quality, name, to.on)
     return Calibration(

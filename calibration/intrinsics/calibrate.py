@@ -136,6 +136,33 @@ def _same(seen: Seen, before: Seen) -> bool:
     return same_points and is_duplicate_view(seen.corners, before.corners)
 
 
+def fit_corners(
+    views: Mapping[str, Seen], size: tuple[int, int], lens: str, where: str
+) -> CameraCalibration:
+    """Fits a camera to corners that another program detected.
+
+    Args:
+        views: By picture.
+        size: Width and height of the images, [px].
+        lens: As of `fit_camera`.
+        where: Names the source in messages.
+
+    Raises:
+        BadInput: Too few pictures, or corners outside the images.
+    """
+    every = np.concatenate([seen.corners for seen in views.values()])
+    low, high = every.min(axis=0), every.max(axis=0)
+    if (low < -0.5).any() or (high > np.array(size) - 0.5).any() or len(views) < LEAST_VIEWS:
+        raise BadInput(
+            f"{len(views)} pictures have corners from ({low[0]:.0f}, {low[1]:.0f}) to"
+            f" ({high[0]:.0f}, {high[1]:.0f}) px; {LEAST_VIEWS} are required, within {size[0]} x"
+            f" {size[1]} px",
+            where=where,
+            next_step="check the columns and the size of the images",
+        )
+    return calibrate_from_views(views, size, lens=lens)
+
+
 def calibrate_from_views(
     views: Mapping[str, Seen],
     size: tuple[int, int],
