@@ -1,7 +1,4 @@
-"""Whole calibrations: from images or runs to a judged result and its report.
-
-`calibration.load.with_calibrations` puts their result files into a rig.
-"""
+"""Whole calibrations: from images or runs to a judged result and its report."""
 
 from __future__ import annotations
 
@@ -220,14 +217,14 @@ def calibrate_camera_from_corners(
     Args:
         corners: A CSV file (docs/data-formats.md).
         size: Width and height of the images, [px].
-        name: As the others of `calibrate_camera`.
-        wanted: So is this, [m].
-        distance: And this, [m].
-        lens: And this.
-        to: And this.
+        name: Of the camera.
+        wanted: What is good enough, 95 %, [m].
+        distance: From which the camera measures, [m].
+        lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
+        to: For the result.
 
     Raises:
-        BadInput: The file cannot be read, corners are outside the images, or too few.
+        BadInput: The file cannot be read, or as of `fit_corners`.
     """
     require_file_name(name, "--name")
     to = to or Destination()
@@ -278,7 +275,7 @@ def locate_camera(
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags
-    source, to = _pictures(pictures, camera, USUAL_PICTURES), to or Destination()
+    source, to = opened_pictures(pictures, camera, USUAL_PICTURES), to or Destination()
     to.require_free("extrinsics", camera.name)
     ready_to_measure(listener)
     with source.reported("detecting tags", listener) as images:
@@ -319,7 +316,7 @@ def locate_tags(
     """
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
-    source, to = _pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
+    source, to = opened_pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
     to.require_free("tags", rig.name)
     ready_to_measure(listener)
     with source.reported("detecting tags", listener) as images:
@@ -376,7 +373,8 @@ def measure_readout(
     return Calibration(result, page, found, verdict).saved_in(to.folder)
 
 
-def _pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
+def opened_pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
+    """The images of a source; ``usual`` of a camera or a video."""
     if isinstance(pictures, Pictures):
         return pictures
     if callable(pictures):
@@ -410,8 +408,7 @@ def calibrate_rig(
         length_deviation: Of a cable's length from the encoders, [m].
         pose_deviations: Of poses, added to that of their file, [m] and [rad].
         without_poses: Drive positions alone, as without a camera.
-        reflector: The point whose positions were measured where no rotation was, platform frame,
-            [m].
+        reflector: The point of positions without rotations, platform frame, [m].
         tilt: How far the platform will be rotated, [rad].
         wanted: What is good enough, 95 %, [m].
         name: Of the result.
