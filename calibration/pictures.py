@@ -174,6 +174,7 @@ def take_pictures(
             if advice.taken:
                 data = cv2.imencode(".png", image)[1].tobytes()
                 write_bytes_atomic(folder / f"live_{len(guide.views):03}.png", data)
+                on_advice(guide.drawn())
             if advice.text != last:
                 last = advice.text
                 on_advice(last)
