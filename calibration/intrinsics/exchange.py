@@ -13,6 +13,7 @@ import ast
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -36,8 +37,10 @@ _MRCAL_MODELS = {
     "LENSMODEL_OPENCV8": 8,
     "LENSMODEL_OPENCV12": 12,
 }
-_TEXT_LIMIT = 32_000_000
-"""Of characters; mrcal's files may hold all corners that they were made from."""
+_SMALL, _TEXT_LIMIT = 1_000_000, 32_000_000
+"""Of characters, of OpenCV and of all; mrcal's may hold all corners that they were made from."""
+_BAD_NUMBERS = (TypeError, ValueError, OverflowError, AttributeError)
+"""What a file raises whose numbers are none."""
 _KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
 
 
@@ -243,19 +246,38 @@ def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
 
 
 def _from_opencv(text: str, path: Path) -> dict[str, Any]:
+    """Read without OpenCV, whose own reader dies of damaged files."""
+    if len(text) > _SMALL:
+        raise _unusable(path, f"it is longer than {_SMALL} characters")
     try:
-        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        size = [storage.getNode(f"image_{side}") for side in ("width", "height")]
-        matrix = storage.getNode("camera_matrix").mat()
-        lens = storage.getNode("distortion_coefficients").mat()
-        fisheye = storage.getNode("fisheye_model")
-        is_fisheye = not fisheye.empty() and int(fisheye.real()) == 1
-        if any(node.empty() for node in size) or not (np.size(matrix) > 1 and np.size(lens) > 1):
-            raise _unusable(path, "its size, camera_matrix or distortion_coefficients is missing")
-        width, height = (int(node.real()) for node in size)
-    except (cv2.error, SystemError) as error:
-        raise _unusable(path, str(error).strip().splitlines()[-1]) from None
+        plain = _opencv_xml(text) if text.lstrip().startswith("<") else _opencv_yaml(text)
+        width, height = int(plain["image_width"]), int(plain["image_height"])
+        matrix, lens = (
+            np.array(plain[key]["data"], dtype=np.float64)
+            for key in ("camera_matrix", "distortion_coefficients")
+        )
+        is_fisheye = int(plain.get("fisheye_model", 0)) == 1
+    except KeyError as error:
+        raise _unusable(path, f"{error} is missing") from None
+    except (*_BAD_NUMBERS, yaml.YAMLError, ElementTree.ParseError, RecursionError) as error:
+        raise _unusable(path, f"{type(error).__name__}: {error}"[:200]) from None
     return _numbers(path, width, height, matrix, lens, "fisheye" if is_fisheye else "pinhole")
+
+
+def _opencv_yaml(text: str) -> Mapping[str, Any]:
+    body = text.lstrip().partition("\n")[2].replace("!!opencv-matrix", "")
+    plain = yaml.safe_load(body)
+    if not isinstance(plain, Mapping):
+        raise ValueError("it holds no names")
+    return plain
+
+
+def _opencv_xml(text: str) -> Mapping[str, Any]:
+    found: dict[str, Any] = {}
+    for node in ElementTree.fromstring(text):
+        data = node.find("data")
+        found[node.tag] = node.text if data is None else {"data": (data.text or "").split()}
+    return found
 
 
 def _from_ros(plain: object, path: Path) -> dict[str, Any]:
@@ -266,9 +288,9 @@ def _from_ros(plain: object, path: Path) -> dict[str, Any]:
         matrix = np.array(plain["camera_matrix"]["data"], dtype=np.float64)
         lens = np.array(plain["distortion_coefficients"]["data"], dtype=np.float64)
         width, height = plain["image_width"], plain["image_height"]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, *_BAD_NUMBERS) as error:
         raise _unusable(path, f"{type(error).__name__}: {error}") from None
-    if model not in (*_ROS_MODELS, *_ROS_FISHEYE):
+    if str(model) not in (*_ROS_MODELS, *_ROS_FISHEYE):
         raise _unusable(path, f"its distortion_model {model!r} is not known")
     kind = "fisheye" if model in _ROS_FISHEYE else "pinhole"
     return _numbers(path, width, height, matrix, lens, kind)
@@ -292,9 +314,9 @@ def _from_kalibr(plain: Mapping[Any, Any], path: Path, entry: str | None) -> dic
         kind, model = own["camera_model"], own["distortion_model"]
         lens, numbers = list(own["distortion_coeffs"]), list(own["intrinsics"])
         width, height = own["resolution"]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, *_BAD_NUMBERS) as error:
         raise _unusable(path, f"{name}: {type(error).__name__}: {error}") from None
-    if kind != "pinhole" or model not in _KALIBR_MODELS:
+    if kind != "pinhole" or str(model) not in _KALIBR_MODELS:
         why = f"{name} is {kind}-{model}; pinhole-radtan and pinhole-equi(distant) can be read"
         raise _unusable(path, why)
     ours, count = _KALIBR_MODELS[model]
@@ -308,9 +330,9 @@ def _from_mrcal(text: str, path: Path) -> dict[str, Any]:
         plain = ast.literal_eval(_without_comments(text))
         model, numbers = plain["lensmodel"], list(plain["intrinsics"])
         width, height = plain["imagersize"]
-    except (KeyError, TypeError, ValueError, SyntaxError, RecursionError, MemoryError) as error:
+    except (KeyError, *_BAD_NUMBERS, SyntaxError, RecursionError, MemoryError) as error:
         raise _unusable(path, f"{type(error).__name__}: {error}"[:200]) from None
-    if model not in _MRCAL_MODELS:
+    if str(model) not in _MRCAL_MODELS:
         known = ", ".join(_MRCAL_MODELS)
         why = f"its lensmodel is {model!r}; mrcal-convert-lensmodel makes one of {known} of it"
         raise _unusable(path, why)
@@ -327,7 +349,7 @@ def _without_comments(text: str) -> str:
 def _matrix_of(path: Path, numbers: list[Any]) -> np.ndarray[Any, Any]:
     try:
         fx, fy, cx, cy = (float(number) for number in numbers[:4])
-    except (TypeError, ValueError) as error:
+    except _BAD_NUMBERS as error:
         raise _unusable(path, f"intrinsics: {error}") from None
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
@@ -336,10 +358,10 @@ def _numbers(
     path: Path, width: object, height: object, matrix: object, lens: object, kind: str
 ) -> dict[str, Any]:
     """The keys of the rig file's ``cameras``."""
-    numbers = np.asarray(matrix, np.float64)
     try:
+        numbers = np.asarray(matrix, np.float64)
         coefficients = np.ravel(np.asarray(lens, np.float64))
-    except (TypeError, ValueError) as error:
+    except _BAD_NUMBERS as error:
         raise _unusable(path, f"distortion: {error}") from None
     if numbers.size != 9:
         raise _unusable(path, "camera_matrix is not 3 x 3")

@@ -384,7 +384,12 @@ def test_opencv_itself_reads_what_is_written(rig, tmp_path) -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "a: 1", "%YAML:1.0\n---\nimage_width: 640\n", "%YAML:1.0\n---\n{[", "- 1",
-     "cam0: 3", "cam0: {camera_model: pinhole}", "{'lensmodel': 3}", "{'lensmodel': [",
+     "cam0: 3", "{'lensmodel': ['a'], 'intrinsics': [1, 2, 3, 4], 'imagersize': [1, 2]}",
+     "{'lensmodel': 'LENSMODEL_PINHOLE', 'intrinsics': [1%s, 2, 3, 4], 'imagersize': [1, 2]}"
+     % ("0" * 400), "%YAML:1.0\n- 3\n", "<?xml version='1.0'?><a>",
+     "cam0: {camera_model: pinhole, distortion_model: [a], distortion_coeffs: [],"
+     " intrinsics: [1, 2, 3, 4], resolution: [9, 9]}",
+     "cam0: {camera_model: pinhole}", "{'lensmodel': 3}", "{'lensmodel': [",
      "{'lensmodel': 'LENSMODEL_PINHOLE', 'intrinsics': 'abcd', 'imagersize': [1, 2]}",
      "image_width: 640\nimage_height: 480\ndistortion_model: odd\n"
      "camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_coefficients: {data: []}"],
@@ -405,6 +410,31 @@ def test_a_rig_file_with_an_imported_lens_is_written_and_never_replaced(rig, tmp
     one_message(call("calibrate", "import", path, file, "-o", new), 2, "exists already")
     with pytest.raises(BadInput, match="exists"):
         write_rig_with_camera(new, rig, rig.cameras[0].name, file)
+
+
+def test_a_camera_of_opencvs_xml_is_read(rig, tmp_path) -> None:
+    file = tmp_path / "camera.xml"
+    storage = cv2.FileStorage(str(file), cv2.FileStorage_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", matrix_of(500.0))
+    storage.write("distortion_coefficients", np.array([[0.1, 0.2, 0.0, 0.0, 0.3]]))
+    storage.release()
+    found = imported_camera(file, rig.document.cameras[0])
+    assert (found.fx_px, found.cx_px, found.width_px) == (500.0, 470.0, 640)
+    assert found.distortion == [0.1, 0.2, 0.0, 0.0, 0.3]
+
+
+def test_a_damaged_opencv_file_ends_in_a_message_not_in_a_dead_program(rig, tmp_path) -> None:
+    """OpenCV's own reader writes past the end of a matrix with fewer rows than numbers."""
+    whole = FORMATS["opencv"](with_lens(rig, "pinhole", [0.1, 0.2, 0.0, 0.0, 0.3]))
+    file = tmp_path / "camera.yml"
+    for old, new in (("rows: 3", "rows: 99999"), ("dt: d", "dt: 9x"), ("1280", "9" * 400)):
+        file.write_text(whole.replace(old, new))
+        try:
+            imported_camera(file, rig.document.cameras[0])
+        except BadInput:
+            continue
 
 
 def test_ros_has_no_thin_prism(rig) -> None:
