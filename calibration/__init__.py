@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from calibration.extrinsics.result import ExtrinsicsResult
     from calibration.geometry.pose_selection import measurement_poses
     from calibration.geometry.result import RigResult
-    from calibration.intrinsics.readout import ReadoutResult
     from calibration.intrinsics.result import CameraResult
     from calibration.load import load_result
     from calibration.procedures import Calibration
@@ -28,7 +27,6 @@ __all__ = [
     "Chessboard",
     "CircleGrid",
     "ExtrinsicsResult",
-    "ReadoutResult",
     "ResultDocument",
     "RigResult",
     "TagGrid",
@@ -44,7 +42,6 @@ if not TYPE_CHECKING:
             "calibration.extrinsics.result": "ExtrinsicsResult",
             "calibration.geometry.pose_selection": "measurement_poses",
             "calibration.geometry.result": "RigResult",
-            "calibration.intrinsics.readout": "ReadoutResult",
             "calibration.intrinsics.result": "CameraResult",
             "calibration.load": "load_result",
             "calibration.procedures": "Calibration",
