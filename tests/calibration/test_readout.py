@@ -59,7 +59,7 @@ def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: P
     made = measure_readout(rig, rig.cameras[0], film, rate=RATE)
     found = made.found
     assert abs(found.readout - TRUE) < found.half_width
-    assert found.half_width < 0.15 * TRUE
+    assert found.half_width < 0.05 * TRUE
     assert len(found.speeds) == 22
     assert found.after < 0.7 * found.before
     assert made.quality.good
