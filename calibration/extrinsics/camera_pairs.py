@@ -79,7 +79,7 @@ def looks_at_tags(rig: Rig, camera: Camera, sights: TagSights) -> dict[str, Body
         if bundle is None or not np.isfinite(bundle.covariance).all():
             continue
         alone = len(squares) == 1
-        if not alone or bundle.rival_cost - bundle.cost > TrackerSettings().single_tag_margin:
+        if not alone or bundle.second_best_cost - bundle.cost > TrackerSettings().single_tag_margin:
             found[name] = BodyLook(bundle.camera_from_body, bundle.covariance, bundle.reprojection)
     return found
 
