@@ -9,6 +9,7 @@ import yaml
 
 from calibration.extrinsics.result import ExtrinsicsResult
 from calibration.geometry.result import RigResult
+from calibration.intrinsics.readout import ReadoutResult
 from calibration.intrinsics.result import CameraResult
 from calibration.results import ResultDocument, in_order
 from calibration.tag_map.result import TagsResult
@@ -19,6 +20,7 @@ from model.rig import Rig
 
 KINDS: dict[str, type[ResultDocument]] = {
     "camera": CameraResult,
+    "readout": ReadoutResult,
     "tags": TagsResult,
     "extrinsics": ExtrinsicsResult,
     "rig": RigResult,

@@ -11,8 +11,8 @@ import cv2
 
 from calibration.intrinsics.capture import CaptureGuide
 from calibration.targets.board import Board, plain_camera
-from drivers.cameras.files import OneCamerasPictures
-from drivers.cameras.live import LiveCamera, VideoFile, video_size
+from drivers.cameras.files import ImageFolder, OneCamerasPictures
+from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
 from model.errors import BadInput
 from model.files.documents import write_bytes_atomic
@@ -93,6 +93,37 @@ def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: i
     return Pictures(_live(str(source), camera, most), most)
 
 
+def timed_pictures(source: Path, camera: Camera, rate: float | None) -> Pictures:
+    """All images of a folder or a video, which know when they were taken.
+
+    Args:
+        source: The folder, or the file.
+        camera: The rig's camera that took them.
+        rate: Images a second of a folder; the camera's when left out.
+
+    Returns:
+        The images; their names are times in seconds since the first, such as ``0.100 s a.png``.
+
+    Raises:
+        BadInput: It is neither, or its images are of another size.
+    """
+    if source.is_dir():
+        folder = ImageFolder(source, camera, rate)
+        return Pictures(_named_by_time(folder), len(folder), folder.unused)
+    if rate is not None:
+        raise BadInput(
+            "--rate-hz is for a folder of images",
+            where=str(source),
+            next_step="leave it out: a video states its rate",
+        )
+    video = VideoFile(source, camera)
+    return Pictures(_named_by_time(video), len(video))
+
+
+def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
+    return ((f"{frame.time:.6f} s {frame.name}", frame.image) for frame in frames)
+
+
 def _spread_over(video: VideoFile, most: int) -> Pictures:
     every = max(1, -(-len(video) // most))
     frames = (frame for number, frame in enumerate(video) if number % every == 0)
@@ -143,6 +174,7 @@ def take_pictures(
             if advice.taken:
                 data = cv2.imencode(".png", image)[1].tobytes()
                 write_bytes_atomic(folder / f"live_{len(guide.views):03}.png", data)
+                on_advice(guide.drawn())
             if advice.text != last:
                 last = advice.text
                 on_advice(last)

@@ -1,7 +1,4 @@
-"""Whole calibrations: from images or runs to a judged result and its report.
-
-`calibration.load.with_calibrations` puts their result files into a rig.
-"""
+"""Whole calibrations: from images or runs to a judged result and its report."""
 
 from __future__ import annotations
 
@@ -23,17 +20,25 @@ from calibration.geometry.model import DEFAULT_DEVIATIONS
 from calibration.geometry.quality import RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
-from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
+from calibration.intrinsics.calibrate import CameraCalibration, fit_camera, fit_corners
 from calibration.intrinsics.lens import AUTO
 from calibration.intrinsics.quality import CameraQuality, judge_camera
+from calibration.intrinsics.readout import (
+    ReadoutCalibration,
+    ReadoutResult,
+    fit_readout,
+    judge_readout,
+    readout_page,
+    readout_result,
+)
 from calibration.intrinsics.result import CameraResult, camera_page, camera_result
-from calibration.pictures import Pictures, pictures_in, pictures_of
+from calibration.pictures import Pictures, pictures_in, pictures_of, timed_pictures
 from calibration.results import ResultDocument, require_file_name, result_file_name, write_result
 from calibration.run_data import poses_by_picture, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
 from calibration.tag_map.observations import sights_of
 from calibration.tag_map.result import TagsResult, judge_layout, tags_page, tags_result
-from calibration.targets.board import Board
+from calibration.targets.board import Board, read_corners
 from calibration.verdict import CalibrationVerdict
 from executor.kernels import ready_to_measure
 from model.display import html_table
@@ -42,7 +47,7 @@ from model.files.documents import write_atomic
 from model.files.output import make_place, require_new_file
 from model.files.rig_file import RigDocument
 from model.kinematics import NoCable
-from model.pose import Pose
+from model.pose import Pose, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 
@@ -157,6 +162,7 @@ class Destination:
 CameraOutcome = Calibration[CameraResult, CameraCalibration, CameraQuality]
 ExtrinsicsOutcome = Calibration[ExtrinsicsResult, ExtrinsicCalibration, CalibrationVerdict]
 TagsOutcome = Calibration[TagsResult, TagLayout, CalibrationVerdict]
+ReadoutOutcome = Calibration[ReadoutResult, ReadoutCalibration, CalibrationVerdict]
 RigOutcome = Calibration[RigResult, RigCalibration, RigQuality]
 
 
@@ -193,6 +199,43 @@ def calibrate_camera(
     to.require_free("camera", name)
     with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused, lens)
+    return _judged_camera(found, name, wanted, distance, to)
+
+
+def calibrate_camera_from_corners(
+    corners: Path,
+    size: tuple[int, int],
+    *,
+    name: str = "camera",
+    wanted: float = 1e-3,
+    distance: float | None = None,
+    lens: str = AUTO,
+    to: Destination | None = None,
+) -> CameraOutcome:
+    """Finds a camera's matrix and lens distortion from corners that another program detected.
+
+    Args:
+        corners: A CSV file (docs/data-formats.md).
+        size: Width and height of the images, [px].
+        name: Of the camera.
+        wanted: What is good enough, 95 %, [m].
+        distance: From which the camera measures, [m].
+        lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
+        to: For the result.
+
+    Raises:
+        BadInput: The file cannot be read, or as of `fit_corners`.
+    """
+    require_file_name(name, "--name")
+    to = to or Destination()
+    to.require_free("camera", name)
+    found = fit_corners(read_corners(corners), size, lens, str(corners))
+    return _judged_camera(found, name, wanted, distance, to)
+
+
+def _judged_camera(
+    found: CameraCalibration, name: str, wanted: float, distance: float | None, to: Destination
+) -> CameraOutcome:
     quality = judge_camera(found, wanted, distance)
     result = camera_result(found, quality, name, to.on)
     return Calibration(
@@ -232,7 +275,7 @@ def locate_camera(
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags
-    source, to = _pictures(pictures, camera, USUAL_PICTURES), to or Destination()
+    source, to = opened_pictures(pictures, camera, USUAL_PICTURES), to or Destination()
     to.require_free("extrinsics", camera.name)
     ready_to_measure(listener)
     with source.reported("detecting tags", listener) as images:
@@ -273,7 +316,7 @@ def locate_tags(
     """
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
-    source, to = _pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
+    source, to = opened_pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
     to.require_free("tags", rig.name)
     ready_to_measure(listener)
     with source.reported("detecting tags", listener) as images:
@@ -287,7 +330,51 @@ def locate_tags(
     )
 
 
-def _pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
+def measure_readout(
+    rig: Rig,
+    camera: Camera,
+    source: Path,
+    *,
+    rate: float | None = None,
+    speed: float | None = None,
+    wanted: float = 0.1e-3,
+    to: Destination | None = None,
+    listener: Listener = SILENT,
+) -> ReadoutOutcome:
+    """Finds how long a camera takes from its top row to its bottom row (rolling shutter).
+
+    Args:
+        rig: The robot; its platform moves in the images and carries tags.
+        camera: Its matrix and distortion hold; it stands still.
+        source: A video, or a folder of images one after the other.
+        rate: Images a second of a folder; the camera's when left out.
+        speed: Of the platform, for which the error is stated, [m/s]; the rig's when left out.
+        wanted: What is good enough, 95 %, [m].
+        to: Where the result is written; nowhere when left out.
+        listener: Receives how far it is.
+
+    Raises:
+        BadInput: There are no tags, or the images do not determine the readout.
+    """
+    require_file_name(camera.name, "cameras")
+    require_tags(rig, None)
+    pictures, to = timed_pictures(source, camera, rate), to or Destination()
+    to.require_free("readout", camera.name)
+    ready_to_measure(listener)
+    with pictures.reported("detecting tags", listener) as images:
+        numbers = [tag.id for tag in rig.platform_tags]
+        sights = sights_of(images, rig, camera, numbers, pictures.unused)
+    times = {name: float(name.split(" s ")[0]) for name in sights.squares}
+    found = fit_readout(rig, camera, sights, times)
+    speed = rig.motion.speed if speed is None else speed
+    verdict = judge_readout(found, wanted, speed)
+    result = readout_result(found, verdict, speed, to.on)
+    page = readout_page(found, verdict, result.date)
+    return Calibration(result, page, found, verdict).saved_in(to.folder)
+
+
+def opened_pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
+    """The images of a source; ``usual`` of a camera or a video."""
     if isinstance(pictures, Pictures):
         return pictures
     if callable(pictures):
@@ -303,6 +390,7 @@ def calibrate_rig(
     length_deviation: float = 0.1e-3,
     pose_deviations: tuple[float, float] = (0.1e-3, radians(0.02)),
     without_poses: bool = False,
+    reflector: Sequence[float] = (0.0, 0.0, 0.0),
     tilt: float = radians(5.0),
     wanted: float = 1e-3,
     name: str = "rig",
@@ -320,6 +408,7 @@ def calibrate_rig(
         length_deviation: Of a cable's length from the encoders, [m].
         pose_deviations: Of poses, added to that of their file, [m] and [rad].
         without_poses: Drive positions alone, as without a camera.
+        reflector: The point of positions without rotations, platform frame, [m].
         tilt: How far the platform will be rotated, [rad].
         wanted: What is good enough, 95 %, [m].
         name: Of the result.
@@ -333,7 +422,10 @@ def calibrate_rig(
     require_file_name(name, "--name")
     counted, measured = rig_measurements(rig, data)
     length, turn = pose_deviations
-    measured = measured.with_doubt(np.array([length] * 3 + [turn] * 3))
+    measured = replace(
+        measured.with_doubt(np.array([length] * 3 + [turn] * 3)),
+        reflector=read_only(reflector),
+    )
     if without_poses:
         measured = measured.without_poses()
     to = to or Destination()

@@ -229,6 +229,7 @@ def calibrate_rig(
     length_deviation: float = 0.1e-3,
     pose_deviations: tuple[float, float] = (0.1e-3, radians(0.02)),
     without_poses: bool = False,
+    reflector: Sequence[float] = (0.0, 0.0, 0.0),
     tilt: float = radians(5.0),
     wanted: float = 1e-3,
     name: str = "rig",
@@ -245,6 +246,8 @@ def calibrate_rig(
         length_deviation: Of a cable's length from the encoders, [m].
         pose_deviations: Of poses beside what their file states, [m] and [rad].
         without_poses: Drive positions alone, as without a camera.
+        reflector: The point whose positions were measured where no rotation was, platform frame,
+            [m].
         tilt: How far the platform will be rotated, [rad].
         wanted: What is good enough, 95 %, [m].
         name: Of the result.
@@ -261,6 +264,7 @@ def calibrate_rig(
         length_deviation=length_deviation,
         pose_deviations=pose_deviations,
         without_poses=without_poses,
+        reflector=reflector,
         tilt=tilt,
         wanted=wanted,
         name=name,

@@ -45,6 +45,8 @@ class Camera:
         place_covariance: Of ``world_from_camera``: position [m] and rotation vector [rad] along the
             world's axes, shape (6, 6); None where the rig file does not say.
         whole_error: Whether that covariance stands for all that is shared, tags included.
+        readout: From the exposure of the top row to that of the bottom row, [s]; images are stamped
+            with the time of the middle one.
     """
 
     name: str
@@ -57,6 +59,18 @@ class Camera:
     lens: str = "pinhole"
     place_covariance: Array | None = None
     whole_error: bool = False
+    readout: float = 0.0
+
+    def row_times(self, pixels: Array) -> Array:
+        """When rows are exposed, after the middle one.
+
+        Args:
+            pixels: Shape (..., 2), [px].
+
+        Returns:
+            Shape (...), [s].
+        """
+        return np.asarray(self.readout * ((pixels[..., 1] + 0.5) / self.height - 0.5))
 
     def shared_covariance(self, world_from_body: Pose) -> Array:
         """What its place makes every pose that it measures err by alike, shape (6, 6), [m, rad].
@@ -105,6 +119,7 @@ def camera_from(document: CameraDocument) -> Camera:
         lens=document.lens,
         place_covariance=_place_covariance(document),
         whole_error=document.pose_covariance is None and document.error_mm is not None,
+        readout=document.readout_ms / 1e3,
     )
 
 

@@ -153,3 +153,27 @@ def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
     if not turn.any():
         return Pose(position, start.rotation)
     return Pose(position, start.rotation @ matrix_from_rotation_vector(fraction * turn))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlatformMotion:
+    """A steady motion of the platform.
+
+    Attributes:
+        velocity: Of its origin, world frame, shape (3,), [m/s].
+        turning: Along the world's axes, shape (3,), [rad/s].
+    """
+
+    velocity: Array
+    turning: Array
+
+    @classmethod
+    def between(cls, before: Pose, after: Pose, seconds: float) -> PlatformMotion:
+        """The motion from one pose to another in a time that is not 0."""
+        turn = rotation_vector_from_matrix(after.rotation @ before.rotation.T)
+        return cls((after.position - before.position) / seconds, turn / seconds)
+
+    def moved(self, pose: Pose, seconds: float) -> Pose:
+        """The pose at a later or earlier time."""
+        turn = matrix_from_rotation_vector(self.turning * seconds)
+        return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)

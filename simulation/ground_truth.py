@@ -109,7 +109,10 @@ def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
         light=truth.light,
         cables=truth.cables,
     )
-    return _moved(_with_lens(camera, truth), truth.world_from_camera), optics
+    moved = _moved(_with_lens(camera, truth), truth.world_from_camera)
+    if truth.readout_ms is not None:
+        moved = replace(moved, readout=truth.readout_ms / 1e3)
+    return moved, optics
 
 
 def _with_lens(camera: Camera, truth: SimulatedCameraDocument) -> Camera:

@@ -18,11 +18,14 @@ from tracking.detection.tags import modules_across, tag_corners
 from tracking.edges.refine import refine
 from tracking.measurement import NoPose, Observation, PoseMeasurement
 from tracking.pnp import BundlePose, TagView, refine_pnp, solve_pnp
+from tracking.rolling_shutter import FitByRows, RecentMotion, RollingShutter
 from tracking.settings import TrackerSettings
 
 # Why a pose that was found is not believed.
 
 
+UNCERTAIN = "the position's uncertainty is"
+"""What is said of a pose by edges that are too soft, too few or too far away."""
 UNSHARP = "are too blurred to be measured"
 """What is said of tags that are read, but whose edges are not found."""
 
@@ -51,7 +54,7 @@ def doubt(
     largest = float(np.sqrt(np.linalg.norm(bundle.covariance[:3, :3], 2)))
     if not largest <= limits.position_deviation:
         return (
-            f"the position's uncertainty is {largest * 1e3:.1f} mm,"
+            f"{UNCERTAIN} {largest * 1e3:.1f} mm,"
             f" the limit is {limits.position_deviation * 1e3:g} mm"
         )
     return ""
@@ -95,10 +98,14 @@ class PlatformEstimator:
         rig: Its tags and platform.
         camera: The camera that took the images.
         settings: When a pose is believed.
+        recent: The platform's motion, for cameras whose rows are exposed one after the other.
     """
 
-    def __init__(self, rig: Rig, camera: Camera, settings: TrackerSettings) -> None:
+    def __init__(
+        self, rig: Rig, camera: Camera, settings: TrackerSettings, recent: RecentMotion
+    ) -> None:
         self._rig, self._camera, self._settings = rig, camera, settings
+        self._by_rows = RollingShutter(rig, camera, recent)
         self._modules = modules_across(rig.tag_family)
         self._platform = {tag.id: tag for tag in rig.platform_tags}
         self._frame = frozenset(tag.id for tag in rig.frame_tags)
@@ -165,14 +172,23 @@ class PlatformEstimator:
         if start is None:
             return NoPose(time, self._why_nothing(seen, measured), seen)
         views = views + self._looked_for(image, start, {v.tag.id for v in views})
-        fitted = self._fitted(views, start)
+        by_rows: FitByRows | None = None
+        if self._camera.readout == 0.0:
+            fitted = self._fitted(views, start)
+        else:
+            by_rows = self._by_rows.fitted(time, views, start, self._fitted)
+            fitted = None if by_rows is None else (by_rows.views, by_rows.bundle)
         if fitted is None:
             return NoPose(time, "no tag of the platform fits a pose", seen)
         views, bundle = fitted
         reason = doubt(self._settings, views, bundle, prior)
         if reason:
             return NoPose(time, reason, seen)
-        return self._measurement(time, views, bundle, status)
+        found = self._measurement(time, views, bundle, status)
+        if by_rows is None:
+            return found
+        covariance = read_only(found.covariance + by_rows.covariance)
+        return replace(found, covariance=covariance, at_rest=by_rows.at_rest)
 
     def _agreed(self, views: Sequence[TagView]) -> Consensus:
         """The views that agree on a pose of the platform within its frame."""
@@ -233,6 +249,11 @@ class PlatformEstimator:
             views, start = kept, bundle.camera_from_body
         return None
 
+    def _covariance(self, bundle: BundlePose) -> Array:
+        """Of a pose by the scatter of its edges, along the world's axes, shape (6, 6), [m, rad]."""
+        turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
+        return read_only(turn @ bundle.covariance @ turn.T)
+
     def _shared(self, pose: Pose, views: Sequence[TagView]) -> Array:
         """Covariance of what all pictures have in common: the camera's place and the tags."""
         shared = self._camera.shared_covariance(pose)
@@ -258,12 +279,11 @@ class PlatformEstimator:
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str
     ) -> PoseMeasurement:
-        turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
         pose = self._camera.world_from_camera.compose(bundle.camera_from_body)
         return PoseMeasurement(
             time,
             pose,
-            read_only(turn @ bundle.covariance @ turn.T),
+            self._covariance(bundle),
             tuple(sorted(view.tag.id for view in views)),
             bundle.reprojection,
             status,

@@ -31,6 +31,8 @@ class PoseMeasurement:
         shared: As `covariance`, of the errors that all pictures have in common: of the camera's
             place and of the tags, as far as calibrations or the rig file state them.
         unstated: Whether a part of these is not stated.
+        at_rest: ``world_from_platform`` as if all rows of the image had been exposed at once; None
+            where they were.
     """
 
     time: float
@@ -41,6 +43,12 @@ class PoseMeasurement:
     status: str
     shared: Array = field(default_factory=lambda: np.zeros((6, 6)))
     unstated: bool = True
+    at_rest: Pose | None = None
+
+    @property
+    def uncorrected(self) -> Pose:
+        """The pose as if all rows of the image had been exposed at once."""
+        return self.at_rest or self.pose
 
     @property
     def position_deviation(self) -> Array:

@@ -14,8 +14,8 @@ from model.clearance import ClearanceModel
 from model.errors import BadInput
 from tracking.camera_model import Image
 from tracking.clearance import MeasuredClearance, clearance_of
-from tracking.detection.diagnostics import diagnose_tags
-from tracking.estimator import UNSHARP
+from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
+from tracking.estimator import UNCERTAIN, UNSHARP
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.multi_camera import MultiCameraFusion, moments
 from tracking.pose_log import LoggedPicture
@@ -123,7 +123,10 @@ def _nothing_seen(
         " has the family and numbers of the printed tags"
     )
     reason = reasons.most_common(1)[0][0]
-    if UNSHARP in reason:
+    soft = edge_width(last.image) > SOFT
+    if UNCERTAIN in reason and not soft:
+        next_step = "focus the camera, bring it nearer, or let it see more tags of the platform"
+    elif UNSHARP in reason or soft:
         next_step = "focus the camera on the platform, and light it so that nothing blurs in motion"
     elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"

@@ -15,6 +15,7 @@ from tracking.detection.detector import Detection, near_places, nearest_to, regi
 from tracking.detection.libraries import make_detector
 from tracking.estimator import PlatformEstimator
 from tracking.measurement import NoPose, Observation, PoseMeasurement, predicted
+from tracking.rolling_shutter import RecentMotion
 from tracking.settings import TrackerSettings
 
 # Where the platform should be seen, by the positions of its drives.
@@ -107,7 +108,8 @@ class Tracker:
         self.camera_check: CameraCheck | None = None
         self._detector = make_detector(rig.tag_detector, rig.tag_family)
         self._frame = {tag.id: tag for tag in rig.frame_tags}
-        self._sight = PlatformEstimator(rig, camera, self.settings)
+        self._recent = RecentMotion(camera.readout)
+        self._sight = PlatformEstimator(rig, camera, self.settings, self._recent)
         self._last: PoseMeasurement | None = None
         self._before: PoseMeasurement | None = None
         self._guidance = EncoderPrior()
@@ -151,6 +153,7 @@ class Tracker:
         self._before, self._last = self._last, None
         if isinstance(result, PoseMeasurement):
             self._last = result
+            self._recent.add(result)
             if by_drives is not None:
                 self._guidance.learn(result.pose, by_drives)
         return result

@@ -23,7 +23,7 @@ class ExtrinsicCalibration:
 
     Attributes:
         camera: The camera at its new place.
-        by: ``frame tags`` or ``rig motion``.
+        by: ``frame tags``, ``rig motion`` or ``another camera``.
         covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6).
         half_widths: Of the 95 % intervals of the same, shape (6,).
         points: Places in the world that matter, shape (n, 3), [m].
@@ -35,7 +35,7 @@ class ExtrinsicCalibration:
     """
 
     camera: Camera
-    by: Literal["frame tags", "rig motion"]
+    by: Literal["frame tags", "rig motion", "another camera"]
     covariance: Array
     half_widths: Array
     points: Array
@@ -83,6 +83,8 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
         more = "survey more tags, all around the camera's view"
         if result.by == "rig motion":
             more = "take images at more poses, far apart and rotated up to 20° in every direction"
+        if result.by == "another camera":
+            more = "take more pairs of images, and calibrate the other camera's extrinsics better"
         what = (
             f"points of the workspace are measured within {error * 1e3:.2g} mm;"
             f" {wanted * 1e3:.2g} mm are required"

@@ -31,7 +31,7 @@ class ExtrinsicsResult(ResultDocument):
     added: ClassVar[tuple[str, ...]] = ("pose_covariance",)
 
     kind: Literal["extrinsics"] = "extrinsics"
-    by: Literal["frame tags", "rig motion"]
+    by: Literal["frame tags", "rig motion", "another camera"]
     world_from_camera: PoseDocument
     points_mm: Annotated[list[Vector], Field(min_length=1)] = Field(
         description="positions in the world for which error_mm is stated"
@@ -74,7 +74,7 @@ class ExtrinsicsResult(ResultDocument):
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
 
 
-_NOT_OF_THE_LENS = ("world_from_camera", "rate_hz", "pose_covariance", "error_mm")
+_NOT_OF_THE_LENS = ("world_from_camera", "rate_hz", "pose_covariance", "error_mm", "readout_ms")
 
 
 def extrinsics_result(
@@ -133,6 +133,10 @@ def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
     if of_camera["lens"] == "pinhole":  # as of results before there was a choice
         del of_camera["lens"]
     tags = rig.tags.model_dump(mode="json") if rig.tags else {}
+    if by == "another camera":
+        keys = ("name", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "world_from_camera")
+        others = [one.model_dump(mode="json") for one in rig.cameras if one.name != name]
+        return {"camera": of_camera, "others": [{k: one[k] for k in keys} for one in others]}
     which = "frame" if by == "frame tags" else "platform"
     return {"camera": of_camera, "family": tags.get("family"), "tags": tags.get(which)}
 

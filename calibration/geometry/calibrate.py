@@ -55,7 +55,7 @@ def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> Rig
         worst = int(np.argmax(np.abs(cables[k])))
         by_pose = fit.pose_misfits[k] > abs(cables[k, worst])
         what = "pose" if by_pose else f"cable {worst + 1}"
-        apart = fit.positions[k] - measured.positions[k]
+        apart = (measured.measured_points(fit.positions, fit.rotations) - measured.positions)[k]
         off = float(np.linalg.norm(apart)) if by_pose else float(abs(fit.residuals[k, worst]))
         unused[measured.names[k]] = (
             f"contradicts the others: {what} is {off * 1e3:.3g} mm off,"
@@ -66,7 +66,7 @@ def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> Rig
 
 def _misfits(cables: Array, poses: Array, measured: RigMeasurements) -> Array:
     """How far off places are, RMS in standard deviations, shape (n,)."""
-    freedom = np.maximum(cables.shape[1] - 6 * ~measured.posed, 1)
+    freedom = np.maximum(cables.shape[1] - measured.unmeasured, 1)
     misfits: Array = np.sqrt((np.sum(cables**2, axis=1) + poses**2) / freedom)
     return misfits
 
@@ -121,10 +121,13 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
     model, geometry = RigModel(parameters, measured), parameters.geometry(values)
     lengths, rig = model.counted.by(geometry), rig_with(parameters.rig, geometry)
     if not posed:
-        found = poses_from_lengths(rig, lengths)
-        return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in found])
-    positions, _ = poses_near(rig, lengths, measured.positions, measured.rotations, steps=8)
-    return np.asarray(np.linalg.norm(positions - measured.positions, axis=1))
+        solutions = poses_from_lengths(rig, lengths)
+        return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in solutions])
+    rotations = measured.first_rotations(rig)
+    arms = measured.measured_points(np.zeros((len(rotations), 3)), rotations)
+    found = poses_near(rig, lengths, measured.positions - arms, rotations, steps=8)
+    apart = measured.measured_points(*found) - measured.positions
+    return np.asarray(np.linalg.norm(apart, axis=1))
 
 
 FEWEST_PLACES = 10

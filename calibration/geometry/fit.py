@@ -139,9 +139,7 @@ class RigFitter:
         self._parameters, self._measured = parameters, measured
         self._model = RigModel(parameters, measured)
         self._deviations = self._model.length_deviations(length_deviation)
-        self._posed = measured.posed
-        self._pose_weights = np.zeros((len(measured), 6, 6))
-        self._pose_weights[self._posed] = np.linalg.inv(measured.covariances[self._posed])
+        self._posed, self._turned = measured.posed, measured.turned
 
     def fit(self, basis: Array | None = None) -> RigFit:
         """The most probable values and poses.
@@ -179,28 +177,36 @@ class RigFitter:
         )
 
     def _start(self) -> tuple[Array, Array]:
-        """Measured poses; the others from the rig file's forward kinematics, each near the last."""
+        """Measured poses; the others from the rig file's forward kinematics, each near the last.
+
+        Rotations alone that were not measured come from there as well.
+        """
         rig, counted = self._parameters.rig, self._model.counted
         lengths = counted.by(self._parameters.geometry(np.zeros(len(self._parameters))))
         positions, rotations = self._measured.positions.copy(), self._measured.rotations.copy()
-        unknown = np.flatnonzero(~self._posed)
+        unknown = np.flatnonzero(~(self._posed & self._turned))
         for k, found in zip(unknown, poses_from_lengths(rig, lengths[unknown]), strict=True):
-            positions[k], rotations[k] = found.pose.position, found.pose.rotation
+            rotations[k] = found.pose.rotation
+            positions[k] = found.pose.position
+            if self._posed[k]:
+                positions[k] = self._measured.positions[k]
+                positions[k] -= rotations[k] @ self._measured.reflector
         return positions, rotations
 
     def _pose_errors(self, positions: Array, rotations: Array) -> Array:
         """Estimated less measured poses, shape (n, 6), [m, rad]; 0 where there is none."""
         errors = np.zeros((len(positions), 6))
-        errors[:, :3] = positions - self._measured.positions
+        points = self._measured.measured_points(positions, rotations)
+        errors[:, :3] = points - self._measured.positions
         turns = rotations @ np.swapaxes(self._measured.rotations, 1, 2)
-        for k in np.flatnonzero(self._posed):
+        for k in np.flatnonzero(self._posed & self._turned):
             errors[k, 3:] = rotation_vector_from_matrix(turns[k])
         errors[~self._posed] = 0.0
         return errors
 
-    def _distances(self, errors: Array) -> Array:
+    def _distances(self, errors: Array, weights: Array) -> Array:
         """Of poses from the measured ones, in standard deviations, shape (n,)."""
-        squares = np.einsum("ni,nij,nj->n", errors, self._pose_weights, errors)
+        squares = np.einsum("ni,nij,nj->n", errors, weights, errors)
         distances: Array = np.sqrt(np.maximum(squares, 0.0))
         return distances
 
@@ -210,7 +216,8 @@ class RigFitter:
         except NoCable:
             return float("inf")
         cables = np.abs(residuals) / self._deviations
-        poses = self._distances(self._pose_errors(positions, rotations))
+        weights = self._measured.pose_information(rotations)
+        poses = self._distances(self._pose_errors(positions, rotations), weights)
         return float(z @ z + huber(cables, CABLE_BEND).sum() + huber(poses, POSE_BEND).sum())
 
     def _system(
@@ -219,8 +226,9 @@ class RigFitter:
         line = self._model.linearised(values, positions, rotations)
         weights = self._cable_share(line.residuals) / self._deviations**2
         errors = self._pose_errors(positions, rotations)
-        share = share_of(self._distances(errors), POSE_BEND)
-        pose_weights = share[:, None, None] * self._pose_weights
+        informations = self._measured.pose_information(rotations)
+        share = share_of(self._distances(errors, informations), POSE_BEND)
+        pose_weights = share[:, None, None] * informations
         by_z = line.by_values @ spread
         weighted = weights[..., None] * line.by_pose
         return NormalEquations(
@@ -249,7 +257,9 @@ class RigFitter:
             residuals,
             read_only(self._deviations),
             self._cable_share(residuals),
-            self._distances(self._pose_errors(positions, rotations)),
+            self._distances(
+                self._pose_errors(positions, rotations), self._measured.pose_information(rotations)
+            ),
             *system.by_place(),
         )
 

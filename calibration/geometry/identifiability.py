@@ -237,7 +237,7 @@ def uncertainty_of_rig(
     scores = fit.scores @ known
     whole = informations.sum(axis=0) + np.eye(known.shape[1])
     squares = float(np.sum(fit.weights * (fit.residuals / fit.deviations) ** 2))
-    freedom = fit.residuals.size - known.shape[1] - 6 * int((~measured.posed).sum())
+    freedom = fit.residuals.size - known.shape[1] - int(measured.unmeasured.sum())
     scatter = max(1.0, squares / max(freedom, 1))
     count = len(measured)
     without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.results import data_hash
 from model.errors import BadInput
 from model.files.reading import CsvFile
-from model.pose import Array, Pose, matrix_from_quaternion, read_only
+from model.pose import Array, Pose, matrix_from_quaternion, read_only, skew
 from model.rig import Rig
 from model.statics.gravity import PRETENSION_SHARE, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
@@ -34,10 +34,13 @@ class RigMeasurements:
         names: Of the places, n texts.
         counts: Drive positions, shape (n, m), [counts].
         tensions: Shape (n, m), [N]; NaN where they were not measured.
-        positions: World frame, shape (n, 3), [m]; NaN where the pose is not known.
-        rotations: ``world_from_platform``, shape (n, 3, 3); NaN where the pose is not known.
+        positions: World frame, shape (n, 3), [m]; NaN where they are not known.
+        rotations: ``world_from_platform``, shape (n, 3, 3); NaN where they are not known, as of a
+            tracker that follows one reflector.
         covariances: Of position and rotation vector about world axes, shape (n, 6, 6).
         unused: Why others were left out, by name.
+        reflector: The point of the platform whose positions were measured where rotations are not
+            known, platform frame, shape (3,), [m]; else it is the origin.
     """
 
     names: tuple[str, ...]
@@ -47,14 +50,55 @@ class RigMeasurements:
     rotations: Array
     covariances: Array
     unused: Mapping[str, str] = field(default_factory=dict)
+    reflector: Array = field(default_factory=lambda: np.zeros(3))
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def posed(self) -> NDArray[np.bool_]:
-        """Where the pose was measured, shape (n,)."""
+        """Where the position was measured, shape (n,)."""
         return np.asarray(np.isfinite(self.positions).all(axis=1))
+
+    @property
+    def turned(self) -> NDArray[np.bool_]:
+        """Where the rotation was measured, shape (n,)."""
+        return np.asarray(np.isfinite(self.rotations).all(axis=(1, 2)))
+
+    @property
+    def unmeasured(self) -> NDArray[np.int_]:
+        """How many of the six numbers of each pose were not measured, shape (n,)."""
+        return np.asarray(6 - 3 * self.posed.astype(int) - 3 * self.turned.astype(int))
+
+    def measured_points(self, positions: Array, rotations: Array) -> Array:
+        """Points whose positions were measured, of platforms at poses, shape (n, 3), [m].
+
+        Args:
+            positions: World frame, shape (n, 3), [m].
+            rotations: ``world_from_platform``, shape (n, 3, 3).
+        """
+        arms = np.where(self.turned[:, None], 0.0, rotations @ self.reflector)
+        return np.asarray(positions + arms)
+
+    def pose_information(self, rotations: Array) -> Array:
+        """What the measurements say of twists of the poses, shape (n, 6, 6); 0 where nothing.
+
+        Args:
+            rotations: ``world_from_platform`` about which, shape (n, 3, 3).
+        """
+        information = np.zeros((len(self), 6, 6))
+        whole = self.posed & self.turned
+        information[whole] = np.linalg.inv(self.covariances[whole])
+        for k in np.flatnonzero(self.posed & ~self.turned):
+            by_twist = np.hstack([np.eye(3), -skew(rotations[k] @ self.reflector)])
+            own = np.linalg.inv(self.covariances[k, :3, :3])
+            information[k] = by_twist.T @ own @ by_twist
+        return information
+
+    def first_rotations(self, rig: Rig) -> Array:
+        """Rotations, those of home where they were not measured, shape (n, 3, 3)."""
+        known = self.turned[:, None, None]
+        return np.where(known, self.rotations, rig.home.rotation)
 
     @property
     def data_hash(self) -> str:
@@ -67,6 +111,7 @@ class RigMeasurements:
         return RigMeasurements(
             names=tuple(n for n, yes in zip(self.names, chosen.tolist(), strict=True) if yes),
             unused=self.unused,
+            reflector=self.reflector,
             **{key: read_only(getattr(self, key)[chosen]) for key in _ARRAYS},
         )
 
@@ -187,6 +232,8 @@ _TO_SI = np.array([1e-3, 1e-3, 1e-3, *([float(np.radians(1.0))] * 3)])
 def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     """The places of a file; poses without a stated deviation are exact.
 
+    Positions without rotations are those of one point, as trackers with one reflector give them.
+
     Args:
         path: The file.
         cables: How many the rig has.
@@ -209,10 +256,12 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     deviations = np.zeros((n, 6))
     if _POSITION[0] in table.names:
         positions = table.of(_POSITION) / 1e3
-        rotations = _rotations(table)
+        if any(name in table.names for name in _ROTATION):
+            rotations = _rotations(table)
     if _DEVIATIONS[0] in table.names:
-        deviations = table.of(_DEVIATIONS) * _TO_SI
-        if (deviations <= 0.0).any():
+        stated = _DEVIATIONS if np.isfinite(rotations).all() else _DEVIATIONS[:3]
+        deviations[:, : len(stated)] = table.of(stated) * _TO_SI[: len(stated)]
+        if (deviations[:, : len(stated)] <= 0.0).any():
             raise table.bad("a standard deviation is not positive", "leave out what is unknown")
     return RigMeasurements(
         names=tuple(f"{path}, line {k + 2}" for k in range(n)),
@@ -322,6 +371,6 @@ def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
     likely = np.tile(working_tensions(rig, rig.home).tensions, (len(measured), 1))
     for k in np.flatnonzero(measured.posed & ~told.all(axis=1)):
         with suppress(TensionInfeasible):
-            pose = Pose(measured.positions[k], measured.rotations[k])
+            pose = Pose(measured.positions[k], measured.first_rotations(rig)[k])
             likely[k] = working_tensions(rig, pose).tensions
     return np.where(told, measured.tensions, likely)

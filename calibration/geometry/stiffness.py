@@ -134,7 +134,7 @@ def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
     weights = fit.weights / fit.deviations**2
     weighted = weights[..., None] * line.by_pose
     poses = np.swapaxes(line.by_pose, 1, 2) @ weighted
-    poses[data.posed] += np.linalg.inv(data.covariances[data.posed])
+    poses += data.pose_information(fit.rotations)
     mixed = np.swapaxes(by_all, 1, 2) @ weighted
     gained = np.linalg.solve(poses, np.swapaxes(mixed, 1, 2))
     information = np.einsum("nmp,nm,nmq->pq", by_all, weights, by_all)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -24,6 +24,8 @@ _FAR_OFF, _OFF = 4.0, 0.5
 """A view is left out whose error is this many times the median, and this many pixels at least."""
 _LOOKED_AT = 5
 """Images without the board, spread over all, that are searched for what they show instead."""
+_PREVIEW = 800
+"""Width of the reduced copies of images, [px]."""
 NOT_FOUND = "no board was found in it"
 """Why most pictures are not used."""
 _MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
@@ -44,6 +46,7 @@ class CameraCalibration:
         view_errors: RMS distance of each used image's corners, by name, [px].
         unused: Why each of the other images is not used, by name.
         data_hash: Of the corners it rests on.
+        previews: Reduced copies of the images used, by name; none where it is from corners.
     """
 
     size: tuple[int, int]
@@ -56,6 +59,7 @@ class CameraCalibration:
     view_errors: Mapping[str, float]
     unused: Mapping[str, str]
     data_hash: str
+    previews: Mapping[str, Image] = field(default_factory=dict)
 
     @property
     def error(self) -> float:
@@ -93,6 +97,7 @@ def fit_camera(
         BadInput: Images of different sizes, or too few that show the board.
     """
     views: dict[str, Seen] = {}
+    previews: dict[str, Image] = {}
     left_out = dict(unused or {})
     size: tuple[int, int] | None = None
     without = EvenSample[tuple[str, Image]](_LOOKED_AT)
@@ -113,15 +118,49 @@ def fit_camera(
             left_out[name] = as_in(first)
         else:
             views[name] = seen
+            previews[name] = _reduced(image)
             left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
-    return calibrate_from_views(views, size, left_out, lens)
+    return replace(calibrate_from_views(views, size, left_out, lens), previews=previews)
+
+
+def _reduced(image: Image) -> Image:
+    times = min(1.0, _PREVIEW / image.shape[1])
+    size = (round(image.shape[1] * times), max(1, round(image.shape[0] * times)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _same(seen: Seen, before: Seen) -> bool:
     same_points = np.array_equal(seen.points, before.points)
     return same_points and is_duplicate_view(seen.corners, before.corners)
+
+
+def fit_corners(
+    views: Mapping[str, Seen], size: tuple[int, int], lens: str, where: str
+) -> CameraCalibration:
+    """Fits a camera to corners that another program detected.
+
+    Args:
+        views: By picture.
+        size: Width and height of the images, [px].
+        lens: As of `fit_camera`.
+        where: Names the source in messages.
+
+    Raises:
+        BadInput: Too few pictures, or corners outside the images.
+    """
+    every = np.concatenate([seen.corners for seen in views.values()])
+    low, high = every.min(axis=0), every.max(axis=0)
+    if (low < -0.5).any() or (high > np.array(size) - 0.5).any() or len(views) < LEAST_VIEWS:
+        raise BadInput(
+            f"{len(views)} pictures have corners from ({low[0]:.0f}, {low[1]:.0f}) to"
+            f" ({high[0]:.0f}, {high[1]:.0f}) px; {LEAST_VIEWS} are required, within {size[0]} x"
+            f" {size[1]} px",
+            where=where,
+            next_step="check the columns and the size of the images",
+        )
+    return calibrate_from_views(views, size, lens=lens)
 
 
 def calibrate_from_views(

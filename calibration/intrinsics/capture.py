@@ -94,6 +94,24 @@ class CaptureGuide:
         self.views.append(view)
         return self._advice(True, self.missing() or "move it to another position and tilt it")
 
+    def drawn(self) -> str:
+        """What images show so far, in plain characters, as a terminal far away shows it too.
+
+        Parts of the image with the board are ``#``, others ``.``; beside them the tilts that were
+        seen: the edge of the board that was away.
+        """
+        covered = {part for view in self.views for part in view.parts}
+        rows = [" ".join("#" if (x, y) in covered else "." for x in range(3)) for y in range(3)]
+        tilts = [name if self._is_tilted(k) else "-" for k, name in enumerate(_AWAY)]
+        upper, lower, left, right = tilts[1], tilts[0], tilts[3], tilts[2]
+        beside = (f"edges away: {upper}", f"            {left} {right}", f"            {lower}")
+        return "\n".join(f"  {row}   {text}" for row, text in zip(rows, beside, strict=True))
+
+    def _is_tilted(self, which: int) -> bool:
+        """Whether an image shows the edge of `_AWAY` away from the camera."""
+        axis, sign = which // 2, (-1.0, 1.0)[which % 2]
+        return any(sign * view.tilt[axis] > ENOUGH_TILT for view in self.views)
+
     def missing(self) -> str:
         """The first thing that no image shows yet; empty when all is there."""
         covered = {part for view in self.views for part in view.parts}
@@ -101,8 +119,7 @@ class CaptureGuide:
             if part not in covered:
                 return f"bring the board to the {_name(part)} of the image"
         for which, name in enumerate(_AWAY):
-            axis, sign = which // 2, (-1.0, 1.0)[which % 2]
-            if not any(sign * view.tilt[axis] > ENOUGH_TILT for view in self.views):
+            if not self._is_tilted(which):
                 return f"tilt the board by 20° to 40°, its {name} edge away from the camera"
         return ""
 

@@ -1,16 +1,19 @@
-"""Camera files of other programs: OpenCV's YAML and ROS's camera_info, written and read.
+"""Camera files of other programs, written and read: OpenCV, ROS, Kalibr and mrcal.
 
-Neither holds how sure its numbers are. Both count a pixel's middle as whole, as rig files do.
+None says how sure its numbers are. All count a pixel's middle as whole, as rig files do.
 
 Source: OpenCV, samples/cpp/calibration.cpp (keys); ROS, sensor_msgs/CameraInfo and
-camera_calibration_parsers (keys, models plumb_bob, rational_polynomial, equidistant).
+camera_calibration_parsers (keys, models plumb_bob, rational_polynomial, equidistant); Kalibr, wiki
+page "yaml formats" (camchain); mrcal, "Camera model representation in memory and on disk".
 """
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -21,11 +24,23 @@ from calibration.intrinsics.result import camera_named, with_camera
 from model.errors import BadInput
 from model.files.documents import FISHEYE, read_text, read_yaml, write_atomic
 from model.files.rig_file import CameraDocument, RigDocument
+from model.pose import rotation_vector_from_matrix
 from model.rig import Rig, rig_from_document
 
 _ROS_MODELS = {"plumb_bob": ("pinhole", 5), "rational_polynomial": ("pinhole", 8)}
 _ROS_FISHEYE = ("equidistant", "fisheye")
-_TEXT_LIMIT = 1_000_000
+_KALIBR_MODELS = {"radtan": ("pinhole", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
+_MRCAL_MODELS = {
+    "LENSMODEL_PINHOLE": 0,
+    "LENSMODEL_OPENCV4": 4,
+    "LENSMODEL_OPENCV5": 5,
+    "LENSMODEL_OPENCV8": 8,
+    "LENSMODEL_OPENCV12": 12,
+}
+_SMALL, _TEXT_LIMIT = 1_000_000, 32_000_000
+"""Of characters, of OpenCV and of all; mrcal's may hold all corners that they were made from."""
+_BAD_NUMBERS = (TypeError, ValueError, OverflowError, AttributeError)
+"""What a file raises whose numbers are none."""
 _KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
 
 
@@ -75,26 +90,86 @@ def ros_text(camera: CameraDocument) -> str:
     )
 
 
-FORMATS: dict[str, Callable[[CameraDocument], str]] = {"opencv": opencv_text, "ros": ros_text}
+def kalibr_text(camera: CameraDocument) -> str:
+    """A camchain of Kalibr with this camera alone, ``cam0``.
+
+    Raises:
+        BadInput: Kalibr has no such lens model.
+    """
+    if camera.lens == FISHEYE:
+        model, lens = "equidistant", list(camera.distortion)
+    else:
+        lens, rest = list(camera.distortion[:4]), camera.distortion[4:]
+        if any(rest):
+            raise BadInput(
+                f"Kalibr's radtan has k1 k2 p1 p2 alone; this lens has {len(camera.distortion)}"
+                " coefficients",
+                where=f"camera {camera.name}",
+                next_step="calibrate it with --lens fisheye, or use --to opencv, ros or mrcal",
+            )
+        model = "radtan" if lens else "none"
+    entry = {
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px],
+        "distortion_model": model,
+        "distortion_coeffs": lens,
+        "resolution": [camera.width_px, camera.height_px],
+        "rostopic": f"/{camera.name}/image_raw",
+        "cam_overlaps": [],
+    }
+    return yaml.safe_dump({"cam0": entry}, sort_keys=False, default_flow_style=None)
+
+
+def mrcal_text(camera: CameraDocument) -> str:
+    """A ``.cameramodel`` of mrcal; its reference is the world of the rig file, in metres.
+
+    Raises:
+        BadInput: mrcal has no such lens model.
+    """
+    lens = list(camera.distortion)
+    names = {count: name for name, count in _MRCAL_MODELS.items()}
+    if camera.lens == FISHEYE or len(lens) not in names:
+        what = "Kannala and Brandt's fisheye" if camera.lens == FISHEYE else f"{len(lens)} of them"
+        raise BadInput(
+            f"mrcal has lens models with {', '.join(map(str, names))} coefficients, not {what}",
+            where=f"camera {camera.name}",
+            next_step="calibrate it with --lens rational, or use --to opencv or kalibr",
+        )
+    camera_from_world = camera.world_from_camera.pose().inverse()
+    turn = rotation_vector_from_matrix(camera_from_world.rotation)
+    extrinsics = [float(x) for x in (*turn, *camera_from_world.position)]
+    numbers = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *lens]
+    return (
+        "{\n"
+        f"    'lensmodel': '{names[len(lens)]}',\n"
+        f"    'intrinsics': {numbers},\n"
+        f"    'extrinsics': {extrinsics},\n"
+        f"    'imagersize': [{camera.width_px}, {camera.height_px}]\n"
+        "}\n"
+    )
+
+
+FORMATS: dict[str, Callable[[CameraDocument], str]] = {
+    "opencv": opencv_text,
+    "ros": ros_text,
+    "kalibr": kalibr_text,
+    "mrcal": mrcal_text,
+}
 """What writes a camera's numbers, by the name of the format."""
 
 
-def imported_camera(path: Path, camera: CameraDocument) -> CameraDocument:
-    """A camera with the numbers of an OpenCV or ROS file, distinguished by their content.
+def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None) -> CameraDocument:
+    """A camera with the numbers of a file of `FORMATS`, which is known by its content.
 
     Args:
         path: The file.
         camera: Its name, pose and rate are kept.
+        entry: Which camera of a Kalibr camchain, such as ``cam1``; the only one when left out.
 
     Raises:
-        BadInput: The file cannot be read, is neither, or its numbers cannot be.
+        BadInput: The file cannot be read, is none of them, or its numbers cannot be.
     """
-    text = read_text(path, _TEXT_LIMIT)
-    if text.lstrip().startswith(("%YAML", "<?xml")):
-        found = _from_opencv(text, path)
-    else:
-        found = _from_ros(read_yaml(path).data, path)
-    plain = camera.model_dump(mode="json") | found
+    plain = camera.model_dump(mode="json") | _found(path, entry)
     try:
         return CameraDocument.model_validate(plain)
     except ValidationError as error:
@@ -103,19 +178,39 @@ def imported_camera(path: Path, camera: CameraDocument) -> CameraDocument:
         raise _unusable(path, f"{key}: {first['msg']}") from None
 
 
-def with_imported_camera(rig: Rig, name: str, path: Path) -> RigDocument:
-    """A rig file's content with the numbers of an OpenCV or ROS file for one of its cameras.
+def _found(path: Path, entry: str | None) -> dict[str, Any]:
+    """The keys of the rig file's ``cameras`` in a file."""
+    text = read_text(path, _TEXT_LIMIT)
+    if "lensmodel" in text and _without_comments(text).startswith("{"):
+        found = _from_mrcal(text, path)
+    elif text.lstrip().startswith(("%YAML", "<?xml")):
+        found = _from_opencv(text, path)
+    else:
+        plain = read_yaml(path).data
+        if isinstance(plain, Mapping) and any(_is_entry(key) for key in plain):
+            return _from_kalibr(plain, path, entry)
+        found = _from_ros(plain, path)
+    if entry is not None:
+        raise _unusable(path, f"it holds one camera, there is no {entry!r} to choose")
+    return found
+
+
+def with_imported_camera(rig: Rig, name: str, path: Path, entry: str | None = None) -> RigDocument:
+    """A rig file's content with the numbers of another program's file for one of its cameras.
 
     Raises:
         BadInput: As of `imported_camera`, or the rig has no such camera.
     """
-    document = with_camera(rig.document, imported_camera(path, camera_named(rig.document, name)))
+    own = camera_named(rig.document, name)
+    document = with_camera(rig.document, imported_camera(path, own, entry))
     rig_from_document(document)
     return document
 
 
-def write_rig_with_camera(output: Path, rig: Rig, name: str, path: Path) -> CameraDocument:
-    """Writes a new rig file with the camera of an OpenCV or ROS file; returns the camera.
+def write_rig_with_camera(
+    output: Path, rig: Rig, name: str, path: Path, entry: str | None = None
+) -> CameraDocument:
+    """Writes a new rig file with the camera of another program's file; returns the camera.
 
     Raises:
         BadInput: As of `with_imported_camera`, or ``output`` exists or cannot be written.
@@ -127,7 +222,7 @@ def write_rig_with_camera(output: Path, rig: Rig, name: str, path: Path) -> Came
             why="a rig file is never replaced by a calibration",
             next_step="choose a name that does not exist yet",
         )
-    document = with_imported_camera(rig, name, path)
+    document = with_imported_camera(rig, name, path, entry)
     plain = document.model_dump(mode="json", exclude_unset=True)
     body = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None)
     head = f"# {rig.name} with camera {name} of {path.name}; written by `cdpr calibrate import`"
@@ -151,42 +246,123 @@ def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
 
 
 def _from_opencv(text: str, path: Path) -> dict[str, Any]:
+    """Read without OpenCV, whose own reader dies of damaged files."""
+    if len(text) > _SMALL:
+        raise _unusable(path, f"it is longer than {_SMALL} characters")
     try:
-        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        size = [storage.getNode(f"image_{side}") for side in ("width", "height")]
-        matrix = storage.getNode("camera_matrix").mat()
-        lens = storage.getNode("distortion_coefficients").mat()
-        fisheye = storage.getNode("fisheye_model")
-        is_fisheye = not fisheye.empty() and int(fisheye.real()) == 1
-        if any(node.empty() for node in size) or not (np.size(matrix) > 1 and np.size(lens) > 1):
-            raise _unusable(path, "its size, camera_matrix or distortion_coefficients is missing")
-        width, height = (int(node.real()) for node in size)
-    except (cv2.error, SystemError) as error:
-        raise _unusable(path, str(error).strip().splitlines()[-1]) from None
+        plain = _opencv_xml(text) if text.lstrip().startswith("<") else _opencv_yaml(text)
+        width, height = int(plain["image_width"]), int(plain["image_height"])
+        matrix, lens = (
+            np.array(plain[key]["data"], dtype=np.float64)
+            for key in ("camera_matrix", "distortion_coefficients")
+        )
+        is_fisheye = int(plain.get("fisheye_model", 0)) == 1
+    except KeyError as error:
+        raise _unusable(path, f"{error} is missing") from None
+    except (*_BAD_NUMBERS, yaml.YAMLError, ElementTree.ParseError, RecursionError) as error:
+        raise _unusable(path, f"{type(error).__name__}: {error}"[:200]) from None
     return _numbers(path, width, height, matrix, lens, "fisheye" if is_fisheye else "pinhole")
+
+
+def _opencv_yaml(text: str) -> Mapping[str, Any]:
+    body = text.lstrip().partition("\n")[2].replace("!!opencv-matrix", "")
+    plain = yaml.safe_load(body)
+    if not isinstance(plain, Mapping):
+        raise ValueError("it holds no names")
+    return plain
+
+
+def _opencv_xml(text: str) -> Mapping[str, Any]:
+    found: dict[str, Any] = {}
+    for node in ElementTree.fromstring(text):
+        data = node.find("data")
+        found[node.tag] = node.text if data is None else {"data": (data.text or "").split()}
+    return found
 
 
 def _from_ros(plain: object, path: Path) -> dict[str, Any]:
     if not isinstance(plain, Mapping):
-        raise _unusable(path, "it is neither OpenCV's YAML nor a ROS camera_info")
+        raise _unusable(path, "it is neither of OpenCV, ROS, Kalibr nor mrcal")
     try:
         model = plain["distortion_model"]
         matrix = np.array(plain["camera_matrix"]["data"], dtype=np.float64)
         lens = np.array(plain["distortion_coefficients"]["data"], dtype=np.float64)
         width, height = plain["image_width"], plain["image_height"]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, *_BAD_NUMBERS) as error:
         raise _unusable(path, f"{type(error).__name__}: {error}") from None
-    if model not in (*_ROS_MODELS, *_ROS_FISHEYE):
+    if str(model) not in (*_ROS_MODELS, *_ROS_FISHEYE):
         raise _unusable(path, f"its distortion_model {model!r} is not known")
     kind = "fisheye" if model in _ROS_FISHEYE else "pinhole"
     return _numbers(path, width, height, matrix, lens, kind)
+
+
+def _is_entry(key: object) -> bool:
+    """Whether a key of a YAML file is of a camera of Kalibr, such as ``cam0``."""
+    text = str(key)
+    return text.startswith("cam") and text[3:].isdecimal()
+
+
+def _from_kalibr(plain: Mapping[Any, Any], path: Path, entry: str | None) -> dict[str, Any]:
+    names = [str(key) for key in plain if _is_entry(key)]
+    if entry is None and len(names) > 1:
+        raise _unusable(path, f"it holds {', '.join(names)}; say which with --entry")
+    name = entry or names[0]
+    if name not in names:
+        raise _unusable(path, f"it has no {name!r}, but {', '.join(names)}")
+    try:
+        own = plain[name]
+        kind, model = own["camera_model"], own["distortion_model"]
+        lens, numbers = list(own["distortion_coeffs"]), list(own["intrinsics"])
+        width, height = own["resolution"]
+    except (KeyError, *_BAD_NUMBERS) as error:
+        raise _unusable(path, f"{name}: {type(error).__name__}: {error}") from None
+    if kind != "pinhole" or str(model) not in _KALIBR_MODELS:
+        why = f"{name} is {kind}-{model}; pinhole-radtan and pinhole-equi(distant) can be read"
+        raise _unusable(path, why)
+    ours, count = _KALIBR_MODELS[model]
+    if len(lens) != count or len(numbers) != 4:
+        raise _unusable(path, f"{name}: {model} has {count} coefficients and 4 intrinsics")
+    return _numbers(path, width, height, _matrix_of(path, numbers), lens, ours)
+
+
+def _from_mrcal(text: str, path: Path) -> dict[str, Any]:
+    try:
+        plain = ast.literal_eval(_without_comments(text))
+        model, numbers = plain["lensmodel"], list(plain["intrinsics"])
+        width, height = plain["imagersize"]
+    except (KeyError, *_BAD_NUMBERS, SyntaxError, RecursionError, MemoryError) as error:
+        raise _unusable(path, f"{type(error).__name__}: {error}"[:200]) from None
+    if str(model) not in _MRCAL_MODELS:
+        known = ", ".join(_MRCAL_MODELS)
+        why = f"its lensmodel is {model!r}; mrcal-convert-lensmodel makes one of {known} of it"
+        raise _unusable(path, why)
+    if len(numbers) != 4 + _MRCAL_MODELS[model]:
+        raise _unusable(path, f"{model} has {4 + _MRCAL_MODELS[model]} intrinsics")
+    return _numbers(path, width, height, _matrix_of(path, numbers), numbers[4:], "pinhole")
+
+
+def _without_comments(text: str) -> str:
+    lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
+    return "\n".join(lines).strip()
+
+
+def _matrix_of(path: Path, numbers: list[Any]) -> np.ndarray[Any, Any]:
+    try:
+        fx, fy, cx, cy = (float(number) for number in numbers[:4])
+    except _BAD_NUMBERS as error:
+        raise _unusable(path, f"intrinsics: {error}") from None
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _numbers(
     path: Path, width: object, height: object, matrix: object, lens: object, kind: str
 ) -> dict[str, Any]:
     """The keys of the rig file's ``cameras``."""
-    numbers, coefficients = np.asarray(matrix, np.float64), np.ravel(np.asarray(lens, np.float64))
+    try:
+        numbers = np.asarray(matrix, np.float64)
+        coefficients = np.ravel(np.asarray(lens, np.float64))
+    except _BAD_NUMBERS as error:
+        raise _unusable(path, f"distortion: {error}") from None
     if numbers.size != 9:
         raise _unusable(path, "camera_matrix is not 3 x 3")
     flat = numbers.ravel()
@@ -205,5 +381,6 @@ def _unusable(path: Path, why: str) -> BadInput:
         "no camera can be read from this file",
         where=str(path),
         why=why,
-        next_step="name a camera file of OpenCV (YAML, XML) or ROS (camera_info)",
+        next_step="name a camera file of OpenCV (YAML, XML), ROS (camera_info), Kalibr (camchain)"
+        " or mrcal (.cameramodel)",
     )

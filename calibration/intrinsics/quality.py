@@ -84,13 +84,13 @@ def judge_camera(
     told = distance is not None
     distance = float(np.median(away)) if distance is None else distance
     coverage, tilts = _coverage(result), _tilts(result)
-    slopes = _without_rotation(*_slopes(result))
+    slopes = _without_rotation(*_grid_slopes(result))
     scale = distance / float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
     error = scale * np.sqrt(2.0) * result.uncertainty.half_width_of(slopes)  # of both axes
     apart = slopes @ result.uncertainty.halves
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     bow, bent = bow_of(result)
-    radial = radial_share(*_all_errors(result), result.matrix)
+    radial = radial_share(*corner_errors(result), result.matrix)
     lacks = [
         *_about_pictures(result, coverage, tilts),
         *_about_the_board(bow, bent),
@@ -132,13 +132,41 @@ def picture_grid(size: tuple[int, int]) -> Array:
     return np.array([(x * size[0], y * size[1]) for x in across for y in across])
 
 
-def _slopes(result: CameraCalibration) -> tuple[Array, Array]:
-    """Derivatives of pixels on a grid of rays.
+def pixel_uncertainty(result: CameraCalibration, pixels: Array) -> Array:
+    """Half widths of the 95 % intervals of points that are seen in pixels, [px].
+
+    Without what the rotation takes up that fits best over the whole image.
+
+    Args:
+        result: The calibration.
+        pixels: Shape (n, 2), [px].
+
+    Returns:
+        Shape (n,).
+    """
+    over, turns = (part.reshape(-1, part.shape[-1]) for part in _grid_slopes(result))
+    as_turns = np.linalg.lstsq(turns, over, rcond=None)[0]
+    own, own_turns = _slopes(result, pixels)
+    slopes = own - own_turns @ as_turns
+    each = [result.uncertainty.half_width_of(slope) for slope in slopes]
+    return np.asarray(np.sqrt(2.0) * np.array(each))  # of both axes
+
+
+def _grid_slopes(result: CameraCalibration) -> tuple[Array, Array]:
+    return _slopes(result, picture_grid(result.size))
+
+
+def _slopes(result: CameraCalibration, pixels: Array) -> tuple[Array, Array]:
+    """Derivatives of pixels by what is unknown of the camera.
+
+    Args:
+        result: The calibration.
+        pixels: Shape (rays, 2), [px].
 
     Returns:
         By the camera's n numbers, shape (rays, 2, n), and by its rotation, shape (rays, 2, 3).
     """
-    pixels, lens = picture_grid(result.size), result.lens
+    lens = result.lens
     flat = rays_of(lens.kind, result.matrix, result.distortion, pixels)
     rays, nothing = np.column_stack([flat, np.ones(len(pixels))]), np.zeros(3)
     _, pose, camera = lens.slopes(rays, nothing, nothing, result.matrix, result.distortion)
@@ -208,8 +236,8 @@ def _about_the_board(bow: float, bent: float) -> list[Issue]:
     return [Issue(what, "glue the print on glass or another flat, stiff plate")]
 
 
-def _all_errors(result: CameraCalibration) -> tuple[Array, Array]:
-    """Corners of all pictures and their errors, shape (n, 2) both, [px]."""
+def corner_errors(result: CameraCalibration) -> tuple[Array, Array]:
+    """Corners of all images and their errors, shape (n, 2) both, [px]."""
     corners, errors = [], []
     for name, seen in result.views.items():
         turn = rotation_vector_from_matrix(result.boards[name].rotation)

@@ -10,8 +10,16 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from calibration.intrinsics.calibrate import CameraCalibration
+from calibration.intrinsics.figures import (
+    coverage_map,
+    radial_pattern,
+    residual_arrows,
+    tilt_figure,
+    uncertainty_figure,
+    worst_picture,
+)
 from calibration.intrinsics.quality import CameraQuality, picture_grid
-from calibration.report import Section, drawing, interval_rows, page_of, table_of
+from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from model.errors import BadInput
 from model.files.documents import AnyNonNegative, AnyNumber, LensName, Positive
@@ -153,9 +161,6 @@ def with_camera(rig: RigDocument, changed: CameraDocument) -> RigDocument:
 # The report of a camera calibration.
 
 
-_WIDTH = 560.0
-
-
 def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, date: str) -> str:
     """The whole page."""
     lead = (
@@ -164,6 +169,15 @@ def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, da
     )
     covered = f"{quality.covered:.0%} of the image's cells contain corners"
     tilted = "A dot per image: vertical for forward and backward, horizontal for left and right."
+    sure = (
+        "Half widths of the 95 % intervals of points seen there, without what a rotation of the"
+        " camera takes up."
+    )
+    arrows = "From where a corner is expected towards where it was detected."
+    along = (
+        "Mean error away from the principal point, in rings with as many corners each; bars are 95"
+        " % of the mean. A lens that the model fits has none."
+    )
     used = "Error, corners, and change of fx without the image."
     return page_of(
         f"Calibration of camera {name}",
@@ -171,8 +185,12 @@ def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, da
         quality.verdict,
         [
             Section("Parameters, with 95 % intervals", _numbers(result, quality)),
-            Section("Where the board was seen", _map(result, quality), covered),
-            Section("How the board was tilted", _tilts(quality), tilted),
+            Section("Where the board was seen", coverage_map(result, quality), covered),
+            Section("How sure pixels are", uncertainty_figure(result, quality), sure),
+            Section("Errors of corners", residual_arrows(result), arrows),
+            Section("Errors along the radius", radial_pattern(result), along),
+            *worst_picture(result),
+            Section("How the board was tilted", tilt_figure(quality), tilted),
             Section("Images used", _pictures(result), used),
             Section("Images not used", table_of(result.unused.items())),
         ],
@@ -193,45 +211,6 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
             ("data", result.data_hash[:23]),
         ]
     )
-
-
-def _map(result: CameraCalibration, quality: CameraQuality) -> str:
-    """Corners seen, on cells that are darker the more corners they have."""
-    width, height = result.size
-    scale = _WIDTH / width
-    columns, rows = quality.coverage.shape
-    most = max(float(quality.coverage.max()), 1.0)
-    shapes = []
-    for (i, j), count in np.ndenumerate(quality.coverage):
-        shade = 0.0 if count == 0 else 0.15 + 0.45 * float(count) / most
-        shapes.append(
-            f'<rect x="{i * _WIDTH / columns:.1f}" y="{j * height * scale / rows:.1f}"'
-            f' width="{_WIDTH / columns:.1f}" height="{height * scale / rows:.1f}"'
-            f' fill="var(--encoder)" fill-opacity="{shade:.2f}" stroke="var(--line)"/>'
-        )
-    for seen in result.views.values():
-        shapes += [
-            f'<circle cx="{x * scale:.1f}" cy="{y * scale:.1f}" r="1.4" fill="var(--ink)"/>'
-            for x, y in seen.corners
-        ]
-    label = f"Corners in the camera's image, in {quality.covered:.0%} of its cells."
-    return drawing("".join(shapes), (_WIDTH, height * scale), label)
-
-
-def _tilts(quality: CameraQuality) -> str:
-    """Tilt of each image's board, about both axes, ± 50°."""
-    dots = "".join(
-        f'<circle cx="{140 + 2.4 * np.clip(y, -50, 50):.1f}"'
-        f' cy="{140 - 2.4 * np.clip(x, -50, 50):.1f}" r="4" fill="var(--ink)"/>'
-        for x, y in quality.tilts
-    )
-    rings = "".join(
-        f'<circle cx="140" cy="140" r="{2.4 * ring}" fill="none" stroke="var(--muted)"/>'
-        f'<text x="{144 + 2.4 * ring}" y="137">{ring}°</text>'
-        for ring in (20, 40)
-    )
-    label = f"Tilt of the board in {len(quality.tilts)} images; rings at 20° and 40°."
-    return drawing(rings + dots, (280, 280), label, "small")
 
 
 def _pictures(result: CameraCalibration) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from model.errors import BadInput
-from model.pose import Array, Pose
+from model.files.reading import CsvFile
+from model.pose import Array, Pose, read_only
 from model.rig import Camera
 from tracking.camera_model import Image
 
@@ -78,3 +80,55 @@ def plain_camera(size: tuple[int, int], name: str = "camera") -> Camera:
     width, height = size
     matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
     return Camera(name, width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 10.0)
+
+
+# Corners that another program detected, from a CSV file (docs/data-formats.md).
+
+_COLUMNS = ("picture", "x_px", "y_px", "board_x_mm", "board_y_mm")
+
+
+def read_corners(path: Path) -> dict[str, Seen]:
+    """Corners of a flat board by picture, as another program detected them.
+
+    Raises:
+        BadInput: The file cannot be read, a column is missing, a number is none, or pictures show
+            fewer than `LEAST_POINTS`.
+    """
+    rows = CsvFile(path).rows
+    names = [name.strip() for name in rows[0]] if rows else []
+    if missing := [name for name in _COLUMNS if name not in names]:
+        raise BadInput(
+            f"the column {missing[0]!r} is missing",
+            where=str(path),
+            why=f"a file of corners has {', '.join(_COLUMNS)}",
+            next_step="see docs/data-formats.md",
+        )
+    places = [names.index(name) for name in _COLUMNS]
+    found: dict[str, list[list[float]]] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            picture, *texts = (row[place] for place in places)
+            values = [float(text) for text in texts]
+        except (ValueError, IndexError):
+            values = []
+        if not values or not np.isfinite(values).all():
+            raise BadInput(
+                f"line {number} does not hold a picture and four finite numbers",
+                where=str(path),
+                next_step="leave out lines of corners that were not detected",
+            )
+        found.setdefault(picture.strip(), []).append(values)
+    seen = {}
+    for picture, corners in found.items():
+        if len(corners) < LEAST_POINTS:
+            continue
+        numbers = np.array(corners)
+        flat = np.column_stack([numbers[:, 2:] / 1e3, np.zeros(len(numbers))])
+        seen[picture] = Seen(read_only(flat), read_only(numbers[:, :2]))
+    if not seen:
+        raise BadInput(
+            f"no picture has {LEAST_POINTS} corners",
+            where=str(path),
+            next_step="write a line for every corner: its picture, pixels and place on the board",
+        )
+    return seen

@@ -45,6 +45,11 @@ CALIBRATE = (
         "calibrate.extrinsics:extrinsics",
     ),
     Verb(
+        "readout",
+        "Measure a rolling shutter, from images of the platform while it moves.",
+        "calibrate.readout:readout",
+    ),
+    Verb(
         "tags",
         "Find the tags' poses on the platform, from images that show two or more at once.",
         "calibrate.tags:tags",
@@ -76,12 +81,12 @@ CALIBRATE = (
     ),
     Verb(
         "export",
-        "Write a camera's matrix and lens for OpenCV (YAML) or ROS (camera_info).",
+        "Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.",
         "calibrate.exchange:export",
     ),
     Verb(
         "import",
-        "Write a new rig file with a camera's matrix and lens from OpenCV or ROS.",
+        "Write a new rig file with a camera's matrix and lens from another program.",
         "calibrate.exchange:import_",
     ),
 )

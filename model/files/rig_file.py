@@ -128,6 +128,7 @@ def tags_in(family: str) -> int:
 
 
 Pixels = Annotated[int, Field(ge=64, le=16384)]
+Readout = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 
 
 class PlatformDocument(Document):
@@ -291,6 +292,11 @@ class CameraDocument(Document):
         " used where there is no pose_covariance",
     )
     rate_hz: Positive = 10.0
+    readout_ms: Readout = Field(
+        default=0.0,
+        description="from the exposure of the top row to that of the bottom row (rolling shutter);"
+        " 0: all rows at once, negative: from the bottom up",
+    )
 
     @field_validator("distortion")
     @classmethod

@@ -77,6 +77,9 @@ class SimulatedCameraDocument(Document):
     exposure_ms: NonNegative = Field(
         default=0.0, description="motion blur over this time; 0 for none"
     )
+    readout_ms: Annotated[float, Field(ge=-1000.0, le=1000.0)] | None = Field(
+        default=None, description="true readout of the rows; left out, as in `cameras`"
+    )
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
     light: Positive = Field(default=1.0, description="share of full light")
     cables: bool = Field(default=True, description="cables hide what is behind them")

@@ -7,7 +7,6 @@ What stands still is drawn once; an image redraws the platform's surroundings an
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput
 from model.kinematics import cables_at
-from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.pose import PlatformMotion, Pose
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.cables import draw_cables
@@ -41,31 +40,7 @@ if TYPE_CHECKING:
     from simulation.camera.rendering import Image8
 
 
-# How a simulated platform moves while an image is exposed, and images one after the other.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlatformMotion:
-    """A steady motion of the platform.
-
-    Attributes:
-        velocity: Of its origin, world frame, shape (3,), [m/s].
-        turning: Along the world's axes, shape (3,), [rad/s].
-    """
-
-    velocity: Array
-    turning: Array
-
-    @classmethod
-    def between(cls, before: Pose, after: Pose, seconds: float) -> PlatformMotion:
-        """The motion from one pose to another in a time that is not 0."""
-        turn = rotation_vector_from_matrix(after.rotation @ before.rotation.T)
-        return cls((after.position - before.position) / seconds, turn / seconds)
-
-    def moved(self, pose: Pose, seconds: float) -> Pose:
-        """The pose at a later or earlier time."""
-        turn = matrix_from_rotation_vector(self.turning * seconds)
-        return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)
+# Images one after the other.
 
 
 class Film:
@@ -103,6 +78,8 @@ PLATFORM = 168.0
 NEAREST = 0.02
 #: Motion blur is drawn as poses this far apart, [px], but no more of them than:
 SMEAR_STEP, MOST_POSES = 0.5, 64
+#: Moments of an exposure over which a row of a rolling shutter is averaged.
+_SUB_TIMES = 8
 #: A shorter smear is not to be seen, [px].
 LEAST_SMEAR = 0.02
 #: Slack of the precomputed noise, in which each image takes another place, [px].
@@ -153,16 +130,20 @@ class SyntheticCamera:
         Returns:
             Grey image, shape (height, width).
         """
-        poses = self._while_exposed(pose, motion)
-        if len(poses) == 1:
-            return self._with_noise(self._at(pose), frame)
-        light = np.zeros(self._still.shape, np.float32)
-        for one in poses:
-            light += self._at(one)
+        if self.camera.readout != 0.0 and motion is not None:
+            light = self._row_by_row(pose, motion)
+        else:
+            poses = self._while_exposed(pose, motion)
+            if len(poses) == 1:
+                return self._with_noise(self._at(pose), frame)
+            light = np.zeros(self._still.shape, np.float32)
+            for one in poses:
+                light += self._at(one)
+            light /= len(poses)
         # Rounded up as often as the mean lies near: the mean of two is a tie half the time, and a
         # rule for ties would make edges brighter or darker.
         chance = np.random.default_rng([self.seed, frame, 0x5EA2]).random(light.shape, np.float32)
-        mean = np.floor(light / len(poses) + chance)
+        mean = np.floor(light + chance)
         return self._with_noise(np.asarray(np.minimum(mean, 255.0), dtype=np.uint8), frame)
 
     def _while_exposed(self, pose: Pose, motion: PlatformMotion | None) -> list[Pose]:
@@ -170,14 +151,47 @@ class SyntheticCamera:
         time = self.optics.exposure
         if motion is None or time <= 0.0:
             return [pose]
-        ends = (motion.moved(pose, share * time) for share in (-0.5, 0.5))
-        seen = [self._camera_from_world.apply(p.apply(self.rig.platform_corners)) for p in ends]
-        if min(float(corners[:, 2].min()) for corners in seen) < NEAREST:
-            return [pose]
-        first, last = (pixels_of(self.camera, corners) for corners in seen)
-        smear = float(np.linalg.norm(last - first, axis=1).max())
+        smear = self._smear(pose, motion, (-0.5 * time, 0.5 * time))
         count = 1 if smear < LEAST_SMEAR else min(MOST_POSES, 1 + math.ceil(smear / SMEAR_STEP))
         return [motion.moved(pose, ((k + 0.5) / count - 0.5) * time) for k in range(count)]
+
+    def _smear(self, pose: Pose, motion: PlatformMotion, times: tuple[float, float]) -> float:
+        """How far the platform's corners go meanwhile at most, [px]; 0 too near to the lens."""
+        ends = (motion.moved(pose, time) for time in times)
+        seen = [self._camera_from_world.apply(p.apply(self.rig.platform_corners)) for p in ends]
+        if min(float(corners[:, 2].min()) for corners in seen) < NEAREST:
+            return 0.0
+        first, last = (pixels_of(self.camera, corners) for corners in seen)
+        return float(np.linalg.norm(last - first, axis=1).max())
+
+    def _row_by_row(self, pose: Pose, motion: PlatformMotion) -> Image32:
+        """Light of a platform whose rows are exposed one after the other, shape of the image.
+
+        Each row blends the images of the poses before and after: less than `SMEAR_STEP` apart, its
+        edges are where they would be.
+        """
+        rows = np.zeros((self.camera.height, 2))
+        rows[:, 1] = np.arange(self.camera.height)
+        half = self.optics.exposure / 2.0
+        of_rows = self.camera.row_times(rows)
+        first, last = float(of_rows.min()), float(of_rows.max())
+        regions = [self._platform_region(motion.moved(pose, time)) for time in (first, last)]
+        seen = [region for region in regions if not region.empty]
+        if seen:  # only rows that show it need poses
+            top = max(0, min(region.slices()[0].start for region in seen) - 1)
+            bottom = min(len(rows), max(region.slices()[0].stop for region in seen) + 1)
+            first, last = sorted((float(of_rows[top]), float(of_rows[bottom - 1])))
+        ends = (first - half, last + half)
+        count = min(MOST_POSES, 2 + math.ceil(self._smear(pose, motion, ends) / SMEAR_STEP))
+        times = np.linspace(*ends, count)
+        within = (np.arange(_SUB_TIMES) + 0.5) / _SUB_TIMES - 0.5 if half > 0.0 else np.zeros(1)
+        exposed = np.clip(of_rows[:, None] + 2.0 * half * within, *ends)
+        place = (exposed - ends[0]) / (ends[1] - ends[0]) * (count - 1)
+        light = np.zeros(self._still.shape, np.float32)
+        for k, time in enumerate(times):
+            share = np.maximum(0.0, 1.0 - np.abs(place - k)).mean(axis=1)
+            light += share[:, None].astype(np.float32) * self._at(motion.moved(pose, float(time)))
+        return light
 
     def _at(self, pose: Pose) -> Image8:
         """The image of a platform that stands still, without noise."""

@@ -110,6 +110,19 @@ def test_tilts_are_named_by_the_edge_that_is_away(shown, turn, edge: str) -> Non
     assert asked == f"tilt the board by 20° to 40°, its {edge} edge away from the camera"
 
 
+def test_what_was_seen_is_drawn_in_plain_characters(shown) -> None:
+    guide = CaptureGuide(shown, wanted=4)
+    assert guide.drawn().count("#") == 0
+    show(guide, shown, held(-0.21, -0.11))
+    rows = guide.drawn().splitlines()
+    assert rows[0].split()[0] == "#"
+    assert rows[2].split()[2] == "."
+    assert "upper" not in guide.drawn()
+    show(guide, shown, held(0.0, 0.0, [-0.5, 0.0, 0.0]))
+    assert guide.drawn().splitlines()[0].endswith("upper")
+    assert guide.drawn().isascii()
+
+
 def test_enough_is_said_when_all_parts_and_tilts_were_seen(shown) -> None:
     guide = CaptureGuide(shown, wanted=12)
     for x in (-0.21, 0.0, 0.21):

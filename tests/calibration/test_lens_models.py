@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from calibration.intrinsics.quality import (
 )
 from calibration.targets.board import Seen
 from calibration.targets.chessboard import Chessboard
+from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.rig_file import CameraDocument
 from model.pose import Pose, matrix_from_rotation_vector, read_only
@@ -33,7 +35,14 @@ from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
 from tests.cli.program import call, one_message
 from tracking.camera_check import CameraMoved
-from tracking.camera_model import WIDEST, ideal_from_pixels, pixels_from_ideal, project, rays_of
+from tracking.camera_model import (
+    WIDEST,
+    ideal_from_pixels,
+    pixels_from_ideal,
+    pixels_of,
+    project,
+    rays_of,
+)
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 
@@ -157,7 +166,7 @@ def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
 
 def test_a_rotation_of_the_camera_is_no_error_of_it() -> None:
     found = calibrate_from_views(views("fisheye"), SIZE, lens="fisheye")
-    slopes, turns = _slopes(found)
+    slopes, turns = _slopes(found, picture_grid(SIZE))
     assert np.abs(_without_rotation(turns, turns)).max() < 1e-9 * np.abs(turns).max()
     freed = _without_rotation(slopes, turns)
     assert (np.linalg.norm(freed, axis=(0, 1)) <= np.linalg.norm(slopes, axis=(0, 1))).all()
@@ -238,10 +247,18 @@ def with_lens(rig: Rig, kind: str, lens: list[float]) -> CameraDocument:
     return CameraDocument.model_validate(plain | {"lens": kind, "distortion": lens, "cx_px": 651.3})
 
 
+UNKNOWN_THERE = {("kalibr", "five"), ("kalibr", "rational"), ("mrcal", "fisheye")}
+"""Lens models that a program does not have."""
+
+
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("name", TRUTH)
 def test_a_camera_comes_back_from_the_files_of_others(rig, tmp_path, form, name) -> None:
     own = with_lens(rig, LENSES[name].kind, TRUTH[name][1])
+    if (form, name) in UNKNOWN_THERE:
+        with pytest.raises(BadInput, match=r"alone|not Kannala"):
+            FORMATS[form](own)
+        return
     file = tmp_path / "camera.yaml"
     file.write_text(FORMATS[form](own))
     plain = rig.document.cameras[0]
@@ -250,6 +267,109 @@ def test_a_camera_comes_back_from_the_files_of_others(rig, tmp_path, form, name)
     assert back.distortion == pytest.approx(own.distortion, abs=1e-15)
     assert (back.fx_px, back.cx_px, back.width_px) == (own.fx_px, 651.3, own.width_px)
     assert back.world_from_camera == plain.world_from_camera
+
+
+KALIBR = """
+cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.27695497, 0.06712482, 0.00087538, 0.00011556]
+  distortion_model: radtan
+  intrinsics: [461.629, 460.152, 362.680, 246.049]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [-0.0137, 0.0207, -0.0127, 0.0025]
+  distortion_model: equidistant
+  intrinsics: [190.97, 190.98, 254.93, 256.89]
+  resolution: [512, 512]
+  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+"""
+
+
+def test_a_camera_of_a_kalibr_chain_is_read_by_its_entry(rig, tmp_path) -> None:
+    file, plain = tmp_path / "camchain.yaml", rig.document.cameras[0]
+    file.write_text(KALIBR)
+    first, second = (imported_camera(file, plain, entry) for entry in ("cam0", "cam1"))
+    assert (first.lens, second.lens) == ("pinhole", "fisheye")
+    assert first.distortion == [-0.27695497, 0.06712482, 0.00087538, 0.00011556]
+    assert (first.fx_px, first.fy_px, first.cx_px, first.cy_px) == (
+        461.629, 460.152, 362.680, 246.049)  # fmt: skip
+    assert (second.width_px, second.height_px) == (512, 512)
+    with pytest.raises(BadInput) as told:
+        imported_camera(file, plain)
+    assert "cam0, cam1; say which with --entry" in str(told.value.why)
+    with pytest.raises(BadInput) as told:
+        imported_camera(file, plain, "cam7")
+    assert "no 'cam7'" in str(told.value.why)
+
+
+def test_kalibr_models_that_rig_files_lack_are_named(rig, tmp_path) -> None:
+    file = tmp_path / "camchain.yaml"
+    file.write_text(KALIBR.replace("camera_model: pinhole", "camera_model: ds", 1))
+    with pytest.raises(BadInput) as told:
+        imported_camera(file, rig.document.cameras[0], "cam0")
+    assert "cam0 is ds-radtan" in str(told.value.why)
+
+
+MRCAL = """# generated on 2024-01-01 with mrcal-calibrate-cameras
+# 'lensmodel': 'LENSMODEL_SPLINED'
+{
+    'lensmodel':  'LENSMODEL_OPENCV8',
+
+    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....
+    'intrinsics': [ 1761.1, 1761.2, 1965.8, 1087.5, 0.1, 0.2, 0.003, 0.004, 0.5, 0.6, 0.7, 0.8,],
+    'valid_intrinsics_region': [ [ 1.0, 2.0 ], [ 3.0, 4.0 ], ],
+    # extrinsics are rt_fromref
+    'extrinsics': [ 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,],
+    'imagersize': [ 3904, 2196,],
+    'icam_intrinsics': 0,
+    'optimization_inputs': b'abc',
+}
+"""
+
+
+def test_a_camera_of_mrcal_is_read_and_a_splined_one_refused(rig, tmp_path) -> None:
+    file, plain = tmp_path / "camera-0.cameramodel", rig.document.cameras[0]
+    file.write_text(MRCAL)
+    found = imported_camera(file, plain)
+    assert found.distortion == [0.1, 0.2, 0.003, 0.004, 0.5, 0.6, 0.7, 0.8]
+    assert (found.fx_px, found.cy_px, found.width_px, found.height_px) == (
+        1761.1,
+        1087.5,
+        3904,
+        2196,
+    )
+    file.write_text(MRCAL.replace("LENSMODEL_OPENCV8", "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3"))
+    with pytest.raises(BadInput) as told:
+        imported_camera(file, plain)
+    assert "mrcal-convert-lensmodel" in str(told.value.why)
+
+
+@pytest.mark.skipif(not Path("/usr/bin/mrcal-to-cahvor").exists(), reason="needs Debian's mrcal")
+def test_mrcal_itself_reads_what_is_written_and_projects_alike(rig, tmp_path) -> None:
+    """The extrinsics too: a point of the world is seen by both in the same pixel."""
+    file = tmp_path / "camera.cameramodel"
+    document = with_lens(rig, "pinhole", TRUTH["rational"][1])
+    file.write_text(FORMATS["mrcal"](document))
+    camera = camera_from(document)
+    point = camera.world_from_camera.apply(np.array([[0.1, -0.2, 1.0]]))
+    code = (
+        "import sys, mrcal, numpy as np; m = mrcal.cameramodel(sys.argv[1]);"
+        "p = mrcal.transform_point_rt(m.extrinsics_rt_fromref(),"
+        " np.array([float(x) for x in sys.argv[2:]]));"
+        "print(*mrcal.project(p, *m.intrinsics()))"
+    )
+    told = subprocess.run(
+        ["/usr/bin/python3", "-c", code, str(file), *map(str, point[0])],
+        capture_output=True, text=True, check=True, timeout=60,
+    )  # fmt: skip
+    theirs = [float(x) for x in told.stdout.split()]
+    np.testing.assert_allclose(
+        theirs, pixels_of(camera, np.array([[0.1, -0.2, 1.0]]))[0], atol=1e-6
+    )
 
 
 def test_opencv_itself_reads_what_is_written(rig, tmp_path) -> None:
@@ -264,6 +384,13 @@ def test_opencv_itself_reads_what_is_written(rig, tmp_path) -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "a: 1", "%YAML:1.0\n---\nimage_width: 640\n", "%YAML:1.0\n---\n{[", "- 1",
+     "cam0: 3", "{'lensmodel': ['a'], 'intrinsics': [1, 2, 3, 4], 'imagersize': [1, 2]}",
+     "{'lensmodel': 'LENSMODEL_PINHOLE', 'intrinsics': [1%s, 2, 3, 4], 'imagersize': [1, 2]}"
+     % ("0" * 400), "%YAML:1.0\n- 3\n", "<?xml version='1.0'?><a>",
+     "cam0: {camera_model: pinhole, distortion_model: [a], distortion_coeffs: [],"
+     " intrinsics: [1, 2, 3, 4], resolution: [9, 9]}",
+     "cam0: {camera_model: pinhole}", "{'lensmodel': 3}", "{'lensmodel': [",
+     "{'lensmodel': 'LENSMODEL_PINHOLE', 'intrinsics': 'abcd', 'imagersize': [1, 2]}",
      "image_width: 640\nimage_height: 480\ndistortion_model: odd\n"
      "camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_coefficients: {data: []}"],
 )  # fmt: skip
@@ -283,6 +410,31 @@ def test_a_rig_file_with_an_imported_lens_is_written_and_never_replaced(rig, tmp
     one_message(call("calibrate", "import", path, file, "-o", new), 2, "exists already")
     with pytest.raises(BadInput, match="exists"):
         write_rig_with_camera(new, rig, rig.cameras[0].name, file)
+
+
+def test_a_camera_of_opencvs_xml_is_read(rig, tmp_path) -> None:
+    file = tmp_path / "camera.xml"
+    storage = cv2.FileStorage(str(file), cv2.FileStorage_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", matrix_of(500.0))
+    storage.write("distortion_coefficients", np.array([[0.1, 0.2, 0.0, 0.0, 0.3]]))
+    storage.release()
+    found = imported_camera(file, rig.document.cameras[0])
+    assert (found.fx_px, found.cx_px, found.width_px) == (500.0, 470.0, 640)
+    assert found.distortion == [0.1, 0.2, 0.0, 0.0, 0.3]
+
+
+def test_a_damaged_opencv_file_ends_in_a_message_not_in_a_dead_program(rig, tmp_path) -> None:
+    """OpenCV's own reader writes past the end of a matrix with fewer rows than numbers."""
+    whole = FORMATS["opencv"](with_lens(rig, "pinhole", [0.1, 0.2, 0.0, 0.0, 0.3]))
+    file = tmp_path / "camera.yml"
+    for old, new in (("rows: 3", "rows: 99999"), ("dt: d", "dt: 9x"), ("1280", "9" * 400)):
+        file.write_text(whole.replace(old, new))
+        try:
+            imported_camera(file, rig.document.cameras[0])
+        except BadInput:
+            continue
 
 
 def test_ros_has_no_thin_prism(rig) -> None:

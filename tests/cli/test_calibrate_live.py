@@ -47,6 +47,8 @@ def test_pictures_are_taken_with_advice_and_then_used(video: Path, tmp_path: Pat
     assert "bring the board to the top right of the image" in answer.err
     assert "edge away from the camera" in answer.err
     assert "enough" in answer.err
+    assert answer.err.count("edges away:") == len(taken)
+    assert "# # #" in answer.err
 
 
 def test_a_video_in_place_of_a_folder_is_used(video: Path) -> None:

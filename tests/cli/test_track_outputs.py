@@ -109,6 +109,23 @@ def test_tags_that_are_not_as_told_are_named_as_the_cause(tmp_path: Path) -> Non
     assert "size_mm, position_mm and rotation_wxyz of tags.platform" in told.value.next_step
 
 
+@pytest.mark.parametrize("blur", [3.5, 8.0])
+def test_pictures_out_of_focus_are_not_blamed_on_the_tags_sizes(
+    tmp_path: Path, blur: float
+) -> None:
+    (tmp_path / "pictures").mkdir()
+    grey = read_picture(picture_files(SESSION)[0])
+    assert grey is not None
+    soft = cv2.GaussianBlur(grey, (0, 0), blur)
+    cv2.imwrite(str(tmp_path / "pictures" / "a.png"), soft)
+    rig = load_rig(CONFIGS / "gachon_8_6_rehearsal.yaml")
+    source = ImageFolder(tmp_path / "pictures", rig.cameras[0])
+    with pytest.raises(BadInput) as told:
+        list(tracked(source, Tracker(rig, rig.cameras[0])))
+    assert "focus the camera" in told.value.next_step
+    assert "size_mm" not in told.value.next_step
+
+
 def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -> None:
     video = tmp_path / "drawn.avi"
     arguments = ("synthetic", "--plan", plan, "-o", tmp_path / "poses.csv", "--overlay", video)

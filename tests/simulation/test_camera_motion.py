@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.pose import Array, PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
 from model.scene import Scene, nothing_in_the_way
-from simulation.camera.camera import Film, PlatformMotion, SyntheticCamera
+from simulation.camera.camera import Film, SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -37,12 +37,34 @@ def build(folder: Path) -> dict[str, list[Path]]:
         "result": [write_result(folder, camera_result_of())],
         "places": [ROOT / "examples/rig_session/places.csv"],
         "poses": [folder / "poses.csv"],
+        "corners": [_corners(folder)],
+        "camera": _cameras(folder),
         "picture": sorted((folder / "pictures").iterdir()),
         "endpoints": [folder / "flat_endpoints.json"],
         "dbc": [ROOT / "drivers/odrive/cansimple.dbc"],
         "eds": sorted((ROOT / "simulation/drives/eds").glob("*.eds")),
         "profile": sorted((ROOT / "drivers/cia402/profiles").glob("*.yaml")),
     }
+
+
+def _corners(folder: Path) -> Path:
+    rows = [f"{p},{x * 10 + p},{y * 11.5},{x * 25},{y * 25}" for p in range(3) for x in range(4)
+            for y in range(3)]  # fmt: skip
+    path = folder / "corners.csv"
+    path.write_text("\n".join(["picture,x_px,y_px,board_x_mm,board_y_mm", *rows]))
+    return path
+
+
+def _cameras(folder: Path) -> list[Path]:
+    """A camera's numbers in every format that is read."""
+    from calibration.intrinsics.exchange import FORMATS
+    from model.rig import load_rig
+
+    own = load_rig(ROOT / "configs/gachon_8_6.yaml").document.cameras[0]
+    camera = own.model_copy(update={"distortion": [0.1, 0.2, 0.003, 0.004]})
+    for name, text in FORMATS.items():
+        (folder / f"camera_{name}.yaml").write_text(text(camera))
+    return [folder / f"camera_{name}.yaml" for name in FORMATS]
 
 
 def _pictures(folder: Path) -> None:

@@ -29,7 +29,9 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     """All of them; run folders are copied into ``scratch``."""
     from calibration.extrinsics.hand_eye import read_poses
     from calibration.geometry.measurements import read_rig_data
+    from calibration.intrinsics.exchange import imported_camera
     from calibration.load import load_result
+    from calibration.targets.board import read_corners
     from drivers.cameras.files import read_picture
     from drivers.odrive.dbc import read_layouts
     from drivers.odrive.endpoints import read_endpoints
@@ -41,6 +43,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     from model.scene import load_scene
     from simulation.drives.eds_file import read_eds
 
+    camera = load_rig(corpus["rig"][0]).document.cameras[0]
     odrive = OdriveDocument(type="odrive", motor_torque_constant_nm_a=0.05, watchdog_ms=50.0)
     calls: dict[str, Callable[[Path], object]] = {
         "rig": load_rig,
@@ -49,6 +52,8 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         "result": load_result,
         "places": lambda path: read_rig_data(path, 8),
         "poses": read_poses,
+        "corners": read_corners,
+        "camera": lambda path: imported_camera(path, camera),
         "picture": read_picture,
         "endpoints": lambda path: read_endpoints(path, odrive),
         "dbc": read_layouts,

@@ -1,9 +1,10 @@
-"""Which tags an image shows besides the expected ones, for helpful messages."""
+"""What an image shows besides the expected tags, and how soft it is, for helpful messages."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from model.files.rig_file import APRILTAG_FAMILIES
@@ -31,6 +32,21 @@ def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
     if any(d.id in expected for d in TagDetector(family).detect(flipped)):
         told += "; the expected tags appear mirrored, so the images are mirrored"
     return told
+
+
+#: Wider edges are out of focus or smeared, [px].
+SOFT = 4.5
+
+
+def edge_width(image: Image) -> float:
+    """Width of the sharpest edges of a grey image, [px]: contrast by slope; 1 to 4 in focus."""
+    if min(image.shape) < 5:
+        return float("inf")
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.7)
+    across, down = (cv2.Scharr(smooth, cv2.CV_32F, *axis) / 32.0 for axis in ((1, 0), (0, 1)))
+    low, high = np.percentile(smooth, (2.0, 98.0))
+    steepest = float(np.percentile(np.hypot(across, down), 99.8))
+    return float(high - low) / max(steepest, 1e-9)
 
 
 def _same(name: str, family: str) -> bool:

@@ -11,7 +11,12 @@ import typer
 from calibration.intrinsics.lens import AUTO
 from calibration.intrinsics.quality import FULL_COVERAGE
 from calibration.pictures import take_pictures
-from calibration.procedures import CameraOutcome, Destination, calibrate_camera
+from calibration.procedures import (
+    CameraOutcome,
+    Destination,
+    calibrate_camera,
+    calibrate_camera_from_corners,
+)
 from calibration.results import require_file_name
 from calibration.targets.board import Board
 from cdpr.cli.calibrate.board_options import BoardOptions
@@ -40,7 +45,8 @@ def camera(
     folder: Annotated[
         Path,
         typer.Argument(
-            help="folder of pictures of the board, or a video; or for --live", metavar="DIR"
+            help="folder of pictures of the board, a video, or corners (CSV); or for --live",
+            metavar="DIR",
         ),
     ],
     printed: BoardOptions,
@@ -53,7 +59,7 @@ def camera(
     ] = None,
     size_px: Annotated[
         tuple[int, int] | None,
-        typer.Option(help="with --live: image width and height (default: 1280 720)"),
+        typer.Option(help="image width and height, of --live (default: 1280 720) or of corners"),
     ] = None,
     name: Annotated[str, typer.Option(help="name of the camera in the rig file")] = "camera",
     wanted_mm: WantedOption = 1.0,
@@ -79,9 +85,30 @@ def camera(
       cdpr calibrate camera pictures/ --board charuco --columns 7 --rows 5 --square-mm 30
       --marker-mm 22 --dictionary 4X4_50
 
+      cdpr calibrate camera corners.csv --size-px 1280 720 -o calibration
+
       cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
     """
     require_file_name(name, "--name")
+    to = Destination(output, force)
+    if live is None and folder.suffix.lower() == ".csv":
+        if size_px is None:
+            raise BadInput(
+                "a file of corners needs --size-px",
+                where=str(folder),
+                next_step="pass width and height of the images that they were detected in",
+            )
+        made = calibrate_camera_from_corners(
+            folder,
+            size_px,
+            name=name,
+            wanted=wanted_mm / 1e3,
+            distance=distance_m,
+            lens=lens.value,
+            to=to,
+        )
+        show_calibration(made, _facts(made), as_json)
+        return
     board = printed.made()
     if live is None and (pictures is not None or size_px is not None):
         raise BadInput(
@@ -89,7 +116,6 @@ def camera(
             where="calibrate camera",
             next_step="pass --live CAMERA as well, or leave them out",
         )
-    to = Destination(output, force)
     if live is not None:
         to.require_free("camera", name)
         if not Path(live).is_file():

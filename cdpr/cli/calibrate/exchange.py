@@ -1,4 +1,4 @@
-"""`cdpr calibrate export` and `import`: camera files of OpenCV and ROS."""
+"""`cdpr calibrate export` and `import`: camera files of OpenCV, ROS, Kalibr and mrcal."""
 
 from __future__ import annotations
 
@@ -25,18 +25,20 @@ class FormatName(StrEnum):
 
     opencv = "opencv"
     ros = "ros"
+    kalibr = "kalibr"
+    mrcal = "mrcal"
 
 
 def export(
     rig: RigArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", help="file to write (YAML)")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="file to write")],
     to: Annotated[FormatName, typer.Option(help="whose format")] = FormatName.opencv,
     camera: CameraOption = None,
     calibration: CalibrationOption = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a camera's matrix and lens for OpenCV (YAML) or ROS (camera_info).
+    """Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.
 
     [dim]Examples:[/dim]
 
@@ -58,24 +60,27 @@ def export(
 
 def import_(
     rig: RigArgument,
-    file: Annotated[Path, typer.Argument(help="of OpenCV or ROS", metavar="CAMERA")],
+    file: Annotated[Path, typer.Argument(help="of OpenCV, ROS, Kalibr or mrcal", metavar="CAMERA")],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="rig file to write; it must not exist yet")
     ],
     camera: CameraOption = None,
+    entry: Annotated[
+        str | None, typer.Option(help="of a Kalibr camchain with several cameras, such as cam1")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a new rig file with a camera's matrix and lens from OpenCV or ROS.
+    """Write a new rig file with a camera's matrix and lens from another program.
 
-    CAMERA is OpenCV's YAML or a camera_info. How sure its numbers are it does not say; `cdpr
-    calibrate camera` does.
+    CAMERA is OpenCV's YAML, ROS's camera_info, Kalibr's camchain or mrcal's .cameramodel. How sure
+    its numbers are it does not say; `cdpr calibrate camera` does.
 
     [dim]Example:[/dim]
 
       cdpr calibrate import rig.yaml camera_info.yaml --camera front -o rig_with_lens.yaml
     """
     loaded = load_rig(rig)
-    found = write_rig_with_camera(output, loaded, loaded.camera(camera).name, file)
+    found = write_rig_with_camera(output, loaded, loaded.camera(camera).name, file, entry)
     if as_json:
         show_json({"rig": str(output), "camera": found.name, "lens": found.lens})
         return

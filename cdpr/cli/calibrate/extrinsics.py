@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import radians
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from calibration.extrinsics.camera_pairs import locate_camera_by_another
 from calibration.extrinsics.result import moved_rows
 from calibration.extrinsics.surveyed_tags import Survey
-from calibration.pictures import pictures_of
-from calibration.procedures import USUAL_PICTURES, Destination, locate_camera
+from calibration.pictures import Pictures, pictures_of
+from calibration.procedures import (
+    USUAL_PICTURES,
+    Destination,
+    ExtrinsicsOutcome,
+    locate_camera,
+)
+from cdpr.cli.calibrate.board_options import BoardOptions
 from cdpr.cli.calibrate.output import (
     CameraOption,
     FolderOption,
@@ -21,11 +29,22 @@ from cdpr.cli.calibrate.output import (
     WantedOption,
     show_calibration,
 )
-from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig, finite
+from cdpr.cli.options import (
+    CalibrationOption,
+    JsonOption,
+    RigArgument,
+    calibrated_rig,
+    finite,
+    with_option_groups,
+)
 from cdpr.cli.output import Terminal
-from model.rig import load_rig
+from model.errors import BadInput
+from model.rig import Camera, load_rig
+
+NO_BOARD = BoardOptions()
 
 
+@with_option_groups
 def extrinsics(
     rig: RigArgument,
     source: SourceArgument,
@@ -35,6 +54,13 @@ def extrinsics(
         typer.Option(
             help="use the rig's motion: poses per image (CSV), or a run folder",
             metavar="FILE",
+        ),
+    ] = None,
+    beside: Annotated[
+        str | None,
+        typer.Option(
+            help="use another camera whose pose is known, and its images of the same moments",
+            metavar="NAME=SOURCE",
         ),
     ] = None,
     survey_mm: Annotated[
@@ -54,6 +80,7 @@ def extrinsics(
             " tags (default: each corner was surveyed by itself)",
         ),
     ] = None,
+    printed: BoardOptions = NO_BOARD,
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 1.0,
@@ -73,9 +100,31 @@ def extrinsics(
       cdpr calibrate extrinsics rig.yaml 0 --calibration calibration_camera_front_2026-03-01.yaml
 
       cdpr calibrate extrinsics rig.yaml runs/first/pictures --poses runs/first
+
+      cdpr calibrate extrinsics rig.yaml side/ --camera side --beside front=front/
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
     the_camera = the_rig.camera(camera)
+    if beside is not None:
+        if poses is not None:
+            raise BadInput(
+                "--beside and --poses exclude each other",
+                where="calibrate extrinsics",
+                next_step="use the rig's motion, or another camera",
+            )
+        name, _, other = beside.partition("=")
+        made = locate_camera_by_another(
+            the_rig,
+            the_camera,
+            the_rig.camera(name),
+            (_opener(source, the_camera, pictures), _opener(other, the_rig.camera(name), pictures)),
+            board=printed.made() if printed != NO_BOARD else None,
+            wanted=wanted_mm / 1e3,
+            to=Destination(output, force),
+            listener=Terminal(quiet=as_json),
+        )
+        show_calibration(made, _facts(made, the_camera), as_json)
+        return
     made = locate_camera(
         the_rig,
         the_camera,
@@ -86,10 +135,17 @@ def extrinsics(
         to=Destination(output, force),
         listener=Terminal(quiet=as_json),
     )
+    show_calibration(made, _facts(made, the_camera), as_json)
+
+
+def _opener(source: str, camera: Camera, pictures: int | None) -> Callable[[], Pictures]:
+    return lambda: pictures_of(source, camera, pictures, USUAL_PICTURES)
+
+
+def _facts(made: ExtrinsicsOutcome, camera: Camera) -> list[tuple[str, str]]:
     found = made.found
-    facts = [
+    return [
         ("by", f"{found.by}, {found.pictures} images"),
         *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
-        *moved_rows(the_camera.world_from_camera, found.world_from_camera),
+        *moved_rows(camera.world_from_camera, found.world_from_camera),
     ]
-    show_calibration(made, facts, as_json)

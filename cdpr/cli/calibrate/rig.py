@@ -99,6 +99,13 @@ def rig(
         bool,
         typer.Option("--without-poses", help="use drive positions alone, without camera poses"),
     ] = False,
+    reflector_mm: Annotated[
+        tuple[float, float, float],
+        typer.Option(
+            help="point of the platform whose positions a file without rotations holds, platform"
+            " frame"
+        ),
+    ] = (0.0, 0.0, 0.0),
     known: Annotated[
         list[GroupName] | None,
         typer.Option(help="parameters to keep as in the rig file; repeatable"),
@@ -158,6 +165,7 @@ def rig(
         length_deviation=length_mm / 1e3,
         pose_deviations=(pose_mm / 1e3, radians(pose_deg)),
         without_poses=without_poses,
+        reflector=[x / 1e3 for x in reflector_mm],
         tilt=radians(tilt_deg),
         wanted=wanted_mm / 1e3,
         name=name,

@@ -1,0 +1,276 @@
+"""How long a camera takes from its top row to its bottom row, by a platform that moves before it.
+
+Each row shows the platform a little later than the one above: a tag that goes down is stretched,
+one that goes sideways is sheared. The readout is that with which the edges of all tags in all
+images fit rigid poses best; the platform's motion follows from the images before and after.
+
+Source: Oth, Furgale, Kneip & Siegwart, "Rolling shutter camera calibration", CVPR 2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+from scipy.optimize import minimize_scalar
+from scipy.stats import t as student
+
+from calibration.intrinsics.result import camera_named, with_camera
+from calibration.report import Section, interval_rows, page_of, table_of
+from calibration.results import ResultDocument, common_keys
+from calibration.statistics import CONFIDENCE, Interval
+from calibration.tag_map.observations import TagSights
+from calibration.verdict import CalibrationVerdict, Issue
+from model.errors import BadInput
+from model.files.documents import AnyNonNegative, Positive
+from model.files.rig_file import Readout, RigDocument
+from model.pose import Array, PlatformMotion, Pose
+from model.rig import Camera, Rig
+from tracking.measurement import MEMORY
+from tracking.pnp import TagView, refine_pnp, solve_pnp
+from tracking.rolling_shutter import rows_at_once
+
+LEAST = 5
+"""Images with a known motion; fewer show nothing of the scatter."""
+GOOD = 20
+_STEP = 2e-4
+"""Of the readout, for how the errors depend on it, [s]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadoutCalibration:
+    """A camera's readout.
+
+    Attributes:
+        camera: As the rig has it.
+        readout: From the exposure of the top row to that of the bottom row, [s].
+        half_width: Of its 95 % interval, [s].
+        speeds: Of the platform in each image used, by name, [m/s].
+        before: Root mean square of the edges' errors as if all rows were exposed at once, in their
+            standard deviations.
+        after: The same with the readout.
+        unused: Why other images are not used.
+        data_hash: Of what was seen.
+    """
+
+    camera: Camera
+    readout: float
+    half_width: float
+    speeds: Mapping[str, float]
+    before: float
+    after: float
+    unused: Mapping[str, str]
+    data_hash: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moving:
+    """An image of a platform whose motion is known."""
+
+    views: list[TagView]
+    pose: Pose
+    camera_from_body: Pose
+    motion: PlatformMotion
+
+    def cost(self, camera: Camera) -> float:
+        """Huber cost of the edges at the camera's readout, in variances."""
+        views = rows_at_once(camera, self.views, self.pose, self.motion)
+        found = refine_pnp(camera, views, self.camera_from_body)
+        return float("inf") if found is None else found.cost
+
+
+def fit_readout(
+    rig: Rig, camera: Camera, sights: TagSights, times: Mapping[str, float]
+) -> ReadoutCalibration:
+    """Finds the readout.
+
+    Args:
+        rig: Its platform carries the tags.
+        camera: Its matrix and distortion hold.
+        sights: What was seen in images of the moving platform.
+        times: When these were taken, by name, [s].
+
+    Raises:
+        BadInput: Too few images show the platform in motion, or its motion shows nothing.
+    """
+    moving, unused = _moving(rig, camera, sights, times)
+    if len(moving) < LEAST:
+        raise BadInput(
+            f"{len(moving)} images show the platform between two others at most {MEMORY:g} s away;"
+            f" {LEAST} are required",
+            where=f"camera {camera.name!r}",
+            next_step="record a video of the platform while it moves up and down and sideways",
+        )
+    longest = float(np.median(np.diff(sorted(times.values()))))
+
+    def costs(readout: float) -> Array:
+        rolling = replace(camera, readout=float(readout))
+        return np.array([image.cost(rolling) for image in moving.values()])
+
+    best = minimize_scalar(
+        lambda readout: float(costs(readout).sum()),
+        bounds=(-longest, longest),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    found = float(best.x)
+    low, middle, high = (costs(found + step) for step in (-_STEP, 0.0, _STEP))
+    bends, slopes = (high - 2.0 * middle + low) / _STEP**2, (high - low) / (2.0 * _STEP)
+    half_width = _half_width(bends, slopes, float(middle.sum()), _freedom(moving))
+    if not half_width < 0.5 * longest:
+        raise BadInput(
+            f"the readout is between {(found - half_width) * 1e3:.2g} and"
+            f" {(found + half_width) * 1e3:.2g} ms: these images do not determine it",
+            where=f"camera {camera.name!r}",
+            why="the platform hardly moves in them, or only along the camera's view",
+            next_step="move it faster, up and down and sideways in the image",
+        )
+    edges = sum(2 * int(v.seen.edges.sum()) for image in moving.values() for v in image.views)
+    return ReadoutCalibration(
+        camera=camera,
+        readout=found,
+        half_width=half_width,
+        speeds={n: float(np.linalg.norm(i.motion.velocity)) for n, i in moving.items()},
+        before=float(np.sqrt(costs(0.0).sum() / edges)),
+        after=float(np.sqrt(middle.sum() / edges)),
+        unused={**sights.unused, **unused},
+        data_hash=sights.data_hash(),
+    )
+
+
+def _moving(
+    rig: Rig, camera: Camera, sights: TagSights, times: Mapping[str, float]
+) -> tuple[dict[str, _Moving], dict[str, str]]:
+    """Images whose motion is known by their neighbours, and why others are not used."""
+    tags = {tag.id: tag for tag in rig.platform_tags}
+    seen: list[tuple[str, list[TagView], Pose]] = []
+    unused = {}
+    for name in sorted(sights.squares, key=lambda n: times[n]):
+        views = [TagView(tags[k], square) for k, square in sights.squares[name].items()]
+        bundle = solve_pnp(camera, views, seen[-1][2] if seen else None)
+        if bundle is None:
+            unused[name] = "no pose fits its tags"
+        else:
+            seen.append((name, views, bundle.camera_from_body))
+    found = {}
+    for (before, _, first), (name, views, here), (after, _, last) in zip(
+        seen, seen[1:], seen[2:], strict=False
+    ):
+        between = times[after] - times[before]
+        if not 0.0 < between <= 2.0 * MEMORY:
+            unused[name] = f"its neighbours are {between:.2g} s apart"
+            continue
+        world = camera.world_from_camera
+        motion = PlatformMotion.between(world.compose(first), world.compose(last), between)
+        found[name] = _Moving(views, world.compose(here), here, motion)
+    return found, unused
+
+
+def _freedom(moving: Mapping[str, _Moving]) -> int:
+    edges = (2 * int(v.seen.edges.sum()) for image in moving.values() for v in image.views)
+    return max(sum(edges) - 6 * len(moving) - 1, 1)
+
+
+def _half_width(bends: Array, slopes: Array, cost: float, freedom: int) -> float:
+    """Of the 95 % interval: the larger of the scatter of edges and of the jackknife over images."""
+    whole, count = float(bends.sum()), len(bends)
+    if not whole > 0.0:
+        return float("inf")
+    by_scatter = 2.0 / whole * max(cost / freedom, 1.0)
+    rest = whole - bends
+    steps = slopes / np.where(rest > 0.0, rest, np.nan)
+    spread = steps - np.nanmean(steps)
+    by_images = (count - 1) / count * float(np.nansum(spread**2))
+    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
+    return quantile * float(np.sqrt(max(by_scatter, by_images)))
+
+
+def judge_readout(found: ReadoutCalibration, wanted: float, speed: float) -> CalibrationVerdict:
+    """What a readout is good for.
+
+    Args:
+        found: The readout.
+        wanted: What is good enough, [m].
+        speed: Of the platform, for which the error is stated, [m/s].
+    """
+    error = 0.5 * found.half_width * speed  # rows at an edge of the image
+    lacks = []
+    step = "record more images of a faster platform, with tags all over the image's height"
+    if len(found.speeds) < GOOD:
+        lacks.append(Issue(f"{len(found.speeds)} images were used; {GOOD} are required", step))
+    if not error <= wanted:
+        what = f"{error * 1e3:.2g} mm remain open, {wanted * 1e3:.2g} mm are required"
+        lacks.append(Issue(what, step))
+    where = f"at {speed * 1e3:.0f} mm/s"
+    return CalibrationVerdict.of(error, wanted, where, lacks)
+
+
+class ReadoutResult(ResultDocument):
+    """A camera's readout, in the key of the rig file's ``cameras`` section."""
+
+    order: ClassVar[int] = 1
+
+    kind: Literal["readout"] = "readout"
+    readout_ms: Readout
+    speed_mm_s: Positive = Field(description="of the platform, for which error_mm is stated")
+    pictures: int
+    edges_before: AnyNonNegative = Field(
+        description="RMS error of edges in standard deviations, as if all rows were exposed at once"
+    )
+    edges_after: AnyNonNegative = Field(description="the same with readout_ms")
+
+    def apart_mm(self, other: Self) -> float:
+        """How far apart a platform is measured at this speed at an edge of the image, [mm]."""
+        return abs(self.readout_ms - other.readout_ms) / 2e3 * self.speed_mm_s
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this readout.
+
+        Raises:
+            BadInput: The rig has no such camera.
+        """
+        camera = camera_named(rig, self.name)
+        return with_camera(rig, camera.model_copy(update={"readout_ms": self.readout_ms}))
+
+
+def readout_result(
+    found: ReadoutCalibration, verdict: CalibrationVerdict, speed: float, on: date
+) -> ReadoutResult:
+    """The result with its quality; the speed is that of the verdict, [m/s]."""
+    interval = Interval(found.readout * 1e3, found.half_width * 1e3)
+    return ReadoutResult(
+        **common_keys(
+            found.camera.name, on, found.data_hash, {"readout_ms": interval}, verdict, found.unused
+        ),
+        readout_ms=round(found.readout * 1e3, 6),
+        speed_mm_s=speed * 1e3,
+        pictures=len(found.speeds),
+        edges_before=found.before,
+        edges_after=found.after,
+    )
+
+
+def readout_page(found: ReadoutCalibration, verdict: CalibrationVerdict, on: str) -> str:
+    """The report."""
+    interval = Interval(found.readout * 1e3, found.half_width * 1e3)
+    images: Sequence[tuple[str, str]] = [
+        (name, f"{speed * 1e3:.0f} mm/s") for name, speed in found.speeds.items()
+    ]
+    errors = [
+        ("edges off, all rows at once", f"{found.before:.2f} standard deviations"),
+        ("edges off, with the readout", f"{found.after:.2f} standard deviations"),
+    ]
+    return page_of(
+        f"Readout of camera {found.camera.name}",
+        f"{on}, {len(found.speeds)} images used, {len(found.unused)} not",
+        verdict,
+        [
+            Section("Readout", table_of([*interval_rows({"readout_ms": interval}), *errors])),
+            Section("Images used", table_of(images, ("image", "the platform's speed"))),
+            Section("Images not used", table_of(found.unused.items())),
+        ],
+    )

@@ -1,0 +1,111 @@
+"""Rig calibration from positions of one point, as trackers with one reflector give them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.geometry.calibrate import fit_rig
+from calibration.geometry.fit import RigFitter
+from calibration.geometry.measurements import RigMeasurements, read_rig_data
+from calibration.geometry.model import DEFAULT_DEVIATIONS, Parameters
+from calibration.geometry.quality import judge_rig
+from calibration.geometry.result import rig_result
+from model.errors import BadInput
+from model.pose import read_only
+from model.rig import Rig, load_rig
+from tests.calibration.rig_places import Truth, places
+from tests.calibration.test_rig_calibration import LENGTH_DEVIATION, TODAY, errors_of, rms
+from tests.cli.program import call
+
+RIG = Path(__file__).parents[2] / "configs" / "gachon_8_6_rehearsal.yaml"
+REFLECTOR = np.array([0.02, -0.03, 0.09])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(RIG)
+
+
+@pytest.fixture(scope="module")
+def truth(rig: Rig) -> Truth:
+    return places(rig, 60, tilt=np.radians(12.0), seed=5)
+
+
+def followed(truth: Truth, reflector: np.ndarray) -> RigMeasurements:
+    """What a tracker of one reflector would have measured."""
+    data = truth.measured
+    points = data.positions + data.rotations @ reflector
+    return replace(
+        data,
+        positions=read_only(points),
+        rotations=read_only(np.full_like(data.rotations, np.nan)),
+        reflector=read_only(reflector),
+    )
+
+
+@pytest.mark.parametrize("reflector", [np.zeros(3), REFLECTOR])
+def test_positions_of_a_reflector_calibrate_a_rig(
+    rig: Rig, truth: Truth, reflector: np.ndarray
+) -> None:
+    result = fit_rig(rig, followed(truth, reflector), DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    quality = judge_rig(result, 1e-3, 0.0)
+    assert result.held_out.poses
+    assert quality.held_out < 0.5 * quality.before
+    corrected = rig.with_calibration(rig_result(result, quality, "rig", TODAY))
+    assert rms(errors_of(corrected, truth)) < 0.25 * rms(errors_of(rig, truth))
+
+
+def test_a_wrong_reflector_fits_worse(rig: Rig, truth: Truth) -> None:
+    right = followed(truth, REFLECTOR)
+    wrong = replace(right, reflector=read_only(np.zeros(3)))
+    squares = [
+        float(np.sum(fit.residuals**2) + np.sum(fit.pose_misfits**2))
+        for fit in (
+            fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION).fit for data in (right, wrong)
+        )
+    ]
+    assert squares[1] > 2.0 * squares[0]
+
+
+def test_what_a_position_says_of_a_pose_is_by_finite_differences(rig: Rig, truth: Truth) -> None:
+    """The gradient of the squared distances, about estimated poses."""
+    data = followed(truth, REFLECTOR)
+    fitter = RigFitter(Parameters.of(rig, DEFAULT_DEVIATIONS), data, LENGTH_DEVIATION)
+    positions, rotations = truth.positions + 1e-3, truth.rotations
+    errors = fitter._pose_errors(positions, rotations)
+    information = data.pose_information(rotations)
+    slopes = 2.0 * np.einsum("nij,nj->ni", information, errors)
+    step = 1e-6
+    for axis in range(3):
+        moved = positions + step * np.eye(3)[axis]
+        there = fitter._pose_errors(moved, rotations)
+        costs = [np.einsum("ni,nij,nj->n", e, information, e) for e in (there, errors)]
+        np.testing.assert_allclose((costs[0] - costs[1]) / step, slopes[:, axis], rtol=1e-2)
+
+
+def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
+    rig: Rig, truth: Truth, tmp_path: Path
+) -> None:
+    data = followed(truth, np.zeros(3))
+    names = [f"actual_{i}_counts" for i in range(1, 9)] + ["x_mm", "y_mm", "z_mm"]
+    names += ["std_x_mm", "std_y_mm", "std_z_mm"]
+    rows = np.column_stack([data.counts, data.positions * 1e3, np.full((60, 3), 0.2)])
+    file = tmp_path / "tracker.csv"
+    lines = [",".join(names), *(",".join(f"{x:.6f}" for x in row) for row in rows)]
+    file.write_text("\n".join(lines))
+    back = read_rig_data(file, 8)
+    assert back.posed.all()
+    assert not back.turned.any()
+    np.testing.assert_allclose(back.positions, data.positions, atol=1e-8)
+    np.testing.assert_allclose(back.covariances[0, :3, :3], 4e-8 * np.eye(3))
+    answer = call("calibrate", "rig", RIG, file, "--reflector-mm", "0", "0", "0", "--tilt-deg", "0")
+    assert answer.code in (0, 3), answer
+    assert "positions RMS error at held-out samples" in " ".join(answer.out.split())
+    half = tmp_path / "half.csv"
+    half.write_text("\n".join([lines[0] + ",qw", *(line + ",1" for line in lines[1:])]))
+    with pytest.raises(BadInput, match="'qx' is missing"):
+        read_rig_data(half, 8)

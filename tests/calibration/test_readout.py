@@ -1,0 +1,103 @@
+"""The readout of a rolling shutter, measured from a moving platform and used afterwards."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from calibration.load import load_result
+from calibration.procedures import measure_readout
+from model.errors import BadInput
+from model.pose import PlatformMotion, Pose
+from model.rig import Rig, load_rig
+from model.scene import nothing_in_the_way
+from simulation.camera.camera import SyntheticCamera
+from simulation.ground_truth import Optics
+from tests.cli.program import call, one_message
+
+RIG = Path(__file__).parents[2] / "configs" / "gachon_8_6.yaml"
+TRUE, RATE = 0.025, 20.0
+
+
+def swinging(rig: Rig, time: float) -> Pose:
+    """Up and down and sideways, at most at about 0.12 m/s."""
+    shift = np.array([0.02 * np.sin(4.0 * time), 0.0, 0.02 * np.sin(5.0 * time + 1.0)])
+    return Pose(rig.home.position + shift, rig.home.rotation)
+
+
+def write_film(rig: Rig, folder: Path, readout: float, images: int, still: bool = False) -> None:
+    camera = replace(rig.cameras[0], readout=readout)
+    optics = Optics(noise=1.5, exposure=2e-3)
+    eye = SyntheticCamera(rig, nothing_in_the_way(rig), camera, 2, optics)
+    for number in range(images):
+        time, step = (0.0 if still else number / RATE), 1e-4
+        ends = (swinging(rig, time + sign * step) for sign in (-1.0, 1.0))
+        motion = None if still else PlatformMotion.between(*ends, 2.0 * step)
+        image = eye.render(swinging(rig, time), number, motion)
+        cv2.imwrite(str(folder / f"{number:03}.png"), image)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(RIG)
+
+
+@pytest.fixture(scope="module")
+def film(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("film")
+    write_film(rig, folder, TRUE, 24)
+    return folder
+
+
+def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: Path) -> None:
+    made = measure_readout(rig, rig.cameras[0], film, rate=RATE)
+    found = made.found
+    assert abs(found.readout - TRUE) < found.half_width
+    assert found.half_width < 0.05 * TRUE
+    assert len(found.speeds) == 22
+    assert found.after < 0.7 * found.before
+    assert made.quality.good
+    assert made.corrected(rig.document).cameras[0].readout_ms == pytest.approx(found.readout * 1e3)
+
+
+def test_a_camera_that_exposes_all_rows_at_once_has_none(rig: Rig, tmp_path: Path) -> None:
+    write_film(rig, tmp_path, 0.0, 12)
+    found = measure_readout(rig, rig.cameras[0], tmp_path, rate=RATE).found
+    assert abs(found.readout) < max(found.half_width, 5e-4)
+
+
+def test_a_platform_at_rest_shows_no_readout(rig: Rig, tmp_path: Path) -> None:
+    write_film(rig, tmp_path, TRUE, 8, still=True)
+    with pytest.raises(BadInput, match="do not determine it"):
+        measure_readout(rig, rig.cameras[0], tmp_path, rate=RATE)
+
+
+def test_the_verb_writes_a_result_that_applies_to_the_rig(film: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    answer = call("calibrate", "readout", RIG, film, "--rate-hz", RATE, "-o", out, "--json")
+    assert answer.code == 0, answer
+    told = json.loads(answer.out)
+    assert told["kind"] == "readout"
+    [file] = out.glob("calibration_readout_front_*.yaml")
+    assert load_result(file).good_enough
+    assert "Readout of camera front" in file.with_suffix(".html").read_text()
+    new = tmp_path / "new.yaml"
+    assert call("calibrate", "apply", RIG, file, "-o", new).code == 0
+    assert yaml.safe_load(new.read_text())["cameras"][0]["readout_ms"] == told["readout_ms"]
+
+
+def test_few_images_and_a_rate_for_a_video_are_refused(rig: Rig, film: Path, tmp_path) -> None:
+    for name in ("000.png", "001.png", "002.png"):
+        (tmp_path / name).write_bytes((film / name).read_bytes())
+    one_message(call("calibrate", "readout", RIG, tmp_path), 2, "5 are required")
+    video = tmp_path / "a.avi"
+    video.write_bytes(b"x")
+    one_message(
+        call("calibrate", "readout", RIG, video, "--rate-hz", "3"), 2, "--rate-hz is for a folder"
+    )
