@@ -15,11 +15,7 @@ from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
 from executor.control.standstill import FaultReset, Release, StandstillMotion
 from executor.current_pose import current_pose
-<<<<<<< HEAD
 from executor.drives import left_alone, require_other_process, resting_drives_of
-=======
-from executor.drives import require_other_process, resting_drives_of
->>>>>>> np
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
