@@ -31,6 +31,7 @@ class PoseMeasurement:
         shared: As `covariance`, of the errors that all pictures have in common: of the camera's
             place and of the tags, as far as calibrations or the rig file state them.
         unstated: Whether a part of these is not stated.
+        cable_error: How far off cables are, 95 %, where the operator's number stands for that, [m].
     """
 
     time: float
@@ -41,6 +42,7 @@ class PoseMeasurement:
     status: str
     shared: Array = field(default_factory=lambda: np.zeros((6, 6)))
     unstated: bool = True
+    cable_error: float = 0.0
 
     @property
     def position_deviation(self) -> Array:

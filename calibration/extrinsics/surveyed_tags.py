@@ -19,7 +19,7 @@ from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_check import change_of_inverse
-from tracking.camera_model import project_undistorted
+from tracking.camera_model import project_undistorted, ray_slopes
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, moved, solve_pnp
@@ -67,6 +67,8 @@ def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Arra
 
 LEAST_TAGS = 3
 """Fewer cannot show that one of them was surveyed wrongly."""
+MANY_TAGS = 8
+"""Of fewer, leaving one out says little of how far off all are: the stated survey counts."""
 MOVED_PX = 0.5
 """Between images of a camera that stands still tags do not move farther."""
 _OFF = 3.0
@@ -123,10 +125,13 @@ def locate_by_frame_tags(
     tags, strangers = _agreeing(camera, tags, start)
     best = _fit(camera, tags, start)
     unused = {f"tag {tag.number}": _is_off(camera, tag, best) for tag in strangers}
+    by_lens = _by_lens(camera, tags, best)
     covariance = _covariance(camera, tags, best)
+    if by_lens is not None and camera.lens_covariance is not None:
+        covariance = covariance + by_lens @ camera.lens_covariance @ by_lens.T
     pose = best.inverse()
     changes = []
-    for k in range(len(tags) if len(tags) >= LEAST_TAGS else 0):
+    for k in range(len(tags) if len(tags) >= MANY_TAGS else 0):
         other = _fit(camera, tags[:k] + tags[k + 1 :], best).inverse()
         turn = rotation_vector_from_matrix(other.rotation @ pose.rotation.T)
         changes.append(np.concatenate([other.position - pose.position, turn]))
@@ -135,6 +140,7 @@ def locate_by_frame_tags(
         by="frame tags",
         covariance=read_only(covariance),
         half_widths=read_only(widths_of(covariance, changes)),
+        by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},
         pictures=len(sights.squares),
@@ -247,16 +253,35 @@ def _is_off(camera: Camera, tag: _SeenTag, best: Pose) -> str:
     return f"is measured {away * 1e3:.1f} mm from its position in the rig file"
 
 
-def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
-    """Of ``world_from_camera``, shape (6, 6); wider where corners scatter more than they should."""
+def _slopes(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
+    """Of the whitened errors by the pose, shape (8 t, 6)."""
     step = 1e-6
-    slopes = np.column_stack(
+    return np.column_stack(
         [
             (_errors(camera, tags, moved(best, d)) - _errors(camera, tags, moved(best, -d)))
             / (2 * step)
             for d in step * np.eye(6)
         ]
     )
+
+
+def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array | None:
+    """How ``world_from_camera`` moves with errors of the lens, shape (6, n)."""
+    if camera.lens_covariance is None:
+        return None
+    slopes, matrix = _slopes(camera, tags, best), camera.matrix
+    focal, middle = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
+    by_lens = []
+    for tag in tags:
+        rays = (tag.pixels.reshape(4, 2) - middle) / focal
+        by_lens.append(tag.whitening @ (ray_slopes(camera, rays) * focal[:, None]).reshape(8, -1))
+    steps = np.linalg.lstsq(slopes, np.concatenate(by_lens), rcond=None)[0]
+    return read_only(change_of_inverse(best) @ steps)
+
+
+def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
+    """Of ``world_from_camera``, shape (6, 6); wider where corners scatter more than they should."""
+    slopes = _slopes(camera, tags, best)
     scale = max(1.0, _misfit(camera, tags, best))
     covariance = scale * np.linalg.inv(slopes.T @ slopes)
     change = change_of_inverse(best)

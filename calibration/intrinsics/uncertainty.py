@@ -23,6 +23,7 @@ from scipy.stats import t as student
 from calibration.intrinsics.lens import LensModel
 from calibration.statistics import CONFIDENCE
 from calibration.targets.board import Seen
+from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, read_only
 
@@ -42,6 +43,12 @@ class Uncertainty:
     half_widths: Array
     without: Array
     halves: Array
+
+    @property
+    def stated_covariance(self) -> Array:
+        """The covariance whose 1.96 deviations are the half widths, shape (n, n)."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance * np.outer(*2 * [self.half_widths / SURE / deviations]))
 
     def half_width_of(self, slopes: Array) -> float:
         """Half width of the 95 % interval of something that depends on all numbers, RMS.

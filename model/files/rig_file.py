@@ -12,12 +12,14 @@ from model.files.documents import (
     WHOLE_LARGEST,
     Document,
     Finding,
+    LensCovariance,
     LensName,
     Name,
     NonNegative,
     Number,
     PoseCovariance,
     PoseDocument,
+    PoseSlopes,
     Positive,
     PositiveVector,
     UnitVector,
@@ -282,13 +284,22 @@ class CameraDocument(Document):
         validate_default=True,
     )
     world_from_camera: PoseDocument
+    lens_covariance: LensCovariance | None = Field(
+        default=None,
+        description="of fx_px, fy_px, cx_px, cy_px and distortion; calibrations write it",
+    )
     pose_covariance: PoseCovariance | None = Field(
         default=None, description="of world_from_camera, mm and deg; calibrations write it"
     )
+    pose_by_lens: PoseSlopes | None = Field(
+        default=None,
+        description="how errors of the numbers of lens_covariance move world_from_camera, mm and"
+        " deg; calibrations write it",
+    )
     error_mm: NonNegative | None = Field(
         default=None,
-        description="how far off the platform is measured, 95 %, all errors that pictures share;"
-        " used where there is no pose_covariance",
+        description="how far off platform and cables are measured, 95 %, by all errors that"
+        " pictures share; used where calibrations do not state all of them",
     )
     rate_hz: Positive = 10.0
 
@@ -297,6 +308,16 @@ class CameraDocument(Document):
     def _opencv_count(cls, distortion: list[float], info: ValidationInfo) -> list[float]:
         require_coefficients(info.data.get("lens", LENSES[0]), len(distortion))
         return distortion
+
+    @field_validator("lens_covariance", "pose_by_lens")
+    @classmethod
+    def _one_a_number(
+        cls, rows: list[list[float]] | None, info: ValidationInfo
+    ) -> list[list[float]] | None:
+        count = 4 + len(info.data.get("distortion", []))
+        if rows is not None and len(rows[0]) != count:
+            raise ValueError(f"needs {count} numbers a row: fx, fy, cx, cy and distortion")
+        return rows
 
 
 class RigDocument(Document):
@@ -309,6 +330,12 @@ class RigDocument(Document):
     workspace: WorkspaceDocument
     outlets_mm: Annotated[list[Vector], Field(min_length=1)]
     anchors_mm: Annotated[list[Vector], Field(min_length=1)]
+    outlets_error_mm: NonNegative | None = Field(
+        default=None, description="how far off any of them is, 95 %; calibrations write it"
+    )
+    anchors_error_mm: NonNegative | None = Field(
+        default=None, description="how far off any of them is, 95 %; calibrations write it"
+    )
     cables: CableDocument
     pulleys: PulleysDocument | None = None
     winches: Annotated[list[WinchDocument], Field(min_length=1)]
