@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from calibration.extrinsics.quality import ExtrinsicCalibration, widths_of, workspace_corners
+from calibration.extrinsics.quality import ExtrinsicCalibration, workspace_corners
+from calibration.statistics import widened
 from calibration.tag_map.observations import TagSights
 from calibration.verdict import Issue
+from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
@@ -127,19 +129,21 @@ def locate_by_frame_tags(
     unused = {f"tag {tag.number}": _is_off(camera, tag, best) for tag in strangers}
     by_lens = _by_lens(camera, tags, best)
     covariance = _covariance(camera, tags, best)
-    if by_lens is not None and camera.lens_covariance is not None:
-        covariance = covariance + by_lens @ camera.lens_covariance @ by_lens.T
     pose = best.inverse()
     changes = []
     for k in range(len(tags) if len(tags) >= MANY_TAGS else 0):
         other = _fit(camera, tags[:k] + tags[k + 1 :], best).inverse()
         turn = rotation_vector_from_matrix(other.rotation @ pose.rotation.T)
         changes.append(np.concatenate([other.position - pose.position, turn]))
+    if changes:
+        covariance = widened(covariance, np.array(changes))
+    if by_lens is not None and camera.lens_covariance is not None:
+        covariance = covariance + by_lens @ camera.lens_covariance @ by_lens.T
     return ExtrinsicCalibration(
         camera=replace(camera, world_from_camera=pose),
         by="frame tags",
         covariance=read_only(covariance),
-        half_widths=read_only(widths_of(covariance, changes)),
+        half_widths=read_only(SURE * np.sqrt(np.diag(covariance))),
         by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from calibration.intrinsics.lens import LensModel
-from calibration.statistics import CONFIDENCE
+from calibration.statistics import CONFIDENCE, jackknife, widened
 from calibration.targets.board import Seen
 from model.cameras import SURE
 from model.errors import BadInput
@@ -46,9 +46,12 @@ class Uncertainty:
 
     @property
     def stated_covariance(self) -> Array:
-        """The covariance whose 1.96 deviations are the half widths, shape (n, n)."""
-        deviations = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance * np.outer(*2 * [self.half_widths / SURE / deviations]))
+        """The covariance that 95 % intervals of whatever depends on the numbers follow from.
+
+        That of the scatter, as much wider as `widened` finds it; shape (n, n).
+        """
+        quantile = _quantile(len(self.without)) / SURE
+        return widened(self.covariance, self.without) * quantile**2
 
     def half_width_of(self, slopes: Array) -> float:
         """Half width of the 95 % interval of something that depends on all numbers, RMS.
@@ -60,7 +63,7 @@ class Uncertainty:
             slopes: Its derivatives by the numbers, shape (..., n).
         """
         flat = slopes.reshape(-1, slopes.shape[-1])
-        both = (self.covariance, _by_pictures(self.without))
+        both = (self.covariance, jackknife(self.without))
         squares = [float(np.einsum("pk,kl,pl->", flat, c, flat)) / len(flat) for c in both]
         return _quantile(len(self.without)) * float(np.sqrt(max(*squares, 0.0)))
 
@@ -106,7 +109,7 @@ def uncertainty_of(
         )
     by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
-    by_pictures = _by_pictures(without)
+    by_pictures = jackknife(without)
     larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures))
     return Uncertainty(
         covariance=read_only(by_scatter),
@@ -114,12 +117,6 @@ def uncertainty_of(
         without=read_only(without),
         halves=read_only(_half(parts, scores, 1) - _half(parts, scores, 0)),
     )
-
-
-def _by_pictures(without: Array) -> Array:
-    """The covariance by the jackknife over pictures."""
-    spread, count = without - without.mean(axis=0), len(without)
-    return np.asarray((count - 1) / count * spread.T @ spread)
 
 
 def _without(information: Array, part: Array, score: Array) -> Array:
