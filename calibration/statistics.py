@@ -71,15 +71,21 @@ def jackknife(without: Array) -> Array:
 def widened(covariance: Array, without: Array) -> Array:
     """A covariance as much wider as the jackknife's is, in the mean of all directions.
 
-    Parts that weigh much make the jackknife's too wide; half of their usual weight is taken off.
-
     Args:
         covariance: By the scatter, shape (n, n).
         without: As `jackknife` takes it.
     """
     count, size = without.shape
     ratio = float(np.trace(np.linalg.solve(covariance, jackknife(without)))) / size
-    return np.asarray(covariance * max(1.0, ratio * (1.0 - min(1.0, size / (2.0 * count)))))
+    return np.asarray(covariance * max(1.0, ratio * kept_share(count, size)))
+
+
+def kept_share(parts: int, numbers: int) -> float:
+    """Share of a jackknife's variance that is the numbers': parts that weigh much make it too wide.
+
+    Half of their usual weight, numbers by parts, is taken off.
+    """
+    return max(0.0, 1.0 - numbers / (2.0 * parts))
 
 
 # Huber's loss: what is far off counts by its distance, not by its square.

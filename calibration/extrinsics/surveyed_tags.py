@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from calibration.extrinsics.quality import ExtrinsicCalibration, workspace_corners
-from calibration.statistics import widened
+from calibration.statistics import CONFIDENCE, widened
 from calibration.tag_map.observations import TagSights
 from calibration.verdict import Issue
 from model.cameras import SURE
@@ -284,9 +285,10 @@ def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array | No
 
 
 def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
-    """Of ``world_from_camera``, shape (6, 6); wider where corners scatter more than they should."""
+    """Of ``world_from_camera``, shape (6, 6); wider where the scatter contradicts the survey."""
     slopes = _slopes(camera, tags, best)
-    scale = max(1.0, _misfit(camera, tags, best))
+    misfit, free = _misfit(camera, tags, best), 8 * len(tags) - 6
+    scale = misfit if misfit > chi2.ppf(CONFIDENCE, free) / free else 1.0
     covariance = scale * np.linalg.inv(slopes.T @ slopes)
     change = change_of_inverse(best)
     return np.asarray(change @ covariance @ change.T)

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from calibration.intrinsics.lens import LensModel
-from calibration.statistics import CONFIDENCE, jackknife, widened
+from calibration.statistics import CONFIDENCE, jackknife, kept_share, widened
 from calibration.targets.board import Seen
 from model.cameras import SURE
 from model.errors import BadInput
@@ -110,7 +110,7 @@ def uncertainty_of(
     by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
     by_pictures = jackknife(without)
-    larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures))
+    larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures) * kept_share(*without.shape))
     return Uncertainty(
         covariance=read_only(by_scatter),
         half_widths=read_only(_quantile(count) * np.sqrt(larger)),

@@ -232,7 +232,9 @@ class SyntheticCamera:
         down, right = np.random.default_rng([self.seed, frame]).integers(0, NOISE_SLACK, 2)
         height, width = picture.shape
         noise = np.ascontiguousarray(self._noise[down : down + height, right : right + width])
-        return np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+        noisy = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+        np.copyto(noisy, 255, where=picture == 255)  # a full sensor gives white, whatever the noise
+        return noisy
 
 
 def _faces(rig: Rig) -> list[tuple[Pose, tuple[float, float]]]:
