@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.files.rig_file import CameraDocument, TagDocument
+from model.files.camera_file import CameraDocument, TagDocument
 from model.pose import Array, Pose, read_only
 
 
