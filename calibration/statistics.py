@@ -71,13 +71,18 @@ def jackknife(without: Array) -> Array:
 def widened(covariance: Array, without: Array) -> Array:
     """A covariance as much wider as the jackknife's is, in the mean of all directions.
 
+    It stays as it is where the jackknife's is wider by no more than chance makes it: by two
+    deviations of a mean of as many squares.
+
     Args:
         covariance: By the scatter, shape (n, n).
         without: As `jackknife` takes it.
     """
     count, size = without.shape
     ratio = float(np.trace(np.linalg.solve(covariance, jackknife(without)))) / size
-    return np.asarray(covariance * max(1.0, ratio * kept_share(count, size)))
+    ratio *= kept_share(count, size)
+    by_chance = 2.0 * float(np.sqrt(2.0 / (size * (count - 1))))
+    return np.asarray(covariance * (ratio if ratio > 1.0 + by_chance else 1.0))
 
 
 def kept_share(parts: int, numbers: int) -> float:

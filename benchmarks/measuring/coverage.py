@@ -1,6 +1,6 @@
 """How often 95 % intervals hold the truth, from the lens to the clearance, and verdicts are right.
 
-    python benchmarks/measuring/coverage.py [--labs 200] [--seed 1]
+    python benchmarks/measuring/coverage.py [--labs 200] [--kind "careful, 4 tags"] [--seed 1]
 
 A lab draws a lens, pictures of a board, a camera's place, a survey of floor tags, tags on the
 platform, outlets and anchors, each off by chance as it is told. It calibrates camera and place,
@@ -333,11 +333,14 @@ def main() -> int:
     """Prints coverage by kind; 1 when something is outside its limits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--labs", type=int, default=200, help="of each kind")
+    parser.add_argument("--kind", nargs="*", choices=KINDS, default=list(KINDS))
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     rig, scene = load_rig(CONFIGS / "gachon_8_6.yaml"), load_scene(CONFIGS / "environment_3.yaml")
     bad = 0
     for number, (name, kind) in enumerate(KINDS.items()):
+        if name not in options.kind:
+            continue
         tally = Tally()
         for lab in range(options.labs):
             rng = np.random.default_rng([options.seed, number, lab])
