@@ -16,7 +16,7 @@ from tracking.measurement import PoseMeasurement
 COVERAGE = 0.95
 """Share of true distances that lie within the stated uncertainty."""
 INTERVAL = f"{100.0 * COVERAGE:.0f} % interval"
-"""What verdict, report and operator are told of it."""
+"""How verdict, report and messages name it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

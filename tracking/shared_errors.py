@@ -164,7 +164,7 @@ def tag_error_slopes(tag: Tag, error: float) -> Array:
 def implied_rotation(camera: Camera) -> Array:
     """The rotation of a camera that best undoes errors of its lens, world axes, shape (3, n).
 
-    Whoever finds a camera's rotation by pictures of that lens finds it turned by this.
+    A camera's rotation that is found by pictures of that lens is found turned by this.
     """
     across = np.linspace(0.0, camera.width - 1.0, _GRID)
     down = np.linspace(0.0, camera.height - 1.0, _GRID)
