@@ -23,7 +23,7 @@ from tracking.edges.refine import RefinedTag
 HUBER = 3.0
 #: The edges' stated deviations weigh as this many residuals when the covariance is scaled by
 #: how well all edges fit: few edges fit well by chance.
-BELIEF = 6.0
+BELIEF = 12.0
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
 
