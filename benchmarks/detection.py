@@ -22,7 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from model.files.rig_file import tags_in
+from model.files.camera_file import tags_in
 from model.pose import Array, Pose
 from model.rig import load_rig
 from model.scene import load_scene

@@ -53,6 +53,46 @@ class Interval:
         return max(0, 1 - math.floor(math.log10(self.half_width)))
 
 
+# The jackknife: what leaving a part of the data out changes shows scatter that a model does not.
+
+
+def jackknife(without: Array) -> Array:
+    """Covariance by the changes of n numbers when each of p parts is left out, shape (n, n).
+
+    Args:
+        without: Shape (p, n).
+
+    Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
+    """
+    spread, count = without - without.mean(axis=0), len(without)
+    return np.asarray((count - 1) / count * spread.T @ spread)
+
+
+def widened(covariance: Array, without: Array) -> Array:
+    """A covariance as much wider as the jackknife's is, in the mean of all directions.
+
+    It stays as it is where the jackknife's is wider by no more than chance makes it: by two
+    deviations of a mean of as many squares.
+
+    Args:
+        covariance: By the scatter, shape (n, n).
+        without: As `jackknife` takes it.
+    """
+    count, size = without.shape
+    ratio = float(np.trace(np.linalg.solve(covariance, jackknife(without)))) / size
+    ratio *= kept_share(count, size)
+    by_chance = 2.0 * float(np.sqrt(2.0 / (size * (count - 1))))
+    return np.asarray(covariance * (ratio if ratio > 1.0 + by_chance else 1.0))
+
+
+def kept_share(parts: int, numbers: int) -> float:
+    """Share of a jackknife's variance that is the numbers': parts that weigh much make it too wide.
+
+    Half of their usual weight, numbers by parts, is taken off.
+    """
+    return max(0.0, 1.0 - numbers / (2.0 * parts))
+
+
 # Huber's loss: what is far off counts by its distance, not by its square.
 
 

@@ -41,6 +41,7 @@ from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from planner.check import verify
+from tracking.shared_errors import require_stated_errors
 
 __all__ = [
     "MotionProposal",
@@ -139,6 +140,8 @@ def run(
     chosen = resolve_cameras(rig, cameras, is_simulated(rig))
     require_simulated_pictures(chosen.values(), not realtime)
     require_own_time(rig, realtime)
+    if plan.scene.obstacles:
+        require_stated_errors(rig, list(chosen))
     if start is not None and not is_simulated(rig):
         raise BadInput(
             "only a platform simulated in this process can be placed",

@@ -1,4 +1,4 @@
-"""Cameras and tags of a rig, and what a camera's place makes its poses err by."""
+"""Cameras and tags of a rig, and how far off what is known of them may be."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.files.rig_file import CameraDocument, TagDocument, TagsDocument
-from model.pose import Array, Pose, read_only, skew
+from model.files.camera_file import CameraDocument, TagDocument
+from model.pose import Array, Pose, read_only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +44,12 @@ class Camera:
         lens: One of `model.files.documents.LENSES`.
         place_covariance: Of ``world_from_camera``: position [m] and rotation vector [rad] along the
             world's axes, shape (6, 6); None where the rig file does not say.
-        whole_error: Whether that covariance stands for all that is shared, tags included.
+        lens_covariance: Of its n numbers fx, fy, cx, cy [px] and distortion, shape (n, n); None
+            where the rig file does not say.
+        place_by_lens: How errors of these numbers move ``world_from_camera``, which was found with
+            them, shape (6, n), [m, rad]; None where that is not known.
+        error: How far off platform and cables are measured with it, 95 %, by all errors that
+            pictures share, [m]; None where the operator does not say.
         readout: From the exposure of the top row to that of the bottom row, [s]; images are stamped
             with the time of the middle one.
     """
@@ -58,7 +63,9 @@ class Camera:
     rate: float
     lens: str = "pinhole"
     place_covariance: Array | None = None
-    whole_error: bool = False
+    lens_covariance: Array | None = None
+    place_by_lens: Array | None = None
+    error: float | None = None
     readout: float = 0.0
 
     def row_times(self, pixels: Array) -> Array:
@@ -72,33 +79,10 @@ class Camera:
         """
         return np.asarray(self.readout * ((pixels[..., 1] + 0.5) / self.height - 0.5))
 
-    def shared_covariance(self, world_from_body: Pose) -> Array:
-        """What its place makes every pose that it measures err by alike, shape (6, 6), [m, rad].
-
-        It is common to all pictures: no mean over them makes it smaller.
-
-        Args:
-            world_from_body: The measured pose.
-
-        Returns:
-            Of position and rotation vector along the world's axes; 0 where nothing is stated.
-        """
-        if self.place_covariance is None:
-            return np.zeros((6, 6))
-        arm = world_from_body.position - self.world_from_camera.position
-        by_place = np.eye(6)
-        by_place[:3, 3:] = -skew(arm)
-        return np.asarray(by_place @ self.place_covariance @ by_place.T)
-
 
 def tag_from(document: TagDocument) -> Tag:
     """The tag that a rig file describes."""
     return Tag(id=document.id, size=document.size_mm / 1000.0, pose=document.pose())
-
-
-def tag_error_in(tags: TagsDocument | None) -> float | None:
-    """How far off corners of the platform's tags are, 95 %, [m]; None where not stated."""
-    return None if tags is None or tags.error_mm is None else tags.error_mm / 1e3
 
 
 def camera_from(document: CameraDocument) -> Camera:
@@ -117,17 +101,16 @@ def camera_from(document: CameraDocument) -> Camera:
         world_from_camera=document.world_from_camera.pose(),
         rate=document.rate_hz,
         lens=document.lens,
-        place_covariance=_place_covariance(document),
-        whole_error=document.pose_covariance is None and document.error_mm is not None,
+        place_covariance=_scaled(document.pose_covariance, np.outer(_SCALES, _SCALES)),
+        lens_covariance=_scaled(document.lens_covariance, np.ones(1)),
+        place_by_lens=_scaled(document.pose_by_lens, _SCALES[:, None]),
+        error=None if document.error_mm is None else document.error_mm / 1e3,
         readout=document.readout_ms / 1e3,
     )
 
 
-def _place_covariance(document: CameraDocument) -> Array | None:
-    if document.pose_covariance is not None:
-        scales = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
-        return read_only(np.array(document.pose_covariance) * np.outer(scales, scales))
-    if document.error_mm is not None:  # the same everywhere: as of a camera that is shifted
-        deviation = document.error_mm / 1e3 / SURE
-        return read_only(np.diag([deviation**2] * 3 + [0.0] * 3))
-    return None
+_SCALES = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
+
+
+def _scaled(rows: list[list[float]] | None, scales: Array) -> Array | None:
+    return None if rows is None else read_only(np.array(rows) * scales)

@@ -10,15 +10,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from model.cameras import Camera, Tag, camera_from, tag_error_in, tag_from
+from model.cameras import Camera, Tag, camera_from, tag_from
 from model.display import html_table
 from model.errors import BadInput
 from model.files.documents import document_hash, key_path, load_yaml, millimetres
-from model.files.rig_file import (
-    MotionDocument,
-    RigDocument,
-    WinchDocument,
-)
+from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
 from model.pose import Array, Pose, read_only
 from model.posed_rig import PosedRig, posed_rig
 
@@ -42,7 +38,7 @@ __all__ = [
 #: Parts of a rig file that a plan's proof does not rest on; they may change under a plan.
 NOT_IN_PLAN_HASH = (
     *("description", "bus", "drives", "tags", "cameras", "motion", "winches"),
-    "simulation",
+    *("simulation", "outlets_error_mm", "anchors_error_mm"),
 )
 
 
@@ -129,6 +125,8 @@ class Rig:
         half_size: Half extents of the platform box, shape (3,), [m].
         tag_error: How far off corners of the platform's tags are, 95 %, [m]; None where the rig
             file does not say.
+        outlet_error: How far off outlets are along any axis, 95 %, [m]; None as above.
+        anchor_error: As `outlet_error`, of anchors.
     """
 
     document: RigDocument
@@ -154,6 +152,8 @@ class Rig:
     frame_tags: tuple[Tag, ...]
     cameras: tuple[Camera, ...]
     tag_error: float | None = None
+    outlet_error: float | None = None
+    anchor_error: float | None = None
 
     @property
     def name(self) -> str:
@@ -345,8 +345,14 @@ def rig_from_document(document: RigDocument) -> Rig:
         platform_tags=tuple(tag_from(t) for t in tags.platform) if tags else (),
         frame_tags=tuple(tag_from(t) for t in tags.frame) if tags else (),
         cameras=tuple(camera_from(c) for c in document.cameras),
-        tag_error=tag_error_in(document.tags),
+        tag_error=_metres(document.tags.error_mm if document.tags else None),
+        outlet_error=_metres(document.outlets_error_mm),
+        anchor_error=_metres(document.anchors_error_mm),
     )
+
+
+def _metres(millimetres: float | None) -> float | None:
+    return None if millimetres is None else millimetres / 1e3
 
 
 def _array(points_mm: list[list[float]]) -> Array:

@@ -36,6 +36,11 @@ class Optics:
         exposure: Time for which the platform's motion is smeared, [s]; 0 for sharp images.
         light: Share of full light; less leaves less contrast, more overexposes.
         cables: Cables hide what is behind them.
+        halo: Of a lamp in view: brightness that it adds where it is, share of white.
+        shadow: Share of light that a shadow across the picture takes.
+        sharpening: How much of what a blur takes off is added, as cameras sharpen.
+        enlarged: How many times fewer pixels the sensor has, either way, than the image.
+        jpeg: Quality of the image's compression; 100 for none.
     """
 
     noise: float = 1.5
@@ -44,6 +49,11 @@ class Optics:
     exposure: float = 0.0
     light: float = 1.0
     cables: bool = True
+    halo: float = 0.0
+    shadow: float = 0.0
+    sharpening: float = 0.0
+    enlarged: int = 1
+    jpeg: int = 100
 
 
 def simulation_of(rig: Rig) -> SimulationDocument:
@@ -108,6 +118,11 @@ def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
         exposure=truth.exposure_ms / 1e3,
         light=truth.light,
         cables=truth.cables,
+        halo=truth.halo,
+        shadow=truth.shadow,
+        sharpening=truth.sharpening,
+        enlarged=truth.enlarged,
+        jpeg=truth.jpeg_quality,
     )
     moved = _moved(_with_lens(camera, truth), truth.world_from_camera)
     if truth.readout_ms is not None:

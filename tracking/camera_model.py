@@ -122,6 +122,29 @@ def project(lens: str, matrix: Array, distortion: Array, points: Array) -> Array
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
+def ray_slopes(camera: Camera, rays: Array) -> Array:
+    """How rays through given pixels move with the camera's n numbers (fx, fy, cx, cy, distortion).
+
+    Args:
+        camera: The camera.
+        rays: Where they meet the plane a metre before it, shape (p, 2), [m].
+
+    Returns:
+        Shape (p, 2, n), [m] for each unit of a number.
+    """
+    zero, count = np.zeros(3), 4 + camera.distortion.size
+    points = np.column_stack([rays, np.ones(len(rays))]).reshape(-1, 1, 3)
+    if camera.lens == FISHEYE:
+        by = cv2.fisheye.projectPoints(points, zero, zero, camera.matrix, camera.distortion)[1]
+        slopes = np.asarray(by, dtype=np.float64).reshape(len(rays), 2, -1)
+        by_ray, by_lens = slopes[..., 11:13], slopes[..., :8]
+    else:
+        by = cv2.projectPoints(points, zero, zero, camera.matrix, camera.distortion)[1]
+        slopes = np.asarray(by, dtype=np.float64).reshape(len(rays), 2, -1)
+        by_ray, by_lens = slopes[..., 3:5], slopes[..., 6 : 6 + count]
+    return np.asarray(-np.linalg.solve(by_ray, by_lens))
+
+
 def pixels_from_ideal(camera: Camera, ideal: Array) -> Array:
     """Puts the lens distortion back on points, shape (..., 2), [px]; same shape."""
     flat = np.asarray(ideal, dtype=np.float64).reshape(-1, 2)

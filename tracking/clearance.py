@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.cameras import SURE
 from model.clearance import ClearanceModel, Nearest, cable_name
+from model.errors import BadInput
 from model.kinematics import Cables, cables_at
 from model.pose import Array, Pose, read_only, skew
 from tracking.measurement import PoseMeasurement
 
-#: How many standard deviations of the pose an uncertainty holds.
-DEVIATIONS = 3.0
-#: Added where nobody stated what the camera's place or the tags may be off by, [m].
-UNSTATED = 0.5e-3
+COVERAGE = 0.95
+"""Share of true distances that lie within the stated uncertainty."""
+INTERVAL = f"{100.0 * COVERAGE:.0f} % interval"
+"""How verdict, report and messages name it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,8 +25,8 @@ class MeasuredClearance:
 
     Attributes:
         nearest: In the order of the scene's obstacles.
-        uncertainties: Of each distance: `DEVIATIONS` standard deviations of the measured pose and
-            what they do not know; shape (k,), [m].
+        uncertainties: Half width of the interval that holds each distance with `COVERAGE`: by the
+            measured pose and by outlets and anchors; shape (k,), [m].
     """
 
     nearest: tuple[Nearest, ...]
@@ -66,16 +68,27 @@ class MeasuredClearance:
 def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
     """Clearance to every obstacle as a camera sees it; None in a scene without obstacles.
 
-    What the camera's place and the tags may be off by counts by its covariance, carried to each
-    distance with that of the pose.
+    What lens, camera's place, tags, outlets and anchors may be off by counts by its covariance,
+    carried to each distance with that of the pose.
+
+    Raises:
+        BadInput: A part of that is not stated.
     """
+    if measurement.unstated:
+        raise BadInput(
+            "it is unknown how far off this pose may be, so it gives no interval of the clearance",
+            next_step="calibrate, or state `error_mm` of the camera in the rig file",
+        )
     covariance = measurement.covariance + measurement.shared
-    allowance = UNSTATED if measurement.unstated else 0.0
-    return clearance_at(model, measurement.pose, covariance, allowance)
+    return clearance_at(model, measurement.pose, covariance, 0.0, measurement.cable_error)
 
 
 def clearance_at(
-    model: ClearanceModel, pose: Pose, covariance: Array, allowance: float
+    model: ClearanceModel,
+    pose: Pose,
+    covariance: Array,
+    allowance: float,
+    cable_error: float = 0.0,
 ) -> MeasuredClearance | None:
     """Clearance to every obstacle at a measured pose; None in a scene without obstacles.
 
@@ -89,32 +102,42 @@ def clearance_at(
         pose: ``world_from_platform``.
         covariance: Of position and rotation vector about world axes, shape (6, 6), [m, rad].
         allowance: What the covariance does not know, [m].
+        cable_error: How far off exits of cables are, 95 %, [m]; 0 where the rig's `outlet_error`
+            and `anchor_error` say so of both ends.
     """
     nearest = model.obstacles(pose)
     if not nearest:
         return None
     cables = cables_at(model.rig, pose)
     names = {cable_name(i): i for i in range(model.rig.cable_count)}
-    deviations = [_deviation(n, names.get(n.first), cables, pose, covariance) for n in nearest]
-    return MeasuredClearance(nearest, read_only(DEVIATIONS * np.array(deviations) + allowance))
+    at_ends = (model.rig.outlet_error or 0.0, model.rig.anchor_error or 0.0)
+    ends = np.array((cable_error, 0.0) if cable_error > 0.0 else at_ends) / SURE
+    variances = [_variance(n, names.get(n.first), cables, pose, covariance, ends) for n in nearest]
+    return MeasuredClearance(nearest, read_only(SURE * np.sqrt(variances) + allowance))
 
 
-def _deviation(
-    nearest: Nearest, cable: int | None, cables: Cables, pose: Pose, spread: Array
+def _variance(
+    nearest: Nearest,
+    cable: int | None,
+    cables: Cables,
+    pose: Pose,
+    spread: Array,
+    ends: Array,
 ) -> float:
-    """Standard deviation of one distance, [m]."""
-    share, point = 1.0, nearest.first_point
+    """Variance of one distance, [m²]; ``ends``: deviations of outlets and anchors, [m]."""
+    share, point, own = 1.0, nearest.first_point, 0.0
     if cable is not None:
         start, end = cables.exits[cable], cables.anchors[cable]
         length = float(np.linalg.norm(end - start))
         share = float(np.clip((point - start) @ (end - start) / length**2, 0.0, 1.0))
         point = end
+        own = ((1.0 - share) * ends[0]) ** 2 + (share * ends[1]) ** 2
     arm = point - pose.position
     by_pose = share * np.hstack([np.eye(3), -skew(arm)])
     covariance = by_pose @ spread @ by_pose.T
     line = nearest.first_point - nearest.second_point
     length = float(np.linalg.norm(line))
     if length < 1e-9:  # they touch, so the line is unknown: any direction may be the worst
-        return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        return own + float(np.linalg.eigvalsh(covariance)[-1])
     direction = line / length
-    return float(np.sqrt(direction @ covariance @ direction))
+    return own + float(direction @ covariance @ direction)

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.cameras import SURE
-from model.pose import Array, Pose, read_only, skew
+from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, pixels_from_ideal, pixels_of
 from tracking.consensus import Consensus, agreeing
@@ -20,6 +19,7 @@ from tracking.measurement import NoPose, Observation, PoseMeasurement
 from tracking.pnp import BundlePose, TagView, refine_pnp, solve_pnp
 from tracking.rolling_shutter import FitByRows, RecentMotion, RollingShutter
 from tracking.settings import TrackerSettings
+from tracking.shared_errors import SharedErrors
 
 # Why a pose that was found is not believed.
 
@@ -113,6 +113,7 @@ class PlatformEstimator:
         size = float(np.linalg.norm(rig.half_size))
         self._lower, self._upper = rig.outlets.min(axis=0) - size, rig.outlets.max(axis=0) + size
         self._camera_from_world = camera.world_from_camera.inverse()
+        self._shared = SharedErrors(rig, camera)
 
     def views(
         self, image: Image, detections: Sequence[Detection], tags: dict[int, Tag]
@@ -254,28 +255,6 @@ class PlatformEstimator:
         turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
         return read_only(turn @ bundle.covariance @ turn.T)
 
-    def _shared(self, pose: Pose, views: Sequence[TagView]) -> Array:
-        """Covariance of what all pictures have in common: the camera's place and the tags."""
-        shared = self._camera.shared_covariance(pose)
-        if self._camera.whole_error or self._rig.tag_error is None:
-            return read_only(shared)
-        corners = np.concatenate([tag_corners(view.tag) for view in views])
-        reach = float(np.mean(np.sum((corners - corners.mean(axis=0)) ** 2, axis=1)))
-        deviation = self._rig.tag_error / SURE
-        # Errors of corners of a face are alike: no mean over corners makes them smaller.
-        turn = deviation**2 / reach
-        by_tags = np.diag([deviation**2] * 3 + [turn] * 3)
-        arm = skew(pose.rotation @ corners.mean(axis=0))
-        by_tags[:3, :3] += turn * arm @ arm.T
-        return read_only(shared + by_tags)
-
-    @property
-    def _unstated(self) -> bool:
-        """Whether the error of the camera's place or of the tags is not stated."""
-        if self._camera.place_covariance is None:
-            return True
-        return not self._camera.whole_error and self._rig.tag_error is None
-
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str
     ) -> PoseMeasurement:
@@ -287,6 +266,7 @@ class PlatformEstimator:
             tuple(sorted(view.tag.id for view in views)),
             bundle.reprojection,
             status,
-            self._shared(pose, views),
-            self._unstated,
+            self._shared.of(pose, views),
+            self._shared.unstated,
+            cable_error=self._shared.whole or 0.0,
         )

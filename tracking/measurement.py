@@ -33,6 +33,7 @@ class PoseMeasurement:
         unstated: Whether a part of these is not stated.
         at_rest: ``world_from_platform`` as if all rows of the image had been exposed at once; None
             where they were.
+        cable_error: How far off cables are, 95 %, where the operator's number stands for that, [m].
     """
 
     time: float
@@ -44,6 +45,7 @@ class PoseMeasurement:
     shared: Array = field(default_factory=lambda: np.zeros((6, 6)))
     unstated: bool = True
     at_rest: Pose | None = None
+    cable_error: float = 0.0
 
     @property
     def uncorrected(self) -> Pose:

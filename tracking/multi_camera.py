@@ -18,7 +18,8 @@ from model.pose import (
 from tracking.measurement import NoPose, Observation, PoseMeasurement, extrapolate
 from tracking.pose_log import LoggedPicture
 
-#: What a camera's place may be off by, beside the covariance of what it measures, [m] and [rad].
+#: What lens, place and tags may make a camera's poses err by where that is not stated, and what is
+#: always allowed for, [m] and [rad].
 PLACE = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
 #: Cameras disagree when their poses differ by more (squared, in covariances) than one pair of true
 #: ones in ten thousand does.
@@ -111,7 +112,8 @@ def _apart(name: str, poses: Mapping[str, PoseMeasurement]) -> float:
     mine, distances = poses[name], []
     for other in (one for key, one in poses.items() if key != name):
         gap = _between(mine.pose, other.pose)
-        spread = mine.covariance + other.covariance + 2.0 * np.diag(PLACE**2)
+        spread = mine.covariance + other.covariance + mine.shared + other.shared
+        spread = spread + 2.0 * np.diag(PLACE**2)
         distances.append(float(gap @ np.linalg.solve(spread, gap)))
     return float(np.median(distances)) if len(distances) > 1 else distances[0]
 
@@ -138,6 +140,7 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
         reprojection=float(np.sqrt(np.mean([one.reprojection**2 for one in poses]))),
         shared=_shared(poses, [covariance @ weight for weight in weights]),
         unstated=any(one.unstated for one in poses),
+        cable_error=max(one.cable_error for one in poses),
     )
 
 

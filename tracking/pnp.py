@@ -23,7 +23,7 @@ from tracking.edges.refine import RefinedTag
 HUBER = 3.0
 #: The edges' stated deviations weigh as this many residuals when the covariance is scaled by
 #: how well all edges fit: few edges fit well by chance.
-PRIOR_WEIGHT = 20.0
+PRIOR_WEIGHT = 12.0
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
 
@@ -144,6 +144,25 @@ def refine_pnp(camera: Camera, views: Sequence[TagView], start: Pose) -> BundleP
         return None
     pose = _improved(squares, start)
     return _result(squares, views, pose, _huber(squares.errors(pose)), float("inf"))
+
+
+def moved_by_pixels(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> Array:
+    """How a fitted pose moves when the corners that were seen do, to first order.
+
+    Args:
+        camera: The camera that saw them.
+        views: The tags.
+        pose: ``camera_from_body`` that fits them.
+        shifts: Of each tag's ideal corners, by each of k causes, shape (t, 8, k), [px].
+
+    Returns:
+        Shift [m] and turn [rad] along the camera's axes, shape (6, k).
+    """
+    squares = _Squares.of(camera, views)
+    slopes = squares.jacobian(pose).reshape(-1, 6)
+    causes = (squares.whitening @ shifts).reshape(len(slopes), -1)
+    weighted = slopes * _weights(squares.errors(pose))[:, None]
+    return np.asarray(np.linalg.solve(slopes.T @ weighted, weighted.T @ causes))
 
 
 def square_poses(camera: Camera, view: TagView) -> list[Pose]:

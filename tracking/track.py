@@ -19,6 +19,7 @@ from tracking.estimator import UNCERTAIN, UNSHARP
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.multi_camera import MultiCameraFusion, moments
 from tracking.pose_log import LoggedPicture
+from tracking.shared_errors import require_stated_errors
 from tracking.tracker import Tracker
 
 
@@ -79,6 +80,8 @@ def track(
         BadInput: An image is not of the camera's size.
         CameraMoved: The frame tags are not where they should be.
     """
+    if model is not None and model.obstacle_names:
+        require_stated_errors(tracker.rig, [tracker.camera])
     count = count or TrackCount()
     reasons: Counter[str] = Counter()
     last: Picture | None = None

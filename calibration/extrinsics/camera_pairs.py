@@ -41,7 +41,7 @@ from calibration.verdict import Issue
 from executor.kernels import ready_to_measure
 from model.cameras import SURE
 from model.errors import BadInput
-from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+from model.pose import Array, Pose, matrix_from_rotation_vector, read_only, skew
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from tracking.camera_model import Image, ideal_from_pixels
@@ -167,7 +167,7 @@ def locate_by_pairs(
         for own, score in zip(information, scores, strict=True)
     ]
     world_from_camera = reference.world_from_camera.compose(between)
-    shared = reference.shared_covariance(world_from_camera)
+    shared = _by_place(reference, world_from_camera)
     own_widths = widths_of(relative, without)
     lacks = []
     if len(pairs) < GOOD_PAIRS:
@@ -181,6 +181,7 @@ def locate_by_pairs(
         camera=replace(camera, world_from_camera=world_from_camera),
         by="another camera",
         covariance=read_only(relative + shared),
+        by_lens=None,
         half_widths=read_only(np.hypot(own_widths, SURE * np.sqrt(np.diag(shared)))),
         points=workspace_corners(rig),
         tag_errors={} if not rig.platform_tags else {rig.platform_tags[0].id: error},
@@ -189,6 +190,15 @@ def locate_by_pairs(
         lacks=tuple(lacks),
         data_hash=hash_of_data,
     )
+
+
+def _by_place(reference: Camera, world_from_camera: Pose) -> Array:
+    """Covariance of a pose by the place of the camera that measured it, (6, 6); 0 if unstated."""
+    if reference.place_covariance is None:
+        return np.zeros((6, 6))
+    by_place = np.eye(6)
+    by_place[:3, 3:] = -skew(world_from_camera.position - reference.world_from_camera.position)
+    return np.asarray(by_place @ reference.place_covariance @ by_place.T)
 
 
 def _fitted(looks: Sequence[tuple[BodyLook, BodyLook]]) -> tuple[Pose, Array, Array]:

@@ -146,6 +146,7 @@ def locate_by_motion(
         by="rig motion",
         covariance=read_only(covariance),
         half_widths=read_only(widths_of(covariance, best.without_each())),
+        by_lens=None,
         points=workspace_corners(rig),
         tag_errors=_tag_errors(looks),
         pictures=len(looks),

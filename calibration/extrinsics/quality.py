@@ -26,6 +26,8 @@ class ExtrinsicCalibration:
         by: ``frame tags``, ``rig motion`` or ``another camera``.
         covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6).
         half_widths: Of the 95 % intervals of the same, shape (6,).
+        by_lens: How errors of the lens's n numbers move the place, shape (6, n), [m, rad]; None
+            where nothing is known of them.
         points: Places in the world that matter, shape (n, 3), [m].
         tag_errors: RMS corner error of each tag, by number, [px].
         pictures: How many images it rests on.
@@ -38,6 +40,7 @@ class ExtrinsicCalibration:
     by: Literal["frame tags", "rig motion", "another camera"]
     covariance: Array
     half_widths: Array
+    by_lens: Array | None
     points: Array
     tag_errors: Mapping[int, float]
     pictures: int

@@ -15,7 +15,7 @@ from calibration.report import Section, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from calibration.statistics import Interval
 from calibration.verdict import CalibrationVerdict
-from model.files.documents import AnyNonNegative, PoseCovariance, PoseDocument, Vector
+from model.files.documents import AnyNonNegative, PoseCovariance, PoseDocument, PoseSlopes, Vector
 from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, rotation_vector_from_matrix
 
@@ -28,7 +28,7 @@ class ExtrinsicsResult(ResultDocument):
     """A camera's place, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 2
-    added: ClassVar[tuple[str, ...]] = ("pose_covariance",)
+    added: ClassVar[tuple[str, ...]] = ("pose_covariance", "pose_by_lens")
 
     kind: Literal["extrinsics"] = "extrinsics"
     by: Literal["frame tags", "rig motion", "another camera"]
@@ -40,6 +40,9 @@ class ExtrinsicsResult(ResultDocument):
     pictures: int
     pose_covariance: PoseCovariance | None = Field(
         default=None, description="of world_from_camera, mm and deg, position before rotation"
+    )
+    pose_by_lens: PoseSlopes | None = Field(
+        default=None, description="how errors of the lens move it: a column for each of its numbers"
     )
 
     def in_words(self) -> list[tuple[str, str]]:
@@ -70,11 +73,14 @@ class ExtrinsicsResult(ResultDocument):
         self.require_basis(
             _basis(rig, self.name, self.by), f"parameters of the camera or {self.by}"
         )
-        keys = ("world_from_camera", "pose_covariance")
+        keys = ("world_from_camera", "pose_covariance", "pose_by_lens")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
 
 
-_NOT_OF_THE_LENS = ("world_from_camera", "rate_hz", "pose_covariance", "error_mm", "readout_ms")
+_NOT_OF_THE_LENS = (
+    *("world_from_camera", "rate_hz", "pose_covariance", "error_mm", "readout_ms"),
+    *("lens_covariance", "pose_by_lens"),
+)
 
 
 def extrinsics_result(
@@ -105,6 +111,9 @@ def extrinsics_result(
         tag_errors_px={str(k): float(v) for k, v in result.tag_errors.items()},
         pictures=result.pictures,
         pose_covariance=(result.stated_covariance * np.outer(SCALES, SCALES)).tolist(),
+        pose_by_lens=(
+            None if result.by_lens is None else (result.by_lens * SCALES[:, None]).tolist()
+        ),
     )
 
 

@@ -11,15 +11,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
-from calibration.extrinsics.quality import ExtrinsicCalibration, widths_of, workspace_corners
+from calibration.extrinsics.quality import ExtrinsicCalibration, workspace_corners
+from calibration.statistics import CONFIDENCE, widened
 from calibration.tag_map.observations import TagSights
 from calibration.verdict import Issue
+from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_check import change_of_inverse
-from tracking.camera_model import project_undistorted
+from tracking.camera_model import project_undistorted, ray_slopes
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, moved, solve_pnp
@@ -67,6 +70,8 @@ def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Arra
 
 LEAST_TAGS = 3
 """Fewer cannot show that one of them was surveyed wrongly."""
+MANY_TAGS = 8
+"""Of fewer, leaving one out says little of how far off all are: the stated survey counts."""
 MOVED_PX = 0.5
 """Between images of a camera that stands still tags do not move farther."""
 _OFF = 3.0
@@ -123,18 +128,24 @@ def locate_by_frame_tags(
     tags, strangers = _agreeing(camera, tags, start)
     best = _fit(camera, tags, start)
     unused = {f"tag {tag.number}": _is_off(camera, tag, best) for tag in strangers}
+    by_lens = _by_lens(camera, tags, best)
     covariance = _covariance(camera, tags, best)
     pose = best.inverse()
     changes = []
-    for k in range(len(tags) if len(tags) >= LEAST_TAGS else 0):
+    for k in range(len(tags) if len(tags) >= MANY_TAGS else 0):
         other = _fit(camera, tags[:k] + tags[k + 1 :], best).inverse()
         turn = rotation_vector_from_matrix(other.rotation @ pose.rotation.T)
         changes.append(np.concatenate([other.position - pose.position, turn]))
+    if changes:
+        covariance = widened(covariance, np.array(changes))
+    if by_lens is not None and camera.lens_covariance is not None:
+        covariance = covariance + by_lens @ camera.lens_covariance @ by_lens.T
     return ExtrinsicCalibration(
         camera=replace(camera, world_from_camera=pose),
         by="frame tags",
         covariance=read_only(covariance),
-        half_widths=read_only(widths_of(covariance, changes)),
+        half_widths=read_only(SURE * np.sqrt(np.diag(covariance))),
+        by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},
         pictures=len(sights.squares),
@@ -247,17 +258,37 @@ def _is_off(camera: Camera, tag: _SeenTag, best: Pose) -> str:
     return f"is measured {away * 1e3:.1f} mm from its position in the rig file"
 
 
-def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
-    """Of ``world_from_camera``, shape (6, 6); wider where corners scatter more than they should."""
+def _slopes(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
+    """Of the whitened errors by the pose, shape (8 t, 6)."""
     step = 1e-6
-    slopes = np.column_stack(
+    return np.column_stack(
         [
             (_errors(camera, tags, moved(best, d)) - _errors(camera, tags, moved(best, -d)))
             / (2 * step)
             for d in step * np.eye(6)
         ]
     )
-    scale = max(1.0, _misfit(camera, tags, best))
+
+
+def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array | None:
+    """How ``world_from_camera`` moves with errors of the lens, shape (6, n)."""
+    if camera.lens_covariance is None:
+        return None
+    slopes, matrix = _slopes(camera, tags, best), camera.matrix
+    focal, middle = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
+    by_lens = []
+    for tag in tags:
+        rays = (tag.pixels.reshape(4, 2) - middle) / focal
+        by_lens.append(tag.whitening @ (ray_slopes(camera, rays) * focal[:, None]).reshape(8, -1))
+    steps = np.linalg.lstsq(slopes, np.concatenate(by_lens), rcond=None)[0]
+    return read_only(change_of_inverse(best) @ steps)
+
+
+def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
+    """Of ``world_from_camera``, shape (6, 6); wider where the scatter contradicts the survey."""
+    slopes = _slopes(camera, tags, best)
+    misfit, free = _misfit(camera, tags, best), 8 * len(tags) - 6
+    scale = misfit if misfit > chi2.ppf(CONFIDENCE, free) / free else 1.0
     covariance = scale * np.linalg.inv(slopes.T @ slopes)
     change = change_of_inverse(best)
     return np.asarray(change @ covariance @ change.T)

@@ -200,6 +200,17 @@ class RigCalibration:
             found |= {f"{n}{unit}": Interval(float(v), float(w)) for n, v, w in rows}
         return found
 
+    def error_of(self, group: str) -> float | None:
+        """How far off the coordinates of a group are, 95 %, RMS, [m]; None if it is not fitted.
+
+        Args:
+            group: ``outlets`` or ``anchors``.
+        """
+        place = self.parameters.slices().get(group)
+        if place is None:
+            return None
+        return float(np.sqrt(np.mean(self.uncertainty.half_widths[place] ** 2)))
+
     def _stiffness(self) -> Interval:
         """Of the cables, [N]: its logarithm is as uncertain to both sides, itself is not."""
         width = float(self.uncertainty.half_widths[self.parameters.slices()["stiffness"]][0])

@@ -26,10 +26,17 @@ class RigResult(ResultDocument):
     """Outlets, anchors, pulleys, winches and cables' stiffness, in the keys of the rig file."""
 
     order: ClassVar[int] = 3
+    added: ClassVar[tuple[str, ...]] = ("outlets_error_mm", "anchors_error_mm")
 
     kind: Literal["rig"] = "rig"
     outlets_mm: list[Vector]
     anchors_mm: list[Vector]
+    outlets_error_mm: AnyNonNegative | None = Field(
+        default=None, description="of their coordinates, 95 %, RMS; null: not calibrated"
+    )
+    anchors_error_mm: AnyNonNegative | None = Field(
+        default=None, description="of their coordinates, 95 %, RMS; null: not calibrated"
+    )
     pulley_radius_mm: Positive | None
     drums_mm_per_rev: list[Positive]
     stiffness_n: Positive = Field(description="E·A of a cable")
@@ -95,7 +102,7 @@ class RigResult(ResultDocument):
                 where=f"calibration {self.kind} {self.name}, {self.date}",
                 next_step="run `cdpr calibrate rig` again; the rig file was changed since",
             )
-        return _with_numbers(
+        better = _with_numbers(
             rig,
             self.outlets_mm,
             self.anchors_mm,
@@ -104,6 +111,12 @@ class RigResult(ResultDocument):
             self.stiffness_n,
             [round(home) for home in self.home_counts],
         )
+        stated = {
+            key: getattr(self, key)
+            for key in ("outlets_error_mm", "anchors_error_mm")
+            if getattr(self, key) is not None
+        }
+        return better.model_copy(update=stated)
 
 
 def _with_numbers(
@@ -161,6 +174,8 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
             drawing_of(rig.document),
         ),
         **numbers,
+        outlets_error_mm=_millimetres(result.error_of("outlets")),
+        anchors_error_mm=_millimetres(result.error_of("anchors")),
         home_counts=_home_counts(result, numbers),
         groups=list(result.parameters.groups),
         not_identified=result.not_identified,
@@ -218,6 +233,10 @@ def require_one_drawing(rig: Rig, others: Sequence[tuple[str, Rig]]) -> Rig:
                 next_step="use runs made after the same `cdpr home`",
             )
     return others[0][1] if others else rig
+
+
+def _millimetres(metres: float | None) -> float | None:
+    return None if metres is None else metres * 1e3
 
 
 def _rows(points: Array) -> list[list[float]]:

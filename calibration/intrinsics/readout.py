@@ -26,8 +26,9 @@ from calibration.statistics import CONFIDENCE, Interval
 from calibration.tag_map.observations import TagSights
 from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
+from model.files.camera_file import Readout
 from model.files.documents import AnyNonNegative, Positive
-from model.files.rig_file import Readout, RigDocument
+from model.files.rig_file import RigDocument
 from model.pose import Array, PlatformMotion, Pose
 from model.rig import Camera, Rig
 from tracking.measurement import MEMORY

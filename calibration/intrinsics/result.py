@@ -22,8 +22,9 @@ from calibration.intrinsics.quality import CameraQuality, picture_grid
 from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from model.errors import BadInput
-from model.files.documents import AnyNonNegative, AnyNumber, LensName, Positive
-from model.files.rig_file import CameraDocument, RigDocument
+from model.files.camera_file import CameraDocument
+from model.files.documents import AnyNonNegative, AnyNumber, LensCovariance, LensName, Positive
+from model.files.rig_file import RigDocument
 from model.pose import Array
 from tracking.camera_model import rays_of
 
@@ -34,7 +35,7 @@ class CameraResult(ResultDocument):
     """A camera's matrix and distortion, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 0
-    added: ClassVar[tuple[str, ...]] = ("lens",)
+    added: ClassVar[tuple[str, ...]] = ("lens", "lens_covariance")
 
     kind: Literal["camera"] = "camera"
     width_px: Pixels
@@ -45,6 +46,9 @@ class CameraResult(ResultDocument):
     cy_px: AnyNumber
     distortion: list[AnyNumber]
     lens: LensName = "pinhole"
+    lens_covariance: LensCovariance | None = Field(
+        default=None, description="of fx_px, fy_px, cx_px, cy_px and distortion"
+    )
     rms_px: AnyNonNegative
     distance_m: Positive = Field(description="for which error_mm is stated")
     halves_apart_mm: AnyNonNegative = Field(
@@ -99,8 +103,9 @@ class CameraResult(ResultDocument):
                 where=f"calibration {self.kind} {self.name}, {self.date}",
                 next_step="calibrate the camera at the image size in use",
             )
-        keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
-        return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
+        keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens", "lens_covariance")
+        changes = {k: getattr(self, k) for k in keys} | {"pose_by_lens": None}
+        return with_camera(rig, camera.model_copy(update=changes))
 
 
 def camera_result(
@@ -125,6 +130,7 @@ def camera_result(
         cy_px=float(m[1, 2]),
         distortion=[float(x) for x in result.distortion],
         lens=result.lens.kind,
+        lens_covariance=result.uncertainty.stated_covariance.tolist(),
         rms_px=result.error,
         distance_m=quality.distance,
         halves_apart_mm=quality.halves * 1e3,

@@ -21,8 +21,9 @@ import numpy as np
 from scipy.stats import t as student
 
 from calibration.intrinsics.lens import LensModel
-from calibration.statistics import CONFIDENCE
+from calibration.statistics import CONFIDENCE, jackknife, kept_share, widened
 from calibration.targets.board import Seen
+from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, read_only
 
@@ -43,6 +44,15 @@ class Uncertainty:
     without: Array
     halves: Array
 
+    @property
+    def stated_covariance(self) -> Array:
+        """The covariance that 95 % intervals of whatever depends on the numbers follow from.
+
+        That of the scatter, as much wider as `widened` finds it; shape (n, n).
+        """
+        quantile = _quantile(len(self.without)) / SURE
+        return widened(self.covariance, self.without) * quantile**2
+
     def half_width_of(self, slopes: Array) -> float:
         """Half width of the 95 % interval of something that depends on all numbers, RMS.
 
@@ -53,7 +63,7 @@ class Uncertainty:
             slopes: Its derivatives by the numbers, shape (..., n).
         """
         flat = slopes.reshape(-1, slopes.shape[-1])
-        both = (self.covariance, _by_pictures(self.without))
+        both = (self.covariance, jackknife(self.without))
         squares = [float(np.einsum("pk,kl,pl->", flat, c, flat)) / len(flat) for c in both]
         return _quantile(len(self.without)) * float(np.sqrt(max(*squares, 0.0)))
 
@@ -99,20 +109,14 @@ def uncertainty_of(
         )
     by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
-    by_pictures = _by_pictures(without)
-    larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures))
+    by_pictures = jackknife(without)
+    larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures) * kept_share(*without.shape))
     return Uncertainty(
         covariance=read_only(by_scatter),
         half_widths=read_only(_quantile(count) * np.sqrt(larger)),
         without=read_only(without),
         halves=read_only(_half(parts, scores, 1) - _half(parts, scores, 0)),
     )
-
-
-def _by_pictures(without: Array) -> Array:
-    """The covariance by the jackknife over pictures."""
-    spread, count = without - without.mean(axis=0), len(without)
-    return np.asarray((count - 1) / count * spread.T @ spread)
 
 
 def _without(information: Array, part: Array, score: Array) -> Array:

@@ -16,8 +16,9 @@ from calibration.statistics import Interval
 from calibration.tag_map.bundle_adjustment import TagLayout
 from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
+from model.files.camera_file import TagDocument
 from model.files.documents import AnyNonNegative, PoseDocument, Positive
-from model.files.rig_file import RigDocument, TagDocument
+from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, rotation_vector_from_matrix
 from model.rig import Tag
 from tracking.detection.tags import tag_corners

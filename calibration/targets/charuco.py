@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.targets.board import LEAST_POINTS, Seen, require_board
-from model.files.rig_file import FAMILIES
+from model.files.camera_file import FAMILIES
 from model.pose import Array
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from calibration.targets.board import LEAST_POINTS, Seen, plain_camera, require_board
-from model.files.rig_file import FAMILIES, tags_in
+from model.files.camera_file import FAMILIES, tags_in
 from model.pose import Array
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector

@@ -13,7 +13,7 @@ from executor.remote.status import RunStatus
 from model.clearance import ClearanceModel
 from model.pose import Pose
 from model.progress import SILENT, Listener
-from tracking.clearance import MeasuredClearance, clearance_of
+from tracking.clearance import INTERVAL, MeasuredClearance, clearance_of
 from tracking.measurement import PoseMeasurement
 from tracking.multi_camera import MultiCameraFusion
 from tracking.track import rates
@@ -54,7 +54,8 @@ class ClearanceMonitor:
         at = clearance.worst_case_obstacle
         near, spread = clearance.nearest[at], float(clearance.uncertainties[at])
         return (
-            f"{near.first} to {near.second}: {near.distance * 1e3:.1f} ± {spread * 1e3:.1f} mm;"
+            f"{near.first} to {near.second}: {near.distance * 1e3:.1f} ± {spread * 1e3:.1f} mm"
+            f" ({INTERVAL});"
             f" the scene requires {self._limit * 1e3:g} mm"
         )
 

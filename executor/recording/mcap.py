@@ -31,7 +31,7 @@ from executor.recording.run_folder import RunFolder
 from executor.recording.summary import RunContext
 from executor.recording.tables import OK, CycleTable, PoseTable
 from model.errors import Fault
-from tracking.clearance import MeasuredClearance
+from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose
 from tracking.pose_log import LoggedPicture
 
@@ -240,6 +240,7 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
         content: dict[str, Any] = {
             "source": "tag" if camera else clearance.source[i],
             **dict(zip(keys, row, strict=True)),
+            "coverage": COVERAGE,
             "body": clearance.body[i],
             "obstacle": clearance.obstacle[i],
             "obstacles": [
@@ -320,6 +321,7 @@ def _track_clearance(clearance: MeasuredClearance) -> dict[str, Any]:
         "distance_mm": clearance.distance * 1e3,
         "uncertainty_mm": clearance.uncertainty * 1e3,
         "at_most_mm": clearance.at_most * 1e3,
+        "coverage": COVERAGE,
         "planned_distance_mm": None,
         "body": nearest.first,
         "obstacle": nearest.second,

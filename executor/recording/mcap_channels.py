@@ -103,6 +103,7 @@ CLEARANCE = _object(
     distance_mm=_NUMBER,
     uncertainty_mm=_NUMBER,
     at_most_mm=_NUMBER,
+    coverage={**_NUMBER, "description": "share of true distances within the interval"},
     planned_distance_mm=_NUMBER,
     body=_TEXT,
     obstacle=_TEXT,

@@ -18,6 +18,7 @@ from executor.safety.limits import tension_limits
 from executor.state_machine import ON_PATH
 from model.rig import Rig
 from model.scene import Scene
+from tracking.clearance import INTERVAL
 
 PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
 #: The final state of a run whose end is not on record: its program was killed, or the disk full.
@@ -268,7 +269,7 @@ def _against_required(rows: ClearanceTable, required: float, source_name: str) -
     worst = int(np.nanargmin(rows.distance if passed else rows.at_most))
     distance, high = rows.distance[worst] * 1e3, rows.at_most[worst] * 1e3
     low = distance - rows.uncertainty[worst] * 1e3
-    bounds = f"bounds {low:.1f} to {high:.1f} mm" if passed else f"upper bound {high:.1f} mm"
+    bounds = f"{INTERVAL} {low:.1f} to {high:.1f} mm"
     text = (
         f"Smallest clearance measured by {source_name}: {distance:.1f} mm, {bounds}"
         f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
@@ -285,10 +286,10 @@ def _against_plan(rows: ClearanceTable) -> Check:
     short, at_most = shortfall[worst] * 1e3, rows.at_most[worst] * 1e3
     text = (
         f"Measured clearance was at most {max(short, 0.0):.2f} mm below the planned one,"
-        f" within its uncertainty of {at_most - rows.distance[worst] * 1e3:.2f} mm there."
+        f" within its {INTERVAL} of ± {at_most - rows.distance[worst] * 1e3:.2f} mm there."
         if passed
         else f"Measured clearance was {short:.2f} mm below the planned one at"
-        f" {rows.time[worst]:.1f} s: upper bound {at_most:.2f} mm,"
+        f" {rows.time[worst]:.1f} s: its {INTERVAL} ends at {at_most:.2f} mm,"
         f" planned {rows.planned_distance[worst] * 1e3:.2f} mm."
     )
     return Check("clearance_plan", passed, text)

@@ -27,6 +27,7 @@ from executor.report.tiles import (
 from model.pages.page import contents, paragraph, section
 from model.pages.page import page as html_page
 from model.pages.scene import scene_data
+from tracking.clearance import INTERVAL
 
 _HINT = (
     "Charts: point or tap for values; drag, pinch or turn the wheel with Ctrl to zoom in time;"
@@ -81,8 +82,8 @@ def _clearance(run: RunData) -> str:
     if not len(run.clearance):
         return paragraph("The scene has no obstacles.")
     text = (
-        "Distances between surfaces. The shaded band shows the measurement's"
-        " uncertainty; planned is for the pose commanded at the same time."
+        f"Distances between surfaces. The shaded band is the {INTERVAL} of the measurement;"
+        " planned is for the pose commanded at the same time."
     )
     return paragraph(text) + clearance_figure(run)
 

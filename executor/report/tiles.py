@@ -15,6 +15,7 @@ from executor.report.run_data import RunData, markdown
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
 from model.pages.page import known, list_table, prose, table, tile, tiles
 from model.scene import legs_of
+from tracking.clearance import INTERVAL
 
 _CLASS = {"PASSED": "pass", "STOPPED": "stop"}
 
@@ -74,7 +75,7 @@ def _clearance(key: dict[str, Any] | None) -> list[str]:
         return []
     by = "camera" if key["source"] == "tag" else "drives"
     note = (
-        f"bounds {_span(key)} mm by the {by};"
+        f"{INTERVAL} {_span(key)} mm by the {by};"
         f" planned {known(key['planned_min'], 1, '')}, required {key['required']:g}"
     )
     return [tile("Smallest clearance", known(key["measured_min"], 1, "mm"), note)]
@@ -347,7 +348,7 @@ def _clearance_frame(run: RunData, row: int) -> str:
         for values in (rows.distance, rows.uncertainty, rows.at_most, rows.planned_distance)
     )
     span = f"{distance - spread:.1f} to {at_most:.1f}"
-    return f"clearance {distance:.1f} mm, bounds {span} (plan {planned:.1f})"
+    return f"clearance {distance:.1f} mm, {INTERVAL} {span} (plan {planned:.1f})"
 
 
 def _measured(run: RunData, row: int) -> str:

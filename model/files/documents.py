@@ -139,17 +139,37 @@ class Document(BaseModel):
         return [finding for rule in self.rules() for finding in rule()]
 
 
-def _is_covariance(rows: list[list[float]]) -> list[list[float]]:
+def _is_covariance(rows: list[list[float]], count: int) -> list[list[float]]:
+    if len(rows) != count or any(len(row) != count for row in rows):
+        raise ValueError(f"needs {count} rows of {count} numbers, symmetric")
     matrix = np.array(rows, dtype=np.float64)
-    if matrix.shape != (6, 6) or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-15):
-        raise ValueError("needs 6 rows of 6 numbers, symmetric")
-    if np.linalg.eigvalsh(matrix)[0] < -1e-9 * np.abs(matrix).max():
+    scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), 1e-300))
+    alike = matrix / np.outer(scale, scale)
+    if not np.allclose(alike, alike.T, rtol=1e-6, atol=1e-6):
+        raise ValueError(f"needs {count} rows of {count} numbers, symmetric")
+    if np.diag(matrix).min() < 0.0 or np.linalg.eigvalsh(alike)[0] < -1e-6:
         raise ValueError("is no covariance: it has a negative eigenvalue")
     return rows
 
 
-PoseCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance)]
+def _is_covariance_of_numbers(rows: list[list[float]]) -> list[list[float]]:
+    return _is_covariance(rows, len(rows))
+
+
+def _has_six_rows(rows: list[list[float]]) -> list[list[float]]:
+    if len(rows) != 6 or len({len(row) for row in rows}) != 1:
+        raise ValueError("needs 6 rows, of as many numbers each as the camera has")
+    return rows
+
+
+PoseCovariance = Annotated[
+    list[list[AnyNumber]], AfterValidator(lambda rows: _is_covariance(rows, 6))
+]
 """Of a pose: position [mm] and turns about the outer frame's axes [deg], 6 x 6."""
+LensCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance_of_numbers)]
+"""Of a camera's n numbers, as the rig file has them: fx, fy, cx, cy [px] and distortion, n x n."""
+PoseSlopes = Annotated[list[list[AnyNumber]], AfterValidator(_has_six_rows)]
+"""Of a pose by a camera's n numbers: position [mm] and turns [deg], 6 x n."""
 
 
 class PoseDocument(Document):

@@ -83,6 +83,15 @@ class SimulatedCameraDocument(Document):
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
     light: Positive = Field(default=1.0, description="share of full light")
     cables: bool = Field(default=True, description="cables hide what is behind them")
+    halo: Share = Field(default=0.0, description="of a lamp in view: added there, share of white")
+    shadow: Share = Field(default=0.0, description="share of light lost beyond a line in the image")
+    sharpening: NonNegative = Field(default=0.0, description="as cameras do, share of the contrast")
+    enlarged: Annotated[int, Field(ge=1, le=4)] = Field(
+        default=1, description="how many times more rows and columns the image has than the sensor"
+    )
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=100, description="of compression; 100 for none"
+    )
 
 
 class SimulationDocument(Document):

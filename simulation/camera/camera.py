@@ -19,6 +19,7 @@ from model.pose import PlatformMotion, Pose
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.cables import draw_cables
+from simulation.camera.processing import before_the_sensor, light_of, processed, veil_of
 from simulation.camera.rendering import (
     ROOM,
     SAMPLES,
@@ -114,8 +115,8 @@ class SyntheticCamera:
         self._camera_from_world = camera.world_from_camera.inverse()
         self._background = Canvas.blank(camera, sample_rays(camera), ROOM)
         draw_background(self._background, rig, scene, self._camera_from_world)
-        self._light = _vignette(camera, self.optics.vignetting) * np.float32(self.optics.light)
-        self._still = self._exposed(self._background, self._light)
+        self._light, self._veil = light_of(camera, self.optics), veil_of(camera, self.optics)
+        self._still = self._exposed(self._background, self._light, self._veil)
         self._depth = self._background.depth[1::SAMPLES, 1::SAMPLES].copy()
         self._noise = _noise(camera, self.optics.noise, seed)
 
@@ -135,7 +136,7 @@ class SyntheticCamera:
         else:
             poses = self._while_exposed(pose, motion)
             if len(poses) == 1:
-                return self._with_noise(self._at(pose), frame)
+                return self._taken(self._at(pose), frame)
             light = np.zeros(self._still.shape, np.float32)
             for one in poses:
                 light += self._at(one)
@@ -144,7 +145,7 @@ class SyntheticCamera:
         # rule for ties would make edges brighter or darker.
         chance = np.random.default_rng([self.seed, frame, 0x5EA2]).random(light.shape, np.float32)
         mean = np.floor(light + chance)
-        return self._with_noise(np.asarray(np.minimum(mean, 255.0), dtype=np.uint8), frame)
+        return self._taken(np.asarray(np.minimum(mean, 255.0), dtype=np.uint8), frame)
 
     def _while_exposed(self, pose: Pose, motion: PlatformMotion | None) -> list[Pose]:
         """Poses in the middles of equal parts of the exposure, close enough for even blur."""
@@ -201,7 +202,8 @@ class SyntheticCamera:
             canvas = self._background.part(region).copy()
             self._draw_platform(canvas, pose)
             rows, columns = region.slices()
-            picture[rows, columns] = self._exposed(canvas, self._light[rows, columns])
+            parts = self._light[rows, columns], self._veil[rows, columns]
+            picture[rows, columns] = self._exposed(canvas, *parts)
             depth = depth.copy()
             depth[rows, columns] = canvas.depth[1::SAMPLES, 1::SAMPLES]
         if self.optics.cables:
@@ -226,11 +228,17 @@ class SyntheticCamera:
         for tag in self.rig.platform_tags:
             draw_tag(canvas, self.rig.tag_family, tag, self._camera_from_world, pose)
 
-    def _exposed(self, canvas: Canvas, light: Image32) -> Image8:
+    def _exposed(self, canvas: Canvas, light: Image32, veil: Image32) -> Image8:
         pixels = canvas.pixels()
         if self.optics.blur > 0:
             pixels = np.asarray(cv2.GaussianBlur(pixels, (0, 0), self.optics.blur), np.float32)
-        return np.asarray(np.clip(pixels * light + 0.5, 0, 255), dtype=np.uint8)
+        return np.asarray(np.clip(pixels * light + veil + 0.5, 0, 255), dtype=np.uint8)
+
+    def _taken(self, picture: Image8, frame: int) -> Image8:
+        """The image that the sensor, and what processes its output, make of light."""
+        size = (self.camera.width, self.camera.height)
+        noisy = self._with_noise(before_the_sensor(picture, self.optics), frame)
+        return processed(noisy, size, self.optics)
 
     def _with_noise(self, picture: Image8, frame: int) -> Image8:
         if self.optics.noise <= 0:
@@ -238,7 +246,9 @@ class SyntheticCamera:
         down, right = np.random.default_rng([self.seed, frame]).integers(0, NOISE_SLACK, 2)
         height, width = picture.shape
         noise = np.ascontiguousarray(self._noise[down : down + height, right : right + width])
-        return np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+        noisy = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+        np.copyto(noisy, 255, where=picture == 255)  # a full sensor gives white, whatever the noise
+        return noisy
 
 
 def _faces(rig: Rig) -> list[tuple[Pose, tuple[float, float]]]:
@@ -253,14 +263,6 @@ def _faces(rig: Rig) -> list[tuple[Pose, tuple[float, float]]]:
             half = (float(rig.half_size[across]), float(rig.half_size[up]))
             faces.append((Pose(centre, rotation), half))
     return faces
-
-
-def _vignette(camera: Camera, loss: float) -> Image32:
-    """Share of light that reaches each pixel."""
-    x = (np.arange(camera.width) - (camera.width - 1) / 2.0) / (camera.width / 2.0)
-    y = (np.arange(camera.height) - (camera.height - 1) / 2.0) / (camera.width / 2.0)
-    radius = x[None, :] ** 2 + y[:, None] ** 2
-    return np.asarray(1.0 - loss * radius / radius.max(), dtype=np.float32)
 
 
 def _noise(camera: Camera, deviation: float, seed: int) -> NDArray[np.int16]:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model.files.rig_file import drawn_upside_down, opencv_dictionary
+from model.files.camera_file import drawn_upside_down, opencv_dictionary
 from model.geometry.shapes import (
     Box,
     Capsule,

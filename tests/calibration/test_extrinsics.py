@@ -94,7 +94,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         tags = crooked(rig.frame_tags, survey, rng)
         poses = {str(k): truth.inverse() for k in range(3)}
         found = locate_by_frame_tags(
-            rig, camera, sights_at(camera, tags, poses, 0.03, rng), Survey(survey)
+            rig,
+            camera,
+            sights_at(camera, tags, poses, 0.03, rng),
+            Survey(survey, 2.0 * survey / tags[0].size),
         )
         pose = found.world_from_camera
         turn = rotation_vector_from_matrix(pose.rotation @ truth.rotation.T)
@@ -105,7 +108,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         stated.append(found.error)
     assert np.mean(inside) >= 0.9
     assert np.mean(np.array(errors) <= stated) >= 0.9
-    assert np.median(stated) < 8.0 * np.median(errors)  # and not by promising nothing
+    assert np.median(stated) < 3.0 * np.median(errors)  # and not by promising nothing
 
 
 def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(rig: Rig) -> None:
@@ -130,7 +133,7 @@ def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(r
             back = found.world_from_camera.apply(truth.inverse().apply(found.points))
             off = np.sqrt(np.mean(np.sum((back - found.points) ** 2, axis=1)))
             errors[-1].append(off)
-            assert off < found.error
+        assert off < found.error
     unaware, aware = np.sqrt(np.mean(np.square(errors), axis=0))
     assert aware < 0.6 * unaware
 

@@ -28,7 +28,7 @@ from calibration.targets.board import Seen
 from calibration.targets.chessboard import Chessboard
 from model.cameras import camera_from
 from model.errors import BadInput
-from model.files.rig_file import CameraDocument
+from model.files.camera_file import CameraDocument
 from model.pose import Pose, matrix_from_rotation_vector, read_only
 from model.rig import Camera, Rig, load_rig
 from model.scene import load_scene

@@ -14,7 +14,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibration.tag_map.observations import moved_tags
-from model.files.rig_file import TagDocument
+from model.files.camera_file import TagDocument
 from model.pose import Pose
 from model.rig import Rig, load_rig, rig_from_document
 from model.scene import load_scene

@@ -229,7 +229,7 @@ def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
     )
     check = distances(both, 0.010)[0]
     assert not check.passed
-    assert "9.9 mm, upper bound 9.9" in check.text or "upper bound 10.0 mm" in check.text
+    assert "9.9 mm, 95 % interval 9.8 to 10.0 mm" in check.text
 
 
 def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRun) -> None:

@@ -43,7 +43,9 @@ def seen_at(
     """A look that finds the platform, so far off along x [m], so much later [s]."""
     covariance = np.diag([deviation**2] * 3 + [1e-6] * 3)
     pose = Pose(HERE.position + np.array([shift, 0.0, 0.0]), HERE.rotation)
-    found = PoseMeasurement(trigger.time + late, pose, covariance, (301, 303), 0.1, "tracked")
+    found = PoseMeasurement(
+        trigger.time + late, pose, covariance, (301, 303), 0.1, "tracked", unstated=False
+    )
     return CameraSample(trigger.frame, found, seconds=0.005)
 
 

@@ -102,7 +102,8 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     assert codes.count("clearance_low") == 1
     assert codes.index("clearance_low") < codes.index("held")
     (low,) = (event["text"] for event in summary["events"] if event["code"] == "clearance_low")
-    assert re.search(r"to block \[/left\]: \d+\.\d ± \d\.\d mm; the scene requires 10 mm", low)
+    wanted = r"to block \[/left\]: \d+\.\d ± \d\.\d mm \(95 % interval\); the scene requires 10 mm"
+    assert re.search(wanted, low)
     assert "to block [/left]: " in answer.said
     assert "details: cdpr explain clearance_low" in answer.said
 

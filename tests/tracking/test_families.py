@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from model.errors import BadInput
-from model.files.rig_file import FAMILIES, opencv_dictionary, tags_in
+from model.files.camera_file import FAMILIES, opencv_dictionary, tags_in
 from model.pose import Pose
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene

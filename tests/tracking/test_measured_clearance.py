@@ -9,15 +9,22 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from model.cameras import SURE
 from model.clearance import ClearanceModel
+from model.errors import BadInput
 from model.files.rig_file import RigDocument
-from model.pose import Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, load_scene
 from simulation.camera.camera import SyntheticCamera
-from tracking.clearance import DEVIATIONS, UNSTATED, MeasuredClearance, clearance_of
+from tracking.camera_model import ideal_from_pixels, pixels_from_ideal, project_undistorted
+from tracking.clearance import MeasuredClearance, clearance_of
+from tracking.detection.tags import tag_corners
+from tracking.edges.refine import RefinedTag
 from tracking.measurement import PoseMeasurement
 from tracking.multi_camera import together
+from tracking.pnp import TagView, moved, solve_pnp
+from tracking.shared_errors import SharedErrors, implied_rotation, require_stated_errors
 from tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -29,7 +36,7 @@ def crowded() -> Scene:
 
 
 def measurement(pose: Pose, covariance: np.ndarray) -> PoseMeasurement:
-    return PoseMeasurement(0.0, pose, covariance, (301, 303), 0.03, "found")
+    return PoseMeasurement(0.0, pose, covariance, (301, 303), 0.03, "found", unstated=False)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -51,7 +58,7 @@ def test_uncertainty_agrees_with_distances_at_scattered_poses(
         near = model.obstacles(Pose(pose.position + step[:3], turned))
         distances.append([n.distance for n in near])
     scatter = np.std(np.array(distances), axis=0)
-    predicted = (stated.uncertainties - UNSTATED) / DEVIATIONS
+    predicted = stated.uncertainties / SURE
     apart = np.array([n.distance > 0.0 for n in stated.nearest])
     assert apart.sum() >= 2
     np.testing.assert_allclose(predicted[apart], scatter[apart], rtol=0.15)
@@ -73,7 +80,7 @@ def test_touching_bodies_take_the_worst_direction(rig: Rig, crowded: Scene) -> N
     assert found is not None
     assert found.distance < 0.0
     assert np.all(np.isfinite(found.uncertainties))
-    assert np.all(found.uncertainties >= UNSTATED)
+    assert found.uncertainties.max() >= 0.99 * SURE * 2e-4  # along the least known direction
 
 
 def test_a_scene_without_obstacles_has_no_clearance(rig: Rig, crowded: Scene) -> None:
@@ -88,6 +95,24 @@ def looking(rig: Rig, **said: object) -> Camera:
     return rig_from_document(RigDocument.model_validate(plain)).cameras[0]
 
 
+def square(rig: Rig, camera: Camera, pose: Pose) -> list[TagView]:
+    """The platform's tags that face the camera, seen without an error."""
+    there = camera.world_from_camera.inverse().compose(pose)
+    views = []
+    for tag in rig.platform_tags:
+        at = there.compose(tag.pose)
+        if -at.rotation[:, 2] @ at.position / np.linalg.norm(at.position) > 0.3:
+            corners = project_undistorted(camera, there.apply(tag_corners(tag)))
+            whitening = np.eye(8) / 0.02
+            seen = RefinedTag(corners, whitening, whitening @ corners.ravel(), np.ones(4, bool))
+            views.append(TagView(tag, seen))
+    return views
+
+
+def shared_of(rig: Rig, camera: Camera, pose: Pose) -> np.ndarray:
+    return SharedErrors(rig, camera).of(pose, square(rig, camera, pose))
+
+
 PLACE = np.array([0.8, 0.5, 1.2, 0.06, 0.09, 0.03])
 """Deviations of a camera's place, [mm] and [deg]."""
 
@@ -95,14 +120,15 @@ PLACE = np.array([0.8, 0.5, 1.2, 0.06, 0.09, 0.03])
 def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crowded: Scene) -> None:
     """Cameras that are off by chance as stated put the platform where the clearance differs."""
     rng = np.random.default_rng(5)
-    camera = looking(rig, pose_covariance=np.diag(PLACE**2).tolist())
+    camera = looking(rig, pose_covariance=np.diag(PLACE**2).tolist(), error_mm=None)
+    known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
+    camera = replace(camera, lens_covariance=np.zeros((8, 8)))
     model = ClearanceModel(rig, crowded)
     pose = Pose(np.array([0.05, -0.03, 0.55]), matrix_from_rotation_vector([0.02, -0.01, 0.03]))
     seen = camera.world_from_camera.inverse().compose(pose)
     sure = replace(
         measurement(pose, np.zeros((6, 6))),
-        shared=camera.shared_covariance(pose),
-        unstated=False,
+        shared=shared_of(known, camera, pose),
     )
     stated = clearance_of(model, sure)
     assert stated is not None
@@ -115,18 +141,84 @@ def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crow
     scatter = np.std(np.array(distances), axis=0)
     apart = np.array([n.distance > 0.005 for n in stated.nearest])
     assert apart.sum() >= 2
-    np.testing.assert_allclose(stated.uncertainties[apart] / DEVIATIONS, scatter[apart], rtol=0.2)
-    assert stated.uncertainties.max() > 2e-3  # where 0.5 mm were stated before, whatever was known
+    np.testing.assert_allclose(stated.uncertainties[apart] / SURE, scatter[apart], rtol=0.2)
+    assert stated.uncertainties.max() > 1e-3  # where 0.5 mm were stated before, whatever was known
 
 
 def test_one_number_of_the_operator_stands_for_all_that_is_shared(rig: Rig, crowded: Scene) -> None:
-    camera = looking(rig, error_mm=1.96)
-    assert camera.whole_error
+    """Also for the cables, unless calibrations state every part of the chain."""
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))
-    np.testing.assert_allclose(
-        camera.shared_covariance(pose), np.diag([1e-6] * 3 + [0.0] * 3), atol=1e-15
+    shared = SharedErrors(rig, looking(rig, error_mm=1.96))
+    one = np.diag([1e-6] * 3 + [0.0] * 3)
+    np.testing.assert_allclose(shared.of(pose, []), one, atol=1e-15)
+    assert not shared.unstated
+    assert shared.whole == pytest.approx(1.96e-3)
+    half = looking(rig, error_mm=1.96, pose_covariance=np.eye(6).tolist())
+    np.testing.assert_allclose(SharedErrors(rig, half).of(pose, []), one, atol=1e-15)
+    sure = measurement(pose, np.zeros((6, 6)))
+    stated = clearance_of(
+        ClearanceModel(rig, crowded), replace(sure, shared=one, cable_error=1.96e-3)
     )
-    assert not looking(rig, error_mm=1.96, pose_covariance=np.eye(6).tolist()).whole_error
+    assert stated is not None
+    assert np.all(stated.uncertainties <= 1.96e-3 * (1.0 + 1e-9))
+    assert np.all(stated.uncertainties >= 1.96e-3 / np.sqrt(2.0) * (1.0 - 1e-9))
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
+    rig: Rig, fisheye: bool
+) -> None:
+    """Against poses that a lens off by a little gives, its camera's place found with it."""
+    lens = {"lens": "fisheye", "distortion": [0.01, -0.004, 0.002, -0.001]} if fisheye else {}
+    camera = looking(rig, **lens)
+    pose = Pose(np.array([0.05, -0.03, 0.55]), matrix_from_rotation_vector([0.1, -0.05, 0.2]))
+    count = 4 + camera.distortion.size
+    by_lens = np.zeros((6, count))
+    by_lens[:3, 0] = 1e-6, -2e-6, 3e-6
+    by_lens[3:, 2] = 1e-5, 2e-5, -1e-5
+    deviations = np.array([0.3, 0.2, 0.5, 0.4, *[1e-3] * (count - 4)])
+    known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
+    told = replace(
+        camera,
+        error=None,
+        lens_covariance=np.diag(deviations**2),
+        place_covariance=by_lens @ np.diag(deviations**2) @ by_lens.T,
+        place_by_lens=by_lens,
+    )
+    expected = np.zeros((6, 6))
+    for k in range(count):
+        step = by_lens[:, k] * deviations[k]
+        place = moved(camera.world_from_camera, step)
+        matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
+        if k < 4:
+            matrix[k % 2, k % 2 if k < 2 else 2] += deviations[k]
+        else:
+            distortion[k - 4] += deviations[k]
+        off = replace(camera, matrix=matrix, distortion=distortion, world_from_camera=place)
+        views = []
+        for view in square(rig, camera, pose):
+            corners = ideal_from_pixels(off, pixels_from_ideal(camera, view.seen.corners))
+            whitening = view.seen.whitening
+            seen = replace(view.seen, corners=corners, target=whitening @ corners.ravel())
+            views.append(TagView(view.tag, seen))
+        found = solve_pnp(off, views, camera.world_from_camera.inverse().compose(pose))
+        assert found is not None
+        measured = place.compose(found.camera_from_body)
+        turn = rotation_vector_from_matrix(measured.rotation @ pose.rotation.T)
+        change = np.concatenate([measured.position - pose.position, turn])
+        expected += np.outer(change, change)
+    got = shared_of(known, told, pose)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        got / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03
+    )
+
+
+def test_a_principal_point_that_is_off_is_a_camera_that_is_turned(rig: Rig) -> None:
+    camera = looking(rig)
+    by_lens = implied_rotation(camera)
+    turn = camera.world_from_camera.rotation.T @ by_lens[:, 2]
+    np.testing.assert_allclose(turn[1], 1.0 / camera.matrix[0, 0], rtol=0.25)
 
 
 @pytest.mark.parametrize(
@@ -140,9 +232,10 @@ def test_what_is_no_covariance_of_a_pose_is_refused(rig: Rig, rows: np.ndarray) 
 def test_a_mean_over_pictures_makes_no_shared_error_smaller(rig: Rig) -> None:
     """Two cameras of one survey err alike: both together are no surer than one."""
     place = np.diag(PLACE**2).tolist()
-    camera = looking(rig, pose_covariance=place)
+    camera = replace(looking(rig, pose_covariance=place), lens_covariance=np.zeros((8, 8)))
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))
-    shared = camera.shared_covariance(pose)
+    known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
+    shared = shared_of(known, camera, pose)
     one = replace(measurement(pose, np.eye(6) * 1e-8), shared=shared, unstated=False)
     both = together({"a": one, "b": one})
     assert isinstance(both, PoseMeasurement)
@@ -153,29 +246,44 @@ def test_a_mean_over_pictures_makes_no_shared_error_smaller(rig: Rig) -> None:
     assert half.unstated
 
 
+ALL = {"pose_covariance": np.eye(6).tolist(), "lens_covariance": np.eye(8).tolist()}
+CABLES = {"outlets_error_mm": 1.0, "anchors_error_mm": 0.5}
+
+
 @pytest.mark.parametrize(
-    ("camera_says", "tags_say", "unstated"),
+    ("camera_says", "tags_say", "rig_says", "lacks"),
     [
-        ({}, None, True),
-        ({}, 0.1, True),
-        ({"pose_covariance": np.eye(6).tolist()}, None, True),
-        ({"pose_covariance": np.eye(6).tolist()}, 0.1, False),
-        ({"error_mm": 0.8}, None, False),
+        ({}, None, {}, "lens_covariance.*pose_covariance.*tags.*outlets.*anchors"),
+        (ALL, 0.1, {}, "outlets_error_mm"),
+        (ALL, None, CABLES, "tags: error_mm"),
+        ({"pose_covariance": np.eye(6).tolist()}, 0.1, CABLES, "lens_covariance"),
+        (ALL, 0.1, CABLES, ""),
+        ({"error_mm": 0.8}, None, {}, ""),
     ],
 )
-def test_half_a_millimetre_is_added_only_where_something_is_unstated(
-    rig: Rig, crowded: Scene, camera_says: dict, tags_say: float | None, unstated: bool
+def test_no_clearance_is_measured_where_nothing_says_how_far_off_it_is(
+    rig: Rig,
+    crowded: Scene,
+    camera_says: dict,
+    tags_say: float | None,
+    rig_says: dict,
+    lacks: str,
 ) -> None:
     plain = rig.document.model_dump(mode="json", exclude_unset=True)
-    plain["cameras"][0] |= camera_says
+    plain["cameras"][0] |= {"error_mm": None} | camera_says
     plain["tags"]["error_mm"] = tags_say
-    said = rig_from_document(RigDocument.model_validate(plain))
+    said = rig_from_document(RigDocument.model_validate(plain | rig_says))
     picture = SyntheticCamera(said, crowded, said.cameras[0], 3).render(said.home, 0)
     found = Tracker(said, said.cameras[0]).observe(picture, 0.0)
     assert isinstance(found, PoseMeasurement)
-    assert found.unstated is unstated
-    known = bool(camera_says) or tags_say is not None
-    assert bool(np.trace(found.shared[:3, :3]) > 0.0) is known
+    assert found.unstated is bool(lacks)
+    if lacks:
+        with pytest.raises(BadInput, match=f"(?s){lacks}"):
+            require_stated_errors(said, said.cameras)
+        with pytest.raises(BadInput, match="error_mm"):
+            clearance_of(ClearanceModel(said, crowded), found)
+        return
+    require_stated_errors(said, said.cameras)
     stated = clearance_of(ClearanceModel(said, crowded), found)
     assert stated is not None
-    assert (stated.uncertainties.min() >= UNSTATED) or not unstated
+    assert stated.uncertainties.min() > 0.5e-3

@@ -50,6 +50,40 @@ def test_the_same_seed_pose_and_frame_give_the_same_picture(
     assert first.dtype == np.uint8
 
 
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        Optics(halo=0.5),
+        Optics(shadow=0.5),
+        Optics(sharpening=1.0),
+        Optics(enlarged=2),
+        Optics(jpeg=30),
+    ],
+)
+def test_lamps_shadows_and_a_cameras_own_processing_spoil_pictures_as_they_do(
+    rig: Rig, scene: Scene, camera: Camera, synthetic: SyntheticCamera, spoiled: Optics
+) -> None:
+    plain = synthetic.render(rig.home, 0).astype(float)
+    picture = SyntheticCamera(rig, scene, camera, seed=7, optics=spoiled).render(rig.home, 0)
+    assert picture.shape == plain.shape
+    assert picture.dtype == np.uint8
+    more, steps = picture - plain, np.abs(np.diff(picture.astype(float), axis=1)).mean()
+    usual = np.abs(np.diff(plain, axis=1)).mean()
+    if spoiled.halo:
+        assert more.mean() > 5.0
+        assert more[250:270, 530:550].mean() > more[600:, 1100:].mean() + 30.0
+    elif spoiled.shadow:
+        assert abs(more[:100, :900].mean()) < 1.0
+        below = np.s_[-100:, 400:]
+        assert picture[below].mean() == pytest.approx(0.5 * plain[below].mean(), rel=0.05)
+    elif spoiled.sharpening:
+        assert steps > 1.3 * usual
+        assert abs(more.mean()) < 1.0
+    else:
+        assert steps < 0.9 * usual
+        assert abs(more.mean()) < 1.0
+
+
 def test_a_picture_does_not_hang_on_the_ones_before(rig: Rig, synthetic: SyntheticCamera) -> None:
     before = synthetic.render(rig.home, 0)
     synthetic.render(Pose.level([0.2, -0.2, 0.3]), 1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from model.files.rig_file import tags_in
+from model.files.camera_file import tags_in
 from model.pose import Array
 from tracking.camera_model import Image
 from tracking.detection.tags import modules_across, official_modules

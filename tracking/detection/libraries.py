@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from model.errors import BadInput
-from model.files.rig_file import DETECTORS
+from model.files.camera_file import DETECTORS
 from model.pose import Array
 from tracking.camera_model import Image
 from tracking.detection.detector import Detection, TagDetector

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
-from model.files.rig_file import FAMILIES, drawn_upside_down, opencv_dictionary
+from model.files.camera_file import FAMILIES, drawn_upside_down, opencv_dictionary
 from model.pose import Array
 from model.rig import Tag
 

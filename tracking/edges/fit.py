@@ -375,14 +375,51 @@ def _improve(pixels: Array, count: int, best: Array, most_spread: float, found: 
         trial[BOXED] = min(max(trial[BOXED], -0.3), 1.3)
         settled = damping < 0.1 and max(abs(step[OFFSET]), abs(step[TILT])) < SETTLED
     if best[BRIGHT] - best[DARK] > LEAST_CONTRAST:
-        _write(best, best_normal, best_variance, weights, found)
+        compare(pixels, count, best, normals, gradients, squares, counts)
+        _write(best, best_normal, best_variance, weights, gradients, found)
+
+
+#: Errors are taken to be alike over this many parts of an edge.
+ALIKE = 3
+#: That errors are independent weighs as much as this many parts that show otherwise.
+INDEPENDENT = 8.0
 
 
 @compiled
-def _write(best: Array, normal: Array, variance: float, weights: Array, found: Array) -> None:
+def _correlated(column: Array, gradients: Array, weights: Array) -> float:
+    """A variance by what each part of the edge pulls, neighbouring parts together.
+
+    Errors that are alike in neighbouring parts (JPEG, enlarging, sharpening) are fewer independent
+    samples than there are pixels.
+
+    Args:
+        column: Of the inverse of the normal matrix, times a factor; the result has its square.
+        gradients: Of the parts, shape (b, p).
+        weights: Of the parts, shape (b,).
+
+    Source: Newey & West, Econometrica 55(3), 1987.
+    """
+    parts = len(weights)
+    pulls = np.zeros(parts)
+    for k in range(parts):
+        for i in range(len(column)):
+            pulls[k] += weights[k] * column[i] * gradients[k, i]
+    total = 0.0
+    for apart in range(ALIKE + 1):
+        share = (1.0 if apart == 0 else 2.0) * (1.0 - apart / (ALIKE + 1.0))
+        for k in range(parts - apart):
+            total += share * pulls[k] * pulls[k + apart]
+    return total
+
+
+@compiled
+def _write(
+    best: Array, normal: Array, variance: float, weights: Array, gradients: Array, found: Array
+) -> None:
     """Writes the edge and how sure it is."""
     size = len(best)
     column = np.empty(size)
+    wider = 0.0
     for i in range(size):
         normal[i, i] += 1e-9
     if not factored(normal, size):
@@ -395,9 +432,16 @@ def _write(best: Array, normal: Array, variance: float, weights: Array, found: A
             found[OFFSET_VARIANCE], found[COVARIANCE] = column[OFFSET], column[TILT]
         else:
             found[TILT_VARIANCE] = column[TILT]
+        wider += 0.5 * _correlated(column, gradients, weights) / (variance * column[k] * variance)
     found[OFFSET], found[TILT] = best[OFFSET], best[TILT]
     found[SPREAD], found[BOXED] = best[SPREAD], best[BOXED]
     used = 0
     for weight in weights:
         used += 1 if weight > 0.1 else 0
     found[SHARE] = used / len(weights)
+    if used > 2 * ALIKE:
+        wider *= used / (used - ALIKE - 1.0)  # the fit has taken off what all parts share
+        wider = max(1.0, (INDEPENDENT + used * wider) / (INDEPENDENT + used))
+        found[OFFSET_VARIANCE] *= wider
+        found[COVARIANCE] *= wider
+        found[TILT_VARIANCE] *= wider

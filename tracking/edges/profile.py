@@ -30,6 +30,10 @@ from tracking.edges.sampling import (
 DARK, DARK_SLOPE, BRIGHT, BRIGHT_SLOPE, BEYOND_PAPER, INNER = 4, 5, 6, 7, 8, 9
 
 
+WHITE = 254.5
+"""Pixels from here on are clipped, [grey levels]."""
+
+
 @compiled
 def compare(
     pixels: Array,
@@ -88,6 +92,9 @@ def _error(pixels: Array, n: int, parameters: Array, change: Array) -> float:
     value = bright - (bright - dark) * black
     if len(parameters) > BEYOND_PAPER:
         value += _surroundings(pixels, n, shift, parameters, change)
+    if pixels[VALUE, n] >= WHITE and value >= WHITE:  # clipped: it is that bright or brighter
+        change[:] = 0.0
+        return 0.0
     return float(pixels[VALUE, n] - value)
 
 

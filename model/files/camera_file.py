@@ -1,0 +1,152 @@
+"""The part of a rig file that says what cameras and tags it has."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from model.files.documents import (
+    LENSES,
+    WHOLE_LARGEST,
+    Document,
+    LensCovariance,
+    LensName,
+    Name,
+    NonNegative,
+    Number,
+    PoseCovariance,
+    PoseDocument,
+    PoseSlopes,
+    Positive,
+    require_coefficients,
+)
+
+# Families of fiducial tags by their names in rig files.
+
+
+AprilTagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
+ArucoDictionary = Literal[
+    "4X4_50", "4X4_100", "4X4_250", "4X4_1000",
+    "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
+    "6X6_50", "6X6_100", "6X6_250", "6X6_1000",
+    "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
+    "ARUCO_ORIGINAL", "ARUCO_MIP_36H12",
+]  # fmt: skip
+TagFamily = Literal[AprilTagFamily, ArucoDictionary]
+#: What finds tags in images: OpenCV, or pyapriltags of the extra `apriltag`.
+TagDetectorName = Literal["opencv", "apriltag"]
+
+APRILTAG_FAMILIES: tuple[str, ...] = get_args(AprilTagFamily)
+DETECTORS: tuple[str, ...] = get_args(TagDetectorName)
+#: All that can be printed and found.
+FAMILIES: tuple[str, ...] = APRILTAG_FAMILIES + get_args(ArucoDictionary)
+
+
+def opencv_dictionary(family: str) -> str:
+    """Name of OpenCV's constant for a family, such as ``DICT_APRILTAG_36H11``."""
+    if family in APRILTAG_FAMILIES:
+        return f"DICT_APRILTAG_{family.removeprefix('tag').upper()}"
+    return f"DICT_{family}"
+
+
+def drawn_upside_down(family: str) -> bool:
+    """Whether OpenCV draws the family turned by 180° against the prints of its own project.
+
+    It does so with the families of the AprilTag project, whose images labs print.
+    """
+    return family in APRILTAG_FAMILIES
+
+
+_APRILTAGS = {"tag16h5": 30, "tag25h9": 35, "tag36h10": 2320, "tag36h11": 587}
+_NAMED = {"ARUCO_ORIGINAL": 1024, "ARUCO_MIP_36H12": 250}
+
+
+def tags_in(family: str) -> int:
+    """How many tags a family has, numbered from 0."""
+    named = _APRILTAGS | _NAMED
+    return named[family] if family in named else int(family.split("_")[1])
+
+
+Pixels = Annotated[int, Field(ge=64, le=16384)]
+Readout = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+
+
+class TagDocument(PoseDocument):
+    """One fiducial tag: its centre and orientation (x right, y up, z out of the print)."""
+
+    id: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
+    size_mm: Positive = Field(description="side of the black square")
+
+
+class TagsDocument(Document):
+    """The tags on the platform (platform frame) and, optionally, on the frame (world)."""
+
+    family: TagFamily = "tag36h11"
+    detector: TagDetectorName = Field(
+        default="opencv", description="apriltag: pyapriltags, of the extra `apriltag`"
+    )
+    platform: Annotated[list[TagDocument], Field(min_length=1)]
+    frame: list[TagDocument] = []
+    error_mm: NonNegative | None = Field(
+        default=None,
+        description="how far off corners of the platform's tags are, 95 %; calibrations write it",
+    )
+
+
+class CameraDocument(Document):
+    """One camera: intrinsics (OpenCV) and pose (x right, y down, z along the view)."""
+
+    name: Name
+    width_px: Pixels
+    height_px: Pixels
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: Number
+    cy_px: Number
+    lens: LensName = Field(default="pinhole", description="OpenCV's model of the lens")
+    distortion: Annotated[list[Number], Field(max_length=14)] = Field(
+        default=[],
+        description="OpenCV order: k1 k2 p1 p2 k3 …; fisheye: k1 k2 k3 k4",
+        validate_default=True,
+    )
+    world_from_camera: PoseDocument
+    lens_covariance: LensCovariance | None = Field(
+        default=None,
+        description="of fx_px, fy_px, cx_px, cy_px and distortion; calibrations write it",
+    )
+    pose_covariance: PoseCovariance | None = Field(
+        default=None, description="of world_from_camera, mm and deg; calibrations write it"
+    )
+    pose_by_lens: PoseSlopes | None = Field(
+        default=None,
+        description="how errors of the numbers of lens_covariance move world_from_camera, mm and"
+        " deg; calibrations write it",
+    )
+    error_mm: NonNegative | None = Field(
+        default=None,
+        description="how far off platform and cables are measured, 95 %, by all errors that"
+        " pictures share; used where calibrations do not state all of them",
+    )
+    rate_hz: Positive = 10.0
+    readout_ms: Readout = Field(
+        default=0.0,
+        description="from the exposure of the top row to that of the bottom row (rolling shutter);"
+        " 0: all rows at once, negative: from the bottom up",
+    )
+
+    @field_validator("distortion")
+    @classmethod
+    def _opencv_count(cls, distortion: list[float], info: ValidationInfo) -> list[float]:
+        require_coefficients(info.data.get("lens", LENSES[0]), len(distortion))
+        return distortion
+
+    @field_validator("lens_covariance", "pose_by_lens")
+    @classmethod
+    def _one_a_number(
+        cls, rows: list[list[float]] | None, info: ValidationInfo
+    ) -> list[list[float]] | None:
+        count = 4 + len(info.data.get("distortion", []))
+        if rows is not None and len(rows[0]) != count:
+            raise ValueError(f"needs {count} numbers a row: fx, fy, cx, cy and distortion")
+        return rows
