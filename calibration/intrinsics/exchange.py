@@ -8,9 +8,11 @@ camera_calibration_parsers (keys, models plumb_bob, rational_polynomial, equidis
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -21,11 +23,19 @@ from calibration.intrinsics.result import camera_named, with_camera
 from model.errors import BadInput
 from model.files.documents import FISHEYE, read_text, read_yaml, write_atomic
 from model.files.rig_file import CameraDocument, RigDocument
+from model.files.validation import YamlSyntaxError, parse_yaml
 from model.rig import Rig, rig_from_document
 
 _ROS_MODELS = {"plumb_bob": ("pinhole", 5), "rational_polynomial": ("pinhole", 8)}
 _ROS_FISHEYE = ("equidistant", "fisheye")
 _TEXT_LIMIT = 1_000_000
+_STORED = (
+    "fisheye_model",
+    "image_width",
+    "image_height",
+    "camera_matrix",
+    "distortion_coefficients",
+)
 _KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
 
 
@@ -89,9 +99,11 @@ def imported_camera(path: Path, camera: CameraDocument) -> CameraDocument:
     Raises:
         BadInput: The file cannot be read, is neither, or its numbers cannot be.
     """
-    text = read_text(path, _TEXT_LIMIT)
-    if text.lstrip().startswith(("%YAML", "<?xml")):
-        found = _from_opencv(text, path)
+    text = read_text(path, _TEXT_LIMIT).lstrip()
+    if text.startswith("<?xml"):
+        found = _from_opencv(_xml_storage(text, path), path)
+    elif text.startswith("%YAML"):
+        found = _from_opencv(_yaml_storage(text, path), path)
     else:
         found = _from_ros(read_yaml(path).data, path)
     plain = camera.model_dump(mode="json") | found
@@ -150,20 +162,51 @@ def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
     return {"rows": rows, "cols": columns, "data": [float(x) for x in values.ravel()]}
 
 
-def _from_opencv(text: str, path: Path) -> dict[str, Any]:
+# OpenCV's own reader of its files ends the program at some damaged ones: these two take what a
+# camera needs of them.
+
+
+def _yaml_storage(text: str, path: Path) -> dict[str, Any]:
+    """The entries of an OpenCV file in YAML that a camera needs."""
+    entries = re.split(r"^(?=[A-Za-z_])", text, flags=re.MULTILINE)
+    needed = [one for one in entries if one.partition(":")[0].rstrip() in _STORED]
     try:
-        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        size = [storage.getNode(f"image_{side}") for side in ("width", "height")]
-        matrix = storage.getNode("camera_matrix").mat()
-        lens = storage.getNode("distortion_coefficients").mat()
-        fisheye = storage.getNode("fisheye_model")
-        is_fisheye = not fisheye.empty() and int(fisheye.real()) == 1
-        if any(node.empty() for node in size) or not (np.size(matrix) > 1 and np.size(lens) > 1):
-            raise _unusable(path, "its size, camera_matrix or distortion_coefficients is missing")
-        width, height = (int(node.real()) for node in size)
-    except (cv2.error, SystemError) as error:
-        raise _unusable(path, str(error).strip().splitlines()[-1]) from None
-    return _numbers(path, width, height, matrix, lens, "fisheye" if is_fisheye else "pinhole")
+        plain = parse_yaml("".join(needed).replace("!!opencv-matrix", "")).data
+    except YamlSyntaxError as error:
+        raise _unusable(path, error.what) from None
+    return plain or {}
+
+
+def _xml_storage(text: str, path: Path) -> dict[str, Any]:
+    """The same of one in XML."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # OpenCV writes none; entities can grow at will
+        raise _unusable(path, "it declares a document type, which OpenCV's files do not")
+    try:
+        root = ElementTree.fromstring(text)
+        found: dict[str, Any] = {one.tag: one for one in root if one.tag in _STORED}
+        for name, node in found.items():
+            data = node.findtext("data")
+            found[name] = int(node.text or "") if data is None else {"data": data.split()}
+    except (ElementTree.ParseError, ValueError) as error:
+        raise _unusable(path, str(error)) from None
+    return found
+
+
+def _from_opencv(plain: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    missing = [name for name in _STORED[1:] if name not in plain]
+    if missing:
+        raise _unusable(path, f"its {missing[0]} is missing")
+    kind = "fisheye" if plain.get(_STORED[0]) == 1 else "pinhole"
+    width, height, matrix, lens = (plain[name] for name in _STORED[1:])
+    return _numbers(path, width, height, matrix, lens, kind)
+
+
+def _data(matrix: object, path: Path) -> np.ndarray[Any, Any]:
+    """The numbers of a matrix as OpenCV and ROS store it."""
+    try:
+        return np.array(matrix["data"], dtype=np.float64)  # type: ignore[index]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise _unusable(path, f"{type(error).__name__}: {error}") from None
 
 
 def _from_ros(plain: object, path: Path) -> dict[str, Any]:
@@ -171,11 +214,10 @@ def _from_ros(plain: object, path: Path) -> dict[str, Any]:
         raise _unusable(path, "it is neither OpenCV's YAML nor a ROS camera_info")
     try:
         model = plain["distortion_model"]
-        matrix = np.array(plain["camera_matrix"]["data"], dtype=np.float64)
-        lens = np.array(plain["distortion_coefficients"]["data"], dtype=np.float64)
+        matrix, lens = plain["camera_matrix"], plain["distortion_coefficients"]
         width, height = plain["image_width"], plain["image_height"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise _unusable(path, f"{type(error).__name__}: {error}") from None
+    except KeyError as error:
+        raise _unusable(path, f"its {error.args[0]} is missing") from None
     if model not in (*_ROS_MODELS, *_ROS_FISHEYE):
         raise _unusable(path, f"its distortion_model {model!r} is not known")
     kind = "fisheye" if model in _ROS_FISHEYE else "pinhole"
@@ -186,10 +228,9 @@ def _numbers(
     path: Path, width: object, height: object, matrix: object, lens: object, kind: str
 ) -> dict[str, Any]:
     """The keys of the rig file's ``cameras``."""
-    numbers, coefficients = np.asarray(matrix, np.float64), np.ravel(np.asarray(lens, np.float64))
-    if numbers.size != 9:
+    flat, coefficients = _data(matrix, path).ravel(), _data(lens, path).ravel()
+    if flat.size != 9:
         raise _unusable(path, "camera_matrix is not 3 x 3")
-    flat = numbers.ravel()
     if abs(flat[1]) > 1e-9:
         raise _unusable(path, "camera_matrix has a skew, which rig files have no key for")
     values = (width, height, flat[0], flat[4], flat[2], flat[5], coefficients.tolist(), kind)
