@@ -181,7 +181,10 @@ def _alone(poses: PoseTable | None) -> str:
 def event_table(run: RunData) -> str:
     """What happened, in order."""
     rows = [(f"{e.time_s:.2f} s", e.code, e.text, page_of(e.code)) for e in run.events]
-    return list_table(("Time", "Event", "Text", "More about it"), rows)
+    head = ("Time", "Event", "Text", "More about it")
+    if not any(row[-1] for row in rows):  # a narrow window has no room for an empty column
+        head, rows = head[:-1], [row[:-1] for row in rows]
+    return list_table(head, rows)
 
 
 def fault_texts(run: RunData) -> str:
