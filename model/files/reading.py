@@ -126,6 +126,8 @@ def read_json(path: Path, next_step: str) -> Any:
         what = f"not valid JSON: {error.msg}"
         where = f"{path}:{error.lineno}:{error.colno}"
         why = "the file was cut off or edited" if text.strip() else "the file is empty"
+        if text.strip() and text.lstrip()[0] not in "{[":
+            why, next_step = "it is a file of another kind", f"pass another file, or {next_step}"
         raise BadInput(what, where=where, why=why, next_step=next_step) from None
     except ValueError as error:
         raise BadInput(str(error), where=str(path), next_step=next_step) from None
