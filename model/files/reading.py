@@ -7,6 +7,7 @@ ends in one message before it costs memory or time.
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import os
@@ -77,6 +78,8 @@ def unreadable(path: Path, error: Exception) -> BadInput:
             what, hint = "no such file", "check the path and its spelling"
         case IsADirectoryError():
             what, hint = "this is a folder", "name a file"
+        case OSError(errno=errno.ENAMETOOLONG):  # of an output too
+            what, why, hint = "the path cannot be used", str(error.strerror), "shorten its name"
         case OSError():
             why = error.strerror or str(error)
         case _:

@@ -126,3 +126,8 @@ def test_a_missing_folder_and_a_read_only_one_are_told_apart(tmp_path: Path) -> 
     (tmp_path / "file").touch()
     inside = tmp_path / "file" / "p.json"
     one_message(call("plan", RIG, SCENE, "-o", inside), 2, "file is not a folder")
+
+
+def test_a_name_too_long_for_a_file_to_write_is_not_called_unreadable() -> None:
+    answer = call("plan", RIG, SCENE, "-o", "x" * 300)
+    one_message(answer, 2, "the path cannot be used", "File name too long", "shorten its name")
