@@ -182,9 +182,9 @@ def event_table(run: RunData) -> str:
     """What happened, in order."""
     rows = [(f"{e.time_s:.2f} s", e.code, e.text, page_of(e.code)) for e in run.events]
     head = ("Time", "Event", "Text", "More about it")
-    if not any(row[-1] for row in rows):  # a narrow window has no room for an empty column
-        head, rows = head[:-1], [row[:-1] for row in rows]
-    return list_table(head, rows)
+    # A narrow window has no room for a column that is empty.
+    shown = 4 if any(row[-1] for row in rows) else 3
+    return list_table(head[:shown], [row[:shown] for row in rows])
 
 
 def fault_texts(run: RunData) -> str:
