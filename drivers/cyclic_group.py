@@ -43,17 +43,17 @@ class CyclicBus:
     """
 
     def __init__(
-        self, bus: can.BusABC, own: EchoFilter, foreign_text: Callable[[int], str]
+        self, bus: can.BusABC, own: EchoFilter, foreign_master_message: Callable[[int], str]
     ) -> None:
         """Takes an open bus.
 
         Args:
             bus: The caller's.
             own: Filters own frames from another master's.
-            foreign_text: What another master does that sends a frame of an identifier.
+            foreign_master_message: What another master does that sends a frame of an identifier.
         """
         self._bus, self._where = bus, bus_name(bus)
-        self._own, self._foreign_text = own, foreign_text
+        self._own, self._foreign_master_message = own, foreign_master_message
         self._errors = ErrorFrames(self._where)
         self._lost = lost_frames(bus)
         self._found: list[BusFault] = []
@@ -154,7 +154,9 @@ class CyclicBus:
         elif message.is_extended_id or message.is_remote_frame:
             return
         elif self._own.is_foreign(message.arbitration_id):
-            self._find(ForeignMaster(self._foreign_text(message.arbitration_id), self._where))
+            self._find(
+                ForeignMaster(self._foreign_master_message(message.arbitration_id), self._where)
+            )
         else:
             listener.take(message.arbitration_id, message.data, stale=stale)
 

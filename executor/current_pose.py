@@ -17,7 +17,7 @@ from model.winches import WinchMap
 _SETTLED, _ROUNDS = 1e-8, 200
 
 
-def standing_pose(rig: Rig, counts: Array, load: Load) -> Pose:
+def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
     """The pose whose planned drive positions are these, ``world_from_platform``.
 
     Args:

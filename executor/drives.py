@@ -101,7 +101,7 @@ def _reached(
         stack.callback(far_end.shutdown)
         rehearsal = make_rehearsal(rig, far_end, simulated_start, load)
         if lost_power is not None:
-            lost_power.happen_to(rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+            lost_power.apply_to(rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         yield _Drives(bus, rehearsal)
 
 
@@ -142,12 +142,12 @@ def open_drives(
         HardwareMissing: The bus cannot be opened or a drive does not answer.
         Refused: The bus is too slow, a drive does not keep a setting, or somebody else sets it up.
     """
-    custody, counted, max_tension = MotionInterlock(rig), rig, None
+    interlock, counted, max_tension = MotionInterlock(rig), rig, None
     restarted: set[int] = set()
 
     def note_restarted(nodes: tuple[int, ...]) -> None:
         restarted.update(nodes)
-        custody.found_restarted(nodes)
+        interlock.found_restarted(nodes)
 
     with _reached(rig, simulated_start, load, lost_power, listener) as reached:
         if set_up_as is not None:

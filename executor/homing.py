@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from executor.cameras.open import look_at_rest
 from executor.cameras.sources import choose_one_camera, require_simulated_pictures
-from executor.cameras.static_pose import rest_pose
+from executor.cameras.static_pose import static_pose
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
 from executor.control.winch_motion import WinchesStand
 from executor.drives import is_simulated, require_own_time
@@ -311,6 +311,6 @@ def _referenced(
             )
 
     looks = look_at_rest(rig, eye, pictures, true_pose, unless_stopped, SILENT)
-    found = rest_pose(rig, looks)
+    found = static_pose(rig, looks)
     how = f"tags in {found.pictures} of {pictures} images, camera {eye[0].name!r}"
     return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)

@@ -14,7 +14,7 @@ import numpy as np
 
 from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
-from executor.current_pose import standing_pose
+from executor.current_pose import current_pose
 from executor.drives import is_simulated, look_at, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_course import free_folder
@@ -134,7 +134,7 @@ def measured_pose(rig: Rig, scene: Scene) -> Pose:
     seen = look_at(rig, rig.home, scene.load)
     positions = seen.positions.tolist()
     require_still_referenced(rig, reference, seen.restarted, positions)
-    return standing_pose(rig, np.array(positions, dtype=np.float64), scene.load)
+    return current_pose(rig, np.array(positions, dtype=np.float64), scene.load)
 
 
 def straight_way(

@@ -28,7 +28,7 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder
 from executor.recording.run_course import RunCourse, dated_folder
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
-from executor.remote.registry import announced
+from executor.remote.registry import advertised
 from executor.remote.server import serving
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
@@ -302,7 +302,7 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
         open_cameras, prepared.rig, prepared.scene, job.cameras, job.folder.path, pictures, board
     )
     with ExitStack() as stack:
-        listeners = stack.enter_context(announced())
+        listeners = stack.enter_context(advertised())
         stack.enter_context(serving(listeners, board, status))
         cameras = stack.enter_context(opening(simulated_time=fast, listener=listener))
         with listener.progress("preparing, row", rows) as advance:

@@ -14,14 +14,14 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
 from executor.control.standstill import FaultReset, Release, StandstillMotion
-from executor.current_pose import standing_pose
+from executor.current_pose import current_pose
 from executor.drives import require_other_process, resting_drives_of
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
-from executor.remote.registry import announced
+from executor.remote.registry import advertised
 from executor.remote.server import serving
 from executor.remote.status import WinchStatus
 from executor.standstill_runs import is_braked, release_drives, reset_drives
@@ -203,7 +203,7 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     as_referenced = interlock.referenced_rig()
     load = nothing_in_the_way(as_referenced).load
     try:
-        pose = standing_pose(as_referenced, np.array(positions, dtype=np.float64), load)
+        pose = current_pose(as_referenced, np.array(positions, dtype=np.float64), load)
     except CdprError as error:
         return replace(read, why_no_pose=error.what)
     return replace(read, pose=pose)
@@ -382,7 +382,7 @@ def _released(
         status.take_release()
 
     with ExitStack() as stack:
-        stack.enter_context(serving(stack.enter_context(announced()), board, status))
+        stack.enter_context(serving(stack.enter_context(advertised()), board, status))
         process = stack.enter_context(
             real_time_process(
                 StandstillMotion.of(Release, rig),

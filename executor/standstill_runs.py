@@ -35,13 +35,13 @@ def is_braked(rig: Rig) -> bool:
 
 
 def release_drives(
-    rig: Rig, custody: MotionInterlock, process: RealTimeProcess, on_armed: Callable[[str], None]
+    rig: Rig, interlock: MotionInterlock, process: RealTimeProcess, on_armed: Callable[[str], None]
 ) -> CycleStatus:
     """Takes the torque off; what becomes of the bus and the reference is kept.
 
     Args:
         rig: The robot.
-        custody: Of that rig.
+        interlock: Of that rig.
         process: For `executor.control.standstill.Release`.
         on_armed: Called when all is ready, with what the system did not grant.
 
@@ -52,10 +52,10 @@ def release_drives(
         StoppedByOperator: The operator stopped it.
         CdprError: They could not be set up, or were not released; then a fault is latched.
     """
-    record = custody.file.path.parent
+    record = interlock.file.path.parent
     armed = process.arm(Unrecorded())
     on_armed(armed.denied)
-    custody.begin(record, custody.still_counts(armed.stands_at))
+    interlock.begin(record, interlock.still_counts(armed.stands_at))
     ended = _CUT_SHORT
     try:
         ended = process.run()
@@ -66,10 +66,10 @@ def release_drives(
     finally:
         if ended.state is not State.FINISHED:
             cause = f"while releasing the drives: {ended.cause}"
-            custody.end(State.LATCHED, cause, record, holding=False, stands_at=None)
+            interlock.end(State.LATCHED, cause, record, holding=False, stands_at=None)
     if left is None:
         raise ended.error or Fault(ended.cause, where="release")
-    custody.end(
+    interlock.end(
         State.FINISHED,
         "",
         record,
@@ -93,14 +93,14 @@ class DrivesReset:
     restarted: tuple[int, ...]
 
 
-def reset_drives(custody: MotionInterlock, process: RealTimeProcess) -> DrivesReset:
+def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> DrivesReset:
     """Resets drives in fault; those that hold keep holding.
 
     Where all held all the while, as after a program that was killed, their reference still counts
     from where they are.
 
     Args:
-        custody: Of their rig.
+        interlock: Of their rig.
         process: For `executor.control.standstill.FaultReset`.
 
     Raises:
@@ -112,5 +112,5 @@ def reset_drives(custody: MotionInterlock, process: RealTimeProcess) -> DrivesRe
         raise ended.error or Fault(ended.cause, where="reset")
     left = process.stands_now()
     if ended.holding and not armed.restarted:
-        custody.found_held(left.positions.tolist())
+        interlock.confirm_held(left.positions.tolist())
     return DrivesReset(left, armed.restarted)

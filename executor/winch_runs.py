@@ -19,7 +19,7 @@ from executor.realtime.clock import SimulatedClock
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.run_course import free_folder
-from executor.remote.registry import announced
+from executor.remote.registry import advertised
 from executor.remote.server import serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
@@ -137,7 +137,7 @@ def _supervised(
     rig, interlock = motion.rig, MotionInterlock(motion.rig)
     status = WinchStatus(rig, board, simulated_time=not motion.realtime)
     with ExitStack() as stack:
-        listeners = stack.enter_context(announced())
+        listeners = stack.enter_context(advertised())
         stack.enter_context(serving(listeners, board, status))
         mover = stack.enter_context(_mover(motion, board))
         kept = stack.enter_context(

@@ -167,7 +167,7 @@ class PowerLoss:
         slack = random.uniform(0.0, most_slack, rig.cable_count)
         return cls(read_only(np.rint(turns * per_turn)), read_only(slack), on_a_stand)
 
-    def happen_to(self, rig: Rig, plant: Plant, motors: Iterable[Motor]) -> None:
+    def apply_to(self, rig: Rig, plant: Plant, motors: Iterable[Motor]) -> None:
         """Turns the drums and sets their counters; the platform goes where that leaves it.
 
         Raises:

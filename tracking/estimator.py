@@ -44,7 +44,7 @@ def doubt(
             f"the reprojection error is {bundle.reprojection:.2f} px,"
             f" the limit is {limits.reprojection_px:g} px"
         )
-    if len(views) == 1 and bundle.rival_cost - bundle.cost < limits.single_tag_margin:
+    if len(views) == 1 and bundle.second_best_cost - bundle.cost < limits.single_tag_margin:
         near = prior is not None and prior.angle_to(bundle.camera_from_body) < 0.1
         if not near:
             return f"only tag {views[0].tag.id} is detected, and it allows two poses"

@@ -23,7 +23,7 @@ from tracking.edges.refine import RefinedTag
 HUBER = 3.0
 #: The edges' stated deviations weigh as this many residuals when the covariance is scaled by
 #: how well all edges fit: few edges fit well by chance.
-BELIEF = 20.0
+PRIOR_WEIGHT = 20.0
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
 
@@ -44,7 +44,7 @@ class BundlePose:
         camera_from_body: The pose.
         covariance: Of position [m] and rotation vector [rad] along the camera's axes, shape (6, 6).
         cost: Huber cost of the edges, in variances.
-        rival_cost: Cost of the best other pose, infinite without one.
+        second_best_cost: Cost of the best other pose, infinite without one.
         edge_errors: Of each tag's edges in deviations, 0 where hidden, shape (t, 4).
         corner_errors: Of each tag's corners, RMS, shape (t,), [px]; of whole tags their corners,
             else of the edges that were measured.
@@ -54,7 +54,7 @@ class BundlePose:
     camera_from_body: Pose
     covariance: Array
     cost: float
-    rival_cost: float
+    second_best_cost: float
     edge_errors: Array
     corner_errors: Array
     certainties: Array
@@ -248,7 +248,7 @@ def _result(
     jacobian = squares.jacobian(pose).reshape(-1, 6)
     normal = jacobian.T @ (jacobian * _weights(errors)[:, None])
     freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
-    scale = (BELIEF + cost) / (BELIEF + max(freedom, 0))
+    scale = (PRIOR_WEIGHT + cost) / (PRIOR_WEIGHT + max(freedom, 0))
     try:
         covariance = scale * np.linalg.inv(normal)
     except np.linalg.LinAlgError:  # too few edges to fix all six

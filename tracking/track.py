@@ -14,7 +14,7 @@ from model.clearance import ClearanceModel
 from model.errors import BadInput
 from tracking.camera_model import Image
 from tracking.clearance import MeasuredClearance, clearance_of
-from tracking.detection.diagnostics import what_else_is_seen
+from tracking.detection.diagnostics import diagnose_tags
 from tracking.estimator import UNSHARP
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.multi_camera import MultiCameraFusion, moments
@@ -117,7 +117,7 @@ def _nothing_seen(
     if last is None:
         return NoPlatformSeen("the source has no images", where=where)
     wanted = ", ".join(map(str, tracker.expected_tags))
-    instead = what_else_is_seen(last.image, tracker.rig.tag_family, tracker.expected_tags)
+    instead = diagnose_tags(last.image, tracker.rig.tag_family, tracker.expected_tags)
     next_step = (
         "check that the camera sees the platform, that the light suffices, and that the rig file"
         " has the family and numbers of the printed tags"

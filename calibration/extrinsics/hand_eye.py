@@ -161,7 +161,10 @@ def _look(rig: Rig, camera: Camera, sights: TagSights, name: str, pose: Pose) ->
     found = solve_pnp(camera, [TagView(tags[k], square) for k, square in squares.items()])
     if found is None or not np.isfinite(found.covariance).all():
         return None
-    if len(squares) == 1 and found.rival_cost - found.cost < TrackerSettings().single_tag_margin:
+    if (
+        len(squares) == 1
+        and found.second_best_cost - found.cost < TrackerSettings().single_tag_margin
+    ):
         return None
     return _CameraLook(
         pose, found.camera_from_body, found.covariance, found.reprojection, tuple(squares)

@@ -296,7 +296,7 @@ def _rotations(table: _Table) -> Array:
 # Tensions of samples without a measurement of them, and their uncertainty.
 
 
-def tension_doubt(rig: Rig) -> float:
+def tension_sigma(rig: Rig) -> float:
     """How far off tensions may be that were not measured, one standard deviation, [N].
 
     Cables of a rig that is not built as its file says pull against each other. They were not slack,
@@ -305,11 +305,11 @@ def tension_doubt(rig: Rig) -> float:
     return PRETENSION_SHARE * (rig.max_tension - rig.min_tension) / 2.0
 
 
-def likely_tensions(rig: Rig, measured: RigMeasurements) -> Array:
+def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
     """Tensions as measured; else the working ones of the place, shape (n, m), [N].
 
     Where the pose is not known, or such that the rig file's cables cannot hold the platform there,
-    they are those of home: `tension_doubt` holds for both.
+    they are those of home: `tension_sigma` holds for both.
 
     Args:
         rig: As in its file.

@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from calibration.geometry.measurements import RigMeasurements, likely_tensions, tension_doubt
+from calibration.geometry.measurements import RigMeasurements, nominal_tensions, tension_sigma
 from model.kinematics import Cables, cable_lengths, cables_to
 from model.pose import Array, read_only
 from model.rig import Rig
@@ -221,7 +221,7 @@ class RigModel:
     """Lengths of cables of a rig with unknown numbers, at n poses."""
 
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
-        """Takes the measurements; tensions that were not measured are those of `likely_tensions`.
+        """Takes the measurements; tensions that were not measured are those of `nominal_tensions`.
 
         Where some were not measured, nothing shows the cables' stiffness.
 
@@ -231,7 +231,7 @@ class RigModel:
         self.parameters = parameters
         self._told = np.isfinite(measured.tensions)
         self._stretch_is_told = bool(self._told.all())
-        tensions = likely_tensions(parameters.rig, measured)
+        tensions = nominal_tensions(parameters.rig, measured)
         self.counted = CountedLengths(parameters.rig, measured.counts, tensions)
 
     def length_deviations(self, length_deviation: float) -> Array:
@@ -242,7 +242,7 @@ class RigModel:
                 stretch a cable of the rig file's stiffness.
         """
         rig, drawn = self.parameters.rig, self.parameters.geometry(np.zeros(len(self.parameters)))
-        stretched = tension_doubt(rig) / rig.cable_stiffness * self.counted.by(drawn)
+        stretched = tension_sigma(rig) / rig.cable_stiffness * self.counted.by(drawn)
         deviations: Array = np.hypot(length_deviation, np.where(self._told, 0.0, stretched))
         return deviations
 

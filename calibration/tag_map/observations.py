@@ -17,7 +17,7 @@ from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, project_undistorted
 from tracking.detection.detector import Detection
-from tracking.detection.diagnostics import what_else_is_seen
+from tracking.detection.diagnostics import diagnose_tags
 from tracking.detection.libraries import make_detector
 from tracking.detection.tags import CORNER_SIGNS, modules_across
 from tracking.edges.refine import RefinedTag, refine
@@ -142,7 +142,7 @@ def _nothing_seen(
     why = "; ".join(f"{name} {reason}" for name, reason in list(unused.items())[:4])
     if example is not None:
         name, image = example
-        why += f"; {name} shows {what_else_is_seen(image, family, list(wanted))}"
+        why += f"; {name} shows {diagnose_tags(image, family, list(wanted))}"
     return BadInput(
         f"none of the {family} tags {', '.join(map(str, wanted))} is completely visible",
         where=f"camera {camera.name}",

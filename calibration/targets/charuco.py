@@ -14,7 +14,7 @@ from model.files.rig_file import FAMILIES
 from model.pose import Array
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
-from tracking.detection.diagnostics import what_else_is_seen
+from tracking.detection.diagnostics import diagnose_tags
 
 _LEAST_FOURS = 4
 """Markers of 16 modules are found by chance: this many are not."""
@@ -101,7 +101,7 @@ class Charuco:
             drawn = "4.6 and later draw" if self.legacy else "before 4.6 drew"
             return f"the board as versions of OpenCV {drawn} it: try {use}"
         family = self.dictionary if self.dictionary in FAMILIES else FAMILIES[-1]
-        told = what_else_is_seen(image, family, [])
+        told = diagnose_tags(image, family, [])
         fours = TagDetector("4X4_1000").detect(image)
         if len(fours) < _LEAST_FOURS:
             return told

@@ -22,7 +22,7 @@ from model.files.rig_file import FAMILIES, tags_in
 from model.pose import Array
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
-from tracking.detection.diagnostics import what_else_is_seen
+from tracking.detection.diagnostics import diagnose_tags
 from tracking.detection.tags import CORNER_SIGNS, dictionary, modules_across, upright_corners
 from tracking.edges.refine import refine
 
@@ -166,7 +166,7 @@ class TagGrid:
         other = self._other_order()
         if replace(self, order=other).find(image) is not None:
             return f"these tags {ORDERS[other]}: try --order {other}"
-        return what_else_is_seen(image, self.family, [])
+        return diagnose_tags(image, self.family, [])
 
     def points_of(self, numbers: Iterable[int]) -> Array:
         """Corners of tags in the board's plane, y down the rows, shape (4 n, 3), [m]."""

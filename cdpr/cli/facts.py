@@ -12,7 +12,7 @@ from rich.markup import escape
 from cdpr.cli.output import err, out, show_facts, show_json
 from cdpr.cli.plan_facts import stop_facts
 from drivers.can_bus import IN_PROCESS
-from executor.cameras.sources import looked_with
+from executor.cameras.sources import describe_cameras
 from executor.homing import ForgetProposal, HomeResult, HomingProposal
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
@@ -82,7 +82,7 @@ def _cameras(rig: Rig, used: Mapping[Camera, str]) -> str:
     """Which cameras look, and which of the rig file's do not."""
     names = {camera.name for camera in used}
     unused = [camera.name for camera in rig.cameras if camera.name not in names]
-    parts = [looked_with(used)] if used else []
+    parts = [describe_cameras(used)] if used else []
     parts += [f"not used: {', '.join(unused)}"] if unused else []
     return "; ".join(parts) or "none"
 

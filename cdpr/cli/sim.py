@@ -108,7 +108,7 @@ def sim(
         rehearsal = make_rehearsal(the_rig, bus, pose, load, behaviour=behaviour, eds=eds)
         if power_lost is not None:
             loss = PowerLoss.drawn(the_rig, power_lost, slack_mm / 1000.0, on_a_stand=on_a_stand)
-            loss.happen_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+            loss.apply_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         x, y, z = rehearsal.pose.position * 1000.0
         out.print(
             f"{the_rig.cable_count} simulated drives of {the_rig.name} on"

@@ -28,7 +28,7 @@ def set_up_ids(nodes: Sequence[int]) -> frozenset[int]:
     return commanding_ids(nodes) | {SDO_REQUEST_BASE + node for node in nodes}
 
 
-def foreign_text(can_id: int) -> str:
+def foreign_master_message(can_id: int) -> str:
     """What another program does when it sends a frame of one of these identifiers."""
     node = can_id & 0x7F
     if can_id == SYNC_ID:

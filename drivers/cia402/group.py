@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.can_bus import EchoFilter, SentFrame, echoes_own_frames
 from drivers.can_load import TESTED_HZ, check_bus_load, heartbeat_cycles, heartbeat_timeout
-from drivers.cia402.cob_ids import commanding_ids, foreign_text
+from drivers.cia402.cob_ids import commanding_ids, foreign_master_message
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.monitor import DriveMonitor
 from drivers.cia402.pdo import CyclicFrames
@@ -94,7 +94,7 @@ class Cia402Group(CyclicGroup):
         own = EchoFilter(
             commanding_ids(self._nodes), echoes_own_frames=echoes_own_frames(self._bus)
         )
-        self._cyclic = CyclicBus(self._bus, own, foreign_text)
+        self._cyclic = CyclicBus(self._bus, own, foreign_master_message)
         self._frames = CyclicFrames(self._nodes)
         is_warning = self._profile.is_warning
         self._watch = DriveMonitor(self._rig.drive_names, self._max_steps, is_warning)

@@ -19,7 +19,7 @@ import can
 
 from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, take, transmit
 from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
-from drivers.cia402.cob_ids import foreign_text, set_up_ids
+from drivers.cia402.cob_ids import foreign_master_message, set_up_ids
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import NMT_ID, SDO_REPLY_BASE, SDO_REQUEST_BASE, NmtCommand, make_nmt
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
@@ -184,7 +184,7 @@ class SetupNetwork:
     def _refuse_foreign(self, can_id: int) -> None:
         if self._own.is_foreign(can_id):
             raise Refused(
-                foreign_text(can_id),
+                foreign_master_message(can_id),
                 where=SETTING_UP,
                 why=ForeignMaster.cause,
                 next_step=ForeignMaster.remedy,

@@ -29,7 +29,7 @@ from drivers.drive_group import (
     Pace,
     Pump,
 )
-from drivers.odrive.configure import commanding_ids, configure_drives, foreign_text
+from drivers.odrive.configure import commanding_ids, configure_drives, foreign_master_message
 from drivers.odrive.dbc import OWN_DBC, read_layouts
 from drivers.odrive.messages import RESULT_TEXTS, AxisState, OdriveFrames, state_text
 from drivers.odrive.monitor import OdriveWatch
@@ -85,7 +85,7 @@ class OdriveGroup(CyclicGroup):
     def _reset_memory(self) -> None:
         ids = commanding_ids(self._layouts, self._nodes)
         own = EchoFilter(ids, echoes_own_frames=echoes_own_frames(self._bus))
-        self._cyclic = CyclicBus(self._bus, own, foreign_text)
+        self._cyclic = CyclicBus(self._bus, own, foreign_master_message)
         self._watch = OdriveWatch(self._rig, self._document, self._layouts, self._max_steps)
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
         self._stop = _Stop.NONE

@@ -10,7 +10,7 @@ import numpy as np
 from drivers.can_bus import EchoFilter, echoes_own_frames
 from drivers.cyclic_group import CyclicBus
 from drivers.drive_group import DriveSnapshot, Pump
-from drivers.odrive.configure import commanding_ids, foreign_text
+from drivers.odrive.configure import commanding_ids, foreign_master_message
 from drivers.odrive.dbc import OWN_DBC, read_layouts
 from drivers.odrive.monitor import OdriveWatch
 from drivers.plausibility import largest_steps, winding_signs
@@ -26,7 +26,7 @@ def look(rig: Rig, document: OdriveDocument, bus: can.BusABC, pump: Pump | None)
     layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
     nodes = [winch.node_id for winch in rig.winches]
     own = EchoFilter(commanding_ids(layouts, nodes), echoes_own_frames=echoes_own_frames(bus))
-    cyclic = CyclicBus(bus, own, foreign_text)
+    cyclic = CyclicBus(bus, own, foreign_master_message)
     watch = OdriveWatch(
         rig, document, layouts, largest_steps(rig, rig.document.bus.cycle_ms / 1000.0)
     )

@@ -42,7 +42,7 @@ KEPT_PICTURES = 12
 def open_cameras(
     rig: Rig,
     scene: Scene,
-    eyes: Mapping[Camera, str],
+    sources: Mapping[Camera, str],
     folder: Path,
     pictures: int,
     board: RequestBoard,
@@ -55,7 +55,7 @@ def open_cameras(
     Args:
         rig: The robot.
         scene: What the cameras see beside it.
-        eyes: From `resolve_cameras`.
+        sources: From `resolve_cameras`.
         folder: The run folder.
         pictures: How many are expected of each; some of them are kept.
         board: A stop that is wished here ends the opening.
@@ -66,33 +66,35 @@ def open_cameras(
         StoppedByOperator: A stop was wished before all were open.
         CdprError: A camera cannot be used, for the reason given.
     """
-    if not eyes:
+    if not sources:
         yield None
         return
     keep_every = max(1, pictures // KEPT_PICTURES)
     ready_for_camera_processes(listener)
     with ExitStack() as stack:
         processes = {}
-        for camera, source in eyes.items():
+        for camera, source in sources.items():
             place = (camera.name, source, folder, keep_every)
-            make = partial(make_observer, rig.document, scene.document, *place, named=len(eyes) > 1)
+            make = partial(
+                make_observer, rig.document, scene.document, *place, named=len(sources) > 1
+            )
             process = CameraProcess(camera.name, make, may_wait=simulated_time)
             stack.callback(process.close)
             processes[camera] = process
-        names = ", ".join(camera.name for camera in eyes)
+        names = ", ".join(camera.name for camera in sources)
         with listener.waiting(f"opening camera {names}"):
             wait_until_ready(list(processes.values()), partial(require_no_stop, board))
         yield RunCameras(
-            [CameraClient(process, eyes[camera]) for camera, process in processes.items()],
+            [CameraClient(process, sources[camera]) for camera, process in processes.items()],
             ClearanceModel(rig, scene),
             scene.obstacle_clearance,
-            asked_rate(eyes),
+            asked_rate(sources),
         )
 
 
-def asked_rate(eyes: Mapping[Camera, str]) -> float:
+def asked_rate(sources: Mapping[Camera, str]) -> float:
     """How often all cameras are asked for an image: as often as the slowest takes one, [Hz]."""
-    return min(camera.rate for camera in eyes)
+    return min(camera.rate for camera in sources)
 
 
 def require_no_stop(board: RequestBoard) -> None:

@@ -246,6 +246,6 @@ def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
         )
 
 
-def looked_with(eyes: Mapping[Camera, str]) -> str:
+def describe_cameras(eyes: Mapping[Camera, str]) -> str:
     """The cameras of a run and their sources, in a few words."""
     return ", ".join(f"{camera.name} ({source})" for camera, source in eyes.items())

@@ -40,7 +40,7 @@ class RestPose:
     pictures: int
 
 
-def rest_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
+def static_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
     """The pose in which the platform stood still in all images.
 
     What is wrong with one image is wrong with all, so the mean is not more certain than each.

@@ -128,8 +128,8 @@ def run_in_real_time(
             nothing was enabled.
         StoppedByOperator: The operator wanted to stop before anything moved.
     """
-    custody = MotionInterlock(prepared.rig)
-    reference = custody.require_ready()
+    interlock = MotionInterlock(prepared.rig)
+    reference = interlock.require_ready()
     motion = PathMotion.of(
         checked_setpoints_of(prepared.checked),
         pose_every=pose_every,
@@ -140,16 +140,16 @@ def run_in_real_time(
         motion, make_drives, board, need_real_time=need_real_time, listener=listener
     ) as process:
         denied = process.arm(recorder).denied
-        custody.begin(recorder.folder.path, reference)
+        interlock.begin(recorder.folder.path, reference)
         try:
             before_motion(denied)
         except BaseException:
-            custody.prevented()
+            interlock.cancel()
             raise
         started = datetime.now(UTC)
         ended = process.run()
         try:
-            custody.end(
+            interlock.end(
                 ended.state,
                 ended.cause,
                 recorder.folder.path,

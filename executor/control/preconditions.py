@@ -180,7 +180,7 @@ def set_up_here(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
     return counted_here(rig, snapshot.positions.tolist(), rig.home), rig.max_tension
 
 
-def careful(rig: Rig, *, limit: float, speed: float) -> Rig:
+def with_reduced_limits(rig: Rig, *, limit: float, speed: float) -> Rig:
     """The rig as gate and watch see it while winches move by a law; drives are not set up by it.
 
     With the platform on a jig or not on its cables at all, no tensions need balance it.

@@ -15,7 +15,7 @@ import numpy as np
 from drivers.drive_group import CycleStatus
 from executor.control.feed import Feed
 from executor.control.loop import Loop
-from executor.control.preconditions import careful
+from executor.control.preconditions import with_reduced_limits
 from executor.control.sync_master import SyncMaster
 from executor.control.winch_laws import WinchLaw
 from executor.operator_requests import OperatorRequests, RequestBoard
@@ -133,7 +133,7 @@ class LawMotion:
         on_event: Callable[[LoopEvent], None],
     ) -> Loop:
         """See `Motion`."""
-        rig = careful(drives.rig, limit=self.limit, speed=self.speed)
+        rig = with_reduced_limits(drives.rig, limit=self.limit, speed=self.speed)
         law = self.make_law(rig, master.read_positions().positions.tolist())
         return WinchLoop(rig, law, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
 

@@ -112,7 +112,7 @@ class _LastCycles:
 def move_winches(
     mover: WinchMover,
     rig: Rig,
-    custody: MotionInterlock,
+    interlock: MotionInterlock,
     records: Records,
     *,
     record: Path,
@@ -124,7 +124,7 @@ def move_winches(
     Args:
         mover: Moves them, here or in a process of its own.
         rig: The robot as its file is.
-        custody: Of that rig.
+        interlock: Of that rig.
         records: Takes in what happens.
         record: What the latch names, should this not finish.
         rehome: The drives are to be homed again afterwards.
@@ -139,12 +139,12 @@ def move_winches(
         StoppedByOperator: The operator wanted to stop before anything moved.
         CdprError: The drives did not hold after the motion, or did not answer; it is latched.
     """
-    custody.require_free()
+    interlock.require_free()
     last = _LastCycles(records)
     armed = mover.arm(last)
     if armed.denied:
         last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
-    custody.begin(record, custody.still_counts(armed.stands_at), rehome=rehome)
+    interlock.begin(record, interlock.still_counts(armed.stands_at), rehome=rehome)
     ended, found = _CUT_SHORT, None
     try:
         ended = mover.run()
@@ -159,9 +159,9 @@ def move_winches(
                 last.tell("not_held", error.what)
                 raise
             if reference is not None:
-                custody.take(reference)
+                interlock.take(reference)
     finally:
-        not_kept = _kept(custody, ended, record, _stands_at(last.cycles, found))
+        not_kept = _kept(interlock, ended, record, _stands_at(last.cycles, found))
     if not_kept:
         last.tell("recorder", not_kept)
         stand = replace(stand, state=State.LATCHED, cause=stand.cause or not_kept)
@@ -194,11 +194,11 @@ def _stands_at(last: Sequence[CycleRecord], found: CycleStatus | None) -> Sequen
 
 
 def _kept(
-    custody: MotionInterlock, ended: Ended, record: Path, stands_at: Sequence[int] | None
+    interlock: MotionInterlock, ended: Ended, record: Path, stands_at: Sequence[int] | None
 ) -> str:
     """Keeps how it ended; an error of keeping is reported as well."""
     try:
-        custody.end(ended.state, ended.cause, record, holding=ended.holding, stands_at=stands_at)
+        interlock.end(ended.state, ended.cause, record, holding=ended.holding, stands_at=stands_at)
     except CdprError as error:
         return f"{error.what} ({error.where}: {error.why})"
     return ""

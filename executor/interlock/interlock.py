@@ -130,7 +130,7 @@ class MotionInterlock:
             names = [name for node, name in self._rig.drive_names.items() if node in forgot]
             self._lose(f"{', '.join(names)}: power-cycled after homing")
 
-    def found_held(self, stands: Sequence[int]) -> None:
+    def confirm_held(self, stands: Sequence[int]) -> None:
         """All drives held since they were last heard: they still count, and stand there [counts].
 
         Raises:
@@ -173,7 +173,7 @@ class MotionInterlock:
         if self._is_kept:
             self.file.write(reference)
 
-    def prevented(self) -> None:
+    def cancel(self) -> None:
         """Nothing moved after all."""
         if self._is_kept:
             self._latch.disengage()

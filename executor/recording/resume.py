@@ -74,7 +74,7 @@ def run_end(folder: RunFolder) -> RunEnd:
     )
 
 
-def continued(scene: Scene, end: RunEnd) -> tuple[Scene, tuple[StopDocument, ...]]:
+def remaining_scene(scene: Scene, end: RunEnd) -> tuple[Scene, tuple[StopDocument, ...]]:
     """A scene from where a run ended, with what was carried and the stops not yet visited.
 
     Returns:
@@ -158,7 +158,7 @@ def scene_after(
     opened = RunFolder.open(folder)
     require_same_rig(opened.plan(), rig, folder / PLAN)
     end = run_end(opened)
-    after, done = continued(scene, end)
+    after, done = remaining_scene(scene, end)
     if end.finished and not after.stops and _is_there(after):
         raise BadInput(
             "the run ended at the scene's goal: nothing remains to be done",

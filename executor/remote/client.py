@@ -87,7 +87,7 @@ def _line(link: socket.socket) -> bytes:
     return got.splitlines()[-1]
 
 
-def the_one(runs: Sequence[Reached], process: int | None, verb: str) -> Reached:
+def select_run(runs: Sequence[Reached], process: int | None, verb: str) -> Reached:
     """The run that is meant.
 
     Raises:
@@ -165,7 +165,7 @@ def request_run(
         BadInput: It is not clear which run is meant.
     """
     with find_runs() as runs:
-        (answer,) = ask_all([the_one(runs, process, verb or command)], command, percent)
+        (answer,) = ask_all([select_run(runs, process, verb or command)], command, percent)
     if answer.status is None:
         raise no_answer(verb or command, [answer])
     return answer.status
@@ -205,7 +205,7 @@ def follow_run(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
         Fault: It is still there and does not answer.
     """
     with find_runs() as runs:
-        run = the_one(runs, process, "monitor")
+        run = select_run(runs, process, "monitor")
         while True:
             (answer,) = ask_all([run], "status")
             if answer.ended:

@@ -1,7 +1,7 @@
 """Which runs are under way, so that `cdpr stop` and its like reach them from any terminal.
 
 A run listens on a socket named after its process in the user's run-time folders; a socket on which
-no process listens was left by one that ended. It is announced in every folder that another
+no process listens was left by one that ended. It is advertised in every folder that another
 terminal may look into, and only in folders that no other user can write to: a folder in /tmp that
 another user made could hold links to this user's files, or sockets of somebody else. Root reaches
 the runs of all users, each in a folder that is that user's alone.
@@ -74,7 +74,7 @@ def _open_folders(paths: Sequence[Path]) -> Iterator[list[_Folder]]:
 
 
 @contextlib.contextmanager
-def announced() -> Iterator[list[socket.socket]]:
+def advertised() -> Iterator[list[socket.socket]]:
     """Listens for the operator for as long as the block runs, in every usable folder.
 
     Yields:

@@ -28,8 +28,8 @@ from calibration.geometry.measurements import (
     RigMeasurements,
     at_rest,
     joined,
-    likely_tensions,
-    tension_doubt,
+    nominal_tensions,
+    tension_sigma,
 )
 from calibration.geometry.model import DEFAULT_DEVIATIONS, CountedLengths, Parameters, RigModel
 from calibration.geometry.quality import judge_rig, judged_places
@@ -249,14 +249,14 @@ def test_tensions_that_were_not_measured_are_the_working_ones_of_their_place(
     positions = turned.measured.positions.copy()
     positions[2] = np.nan
     data = replace(turned.measured, tensions=tensions, positions=positions)
-    likely = likely_tensions(rig, data)
+    likely = nominal_tensions(rig, data)
     place = Pose(positions[1], data.rotations[1])
     assert np.array_equal(likely[1], working_tensions(rig, place).tensions)
     assert np.array_equal(likely[2], working_tensions(rig, rig.home).tensions)
     assert np.isfinite(likely[0, 2])
     assert np.array_equal(np.delete(likely[0], 2), np.delete(tensions[0], 2))
     assert np.array_equal(likely[3:], tensions[3:])
-    assert np.abs(likely - turned.measured.tensions).max() < 3.0 * tension_doubt(rig)
+    assert np.abs(likely - turned.measured.tensions).max() < 3.0 * tension_sigma(rig)
 
 
 def test_what_leaving_a_place_out_changes_is_what_fits_without_it_find(

@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from executor.operator_requests import LocalRequests, OperatorRequests
-from executor.remote.client import ask_all, last_word, no_answer, the_one
+from executor.remote.client import ask_all, last_word, no_answer, select_run
 from executor.remote.protocol import NotACommand, answer_to, make_line, parse_command
-from executor.remote.registry import Reached, announced, find_runs
+from executor.remote.registry import Reached, advertised, find_runs
 from executor.remote.server import LONGEST_QUESTION, MOST_CLIENTS, serving
 from model.errors import BadInput, Fault
 
@@ -106,7 +106,7 @@ def board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[LocalRequ
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
     board = LocalRequests()
-    with announced() as listeners, serving(listeners, board, STATUS):
+    with advertised() as listeners, serving(listeners, board, STATUS):
         yield board
 
 
@@ -225,14 +225,14 @@ def test_which_run_is_meant_must_be_clear():
     ours, theirs = socket.socketpair()
     with ours, theirs:
         one, other = Reached(7, ours), Reached(8, theirs)
-        assert the_one([one], None, "hold") is one
-        assert the_one([one, other], 8, "hold") is other
+        assert select_run([one], None, "hold") is one
+        assert select_run([one, other], 8, "hold") is other
         with pytest.raises(BadInput, match="2 runs"):
-            the_one([one, other], None, "hold")
+            select_run([one, other], None, "hold")
         with pytest.raises(BadInput, match="process 9 is not a run"):
-            the_one([one, other], 9, "hold")
+            select_run([one, other], 9, "hold")
         with pytest.raises(Fault, match="no active run"):
-            the_one([], None, "hold")
+            select_run([], None, "hold")
 
 
 @pytest.mark.parametrize("asked", [0, 1])
@@ -246,7 +246,7 @@ def test_a_run_that_ends_says_once_more_how_it_stands(
     now = {"state": "moving"}
     status: Any = SimpleNamespace(as_dict=lambda: now)
     with ExitStack() as watching:
-        with announced() as listeners, serving(listeners, LocalRequests(), status):
+        with advertised() as listeners, serving(listeners, LocalRequests(), status):
             runs = watching.enter_context(find_runs())
             for _ in range(1 + asked):
                 assert ask_all(runs, "status")[0].status == {"state": "moving"}

@@ -71,43 +71,43 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
     rig = rig_with(encoder)
     if encoder == "incremental":
         MotionInterlock(rig).file.write(reference_of(rig))
-    custody = MotionInterlock(rig)
-    custody.begin(Path("run"), None)
-    custody.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
-    custody.prevented()  # as a reset releases the latch
-    for ask in (custody.reference, custody.require_ready):
+    interlock = MotionInterlock(rig)
+    interlock.begin(Path("run"), None)
+    interlock.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
+    interlock.cancel()  # as a reset releases the latch
+    for ask in (interlock.reference, interlock.require_ready):
         with pytest.raises(Refused, match="homing reference is lost") as caught:
             ask()
         assert "emergency stop" in caught.value.why
     MotionInterlock(rig).file.write(reference_of(rig))
-    assert custody.reference() is not None
+    assert interlock.reference() is not None
 
 
 def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None:
     rig = rig_with("incremental")
-    custody = MotionInterlock(rig)
-    custody.file.write(reference_of(rig))
-    custody.begin(Path("run"), reference_of(rig))
-    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
-    kept = custody.kept_reference()
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference_of(rig))
+    interlock.begin(Path("run"), reference_of(rig))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    kept = interlock.kept_reference()
     assert kept is not None
     assert kept.stands_at == list(range(8))
-    custody.begin(Path("run"), kept)
-    custody.end(State.LATCHED, "killed", Path("run"), holding=True, stands_at=None)
-    assert custody.kept_reference() == kept, "nobody heard anything of the drives"
+    interlock.begin(Path("run"), kept)
+    interlock.end(State.LATCHED, "killed", Path("run"), holding=True, stands_at=None)
+    assert interlock.kept_reference() == kept, "nobody heard anything of the drives"
 
 
 def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
     """`jog --cable` needs no reference; it must not write the evidence over either."""
     rig = rig_with("incremental")
-    custody, left = MotionInterlock(rig), reference_of(rig)
-    custody.file.write(left)
+    interlock, left = MotionInterlock(rig), reference_of(rig)
+    interlock.file.write(left)
     moved = [*left.stands_at[:-1], left.stands_at[-1] + 10**6]
-    assert custody.still_counts(left.stands_at) == left
-    assert custody.still_counts(moved) is None
-    custody.begin(Path("run"), custody.still_counts(moved))
-    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=moved)
-    assert custody.kept_reference() == left
+    assert interlock.still_counts(left.stands_at) == left
+    assert interlock.still_counts(moved) is None
+    interlock.begin(Path("run"), interlock.still_counts(moved))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=moved)
+    assert interlock.kept_reference() == left
     absolute = MotionInterlock(rig_with("absolute"))
     assert absolute.still_counts(moved) == left, "it cannot lose count"
 
@@ -115,22 +115,22 @@ def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
 def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     """Setting them up wipes out its evidence, so the next opening sees nothing any more."""
     rig = rig_with("incremental")
-    custody = MotionInterlock(rig)
-    custody.file.write(reference_of(rig))
-    custody.found_restarted(())
-    assert custody.reference() is not None
-    custody.found_restarted((4,))
-    for ask in (custody.reference, custody.reference, custody.require_ready):
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference_of(rig))
+    interlock.found_restarted(())
+    assert interlock.reference() is not None
+    interlock.found_restarted((4,))
+    for ask in (interlock.reference, interlock.reference, interlock.require_ready):
         with pytest.raises(Refused, match="homing reference is lost") as caught:
             ask()
         assert "cable 4 (drive 4): power-cycled" in caught.value.why
-    found = custody.kept_reference()
+    found = interlock.kept_reference()
     assert found is not None
-    assert custody.still_counts(found.stands_at) is None
-    custody.begin(Path("run"), None)
-    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
-    custody.found_held(range(8))
-    assert custody.kept_reference() == found, "no motion and no reset brings it back"
+    assert interlock.still_counts(found.stands_at) is None
+    interlock.begin(Path("run"), None)
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    interlock.confirm_held(range(8))
+    assert interlock.kept_reference() == found, "no motion and no reset brings it back"
     absolute = MotionInterlock(rig_with("absolute"))
     absolute.file.write(reference_of(rig))
     absolute.found_restarted((4,))
@@ -140,13 +140,13 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
 @pytest.mark.parametrize("ended", [State.STOPPED, State.LATCHED])
 def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) -> None:
     rig = rig_with("incremental")
-    custody = MotionInterlock(rig)
-    custody.file.write(reference_of(rig))
-    custody.begin(Path("run"), reference_of(rig), rehome=True)
-    custody.end(ended, "stopped", Path("run"), holding=True, stands_at=range(8))
-    custody.prevented()
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference_of(rig))
+    interlock.begin(Path("run"), reference_of(rig), rehome=True)
+    interlock.end(ended, "stopped", Path("run"), holding=True, stands_at=range(8))
+    interlock.cancel()
     with pytest.raises(Refused, match="homing reference is lost") as caught:
-        custody.reference()
+        interlock.reference()
     assert "did not finish" in caught.value.why
 
 
@@ -154,26 +154,26 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = rig_with("incremental")
-    custody = MotionInterlock(rig)
-    custody.file.write(reference_of(rig))
-    custody.begin(Path("run"), reference_of(rig))
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference_of(rig))
+    interlock.begin(Path("run"), reference_of(rig))
 
     def full(_reference: object) -> None:
         raise Refused("the homing reference cannot be written")
 
-    monkeypatch.setattr(custody.file, "write", full)
+    monkeypatch.setattr(interlock.file, "write", full)
     with pytest.raises(Refused, match="cannot be written"):
-        custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+        interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
     with pytest.raises(Refused, match=r"latched.*cannot be written"):
-        custody.require_free()
+        interlock.require_free()
 
 
 def test_drives_that_held_after_a_killed_program_still_count() -> None:
     rig = rig_with("incremental")
-    custody = MotionInterlock(rig)
-    custody.file.write(reference_of(rig))
-    custody.found_held(range(8))
-    kept = custody.kept_reference()
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference_of(rig))
+    interlock.confirm_held(range(8))
+    kept = interlock.kept_reference()
     assert kept is not None
     assert (kept.stands_at, kept.lost) == (list(range(8)), "")
 
@@ -181,18 +181,18 @@ def test_drives_that_held_after_a_killed_program_still_count() -> None:
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema_version": 2}', "\x00"])
 def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     rig = rig_with("absolute")
-    custody = MotionInterlock(rig)
-    custody.file.write(reference_of(rig))
-    custody.file.path.write_text(content)
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference_of(rig))
+    interlock.file.path.write_text(content)
     with pytest.raises(Refused, match="cannot be read"):
-        custody.reference()
+        interlock.reference()
     # Homing replaces it; what was moved meanwhile must not stumble over it.
-    custody.found_restarted((1,))
-    custody.begin(Path("run"), custody.still_counts(range(8)), rehome=True)
-    custody.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
-    assert custody.file.path.read_text() == content
-    custody.file.write(reference_of(rig))
-    assert custody.reference() is not None
+    interlock.found_restarted((1,))
+    interlock.begin(Path("run"), interlock.still_counts(range(8)), rehome=True)
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    assert interlock.file.path.read_text() == content
+    interlock.file.write(reference_of(rig))
+    assert interlock.reference() is not None
 
 
 def positions_at(rig: Rig, off_mm: float = 0.0) -> list[int]:

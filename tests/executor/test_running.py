@@ -1,4 +1,4 @@
-"""Reaching runs from elsewhere: every announced run is reached, and nothing else is touched."""
+"""Reaching runs from elsewhere: every advertised run is reached, and nothing else is touched."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ import pytest
 
 from cdpr.cli.supervision import STOP_SIGNALS, stop_requests
 from executor.operator_requests import LocalRequests
-from executor.remote.registry import announced, find_runs
+from executor.remote.registry import advertised, find_runs
 from model.errors import Refused
 
-#: A run as the command line makes one: tells that it is announced, ends when it was asked to.
+#: A run as the command line makes one: tells that it is advertised, ends when it was asked to.
 RUN = """
 import signal
 from cdpr.cli.supervision import stop_requests
-from executor.remote.registry import announced
+from executor.remote.registry import advertised
 from executor.operator_requests import LocalRequests
 board = LocalRequests()
-with stop_requests(board), announced() as listeners:
-    print("announced", flush=True)
+with stop_requests(board), advertised() as listeners:
+    print("advertised", flush=True)
     while not board.read().stop:
         signal.sigtimedwait([], 0.01)
 print("stopped", flush=True)
@@ -50,14 +50,14 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
 
 @contextmanager
 def _run() -> Iterator[subprocess.Popen[str]]:
-    """A run in its own process, announced."""
+    """A run in its own process, advertised."""
     command = [sys.executable, "-c", RUN]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     deadline = threading.Timer(ENDS_WITHIN_S, process.kill)
     deadline.start()
     assert process.stdout is not None
     try:
-        assert process.stdout.readline() == "announced\n"
+        assert process.stdout.readline() == "advertised\n"
         yield process
     finally:
         deadline.cancel()
@@ -108,7 +108,7 @@ def test_a_run_that_was_killed_is_not_reached_and_its_name_is_cleared_away(folde
 
 
 def test_a_run_that_ended_leaves_nothing(folders):
-    with announced():
+    with advertised():
         assert _reached() == [os.getpid()]
     assert not any(list(folder.iterdir()) for folder in folders)
     assert _reached() == []
@@ -133,7 +133,7 @@ def test_root_reaches_the_runs_of_other_users(monkeypatch):
 
 @pytest.mark.root
 def test_a_user_is_not_reached_through_a_folder_of_another(folders):
-    with announced():
+    with advertised():
         for folder in folders:
             os.chown(folder, NOBODY, NOBODY)
         assert _reached() == []
@@ -148,7 +148,7 @@ def test_names_of_other_things_are_left_alone(folders):
 
 
 def test_folder_and_socket_are_closed_to_others(folders):
-    with announced():
+    with advertised():
         for folder in folders:
             (file,) = folder.iterdir()
             assert folder.stat().st_mode & 0o777 == 0o700
@@ -162,7 +162,7 @@ def test_a_link_in_place_of_the_socket_is_not_followed(folders, tmp_path):
     folders[0].mkdir(mode=0o700)
     for ending in ("sock", "sock.new"):
         (folders[0] / f"{os.getpid()}.{ending}").symlink_to(precious)
-    with announced():
+    with advertised():
         assert _reached() == [os.getpid()]
     assert precious.read_text() == "mine"
 
@@ -200,7 +200,7 @@ def test_a_folder_that_others_control_is_not_used_while_there_is_another(
 ):
     safe, doubtful = folders
     _spoil(doubtful, how, tmp_path, monkeypatch)
-    with announced():
+    with advertised():
         assert [path.name for path in safe.iterdir()] == [f"{os.getpid()}.sock"]
         assert list(doubtful.iterdir()) == []
 
@@ -209,7 +209,7 @@ def test_a_folder_that_others_control_is_not_used_while_there_is_another(
 def test_a_run_that_no_stop_could_reach_is_refused(folders, tmp_path, monkeypatch, how):
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     _spoil(folders[1], how, tmp_path, monkeypatch)
-    with pytest.raises(Refused, match="would not reach this run") as caught, announced():
+    with pytest.raises(Refused, match="would not reach this run") as caught, advertised():
         pass
     assert str(folders[1]) in caught.value.where
 
@@ -227,7 +227,7 @@ def test_nobody_is_spoken_to_in_a_folder_that_others_control(folders, tmp_path, 
 
 
 def test_a_listener_of_another_user_is_not_spoken_to(folders, monkeypatch):
-    with announced():
+    with advertised():
         real = os.getuid()
         other = os.stat(folders[0]).st_uid
         assert other == real

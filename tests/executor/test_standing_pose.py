@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.current_pose import standing_pose
+from executor.current_pose import current_pose
 from model.errors import CdprError
 from model.files.scene_file import LoadDocument
 from model.kinematics import cables_at
@@ -41,14 +41,14 @@ def test_a_pose_is_found_again_from_its_drive_positions(rig, share, turn):
         counts = planned_counts(rig, pose)
     except CdprError:  # the cables cannot hold this one
         return
-    found = standing_pose(rig, counts, LOAD)
+    found = current_pose(rig, counts, LOAD)
     assert found.distance_to(pose) < 2e-5
     assert found.angle_to(pose) < 2e-4
 
 
 def test_home_is_where_all_drives_are_at_home():
     home = np.array([winch.home_counts for winch in PAPER.winches], dtype=np.float64)
-    assert standing_pose(PAPER, home, LOAD).distance_to(PAPER.home) < 1e-6
+    assert current_pose(PAPER, home, LOAD).distance_to(PAPER.home) < 1e-6
 
 
 @pytest.mark.parametrize("cable", range(8))
@@ -56,10 +56,10 @@ def test_positions_of_a_drive_that_lost_its_reference_fit_no_pose(cable):
     counts = planned_counts(PAPER, PAPER.home)
     counts[cable] += 0.1 * PAPER.winches[cable].counts_per_metre
     with pytest.raises(CdprError, match=r"fit no pose|no pose fits|cannot"):
-        standing_pose(PAPER, counts, LOAD)
+        current_pose(PAPER, counts, LOAD)
 
 
 def test_a_pose_outside_the_workspace_is_refused():
     outside = Pose.level(PAPER.workspace_upper + np.array([0.005, 0.0, -0.1]))
     with pytest.raises(CdprError, match="fit no pose in the workspace"):
-        standing_pose(PAPER, planned_counts(PAPER, outside), LOAD)
+        current_pose(PAPER, planned_counts(PAPER, outside), LOAD)

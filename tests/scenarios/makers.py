@@ -138,7 +138,7 @@ def a_day(day: Day, prepared: PreparedRun, plan: Path, back: Path) -> Iterator[s
     """Doctor, home, run, hold, resume, stop, fault, reset, home, release; step by step."""
     rehearsal = day.rehearsal
     loss = PowerLoss.drawn(prepared.rig, 4, 0.0005, on_a_stand=True)
-    loss.happen_to(prepared.rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+    loss.apply_to(prepared.rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
     day.doctor()
     yield "doctor"
     start = [f"{x:.6f}" for x in prepared.scene.start.position * 1000.0]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from executor.recording.resume import continued, run_end
+from executor.recording.resume import remaining_scene, run_end
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
 from executor.trajectory.prepare import PreparedRun, prepare
@@ -168,7 +168,7 @@ def test_a_dwell_cut_short_is_done_again_with_the_load_before_it(
     end = run_end(cut.folder)
     assert end.waiting_at == "take"
     assert end.payload.mass_kg == 0.0
-    rest, done = continued(scene, end)
+    rest, done = remaining_scene(scene, end)
     assert done == ()
     assert [stop.name for stop in rest.stops] == ["take", "by", "leave"]
     again = planned(rest, done=done)
@@ -179,7 +179,7 @@ def test_another_task_begins_where_the_run_ended_with_all_its_stops(
     stopped: Ended, scene: Scene
 ) -> None:
     renamed = [s.model_copy(update={"name": s.name + " 2"}) for s in scene.document.stops[1:]]
-    other, done = continued(
+    other, done = remaining_scene(
         scene.changed(stops=[], payload=CARRIED).changed(stops=renamed), run_end(stopped.folder)
     )
     assert done == ()

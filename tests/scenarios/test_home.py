@@ -17,12 +17,12 @@ from drivers.can_errors import BusDown
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup
 from drivers.factory import make_drive_group, read_drives
-from executor.cameras.static_pose import rest_pose
-from executor.control.preconditions import careful, counted_here, require_below
+from executor.cameras.static_pose import static_pose
+from executor.control.preconditions import counted_here, require_below, with_reduced_limits
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
 from executor.control.winch_loop import LawMotion, WinchesHere
 from executor.control.winch_motion import WinchesStand, move_winches, require_held
-from executor.current_pose import standing_pose
+from executor.current_pose import current_pose
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
 from executor.jogging import straight_way
@@ -81,7 +81,7 @@ class Place:
     counts: list[int]
     script: Callable[[Place, int], None] = lambda _place, _cycle: None
     at_rest: Callable[[WinchesStand], HomingReference | None] = lambda _stand: None
-    custody: MotionInterlock | None = None
+    interlock: MotionInterlock | None = None
     rehome: bool = True
     board: LocalRequests = field(default_factory=LocalRequests)
     records: list[CycleRecord] = field(default_factory=list)
@@ -103,7 +103,7 @@ class Place:
         return move_winches(
             mover(self.as_set_up, law, self.group, self.board),
             self.rig,
-            self.custody or MotionInterlock(self.rig),
+            self.interlock or MotionInterlock(self.rig),
             Told(on_cycle, self.events.append),
             record=Path("nowhere"),
             rehome=self.rehome,
@@ -130,12 +130,12 @@ def after_power_loss(
     with open_bus(settings) as near, open_bus(settings) as far:
         rehearsal = SimulatedCia402Rig(rig, far, rig.home)
         if loss is not None:
-            loss.happen_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+            loss.apply_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure()
         counts = group.read_positions().positions.tolist()
         counted = counted_here(rig, counts, rig.home)
-        as_set_up = careful(counted, limit=limit, speed=speed)
+        as_set_up = with_reduced_limits(counted, limit=limit, speed=speed)
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=limit)
         group.configure()
         yield Place(rig, rehearsal, group, as_set_up, counts)
@@ -149,7 +149,7 @@ def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
     rig = load_rig(RIG)
     bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
     kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
-    custody = MotionInterlock(kept)
+    interlock = MotionInterlock(kept)
 
     def at_rest(stand: WinchesStand) -> HomingReference:
         with pytest.raises(Refused, match="in progress"):
@@ -157,7 +157,7 @@ def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
         return reference_at(kept, kept.home, stand.counts, stand.tensions, "stated pose", 0.0)
 
     with after_power_loss(lost(1, on_a_stand=True)) as place:
-        place.custody, place.at_rest = custody, at_rest
+        place.interlock, place.at_rest = interlock, at_rest
         assert place.take_up().state is State.FINISHED
     MotionInterlock(kept).require_free()
     reference = MotionInterlock(kept).reference()
@@ -214,7 +214,7 @@ def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
         folder = RunFolder.create(tmp_path / "run")
         outcome = Stage(prepared, place.rehearsal, group, folder, lambda _stage: None).run()
         assert outcome.state is State.FINISHED, outcome.cause
-        seen = rest_pose(rig, looks(rig, place.rehearsal.pose))
+        seen = static_pose(rig, looks(rig, place.rehearsal.pose))
         assert seen.pose.distance_to(way.goal) < 0.5e-3
         assert place.rehearsal.pose.distance_to(way.goal) < 0.05e-3
         group.close()
@@ -236,13 +236,13 @@ def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
         stand = place.take_up()
         true = place.rehearsal.pose
         assert true.angle_to(place.rig.home) > 0.005, "it came to hang elsewhere"
-        seen = rest_pose(place.rig, looks(place.rig, true))
+        seen = static_pose(place.rig, looks(place.rig, true))
         assert seen.pose.distance_to(true) < 4.0 * seen.uncertainty
         reference = reference_at(
             place.rig, seen.pose, stand.counts, stand.tensions, "tags", seen.uncertainty
         )
         rig, load = referenced(place.rig, reference), nothing_in_the_way(place.rig).load
-        found = standing_pose(rig, stand.counts, load)
+        found = current_pose(rig, stand.counts, load)
         assert found.distance_to(true) < 4.0 * seen.uncertainty
         home = straight_way(rig, nothing_in_the_way(rig), found, rig.home)
         prepared = prepare(verify(plan_from_document(home), rig), rig)
@@ -495,25 +495,25 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
     rig = load_rig(RIG)
     bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can7"})
     kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
-    custody = MotionInterlock(kept)
+    interlock = MotionInterlock(kept)
     with after_power_loss(lost(1, on_a_stand=True)) as place:
         tensions = np.full(rig.cable_count, TARGET)
         begin = np.array(place.counts)
-        custody.take(reference_at(kept, kept.home, begin, tensions, "stated pose", 0.0))
+        interlock.take(reference_at(kept, kept.home, begin, tensions, "stated pose", 0.0))
 
         def at_rest(stand: WinchesStand) -> HomingReference:
             happens(place)
             return reference_at(kept, kept.home, stand.counts, tensions, "new", 0.0)
 
-        place.custody, place.at_rest, place.rehome = custody, at_rest, rehome
+        place.interlock, place.at_rest, place.rehome = interlock, at_rest, rehome
         with pytest.raises(CdprError, match=told):
             place.take_up()
         assert place.events[-1].code == "not_held"
         assert told in place.events[-1].text
         moved = [drive.motor.position for drive in place.rehearsal.drives]
     with pytest.raises(Refused, match=told):
-        custody.require_free()
-    reference = custody.kept_reference()
+        interlock.require_free()
+    reference = interlock.kept_reference()
     assert reference is not None
     assert reference.how == "stated pose"
     assert bool(reference.lost) is (rehome or not counts)
@@ -534,18 +534,18 @@ def test_a_record_that_is_full_by_then_leaves_the_cause_and_the_latch() -> None:
 
     rig = load_rig(RIG)
     bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can8"})
-    custody = MotionInterlock(rig_from_document(rig.document.model_copy(update={"bus": bus})))
+    interlock = MotionInterlock(rig_from_document(rig.document.model_copy(update={"bus": bus})))
     with after_power_loss(lost(1, on_a_stand=True)) as place:
 
         def at_rest(_stand: WinchesStand) -> None:
             loses_all_torque(place)
 
-        place.custody, place.at_rest, place.events = custody, at_rest, Full()
+        place.interlock, place.at_rest, place.events = interlock, at_rest, Full()
         with pytest.raises(CdprError, match="not all drives still hold"):
             place.take_up()
         assert place.events[-1].code == "not_held"
     with pytest.raises(Refused, match="not all drives still hold"):
-        custody.require_free()
+        interlock.require_free()
 
 
 def test_a_stop_before_anything_is_enabled_leaves_all_as_it_was() -> None:
@@ -562,10 +562,10 @@ def test_a_pose_that_is_not_known_well_is_refused() -> None:
     home = rig.home
     away = Pose.level(home.position + np.array([0.004, 0.0, 0.0]))
     with pytest.raises(Refused, match="is not at rest"):
-        rest_pose(rig, looks(rig, home, away, home, away))
+        static_pose(rig, looks(rig, home, away, home, away))
     far = Pose.level(home.position + np.array([5.0, 5.0, 0.0]))
     with pytest.raises(Refused, match="0 of 2 images"):
-        rest_pose(rig, looks(rig, far, far))
+        static_pose(rig, looks(rig, far, far))
 
 
 def test_the_hall_robot_is_taken_up_too() -> None:
@@ -574,12 +574,12 @@ def test_the_hall_robot_is_taken_up_too() -> None:
     settings = BusSettings("virtual", f"home-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
         rehearsal = SimulatedCia402Rig(rig, far, rig.home)
-        loss.happen_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+        loss.apply_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure()
         counts: Sequence[int] = group.read_positions().positions.tolist()
         counted = counted_here(rig, counts, rig.home)
-        limited = careful(counted, limit=400.0, speed=0.005)
+        limited = with_reduced_limits(counted, limit=400.0, speed=0.005)
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=400.0)
         group.configure()
         law = PretensionLaw(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)

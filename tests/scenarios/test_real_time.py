@@ -238,7 +238,7 @@ def test_winches_without_a_path_are_moved_by_the_real_time_process_too(
     monkeypatch.chdir(tmp_path)
     with drives_on(channel, slow_run) as rehearsal:
         loss = PowerLoss.drawn(slow_run.rig, 4, 0.010, on_a_stand=True)
-        loss.happen_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+        loss.apply_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         with program("home", slow_rig, "--at-home", "--speed-mm-s", "0.05", *bus) as homing:
             events = tmp_path / "runs/home/events.jsonl"
             waited_for(events, "moving", homing)

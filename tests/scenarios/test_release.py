@@ -57,8 +57,8 @@ def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
     file = rig if braked else slow_rig
     with drives_on(channel, slow_run) as rehearsal:
         stood = [round(drive.motor.position) for drive in rehearsal.drives]
-        custody = MotionInterlock(_on(channel, file))
-        custody.file.write(
+        interlock = MotionInterlock(_on(channel, file))
+        interlock.file.write(
             as_in_the_file(_on(channel, file)).model_copy(update={"stands_at": stood})
         )
         words: list[int] = []
@@ -89,7 +89,7 @@ def test_drives_that_count_from_anywhere_stay_where_they_are(
     rig.write_text(slow_rig.read_text().replace("encoder: absolute, ", ""))
     with drives_on(channel, slow_run) as rehearsal:
         loss = PowerLoss.drawn(slow_run.rig, 3, 0.0, on_a_stand=True)
-        loss.happen_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+        loss.apply_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         hold(rehearsal.drives)
         stood = [round(drive.motor.position) for drive in rehearsal.drives]
         reset = call("reset", rig, *bus, "--yes", "--json")

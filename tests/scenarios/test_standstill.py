@@ -62,7 +62,7 @@ def held(*, set_up_where_they_are: bool = True) -> Iterator[Held]:
     with open_bus(settings) as near, open_bus(settings) as far:
         rehearsal = SimulatedCia402Rig(rig, far, rig.home)
         loss = PowerLoss.drawn(rig, 3, 0.0, on_a_stand=True)
-        loss.happen_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+        loss.apply_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
         for drive in rehearsal.drives:
             drive.objects[0x605A, 0] = 6  # else it lets go at the end of its ramp
             drive.state = HOLDING

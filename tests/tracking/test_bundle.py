@@ -117,7 +117,7 @@ def test_a_single_tag_knows_its_rival(rig: Rig) -> None:
     lean = Pose(np.array([0.0, 0.0, 2.2]), matrix_from_rotation_vector([0.5, 0.0, 0.0]))
     found = solve_pnp(camera, [view_of(camera, tag, lean.compose(upright), rng)])
     assert found is not None
-    assert found.cost < found.rival_cost < np.inf
+    assert found.cost < found.second_best_cost < np.inf
 
 
 def test_jacobian_matches_finite_differences(rig: Rig) -> None:

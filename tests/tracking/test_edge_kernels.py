@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.stats import norm, uniform
 
 from model.pose import Array
-from tracking.edges.coarse import find_edges
+from tracking.edges.coarse import locate_edges
 from tracking.edges.fit import (
     KIND,
     KIND_DEVIATION,
@@ -39,8 +39,8 @@ from tracking.edges.sampling import (
     VALUE,
     beside,
     plane_of,
-    read_band,
     rise,
+    sample_edge,
 )
 
 SQUARE = np.array([[50.3, 41.2], [98.7, 55.1], [86.2, 104.9], [36.4, 90.0]])
@@ -110,12 +110,12 @@ def brute_band(image: Array, edge: int, span: tuple[float, float], reach: float)
 def test_the_pixels_beside_an_edge_are_all_that_lie_there(edge: int) -> None:
     image = np.random.default_rng(edge).integers(0, 256, (130, 140), dtype=np.uint8)
     pixels = np.zeros((6, 2000))
-    count = read_band(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, pixels)
+    count = sample_edge(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, pixels)
     wanted = brute_band(image, edge, (4.0, 41.5), 3.3)
     assert count == wanted.shape[1] > 200
     np.testing.assert_allclose(pixels[[PLACE, ACROSS, VALUE], :count], wanted, atol=1e-9)
     few = np.zeros((6, 120))
-    some = read_band(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, few)
+    some = sample_edge(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, few)
     assert 60 < some <= 120
     assert np.ptp(few[PLACE, :some]) > 1.7  # spread along the whole edge
 
@@ -136,7 +136,7 @@ def black_square(spread: float, noise: float, seed: int) -> np.ndarray:
 def fitted(image: np.ndarray, quad: Array) -> tuple[Array, Array]:
     """What the kernels say of the four edges, roughly and at last, shape (4, `COLUMNS`) each."""
     widths, before = np.full((1, 4), 6.2), np.zeros((1, 4, COLUMNS))
-    find_edges(image, quad[None], NO_BOW, widths, before)
+    locate_edges(image, quad[None], NO_BOW, widths, before)
     found = np.zeros_like(before)
     fit_edges(image, quad[None], NO_BOW, widths, 8, before, found)
     return before[0], found[0]
@@ -190,7 +190,7 @@ def test_an_edge_that_is_bent_by_the_lens_is_found_along_its_bow() -> None:
     _, straight = fitted(image, SQUARE)
     rough, found = np.zeros((1, 4, COLUMNS)), np.zeros((1, 4, COLUMNS))
     bows, widths = np.full((1, 4, 2), [0.8, 0.0]), np.full((1, 4), 6.2)
-    find_edges(image, SQUARE[None], bows, widths, rough)
+    locate_edges(image, SQUARE[None], bows, widths, rough)
     fit_edges(image, SQUARE[None], bows, widths, 8, rough, found)
     # A bow of 0.8 f (1 - f) is 0.13 px outside of its chord on average.
     gone = straight[:, OFFSET] - found[0, :, OFFSET]

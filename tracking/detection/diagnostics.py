@@ -15,7 +15,7 @@ from tracking.detection.detector import TagDetector
 TOLD = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000", "7X7_1000")
 
 
-def what_else_is_seen(image: Image, family: str, expected: Sequence[int]) -> str:
+def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
     """Says which tags an image shows that are not the expected ones, for an error message.
 
     Also whether the expected ones are there once it is flipped over.

@@ -34,7 +34,7 @@ LEAST_RISE = 1.25
 
 
 @compiled
-def find_edges(image: Image, quads: Array, bows: Array, widths: Array, found: Array) -> None:
+def locate_edges(image: Image, quads: Array, bows: Array, widths: Array, found: Array) -> None:
     """Finds the edges of tags.
 
     Args:

@@ -39,7 +39,7 @@ from tracking.edges.sampling import (
     VALUE,
     edge_frame,
     plane_of,
-    read_band,
+    sample_edge,
     tell_ink,
     tell_modules,
 )
@@ -166,7 +166,7 @@ BEYOND_DEVIATION = 0.25
 
 
 @compiled
-def believe(
+def add_prior(
     parameters: Array, usual_spread: float, variance: float, normal: Array, gradient: Array
 ) -> float:
     """Adds what is known before a pixel is seen; returns its share of the cost."""
@@ -285,7 +285,7 @@ def _fit(
     room = min(int((span[1] - span[0] + 2.0) * (2.0 * reach + 2.0)), MOST_PIXELS)
     crowded = width - reach < CROWDED * spread
     pixels = np.zeros((MODULES + (modules - 2 if crowded else 0), room))
-    count = read_band(image, quad, edge, shape, span, reach, pixels)
+    count = sample_edge(image, quad, edge, shape, span, reach, pixels)
     tell_ink(quad, edge, pixels, count, found, spread_along)
     if crowded:
         plane = np.empty(8)
@@ -352,7 +352,7 @@ def _improve(pixels: Array, count: int, best: Array, most_spread: float, found: 
         if total < 14.0:
             return
         variance = max(cost / max(total - size, total / 3.0), ROUNDING)
-        cost += believe(trial, usual_spread, variance, normal, gradient)
+        cost += add_prior(trial, usual_spread, variance, normal, gradient)
         if cost <= best_cost * (1.0 + 1e-9):
             best[:], best_normal[:, :], best_gradient[:] = trial, normal, gradient
             best_cost, best_variance, damping = cost, variance, max(0.1 * damping, 1e-7)

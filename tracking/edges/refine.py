@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model.pose import Array, read_only
 from model.rig import Camera
 from tracking.camera_model import Image, ideal_from_pixels, pixels_from_ideal
-from tracking.edges.coarse import find_edges
+from tracking.edges.coarse import locate_edges
 from tracking.edges.fit import fit_edges
 from tracking.edges.sampling import (
     COLUMNS,
@@ -239,7 +239,7 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     curves = EdgeCurves.between(camera, np.where(inside, rough, _somewhere(image.shape)))
     found = np.zeros((len(rough), 4, COLUMNS))
     widths = curves.module_widths(modules)
-    find_edges(pixels, curves.pixels, curves.bows, widths, found)
+    locate_edges(pixels, curves.pixels, curves.bows, widths, found)
     final = meet(curves.lines(found, _doubt(found, widths)), curves.ideal)
     again = inside.copy()
     for _ in range(MOST_FITS):
@@ -266,7 +266,7 @@ def load_kernels() -> None:
     grey.flags.writeable = False
     square, bows = _somewhere(grey.shape)[None], np.zeros((1, 4, 2))
     widths, found = np.ones((1, 4)), np.zeros((1, 4, COLUMNS))
-    find_edges(grey, square, bows, widths, found)
+    locate_edges(grey, square, bows, widths, found)
     fit_edges(grey, square, bows, widths, 8, found, np.zeros_like(found))
 
 

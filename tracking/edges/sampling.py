@@ -140,7 +140,7 @@ PLACE, ACROSS, VALUE, INK, WITHIN, BEYOND, MODULES = range(7)
 
 
 @compiled
-def read_band(
+def sample_edge(
     image: Image,
     quad: Array,
     edge: int,
