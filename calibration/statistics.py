@@ -39,7 +39,7 @@ class Interval:
         """Value and half width, to two digits of the half width."""
         if not 0.0 < self.half_width < math.inf:
             return f"{self.value:.6g} {self.doubt}"
-        return f"{self.value:.{self._decimals}f} {self.doubt}"
+        return f"{self.value:z.{self._decimals}f} {self.doubt}"
 
     @property
     def doubt(self) -> str:

@@ -137,6 +137,7 @@ def run(
         StoppedByOperator: It was cancelled before anything moved.
         KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
     """
+    require_same_rig(plan, rig, plan_file)
     chosen = resolve_cameras(rig, cameras, is_simulated(rig))
     require_simulated_pictures(chosen.values(), not realtime)
     require_own_time(rig, realtime)
@@ -153,7 +154,6 @@ def run(
     interlock = MotionInterlock(rig)
     interlock.require_free()
     referenced = interlock.referenced_rig()
-    require_same_rig(plan, referenced, plan_file)
     options = RunOptions(
         realtime=realtime,
         start=start,

@@ -209,4 +209,4 @@ def moved_rows(before: Pose, after: Pose) -> list[tuple[str, str]]:
 
 
 def _listed(values: Array) -> str:
-    return ", ".join(f"{value:+.2f}" for value in values)
+    return ", ".join(f"{value:+z.2f}" for value in values)

@@ -223,7 +223,7 @@ def _pictures(result: CameraCalibration) -> str:
     """Error of each picture, and how much of the focal length hangs on it."""
     change = result.uncertainty.without[:, 0]
     rows = [
-        (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+.2f} px")
+        (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+z.2f} px")
         for (name, error), seen, without in zip(
             result.view_errors.items(), result.views.values(), change, strict=True
         )

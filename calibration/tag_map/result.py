@@ -216,7 +216,7 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
                 f"tag {tag.id}",
                 f"{np.linalg.norm(shift):.3f}",
                 f"{np.degrees(tag.pose.angle_to(drawn.pose)):.3f}",
-                ", ".join(f"{value:+.3f}" for value in shift),
+                ", ".join(f"{value:+z.3f}" for value in shift),
                 f"{result.seen[tag.id]} images",
             )
         )

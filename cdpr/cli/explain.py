@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import Annotated
 
 import typer
@@ -31,9 +32,12 @@ def explain(
             out.print(f"  {known:<22} {title}", markup=False, soft_wrap=True)
         return
     if code not in codes:
+        near = difflib.get_close_matches(code, codes, n=1)
         raise BadInput(
             f"there is no fault code {code!r}",
             where="cdpr explain",
-            next_step=f"use one of: {', '.join(codes)}",
+            next_step=f"run `cdpr explain {near[0]}`"
+            if near
+            else f"use one of: {', '.join(codes)}",
         )
     out.print(page_text(code).rstrip(), markup=False, soft_wrap=True)

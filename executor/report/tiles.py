@@ -182,7 +182,10 @@ def _alone(poses: PoseTable | None) -> str:
 def event_table(run: RunData) -> str:
     """What happened, in order."""
     rows = [(f"{e.time_s:.2f} s", e.code, e.text, page_of(e.code)) for e in run.events]
-    return list_table(("Time", "Event", "Text", "More about it"), rows)
+    head = ("Time", "Event", "Text", "More about it")
+    # A narrow window has no room for a column that is empty.
+    shown = 4 if any(row[-1] for row in rows) else 3
+    return list_table(head[:shown], [row[:shown] for row in rows])
 
 
 def fault_texts(run: RunData) -> str:

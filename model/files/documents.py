@@ -245,6 +245,7 @@ def load_yaml(path: Path, model: type[Model]) -> Model:
     tree = read_yaml(path)
     problems = [Problem(key_path(f.key), f.what, f.line, f.column) for f in tree.faults]
     if isinstance(tree.data, dict):
+        _require_kind(tree.data, model, path)
         check_version(tree.data, model, path, tree.places)
         document, found = _validated(tree.data, model, tree.places)
         problems += found
@@ -255,6 +256,29 @@ def load_yaml(path: Path, model: type[Model]) -> Model:
         what = "the file is empty" if empty else "the file must hold keys and values"
         problems.append(Problem("", what, 1, 1))
     raise InvalidFile(str(path), sorted(problems, key=lambda p: (p.line, p.column)))
+
+
+_MARKS = {
+    "plan file": ("rig_hash", "waypoints"),
+    "rig file": ("outlets_mm", "winches"),
+    "scene file": ("start", "goal"),
+    "calibration result": ("kind", "data_sha256"),
+}
+"""Keys that only one kind of file has together."""
+
+
+def _require_kind(data: Mapping[str, Any], model: type[Document], path: Path) -> None:
+    """Refuses a whole file of another kind: the arguments of a command are in another order."""
+    known = model.model_fields
+    wanted = [kind for kind, marks in _MARKS.items() if all(key in known for key in marks)]
+    given = [kind for kind, marks in _MARKS.items() if all(key in data for key in marks)]
+    if wanted and given and given[0] not in wanted:
+        raise BadInput(
+            f"this is a {given[0]}, not a {wanted[0]}",
+            where=str(path),
+            why="another file was named, or the files in another order",
+            next_step=f"pass a {wanted[0]} here; the command's --help shows the order",
+        )
 
 
 def check_version(

@@ -22,11 +22,17 @@ def require_new_file(path: Path, replace: bool = False) -> None:
         raise BadInput("this is a folder", where=str(path), next_step="name a file")
     if path.exists() and not replace:
         raise AlreadyExists("the file exists already", str(path))
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+    folder, what = path.parent, "the file cannot be written"
+    if not folder.is_dir():
+        why = f"{folder} is not a folder" if folder.exists() else f"there is no folder {folder}"
         raise BadInput(
-            "the file cannot be written",
+            what, where=str(path), why=why, next_step="make the folder, or name another file"
+        )
+    if not os.access(folder, os.W_OK):
+        raise BadInput(
+            what,
             where=str(path),
-            why="the folder does not exist or is read-only",
+            why=f"the folder {folder} is read-only",
             next_step="choose a folder with write permission",
         )
 

@@ -7,6 +7,7 @@ ends in one message before it costs memory or time.
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import os
@@ -77,6 +78,8 @@ def unreadable(path: Path, error: Exception) -> BadInput:
             what, hint = "no such file", "check the path and its spelling"
         case IsADirectoryError():
             what, hint = "this is a folder", "name a file"
+        case OSError(errno=errno.ENAMETOOLONG):  # of an output too
+            what, why, hint = "the path cannot be used", str(error.strerror), "shorten its name"
         case OSError():
             why = error.strerror or str(error)
         case _:
@@ -126,6 +129,8 @@ def read_json(path: Path, next_step: str) -> Any:
         what = f"not valid JSON: {error.msg}"
         where = f"{path}:{error.lineno}:{error.colno}"
         why = "the file was cut off or edited" if text.strip() else "the file is empty"
+        if text.strip() and text.lstrip()[0] not in "{[":
+            why, next_step = "it is a file of another kind", f"pass another file, or {next_step}"
         raise BadInput(what, where=where, why=why, next_step=next_step) from None
     except ValueError as error:
         raise BadInput(str(error), where=str(path), next_step=next_step) from None

@@ -16,6 +16,8 @@ from typing import Any
 
 _UNIT = re.compile(r"(?<=\d) (?=(?:mm|ms|s|N|%)\b|%)")
 
+_OPTION = re.compile(r"(?<![\w<-])(--[a-z][a-z-]*[a-z])(?![^<]*</code>)")
+
 
 def page(
     title: str,
@@ -82,8 +84,13 @@ def paragraph(text: str, kind: str = "") -> str:
 
 
 def bullets(texts: Iterable[str]) -> str:
-    """A list of plain texts."""
-    return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>"
+    """A list of plain texts; commands in backticks and options of the command line are code."""
+    return "<ul>" + "".join(f"<li>{_with_code(text)}</li>" for text in texts) + "</ul>"
+
+
+def _with_code(text: str) -> str:
+    commands = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+    return _OPTION.sub(r'<code class="option">\1</code>', commands)
 
 
 def tile(name: str, value: str, note: str, kind: str = "") -> str:
@@ -131,9 +138,13 @@ def _cell(text: str) -> str:
 
 
 def picture(name: str, alternative: str) -> str:
-    """An image that is a file beside the page, on white as its colours need, and a link to it."""
+    """An image that is a file beside the page, on white as its colours need, and a link to it.
+
+    Where the window is narrow it scrolls within itself, so that its numbers stay readable.
+    """
     file = escape(name)
-    return f'<a href="{file}"><img class="paper" src="{file}" alt="{escape(alternative)}"></a>'
+    shown = f'<a href="{file}"><img class="paper" src="{file}" alt="{escape(alternative)}"></a>'
+    return f'<div class="scroll drawn" tabindex="0">{shown}</div>'
 
 
 def known(value: float | None, digits: int, unit: str) -> str:

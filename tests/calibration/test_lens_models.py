@@ -381,12 +381,41 @@ def test_opencv_itself_reads_what_is_written(rig, tmp_path) -> None:
     assert storage.getNode("distortion_coefficients").mat().size == 4
 
 
+def test_opencvs_xml_gives_the_same_camera_as_its_yaml(rig, tmp_path) -> None:
+    own = with_lens(rig, "fisheye", TRUTH["fisheye"][1])
+    text = FORMATS["opencv"](own)
+    given = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+    file = tmp_path / "camera.xml"
+    xml = cv2.FileStorage(str(file), cv2.FileStorage_WRITE)
+    for name in ("image_width", "image_height", "fisheye_model"):
+        xml.write(name, int(given.getNode(name).real()))
+    for name in ("camera_matrix", "distortion_coefficients"):
+        xml.write(name, given.getNode(name).mat())
+    xml.release()
+    assert imported_camera(file, rig.document.cameras[0]) == own
+
+
+def test_a_damaged_file_of_opencv_does_not_end_the_program(rig, tmp_path) -> None:
+    """A matrix without ``cols`` makes OpenCV's own reader write past its memory."""
+    text = FORMATS["opencv"](with_lens(rig, "pinhole", [0.01] * 4))
+    file = tmp_path / "camera.yml"
+    file.write_text(text.replace("   cols: 1\n", ""))
+    assert imported_camera(file, rig.document.cameras[0]).distortion == [0.01] * 4
+    for number in (".nan", "1e400", "9" * 399, "[", "!!opencv-matrix"):
+        file.write_text(text.replace("image_width: 1280", f"image_width: {number}"))
+        with pytest.raises(BadInput):
+            imported_camera(file, rig.document.cameras[0])
+
+
 @pytest.mark.parametrize(
     "text",
     ["", "a: 1", "%YAML:1.0\n---\nimage_width: 640\n", "%YAML:1.0\n---\n{[", "- 1",
      "cam0: 3", "{'lensmodel': ['a'], 'intrinsics': [1, 2, 3, 4], 'imagersize': [1, 2]}",
      "{'lensmodel': 'LENSMODEL_PINHOLE', 'intrinsics': [1%s, 2, 3, 4], 'imagersize': [1, 2]}"
      % ("0" * 400), "%YAML:1.0\n- 3\n", "<?xml version='1.0'?><a>",
+     "<?xml version='1.0'?><opencv_storage>", "<?xml version='1.0'?><a/>",
+     "<?xml version='1.0'?><!DOCTYPE a [<!ENTITY b 'c'>]><opencv_storage/>",
+     "<?xml version='1.0'?><a><image_width/></a>",
      "cam0: {camera_model: pinhole, distortion_model: [a], distortion_coeffs: [],"
      " intrinsics: [1, 2, 3, 4], resolution: [9, 9]}",
      "cam0: {camera_model: pinhole}", "{'lensmodel': 3}", "{'lensmodel': [",

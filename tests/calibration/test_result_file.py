@@ -124,6 +124,10 @@ def test_a_number_is_shown_to_two_digits_of_its_width(value: float, width: float
     assert half == pytest.approx(width, rel=0.06)
 
 
+def test_a_number_is_never_a_negative_zero() -> None:
+    assert str(Interval(-0.00001, 0.002)) == "0.0000 ± 0.0020"
+
+
 def test_a_verdict_says_each_next_step_once() -> None:
     lacks = [Issue("few", "take more"), Issue("wide", "take more"), Issue("flat", "tilt")]
     verdict = CalibrationVerdict.of(2e-3, 1e-3, "at 1 m", lacks)

@@ -109,3 +109,25 @@ def test_a_file_that_is_no_rig_file_is_named(tmp_path: Path, verb: str, kind: st
         answer = call(verb, rig, *rest)
     one_message(answer, 2, str(rig))
     assert answer.out == ""
+
+
+def test_files_in_another_order_are_named_for_what_they_are(tmp_path: Path) -> None:
+    """Not as a dozen keys to mend in a file that is whole."""
+    plan = tmp_path / "plan.json"
+    with nothing_written(tmp_path):
+        one_message(call("plan", SCENE, RIG, "-o", plan), 2, "a scene file, not a rig file")
+        one_message(call("plan", RIG, RIG, "-o", plan), 2, "a rig file, not a scene file")
+        one_message(call("check", RIG), 2, "a file of another kind", "pass another file")
+
+
+def test_a_missing_folder_and_a_read_only_one_are_told_apart(tmp_path: Path) -> None:
+    missing = tmp_path / "not there"
+    one_message(call("plan", RIG, SCENE, "-o", missing / "p.json"), 2, f"no folder {missing}")
+    (tmp_path / "file").touch()
+    inside = tmp_path / "file" / "p.json"
+    one_message(call("plan", RIG, SCENE, "-o", inside), 2, "file is not a folder")
+
+
+def test_a_name_too_long_for_a_file_to_write_is_not_called_unreadable() -> None:
+    answer = call("plan", RIG, SCENE, "-o", "x" * 300)
+    one_message(answer, 2, "the path cannot be used", "File name too long", "shorten its name")

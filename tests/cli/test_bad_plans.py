@@ -68,6 +68,15 @@ def test_a_plan_of_another_rig_names_what_differs(
     one_message(answer, 2, str(short_plan), "made for the rig 'gachon_8_6'", "outlets_mm")
 
 
+def test_a_plan_of_another_rig_is_named_before_the_cameras_that_rig_lacks(
+    short_plan: Path, tmp_path: Path
+) -> None:
+    """Passing --no-camera, as the cameras would ask for, would not help."""
+    rig = CONFIGS / "open_frame_8_6.yaml"
+    answer = call("run", short_plan, "--rig", rig, "--fast", "-o", tmp_path / "run")
+    one_message(answer, 2, "made for the rig 'gachon_8_6'")
+
+
 def test_a_plan_of_the_rig_before_it_was_changed_names_the_part(
     short_plan: Path, tmp_path: Path, verb: str
 ) -> None:

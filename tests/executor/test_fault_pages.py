@@ -102,7 +102,8 @@ def test_every_page_is_explained_and_a_wrong_code_is_told_the_right_ones() -> No
         assert "](" not in answer.out
     listed = call("explain")
     assert [line.split()[0] for line in listed.out.splitlines()] == fault_codes()
-    one_message(call("explain", "drive_silnet"), 2, "drive_silent", "drive_silnet")
+    one_message(call("explain", "drive_silnet"), 2, "cdpr explain drive_silent`", "drive_silnet")
+    one_message(call("explain", "xyz"), 2, "use one of", "drive_silent")
 
 
 def test_the_text_of_a_page_is_in_the_report_without_its_markup() -> None:

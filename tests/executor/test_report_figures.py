@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from executor.recording.run_folder import RunEvent
+from executor.report.tiles import event_table
 from model.geometry.shapes import (
     Box,
     Capsule,
@@ -129,3 +133,11 @@ def test_the_eye_sees_near_things_larger_and_the_centre_in_the_middle() -> None:
     far, near = eye.see(np.array([[2.0, 2.0, 2.0], [2.0, 2.0, 4.0]]))
     assert near[0] > far[0]
     assert near[2] < far[2]
+
+
+def test_the_events_have_a_column_of_fault_pages_only_where_one_has_a_page() -> None:
+    """A narrow window has no room for an empty one."""
+    fine = RunEvent(time_s=0.0, code="enabled", text="all drives are enabled and hold")
+    ill = RunEvent(time_s=1.0, code="late", text="a cycle began 2 cycles late")
+    assert "More about it" not in event_table(SimpleNamespace(events=(fine,)))
+    assert "docs/faults/late.md" in event_table(SimpleNamespace(events=(fine, ill)))

@@ -40,7 +40,7 @@ def test_a_file_beyond_the_limit_is_refused_by_its_stated_size(tmp_path: Path) -
 @pytest.mark.parametrize("name", ["loop", "x" * 300, "a\0b"])
 def test_a_path_that_can_be_none_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    with pytest.raises(BadInput, match="cannot be read"):
+    with pytest.raises(BadInput, match=r"cannot be (read|used)"):
         read_text(tmp_path / name)
 
 

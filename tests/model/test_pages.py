@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.pages.charts import Chart, ChartLine, Span, charts, ticks
-from model.pages.page import list_table, page, picture, resource, section, table, tile
+from model.pages.page import bullets, list_table, page, picture, resource, section, table, tile
 from model.pages.scene import (
     Label,
     Moment,
@@ -87,6 +87,21 @@ def whole() -> str:
     ]
     data = {"scene-data": scene_data(scene)}
     return page(EVIL, "".join(parts), scripts=("charts.js", "viewer.js"), data=data)
+
+
+def test_bullets_show_commands_and_options_as_code() -> None:
+    """An option broken after its two dashes reads as another word."""
+    shown = bullets(["pass --calibration, or `cdpr run P --fast` <i>"])
+    assert '<code class="option">--calibration</code>, or' in shown
+    assert "<code>cdpr run P --fast</code> &lt;i&gt;" in shown
+
+
+def test_drawings_scroll_within_themselves_on_a_phone() -> None:
+    """Nine maps in 340 px of width would have numbers of 3 px."""
+    assert picture("a.png", "maps").startswith('<div class="scroll drawn" tabindex="0">')
+    assert re.search(
+        r"max-width: 560px.*\.drawn img\.paper \{ width: \d{3}px", resource("base.css"), re.S
+    )
 
 
 def test_a_page_fits_a_phone_and_asks_nothing_from_outside() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -17,16 +19,21 @@ def build(folder: Path) -> dict[str, list[Path]]:
 
     folder.mkdir(parents=True)
     run = fake_run.write(fake_run.make(every=20), folder / "run").path
+    _cut_short(run, folder / "cut")
     _endpoints(folder / "flat_endpoints.json")
     (folder / "poses.csv").write_text(
         "picture,x_mm,y_mm,z_mm,qw,qx,qy,qz\na.png,1,2,300,1,0,0,0\nb.png,4,5,300,1,0,0,0\n"
     )
-    for name in ("rigs", "scenes", "pictures"):
+    for name in ("rigs", "scenes", "pictures", "cameras", "state"):
         (folder / name).mkdir()
     for path in sorted((ROOT / "configs").glob("*.yaml")):
         kind = "rigs" if "winches:" in path.read_text() else "scenes"
         shutil.copy(path, folder / kind)
     _pictures(folder / "pictures")
+    _video(folder / "a.avi")
+    _cameras(folder / "cameras")
+    _state(folder / "state")
+    _coordinates(folder / "coordinates.csv")
     return {
         "rig": sorted((folder / "rigs").iterdir()),
         "scene": sorted((folder / "scenes").iterdir()),
@@ -34,11 +41,16 @@ def build(folder: Path) -> dict[str, list[Path]]:
         "run": [
             path for path in sorted(run.iterdir()) if path.suffix in (".json", ".jsonl", ".csv")
         ],
+        "cut": [folder / "cut" / name for name in ("run.json", "cycles.csv", "events.jsonl")],
         "result": [write_result(folder, camera_result_of())],
         "places": [ROOT / "examples/rig_session/places.csv"],
         "poses": [folder / "poses.csv"],
         "corners": [_corners(folder)],
-        "camera": _cameras(folder),
+        "camera": [*_cameras(folder), *sorted((folder / "cameras").iterdir())],
+        "coordinates": [folder / "coordinates.csv"],
+        "reference": [folder / "state" / "reference.json"],
+        "latch": [folder / "state" / "latched.json"],
+        "video": [folder / "a.avi"],
         "picture": sorted((folder / "pictures").iterdir()),
         "endpoints": [folder / "flat_endpoints.json"],
         "dbc": [ROOT / "drivers/odrive/cansimple.dbc"],
@@ -67,6 +79,18 @@ def _cameras(folder: Path) -> list[Path]:
     return [folder / f"camera_{name}.yaml" for name in FORMATS]
 
 
+def _cut_short(run: Path, folder: Path) -> None:
+    """The folder of a run whose program was killed."""
+    from executor.recording.run_course import RunCourse
+    from executor.recording.run_folder import RunFolder
+
+    folder.mkdir()
+    for name in ("plan.json", "rig.json", "cycles.csv", "events.jsonl"):
+        shutil.copy(run / name, folder)
+    started = datetime(2026, 1, 1, tzinfo=UTC)
+    RunFolder(folder).write_course(RunCourse(started, "virtual", simulated=True, fast=False))
+
+
 def _pictures(folder: Path) -> None:
     import cv2
     import numpy as np
@@ -84,3 +108,63 @@ def _endpoints(path: Path) -> None:
     names = [wanted.name for wanted in wanted_settings(document)]
     endpoints = {name: {"id": i, "type": "float"} for i, name in enumerate(names, 100)}
     path.write_text(json.dumps({"fw_version": "0.6.10-0", "endpoints": endpoints}, indent=1))
+
+
+def _video(path: Path) -> None:
+    import cv2
+    import numpy as np
+
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    chance = np.random.default_rng(0)
+    for _ in range(3):
+        writer.write(chance.integers(0, 255, (48, 64, 3), np.uint8))
+    writer.release()
+
+
+def _cameras(folder: Path) -> None:
+    """As OpenCV and ROS write them."""
+    import cv2
+
+    from calibration.intrinsics.exchange import opencv_text, ros_text
+    from model.rig import load_rig
+
+    camera = load_rig(ROOT / "configs/gachon_8_6.yaml").document.cameras[0]
+    text = opencv_text(camera)
+    (folder / "opencv.yml").write_text(text)
+    (folder / "ros.yaml").write_text(ros_text(camera))
+    given = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+    xml = cv2.FileStorage(str(folder / "opencv.xml"), cv2.FileStorage_WRITE)
+    for name in ("image_width", "image_height", "fisheye_model"):
+        xml.write(name, int(given.getNode(name).real()))
+    for name in ("camera_matrix", "distortion_coefficients"):
+        xml.write(name, given.getNode(name).mat())
+    xml.release()
+
+
+def _state(folder: Path) -> None:
+    """A homing reference and an engaged fault latch."""
+    import numpy as np
+
+    from executor.interlock.fault_latch import LatchedFault
+    from executor.interlock.reference import reference_at
+    from model.pose import Pose
+    from model.rig import load_rig
+
+    rig = load_rig(ROOT / "configs/gachon_8_6.yaml")
+    counts, tensions = np.arange(8.0), np.full(8, 20.0)
+    pose = Pose(np.array([0.0, 0.0, 0.4]), np.eye(3))
+    reference = reference_at(rig, pose, counts, tensions, "stated", 0.001)
+    (folder / "reference.json").write_text(reference.model_dump_json(indent=1))
+    latched = LatchedFault("virtual", rig.name, "EMCY", "2026-01-01T00:00:00Z", "runs/a", 1)
+    (folder / "latched.json").write_text(json.dumps(asdict(latched)))
+
+
+def _coordinates(path: Path) -> None:
+    """A table for `cdpr new --coordinates`."""
+    from model.files.new_rig import CSV_COLUMNS
+    from model.rig import load_rig
+
+    rig = load_rig(ROOT / "configs/gachon_8_6.yaml").document
+    rows = zip(rig.outlets_mm, rig.anchors_mm, strict=True)
+    lines = [",".join(f"{value:g}" for value in (*outlet, *anchor)) for outlet, anchor in rows]
+    path.write_text("\n".join([",".join(CSV_COLUMNS), *lines]) + "\n")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -33,17 +35,24 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     from calibration.load import load_result
     from calibration.targets.board import read_corners
     from drivers.cameras.files import read_picture
+    from drivers.cameras.live import VideoFile
+    from drivers.can_bus import BusSettings
     from drivers.odrive.dbc import read_layouts
     from drivers.odrive.endpoints import read_endpoints
+    from executor.interlock.fault_latch import FaultLatch
+    from executor.interlock.reference import ReferenceFile
     from model.files.documents import load_yaml
     from model.files.drive_profile_file import ProfileDocument
+    from model.files.new_rig import read_coordinates
     from model.files.rig_file import OdriveDocument
     from model.plan import load_plan
     from model.rig import load_rig
     from model.scene import load_scene
     from simulation.drives.eds_file import read_eds
 
-    camera = load_rig(corpus["rig"][0]).document.cameras[0]
+    rig = load_rig(corpus["rig"][0])
+    small = replace(rig.cameras[0], width=64, height=48)
+    bus = BusSettings("virtual", "fuzz")
     odrive = OdriveDocument(type="odrive", motor_torque_constant_nm_a=0.05, watchdog_ms=50.0)
     calls: dict[str, Callable[[Path], object]] = {
         "rig": load_rig,
@@ -53,7 +62,11 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         "places": lambda path: read_rig_data(path, 8),
         "poses": read_poses,
         "corners": read_corners,
-        "camera": lambda path: imported_camera(path, camera),
+        "camera": lambda path: imported_camera(path, rig.document.cameras[0]),
+        "coordinates": read_coordinates,
+        "reference": lambda path: _at(ReferenceFile(bus), path).read(),
+        "latch": lambda path: _at(FaultLatch(bus), path).read(),
+        "video": lambda path: sum(1 for _ in VideoFile(path, small)),
         "picture": read_picture,
         "endpoints": lambda path: read_endpoints(path, odrive),
         "dbc": read_layouts,
@@ -65,16 +78,57 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         for kind, call in calls.items()
         for seed in corpus[kind]
     ]
-    folder = scratch / "run"
+    folder, cut = scratch / "run", scratch / "cut"
     shutil.copytree(corpus["run"][0].parent, folder)
-    return found + [
+    shutil.copytree(corpus["cut"][0].parent, cut)
+    whole = [
         Reader(f"run:{seed.name}", seed, _run_part(seed.name), folder / seed.name)
         for seed in corpus["run"]
     ]
+    again = [
+        Reader(f"again:{seed.name}", seed, _again, folder / seed.name)
+        for seed in corpus["run"]
+        if seed.name in ("cycles.csv", "poses.csv", "summary.json")
+    ]
+    unfinished = [Reader(f"cut:{seed.name}", seed, _cut, cut / seed.name) for seed in corpus["cut"]]
+    return found + whole + again + unfinished
+
+
+def _at(file: Any, path: Path) -> Any:
+    """A file of the state folder, elsewhere."""
+    file.path = path
+    return file
+
+
+def _again(path: Path) -> object:
+    """What `cdpr plan --from-run` and `cdpr calibrate` take from a run folder."""
+    from calibration.run_data import poses_of_run, rig_measurements
+    from executor.recording.resume import run_end
+    from executor.recording.run_folder import RunFolder
+    from model.errors import CdprError
+
+    run = RunFolder.open(path.parent)
+    calls: tuple[Callable[[], object], ...] = (
+        lambda: run_end(run),
+        lambda: poses_of_run(run.path, run.rig().cameras[0].name),
+        lambda: rig_measurements(run.rig(), [run.path]),
+    )
+    for call in calls:
+        with suppress(CdprError):
+            call()
+    return run
+
+
+def _cut(path: Path) -> object:
+    """What `cdpr report` makes of the folder of a run that was killed."""
+    from executor.evaluation import evaluate_cut_short
+    from executor.recording.run_folder import RunFolder
+
+    return evaluate_cut_short(RunFolder.open_cut_short(path.parent))
 
 
 def _run_part(name: str) -> Callable[[Path], object]:
-    """What `cdpr report`, `plan --from-run` and `calibrate` read of a run folder."""
+    """What `cdpr report` reads of a run folder."""
     from executor.recording.run_folder import RunFolder
     from executor.report.run_data import read_run
     from executor.report.tiles import (
