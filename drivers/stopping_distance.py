@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drivers.can_load import heartbeat_timeout
 from model.errors import Refused
 from model.files.rig_file import Cia402Document, OdriveDocument
 from model.rig import Rig
@@ -38,14 +39,26 @@ def lost_master(rig: Rig) -> LostMaster:
     cycle = rig.document.bus.cycle_ms / 1000.0
     drives = rig.document.drives
     if isinstance(drives, Cia402Document):
-        # canopen drives only: their objects are not loaded for others
-        from drivers.cia402.object_dictionary import lost_master_times
-
-        noticed_by, notice, ramp = lost_master_times(rig)
+        noticed_by, notice, ramp = _cia402_times(rig)
     else:
         noticed_by, notice, ramp = "set-points", _watchdog(drives), cycle
     distance = rig.motion.speed * (notice + 0.5 * ramp)
     return LostMaster(noticed_by, notice, ramp, distance)
+
+
+def _cia402_times(rig: Rig) -> tuple[str, float, float]:
+    """What CiA 402 drives miss, when the last one notices, and its ramp, [s]."""
+    # Their objects are not loaded for drives of another protocol.
+    from drivers.cia402.object_dictionary import quick_stop_ramp
+    from drivers.cia402.profile import profile_of
+
+    cycle, profile = rig.document.bus.cycle_ms / 1000.0, profile_of(rig)
+    steepest = profile.range_of(0x6085, 0)
+    wanted = max(quick_stop_ramp(rig, i, cycle, profile) for i in range(rig.cable_count))
+    ramp = cycle if steepest is None else cycle * max(1.0, wanted / max(1, steepest.high))
+    if profile.monitoring == "heartbeat":
+        return "heartbeat", heartbeat_timeout(cycle), ramp
+    return "SYNC", profile.sync_timeout_periods * cycle, ramp
 
 
 def _watchdog(drives: OdriveDocument) -> float:

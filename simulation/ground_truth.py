@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.errors import BadInput
-from model.files.documents import PoseDocument, require_coefficients
+from model.files.camera_file import require_coefficients
+from model.files.documents import PoseDocument
 from model.files.simulation_file import (
     SimulatedCameraDocument,
     SimulatedWinchesDocument,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
-from model.files.documents import FISHEYE
+from model.files.camera_file import FISHEYE
 from model.pose import Array
 from model.rig import Camera
 

@@ -15,7 +15,8 @@ from calibration.report import Section, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from calibration.statistics import Interval
 from calibration.verdict import CalibrationVerdict
-from model.files.documents import AnyNonNegative, PoseCovariance, PoseDocument, PoseSlopes, Vector
+from model.files.camera_file import PoseCovariance, PoseSlopes
+from model.files.documents import AnyNonNegative, PoseDocument, Vector
 from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, rotation_vector_from_matrix
 

@@ -22,8 +22,8 @@ from pydantic import ValidationError
 
 from calibration.intrinsics.result import camera_named, with_camera
 from model.errors import BadInput
-from model.files.camera_file import CameraDocument
-from model.files.documents import FISHEYE, read_text, read_yaml, write_atomic
+from model.files.camera_file import FISHEYE, CameraDocument
+from model.files.documents import read_text, read_yaml, write_atomic
 from model.files.rig_file import RigDocument
 from model.pose import rotation_vector_from_matrix
 from model.rig import Rig, rig_from_document

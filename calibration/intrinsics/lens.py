@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from calibration.targets.board import Seen
-from model.files.documents import LensName
+from model.files.camera_file import LensName
 from model.pose import Array
 from tracking.camera_model import rays_of
 

@@ -22,8 +22,8 @@ from calibration.intrinsics.quality import CameraQuality, picture_grid
 from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from model.errors import BadInput
-from model.files.camera_file import CameraDocument
-from model.files.documents import AnyNonNegative, AnyNumber, LensCovariance, LensName, Positive
+from model.files.camera_file import CameraDocument, LensCovariance, LensName
+from model.files.documents import AnyNonNegative, AnyNumber, Positive
 from model.files.rig_file import RigDocument
 from model.pose import Array
 from tracking.camera_model import rays_of

@@ -373,7 +373,7 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
     winch = rig.winches[drive]
     # A drive at its top speed stands within one cycle, so that drives at different speeds stop
     # within a cycle of each other and the tensions stay near what they were.
-    ramp = _ramp(rig, drive, cycle, profile)
+    ramp = quick_stop_ramp(rig, drive, cycle, profile)
     window = rig.motion.following_error * abs(winch.counts_per_metre)
     return (
         Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
@@ -385,26 +385,11 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
     )
 
 
-def _ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
-    """Of a quick stop, in the drive's unit of acceleration."""
+def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
+    """Deceleration by which a drive at its top speed stands within a cycle, in the drive's unit."""
     winch = rig.winches[drive]
     ramp = winch.max_speed / cycle * abs(winch.counts_per_metre)
     return ramp * 60.0 / winch.counts_per_turn if profile.acceleration_unit == "rpm/s" else ramp
-
-
-def lost_master_times(rig: Rig) -> tuple[str, float, float]:
-    """How drives notice that the master is lost, when the last one does, and its ramp, [s].
-
-    Raises:
-        BadInput: There is no such profile, or its file is wrong.
-    """
-    cycle, profile = rig.document.bus.cycle_ms / 1000.0, profile_of(rig)
-    steepest = profile.range_of(0x6085, 0)
-    wanted = max(_ramp(rig, i, cycle, profile) for i in range(rig.cable_count))
-    ramp = cycle if steepest is None else cycle * max(1.0, wanted / max(1, steepest.high))
-    if profile.monitoring == "heartbeat":
-        return "heartbeat", heartbeat_timeout(cycle), ramp
-    return "SYNC", profile.sync_timeout_periods * cycle, ramp
 
 
 def _options() -> tuple[Setting, ...]:

@@ -130,7 +130,7 @@ def _removed(folder: int, name: str) -> None:
 
 
 def _left(folder: int, name: str) -> None:
-    """What cannot be removed was left by a run that ended: nobody listens there."""
+    """What cannot be removed is left: a socket of a run that ended is not connected to."""
     with contextlib.suppress(OSError):
         os.unlink(name, dir_fd=folder)
 

@@ -4,23 +4,77 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field, ValidationInfo, field_validator
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
 from model.files.documents import (
-    LENSES,
     WHOLE_LARGEST,
+    AnyNumber,
     Document,
-    LensCovariance,
-    LensName,
     Name,
     NonNegative,
     Number,
-    PoseCovariance,
     PoseDocument,
-    PoseSlopes,
     Positive,
-    require_coefficients,
 )
+
+# Models of lenses, as rig files name them.
+
+
+FISHEYE = "fisheye"
+LENSES = ("pinhole", FISHEYE)
+"""OpenCV's camera models, by the key `lens`."""
+LensName = Literal["pinhole", "fisheye"]
+
+
+def require_coefficients(lens: str, count: int) -> None:
+    """Refuses numbers of distortion coefficients that OpenCV's model does not have.
+
+    Raises:
+        ValueError: It has no such number.
+    """
+    known = (4,) if lens == FISHEYE else (0, 4, 5, 8, 12, 14)
+    if count not in known:
+        *most, last = map(str, known)
+        listed = f"{', '.join(most)} or {last}" if most else last
+        raise ValueError(f"a {lens} lens needs {listed} coefficients, it has {count}")
+
+
+# How sure a calibration is of a camera.
+
+
+def _is_covariance(rows: list[list[float]], count: int) -> list[list[float]]:
+    if len(rows) != count or any(len(row) != count for row in rows):
+        raise ValueError(f"needs {count} rows of {count} numbers, symmetric")
+    matrix = np.array(rows, dtype=np.float64)
+    scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), 1e-300))
+    alike = matrix / np.outer(scale, scale)
+    if not np.allclose(alike, alike.T, rtol=1e-6, atol=1e-6):
+        raise ValueError(f"needs {count} rows of {count} numbers, symmetric")
+    if np.diag(matrix).min() < 0.0 or np.linalg.eigvalsh(alike)[0] < -1e-6:
+        raise ValueError("is no covariance: it has a negative eigenvalue")
+    return rows
+
+
+def _is_covariance_of_numbers(rows: list[list[float]]) -> list[list[float]]:
+    return _is_covariance(rows, len(rows))
+
+
+def _has_six_rows(rows: list[list[float]]) -> list[list[float]]:
+    if len(rows) != 6 or len({len(row) for row in rows}) != 1:
+        raise ValueError("needs 6 rows, of as many numbers each as the camera has")
+    return rows
+
+
+PoseCovariance = Annotated[
+    list[list[AnyNumber]], AfterValidator(lambda rows: _is_covariance(rows, 6))
+]
+"""Of a pose: position [mm] and turns about the outer frame's axes [deg], 6 x 6."""
+LensCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance_of_numbers)]
+"""Of a camera's n numbers, as the rig file has them: fx, fy, cx, cy [px] and distortion, n x n."""
+PoseSlopes = Annotated[list[list[AnyNumber]], AfterValidator(_has_six_rows)]
+"""Of a pose by a camera's n numbers: position [mm] and turns [deg], 6 x n."""
+
 
 # Families of fiducial tags by their names in rig files.
 

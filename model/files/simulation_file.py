@@ -11,10 +11,10 @@ from typing import Annotated
 
 from pydantic import Field
 
+from model.files.camera_file import LensName
 from model.files.documents import (
     Document,
     Finding,
-    LensName,
     NonNegative,
     Number,
     PoseDocument,
