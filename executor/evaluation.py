@@ -21,8 +21,10 @@ from executor.recording.clearance import (
     source_of,
     tension_noise,
 )
+from executor.recording.cycle_table import CycleTable
 from executor.recording.fused import fused_table
 from executor.recording.mcap import write_mcap
+from executor.recording.pose_table import OK, PoseTable, no_poses
 from executor.recording.run_course import RunCourse, versions
 from executor.recording.run_folder import (
     CLEARANCE,
@@ -40,7 +42,6 @@ from executor.recording.run_folder import (
     RunFolder,
 )
 from executor.recording.summary import RunContext, summarize
-from executor.recording.tables import OK, CycleTable, PoseTable, no_poses
 from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
 from executor.state_machine import SIMULATED, State

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from executor.recording.csv import TableFile
+from executor.recording.csv_columns import TableFile
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
 from model.display import html_table
 

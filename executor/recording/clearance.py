@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from executor.recording.csv import TableFile, numbers, texts, write_table
+from executor.recording.csv_columns import TableFile, numbers, texts, write_table
 from model.clearance import ClearanceModel, Nearest
 from model.kinematics import cable_lengths, structure_matrix
 from model.pose import Array, Pose

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from executor.recording.csv import numbers, write_table
-from executor.recording.tables import CycleTable, PoseTable
+from executor.recording.csv_columns import numbers, write_table
+from executor.recording.cycle_table import CycleTable
+from executor.recording.pose_table import PoseTable
 from model.pose import Array, Pose
 from tracking.encoder_fusion import Measured, fused
 from tracking.pose_log import POSE_COLUMNS

@@ -12,6 +12,7 @@ from typing import Any
 from mcap.writer import Writer
 
 from executor.recording.clearance import ClearanceTable, camera_of
+from executor.recording.cycle_table import CycleTable
 from executor.recording.fused import FusedTable
 from executor.recording.mcap_channels import (
     CHANNELS,
@@ -27,9 +28,9 @@ from executor.recording.mcap_channels import (
     topic_of,
 )
 from executor.recording.mcap_scene import robot_messages, scene_messages
+from executor.recording.pose_table import OK, PoseTable
 from executor.recording.run_folder import RunFolder
 from executor.recording.summary import RunContext
-from executor.recording.tables import OK, CycleTable, PoseTable
 from model.errors import Fault
 from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from executor.recording.cycle_table import CycleTable
 from executor.recording.mcap_channels import STILL, WORLD, Message, pose_value, stamp_of, vector
 from executor.recording.summary import RunContext
-from executor.recording.tables import CycleTable
 from model.geometry.solids import solid_of
 from model.kinematics import cables_to
 from model.pose import Pose

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from executor.recording.clearance import ClearanceTable
+from executor.recording.cycle_table import CycleTable, no_cycles
 from executor.recording.fused import FusedTable
+from executor.recording.pose_table import PoseTable
 from executor.recording.record_files import AGAIN, read_events, read_summary
 from executor.recording.run_course import RunCourse
-from executor.recording.tables import CycleTable, PoseTable, no_cycles
 from model.errors import BadInput, Fault, InvalidFile
 from model.files.documents import keep_names, problems_of, write_atomic
 from model.files.plan_file import PlanDocument

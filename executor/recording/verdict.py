@@ -13,7 +13,8 @@ import numpy as np
 import executor
 from executor.cameras.client import CameraRecord
 from executor.recording.clearance import ClearanceTable
-from executor.recording.tables import CycleTable, PoseTable
+from executor.recording.cycle_table import CycleTable
+from executor.recording.pose_table import PoseTable
 from executor.safety.limits import tension_limits
 from executor.state_machine import ON_PATH
 from model.rig import Rig

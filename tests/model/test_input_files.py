@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from calibration.geometry.measurements import read_rig_data
-from executor.recording.csv import TableFile
+from executor.recording.csv_columns import TableFile
 from model.errors import BadInput, InvalidFile
 from model.files.documents import load_yaml
 from model.files.reading import CsvFile, parse_json, read_bytes, read_text

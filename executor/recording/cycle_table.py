@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from itertools import combinations_with_replacement
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from executor.recording.csv import (
+from executor.recording.csv_columns import (
     Column,
     Integers,
     TableFile,
     header,
     integers,
     numbers,
+    require_equal_lengths,
     rows,
     texts,
     write_table,
 )
 from model.pose import Array, quaternion_from_matrix
-from tracking.pose_log import POSE_COLUMNS
 
 _MM, _MS = 1e3, 1e3
 _PER_CABLE = (
@@ -84,7 +83,7 @@ class CycleTable:
 
     def __post_init__(self) -> None:
         """See `_require_equal_lengths`."""
-        _require_equal_lengths(self)
+        require_equal_lengths(self)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -193,18 +192,6 @@ class CycleTable:
         )
 
 
-def _require_equal_lengths(table: CycleTable | PoseTable) -> None:
-    """Refuses arrays of different lengths.
-
-    Raises:
-        ValueError: Naming the attribute.
-    """
-    for field in fields(table):
-        rows = len(getattr(table, field.name))
-        if rows != len(table.time):
-            raise ValueError(f"{field.name} has {rows} rows, time has {len(table.time)}")
-
-
 def no_cycles(cable_count: int) -> CycleTable:
     """The table of a run of which no cycle is known."""
     none, whole = np.empty(0), np.empty(0, dtype=np.int64)
@@ -231,144 +218,3 @@ def quaternions_of(rotations: Array) -> Array:
     if len(rotations) and (rotations == rotations[0]).all():  # the platform never turns
         return np.tile(quaternion_from_matrix(rotations[0]), (len(rotations), 1))
     return np.array([quaternion_from_matrix(r) for r in rotations]).reshape(-1, 4)
-
-
-# What the camera measured during a run: a row an image.
-
-
-_POSE_MM, _DEG = 1e3, float(np.degrees(1.0))
-_SCALES = np.array([_POSE_MM, _POSE_MM, _POSE_MM, _DEG, _DEG, _DEG])
-_PAIRS = tuple(combinations_with_replacement(range(6), 2))
-#: As `cdpr track` names them: ``std_x_mm`` …, ``cov_x_rz_mm_deg`` … in the order of the pairs.
-_STD = tuple(name for name in POSE_COLUMNS if name.startswith("std_"))
-_COVARIANCE = dict(
-    zip(_PAIRS, (name for name in POSE_COLUMNS if name.startswith("cov_")), strict=True)
-)
-OK = "ok"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseTable:
-    """Measured poses of n images; NaN where an image gave no pose.
-
-    Attributes:
-        frame: Number of the image, shape (n,).
-        time: Since the start of the run, shape (n,), [s].
-        status: ``ok``, or why there is no pose, n texts.
-        position: Of the platform in the world, shape (n, 3), [m].
-        rotation: ``world_from_platform`` as unit quaternions (w, x, y, z), shape (n, 4).
-        covariance: Of position and rotation vector about world axes, shape (n, 6, 6), [m, rad].
-        tags: Numbers of the tags that were used, n texts such as ``301 303``.
-        reprojection: RMS of the corners, shape (n,), [px].
-        planned: Commanded position at that time, shape (n, 3), [m].
-        picture: Name of the kept image inside the run folder, or nothing, n texts.
-    """
-
-    frame: Integers
-    time: Array
-    status: tuple[str, ...]
-    position: Array
-    rotation: Array
-    covariance: Array
-    tags: tuple[str, ...]
-    reprojection: Array
-    planned: Array
-    picture: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        """See `_require_equal_lengths`."""
-        _require_equal_lengths(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    @property
-    def ok(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Which images gave a pose, shape (n,)."""
-        return np.array([status == OK for status in self.status], dtype=bool)
-
-    @property
-    def error(self) -> Array:
-        """Distance of the measured from the planned position, shape (n,), [m]; NaN without pose."""
-        error: Array = np.linalg.norm(self.position - self.planned, axis=1)
-        return error
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations of position and rotation, shape (n, 6), [m] and [rad]."""
-        deviations: Array = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        return deviations
-
-    def write_csv(self, path: Path) -> None:
-        """Writes ``poses.csv``.
-
-        Raises:
-            BadInput: The folder cannot be written to.
-        """
-        std = self.std * _SCALES
-        columns = [
-            integers("frame", self.frame),
-            numbers("time_s", self.time),
-            texts("status", self.status),
-            *_side_by_side([f"{axis}_mm" for axis in "xyz"], self.position * _POSE_MM),
-            *_side_by_side([f"q{axis}" for axis in "wxyz"], self.rotation, decimals=9),
-            *_side_by_side(_STD, std),
-            *(_covariance(self.covariance, pair) for pair in _PAIRS),
-            texts("tags", self.tags),
-            numbers("reprojection_px", self.reprojection, decimals=4),
-            *_side_by_side([f"planned_{axis}_mm" for axis in "xyz"], self.planned * _POSE_MM),
-            texts("picture", self.picture),
-        ]
-        write_table(path, columns)
-
-    @classmethod
-    def read_csv(cls, path: Path) -> PoseTable:
-        """Reads ``poses.csv``.
-
-        Raises:
-            BadInput: The file is missing, cut short or has other columns.
-        """
-        table = TableFile(path)
-        time = table.floats("time_s")
-        covariance = np.empty((len(time), 6, 6))
-        for i, j in _PAIRS:
-            entry = table.floats(_COVARIANCE[i, j], float(_SCALES[i] * _SCALES[j]))
-            covariance[:, i, j] = covariance[:, j, i] = entry
-        return cls(
-            frame=table.ints("frame"),
-            time=time,
-            status=table.texts("status"),
-            position=table.matrix([f"{axis}_mm" for axis in "xyz"], _POSE_MM),
-            rotation=table.matrix([f"q{axis}" for axis in "wxyz"]),
-            covariance=covariance,
-            tags=table.texts("tags"),
-            reprojection=table.floats("reprojection_px"),
-            planned=table.matrix([f"planned_{axis}_mm" for axis in "xyz"], _POSE_MM),
-            picture=table.texts("picture"),
-        )
-
-
-def _side_by_side(names: Sequence[str], values: Array, decimals: int = 6) -> list[Column]:
-    return [numbers(n, values[:, i], decimals=decimals) for i, n in enumerate(names)]
-
-
-def _covariance(covariance: Array, pair: tuple[int, int]) -> Column:
-    i, j = pair
-    scale = float(_SCALES[i] * _SCALES[j])
-    return Column(_COVARIANCE[i, j], covariance[:, i, j] * scale, "%.6e")
-
-
-def no_poses() -> PoseTable:
-    """A table without rows, of a run without a camera."""
-    return PoseTable(
-        frame=np.empty(0, dtype=np.int64),
-        time=np.empty(0),
-        status=(),
-        position=np.empty((0, 3)),
-        rotation=np.empty((0, 4)),
-        covariance=np.empty((0, 6, 6)),
-        tags=(),
-        reprojection=np.empty(0),
-        planned=np.empty((0, 3)),
-        picture=(),
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,18 @@ def integers(name: str, values: Integers) -> Column:
 def texts(name: str, values: Sequence[str]) -> Column:
     """A column of texts, quoted where CSV asks for it."""
     return Column(name, [_quoted(value) for value in values], "%s")
+
+
+def require_equal_lengths(table: Any) -> None:
+    """Refuses arrays of different lengths in a table, a data class with an attribute ``time``.
+
+    Raises:
+        ValueError: Naming the attribute.
+    """
+    for field in fields(table):
+        rows = len(getattr(table, field.name))
+        if rows != len(table.time):
+            raise ValueError(f"{field.name} has {rows} rows, time has {len(table.time)}")
 
 
 def write_table(path: Path, columns: Sequence[Column]) -> None:
