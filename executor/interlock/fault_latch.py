@@ -143,7 +143,7 @@ class FaultLatch:
         try:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
-            raise self._not_kept(error.strerror or str(error)) from None
+            raise self._not_kept(error.strerror) from None
         self._hold()
         try:
             self.require_disengaged()  # no other program engages it from here on
@@ -165,7 +165,7 @@ class FaultLatch:
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
-            raise self._not_kept(error.strerror or str(error)) from None
+            raise self._not_kept(error.strerror) from None
         self._let_go()
 
     def _hold(self) -> None:
@@ -179,7 +179,7 @@ class FaultLatch:
         try:
             lock = open_state_file(self._lock, create=True)
         except OSError as error:
-            raise self._not_kept(error.strerror or str(error)) from None
+            raise self._not_kept(error.strerror) from None
         if not locked_within(lock, LOOKS_WITHIN):
             os.close(lock)
             raise self._refusal(self.read())
@@ -199,7 +199,7 @@ class FaultLatch:
         except FileNotFoundError:
             return False
         except OSError as error:
-            raise self._not_kept(error.strerror or str(error)) from None
+            raise self._not_kept(error.strerror) from None
         try:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -235,10 +235,10 @@ class FaultLatch:
             " nothing was moved",
         )
 
-    def _not_kept(self, why: str) -> Refused:
+    def _not_kept(self, why: str | None) -> Refused:
         return Refused(
             "the fault latch cannot be written",
             where=str(self.path),
-            why=why,
+            why=why or "the operating system gives no reason",
             next_step="make the folder writable for the operators of the rig",
         )
