@@ -72,6 +72,7 @@ NOT_RUN = {
     "calibrate export": "needs a result of a calibration: tests/calibration/test_lens_models.py",
     "calibrate import": "needs another program's file: tests/calibration/test_lens_models.py",
     "calibrate extrinsics": "needs photographs: tests/cli/test_calibrate_extrinsics.py",
+    "calibrate readout": "needs a moving tag: tests/calibration/test_readout.py",
     "calibrate tags": "needs photographs: tests/cli/test_calibrate_tags.py",
     "demo": "tools/run_docs.py runs it",
     "hold": "needs a run under way: tests/scenarios/test_operator_wishes.py",

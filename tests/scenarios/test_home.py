@@ -457,7 +457,7 @@ def moved_by_hand(place: Place) -> None:
     [
         (lambda _place: None, None),
         (moved_by_hand, r"cable 4 \(drive 4\) moved by 0.20 mm"),
-        (loses_all_torque, "not all drives still hold"),
+        (loses_all_torque, "lost its torque: switch on disabled"),
         (fails, "drive 7"),
     ],
 )
@@ -484,7 +484,7 @@ def no_more_heard(place: Place) -> None:
     ("happens", "told", "counts"),
     [
         (moved_by_hand, "moved by 0.20 mm", True),
-        (loses_all_torque, "not all drives still hold", False),
+        (loses_all_torque, "lost its torque: switch on disabled", False),
         (no_more_heard, "no answer after", True),
     ],
 )
@@ -541,10 +541,10 @@ def test_a_record_that_is_full_by_then_leaves_the_cause_and_the_latch() -> None:
             loses_all_torque(place)
 
         place.interlock, place.at_rest, place.events = interlock, at_rest, Full()
-        with pytest.raises(CdprError, match="not all drives still hold"):
+        with pytest.raises(CdprError, match="lost its torque: switch on disabled"):
             place.take_up()
         assert place.events[-1].code == "not_held"
-    with pytest.raises(Refused, match="not all drives still hold"):
+    with pytest.raises(Refused, match="lost its torque: switch on disabled"):
         interlock.require_free()
 
 

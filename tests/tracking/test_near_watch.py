@@ -73,13 +73,13 @@ def test_nearer_than_planned_counts_the_upper_side_too() -> None:
     row = ClearanceRow.at(1.0, "tag", found, nearest([35.0, 50.0]))
     _, against_plan = distances(clearance_table(("post 0", "post 1"), [row]), LIMIT_MM / 1e3)
     assert not against_plan.passed
-    assert "upper bound 31.00 mm" in against_plan.text
+    assert "its 95 % interval ends at 31.00 mm" in against_plan.text
 
 
 def test_what_is_told_names_the_obstacle_that_is_surely_too_near() -> None:
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
     told = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
-    assert told == "platform to post 1: 12.0 ± 1.0 mm; the scene requires 20 mm"
+    assert told == "platform to post 1: 12.0 ± 1.0 mm (95 % interval); the scene requires 20 mm"
 
 
 @given(obstacles_mm=OBSTACLES, shares=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
