@@ -46,7 +46,7 @@ def build(folder: Path) -> dict[str, list[Path]]:
         "places": [ROOT / "examples/rig_session/places.csv"],
         "poses": [folder / "poses.csv"],
         "corners": [_corners(folder)],
-        "camera": [*_cameras(folder), *sorted((folder / "cameras").iterdir())],
+        "camera": sorted((folder / "cameras").iterdir()),
         "coordinates": [folder / "coordinates.csv"],
         "reference": [folder / "state" / "reference.json"],
         "latch": [folder / "state" / "latched.json"],
@@ -65,18 +65,6 @@ def _corners(folder: Path) -> Path:
     path = folder / "corners.csv"
     path.write_text("\n".join(["picture,x_px,y_px,board_x_mm,board_y_mm", *rows]))
     return path
-
-
-def _cameras(folder: Path) -> list[Path]:
-    """A camera's numbers in every format that is read."""
-    from calibration.intrinsics.exchange import FORMATS
-    from model.rig import load_rig
-
-    own = load_rig(ROOT / "configs/gachon_8_6.yaml").document.cameras[0]
-    camera = own.model_copy(update={"distortion": [0.1, 0.2, 0.003, 0.004]})
-    for name, text in FORMATS.items():
-        (folder / f"camera_{name}.yaml").write_text(text(camera))
-    return [folder / f"camera_{name}.yaml" for name in FORMATS]
 
 
 def _cut_short(run: Path, folder: Path) -> None:
@@ -122,16 +110,17 @@ def _video(path: Path) -> None:
 
 
 def _cameras(folder: Path) -> None:
-    """As OpenCV and ROS write them."""
+    """In every format that is read; OpenCV's also as XML."""
     import cv2
 
-    from calibration.intrinsics.exchange import opencv_text, ros_text
+    from calibration.intrinsics.exchange import FORMATS
     from model.rig import load_rig
 
-    camera = load_rig(ROOT / "configs/gachon_8_6.yaml").document.cameras[0]
-    text = opencv_text(camera)
-    (folder / "opencv.yml").write_text(text)
-    (folder / "ros.yaml").write_text(ros_text(camera))
+    own = load_rig(ROOT / "configs/gachon_8_6.yaml").document.cameras[0]
+    camera = own.model_copy(update={"distortion": [0.1, 0.2, 0.003, 0.004]})
+    for name, write in FORMATS.items():
+        (folder / f"{name}.yaml").write_text(write(camera))
+    text = FORMATS["opencv"](camera)
     given = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
     xml = cv2.FileStorage(str(folder / "opencv.xml"), cv2.FileStorage_WRITE)
     for name in ("image_width", "image_height", "fisheye_model"):
