@@ -59,7 +59,7 @@ _PATIENCE = 8
 @kernel
 def handle_of(problem: PathProblem, search: AnytimeSearch) -> Handle:
     """Both as one reference; what is changed in them later is changed for it, too."""
-    return Handle(problem, search)  # type: ignore[no-untyped-call]
+    return Handle(problem, search)
 
 
 @kernel

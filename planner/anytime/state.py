@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
+from numba import config, types
 from numba.experimental import structref
 from numpy.typing import NDArray
 
@@ -69,18 +69,29 @@ class _HandleType(types.StructRef):
     """What compiled code takes a handle for."""
 
 
-class Handle(structref.StructRefProxy):
-    """A problem and the state of a search in it (``problem``, ``search``), as one reference.
-
-    At every call from Python Numba looks at each array that it is given; the fifty of a problem and
-    a search take longer than many a search. `planner.anytime.rounds.handle_of` makes a handle.
-    """
+class _CompiledHandle(structref.StructRefProxy):
+    """What Python takes a handle for."""
 
     problem: Any
     search: Any
 
 
-structref.define_proxy(Handle, _HandleType, ["problem", "search"])  # type: ignore[no-untyped-call]
+class _PlainHandle(NamedTuple):
+    """The same where nothing is compiled (NUMBA_DISABLE_JIT=1)."""
+
+    problem: Any
+    search: Any
+
+
+structref.define_proxy(  # type: ignore[no-untyped-call]
+    _CompiledHandle, _HandleType, ["problem", "search"]
+)
+Handle: Any = _PlainHandle if config.DISABLE_JIT else _CompiledHandle  # type: ignore[attr-defined]
+"""A problem and the state of a search in it (``problem``, ``search``), as one reference.
+
+At every call from Python Numba looks at each array that it is given; the fifty of a problem and a
+search take longer than many a search. `planner.anytime.rounds.handle_of` makes a handle.
+"""
 
 
 def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:
