@@ -291,8 +291,8 @@ class DriveGroup(Protocol):
     def look(self, pace: Pace) -> CycleStatus:
         """Asks every drive how it stands without sending a cycle: after the last one.
 
-        A drive that did not answer the last cycle is not asked; it is missing, as is one that does
-        not answer now.
+        A drive that does not answer now is missing; one that did not answer the last cycle is
+        waited for no longer than one answer takes.
 
         Args:
             pace: Called before each question, as for `read_positions`.

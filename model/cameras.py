@@ -41,7 +41,7 @@ class Camera:
         distortion: OpenCV coefficients of the lens, shape (k,).
         world_from_camera: Pose; x right, y down, z along the view.
         rate: Pictures a second, [Hz].
-        lens: One of `model.files.documents.LENSES`.
+        lens: One of `model.files.camera_file.LENSES`.
         place_covariance: Of ``world_from_camera``: position [m] and rotation vector [rad] along the
             world's axes, shape (6, 6); None where the rig file does not say.
         lens_covariance: Of its n numbers fx, fy, cx, cy [px] and distortion, shape (n, n); None

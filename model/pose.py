@@ -23,6 +23,17 @@ def skew(vector: ArrayLike) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def carried(arm: Array) -> Array:
+    """How errors of a frame move a body in it, shape (6, 6): shift and turn, world axes.
+
+    Args:
+        arm: From the frame's origin to the body's, world axes, shape (3,), [m].
+    """
+    by_frame = np.eye(6)
+    by_frame[:3, 3:] = -skew(arm)
+    return by_frame
+
+
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
     """Rotation matrix of a unit quaternion (w, x, y, z); shape (3, 3)."""
     w, x, y, z = np.asarray(quaternion, dtype=np.float64).tolist()

@@ -145,6 +145,20 @@ def ray_slopes(camera: Camera, rays: Array) -> Array:
     return np.asarray(-np.linalg.solve(by_ray, by_lens))
 
 
+def ideal_slopes(camera: Camera, ideal: Array) -> Array:
+    """How ideal pixels of given pixels move with the camera's n numbers, as `ray_slopes`.
+
+    Args:
+        camera: The camera.
+        ideal: Pixels without distortion, shape (p, 2), [px].
+
+    Returns:
+        Shape (p, 2, n), [px] for each unit of a number.
+    """
+    focal, middle = camera.matrix[[0, 1], [0, 1]], camera.matrix[:2, 2]
+    return np.asarray(ray_slopes(camera, (ideal - middle) / focal) * focal[:, None])
+
+
 def pixels_from_ideal(camera: Camera, ideal: Array) -> Array:
     """Puts the lens distortion back on points, shape (..., 2), [px]; same shape."""
     flat = np.asarray(ideal, dtype=np.float64).reshape(-1, 2)

@@ -14,9 +14,9 @@ import numpy as np
 
 from model.cameras import SURE
 from model.errors import BadInput
-from model.pose import Array, Pose, read_only, skew
+from model.pose import Array, Pose, carried, read_only, skew
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import ray_slopes, rays_of
+from tracking.camera_model import ideal_slopes, ray_slopes, rays_of
 from tracking.detection.tags import tag_corners
 from tracking.pnp import TagView, moved_by_pixels
 
@@ -102,8 +102,7 @@ class SharedErrors:
             return read_only(np.diag([(self.whole / SURE) ** 2] * 3 + [0.0] * 3))
         world_from_camera = self._camera.world_from_camera
         camera_from_body = world_from_camera.inverse().compose(pose)
-        by_place = np.eye(6)
-        by_place[:3, 3:] = -skew(pose.position - world_from_camera.position)
+        by_place = carried(pose.position - world_from_camera.position)
         steps = moved_by_pixels(
             self._camera,
             views,
@@ -124,11 +123,8 @@ class SharedErrors:
 
     def _pixels_by_lens(self, views: Sequence[TagView]) -> Array:
         """Slopes of the ideal pixels of all corners, shape (t, 8, n)."""
-        matrix = self._camera.matrix
-        focal, middle = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
-        pixels = np.concatenate([view.seen.corners for view in views])
-        slopes = ray_slopes(self._camera, (pixels - middle) / focal)
-        return np.asarray((slopes * focal[:, None]).reshape(len(views), 8, -1))
+        ideal = np.concatenate([view.seen.corners for view in views])
+        return ideal_slopes(self._camera, ideal).reshape(len(views), 8, -1)
 
     def _pixels_by_tags(self, views: Sequence[TagView], camera_from_body: Pose) -> Array:
         """Slopes of the same by each tag's errors of size 1, where they look to be, (t, 8, 6 t)."""

@@ -33,7 +33,7 @@ from calibration.procedures import (
 )
 from calibration.results import data_hash
 from calibration.tag_map.bundle_adjustment import require_tags
-from calibration.tag_map.observations import TagSights, sights_of
+from calibration.tag_map.observations import TagSights, platform_pose, sights_of
 from calibration.targets.board import Board, Seen
 from calibration.targets.charuco import Charuco
 from calibration.targets.tag_grid import TagGrid
@@ -41,12 +41,11 @@ from calibration.verdict import Issue
 from executor.kernels import ready_to_measure
 from model.cameras import SURE
 from model.errors import BadInput
-from model.pose import Array, Pose, matrix_from_rotation_vector, read_only, skew
+from model.pose import Array, Pose, carried, matrix_from_rotation_vector, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from tracking.camera_model import Image, ideal_from_pixels
-from tracking.pnp import TagView, moved, solve_pnp
-from tracking.settings import TrackerSettings
+from tracking.pnp import moved
 
 LEAST_PAIRS = 4
 GOOD_PAIRS = 12
@@ -73,15 +72,12 @@ class BodyLook:
 
 def looks_at_tags(rig: Rig, camera: Camera, sights: TagSights) -> dict[str, BodyLook]:
     """The platform in every image in which its tags allow one pose."""
-    tags, found = {tag.id: tag for tag in rig.platform_tags}, {}
-    for name, squares in sights.squares.items():
-        bundle = solve_pnp(camera, [TagView(tags[k], square) for k, square in squares.items()])
-        if bundle is None or not np.isfinite(bundle.covariance).all():
-            continue
-        alone = len(squares) == 1
-        if not alone or bundle.second_best_cost - bundle.cost > TrackerSettings().single_tag_margin:
-            found[name] = BodyLook(bundle.camera_from_body, bundle.covariance, bundle.reprojection)
-    return found
+    bundles = {n: platform_pose(rig, camera, squares) for n, squares in sights.squares.items()}
+    return {
+        name: BodyLook(bundle.camera_from_body, bundle.covariance, bundle.reprojection)
+        for name, bundle in bundles.items()
+        if bundle is not None
+    }
 
 
 def require_oriented(board: Board) -> None:
@@ -196,8 +192,7 @@ def _by_place(reference: Camera, world_from_camera: Pose) -> Array:
     """Covariance of a pose by the place of the camera that measured it, (6, 6); 0 if unstated."""
     if reference.place_covariance is None:
         return np.zeros((6, 6))
-    by_place = np.eye(6)
-    by_place[:3, 3:] = -skew(world_from_camera.position - reference.world_from_camera.position)
+    by_place = carried(world_from_camera.position - reference.world_from_camera.position)
     return np.asarray(by_place @ reference.place_covariance @ by_place.T)
 
 

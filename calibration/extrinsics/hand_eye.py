@@ -19,14 +19,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from calibration.extrinsics.quality import ExtrinsicCalibration, widths_of, workspace_corners
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagSights, platform_pose
 from calibration.verdict import Issue
 from model.errors import BadInput, InvalidFile, Problem
 from model.files.reading import CsvFile
 from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig
-from tracking.pnp import TagView, moved, solve_pnp
-from tracking.settings import TrackerSettings
+from tracking.pnp import moved
 
 LEAST_POSES = 8
 """Fewer poses do not show how accurate the rig's poses are."""
@@ -157,15 +156,9 @@ def locate_by_motion(
 
 
 def _look(rig: Rig, camera: Camera, sights: TagSights, name: str, pose: Pose) -> _CameraLook | None:
-    tags = {tag.id: tag for tag in rig.platform_tags}
     squares = sights.squares[name]
-    found = solve_pnp(camera, [TagView(tags[k], square) for k, square in squares.items()])
-    if found is None or not np.isfinite(found.covariance).all():
-        return None
-    if (
-        len(squares) == 1
-        and found.second_best_cost - found.cost < TrackerSettings().single_tag_margin
-    ):
+    found = platform_pose(rig, camera, squares)
+    if found is None:
         return None
     return _CameraLook(
         pose, found.camera_from_body, found.covariance, found.reprojection, tuple(squares)

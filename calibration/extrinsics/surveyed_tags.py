@@ -22,7 +22,7 @@ from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_check import change_of_inverse
-from tracking.camera_model import project_undistorted, ray_slopes
+from tracking.camera_model import ideal_slopes, project_undistorted
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, moved, solve_pnp
@@ -128,8 +128,9 @@ def locate_by_frame_tags(
     tags, strangers = _agreeing(camera, tags, start)
     best = _fit(camera, tags, start)
     unused = {f"tag {tag.number}": _is_off(camera, tag, best) for tag in strangers}
-    by_lens = _by_lens(camera, tags, best)
-    covariance = _covariance(camera, tags, best)
+    slopes = _slopes(camera, tags, best)
+    by_lens = _by_lens(camera, tags, best, slopes)
+    covariance = _covariance(camera, tags, best, slopes)
     pose = best.inverse()
     changes = []
     for k in range(len(tags) if len(tags) >= MANY_TAGS else 0):
@@ -270,23 +271,20 @@ def _slopes(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
     )
 
 
-def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array | None:
+def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array) -> Array | None:
     """How ``world_from_camera`` moves with errors of the lens, shape (6, n)."""
     if camera.lens_covariance is None:
         return None
-    slopes, matrix = _slopes(camera, tags, best), camera.matrix
-    focal, middle = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
-    by_lens = []
-    for tag in tags:
-        rays = (tag.pixels.reshape(4, 2) - middle) / focal
-        by_lens.append(tag.whitening @ (ray_slopes(camera, rays) * focal[:, None]).reshape(8, -1))
+    by_lens = [
+        tag.whitening @ ideal_slopes(camera, tag.pixels.reshape(4, 2)).reshape(8, -1)
+        for tag in tags
+    ]
     steps = np.linalg.lstsq(slopes, np.concatenate(by_lens), rcond=None)[0]
     return read_only(change_of_inverse(best) @ steps)
 
 
-def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
+def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array) -> Array:
     """Of ``world_from_camera``, shape (6, 6); wider where the scatter contradicts the survey."""
-    slopes = _slopes(camera, tags, best)
     misfit, free = _misfit(camera, tags, best), 8 * len(tags) - 6
     scale = misfit if misfit > chi2.ppf(CONFIDENCE, free) / free else 1.0
     covariance = scale * np.linalg.inv(slopes.T @ slopes)

@@ -67,6 +67,11 @@ class ReadoutCalibration:
     unused: Mapping[str, str]
     data_hash: str
 
+    @property
+    def intervals(self) -> dict[str, Interval]:
+        """The readout with its 95 % interval by the key of result files, [ms]."""
+        return {"readout_ms": Interval(self.readout * 1e3, self.half_width * 1e3)}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moving:
@@ -121,7 +126,9 @@ def fit_readout(
     found = float(best.x)
     low, middle, high = (costs(found + step) for step in (-_STEP, 0.0, _STEP))
     bends, slopes = (high - 2.0 * middle + low) / _STEP**2, (high - low) / (2.0 * _STEP)
-    half_width = _half_width(bends, slopes, float(middle.sum()), _freedom(moving))
+    edges = sum(2 * int(v.seen.edges.sum()) for image in moving.values() for v in image.views)
+    freedom = max(edges - 6 * len(moving) - 1, 1)
+    half_width = _half_width(bends, slopes, float(middle.sum()), freedom)
     if not half_width < 0.5 * longest:
         raise BadInput(
             f"the readout is between {(found - half_width) * 1e3:.2g} and"
@@ -130,7 +137,6 @@ def fit_readout(
             why="the platform hardly moves in them, or only along the camera's view",
             next_step="move it faster, up and down and sideways in the image",
         )
-    edges = sum(2 * int(v.seen.edges.sum()) for image in moving.values() for v in image.views)
     return ReadoutCalibration(
         camera=camera,
         readout=found,
@@ -169,11 +175,6 @@ def _moving(
         motion = PlatformMotion.between(world.compose(first), world.compose(last), between)
         found[name] = _Moving(views, world.compose(here), here, motion)
     return found, unused
-
-
-def _freedom(moving: Mapping[str, _Moving]) -> int:
-    edges = (2 * int(v.seen.edges.sum()) for image in moving.values() for v in image.views)
-    return max(sum(edges) - 6 * len(moving) - 1, 1)
 
 
 def _half_width(bends: Array, slopes: Array, cost: float, freedom: int) -> float:
@@ -242,10 +243,14 @@ def readout_result(
     found: ReadoutCalibration, verdict: CalibrationVerdict, speed: float, on: date
 ) -> ReadoutResult:
     """The result with its quality; the speed is that of the verdict, [m/s]."""
-    interval = Interval(found.readout * 1e3, found.half_width * 1e3)
     return ReadoutResult(
         **common_keys(
-            found.camera.name, on, found.data_hash, {"readout_ms": interval}, verdict, found.unused
+            found.camera.name,
+            on,
+            found.data_hash,
+            found.intervals,
+            verdict,
+            found.unused,
         ),
         readout_ms=round(found.readout * 1e3, 6),
         speed_mm_s=speed * 1e3,
@@ -257,7 +262,6 @@ def readout_result(
 
 def readout_page(found: ReadoutCalibration, verdict: CalibrationVerdict, on: str) -> str:
     """The report."""
-    interval = Interval(found.readout * 1e3, found.half_width * 1e3)
     images: Sequence[tuple[str, str]] = [
         (name, f"{speed * 1e3:.0f} mm/s") for name, speed in found.speeds.items()
     ]
@@ -270,7 +274,7 @@ def readout_page(found: ReadoutCalibration, verdict: CalibrationVerdict, on: str
         f"{on}, {len(found.speeds)} images used, {len(found.unused)} not",
         verdict,
         [
-            Section("Readout", table_of([*interval_rows({"readout_ms": interval}), *errors])),
+            Section("Readout", table_of([*interval_rows(found.intervals), *errors])),
             Section("Images used", table_of(images, ("image", "the platform's speed"))),
             Section("Images not used", table_of(found.unused.items())),
         ],

@@ -21,7 +21,8 @@ from tracking.detection.diagnostics import diagnose_tags
 from tracking.detection.libraries import make_detector
 from tracking.detection.tags import CORNER_SIGNS, modules_across
 from tracking.edges.refine import RefinedTag, refine
-from tracking.pnp import moved
+from tracking.pnp import BundlePose, TagView, moved, solve_pnp
+from tracking.settings import TrackerSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +114,24 @@ def sights_of(
     if not found:
         raise _nothing_seen(camera, family, wanted, left_out, example)
     return TagSights(found, left_out)
+
+
+def platform_pose(rig: Rig, camera: Camera, squares: Mapping[int, RefinedTag]) -> BundlePose | None:
+    """The platform in the camera's frame by its tags; None where they do not allow just one pose.
+
+    Args:
+        rig: Its platform carries the tags.
+        camera: Its matrix and distortion hold.
+        squares: Of one image, by the tags' numbers.
+    """
+    tags = {tag.id: tag for tag in rig.platform_tags}
+    found = solve_pnp(camera, [TagView(tags[k], square) for k, square in squares.items()])
+    if found is None or not np.isfinite(found.covariance).all():
+        return None
+    margin = found.second_best_cost - found.cost
+    if len(squares) == 1 and margin < TrackerSettings().single_tag_margin:
+        return None
+    return found
 
 
 def _alike(squares: Mapping[int, RefinedTag], before: Mapping[int, RefinedTag]) -> bool:

@@ -130,13 +130,10 @@ def show_missing(result: RunResult) -> None:
     for why in dict.fromkeys(missing.values()):
         names = [name for name, reason in missing.items() if reason == why]
         lines.append(f"  why: {', '.join(names)}: {why}")
-    lines.append("  next: the verdict and the exit code are valid; ")
-    lines[-1] += (
-        f"free some disk space if it is full, then `cdpr report {folder}` to write the"
-        " missing files"
-        if folder.is_dir()
-        else "the folder was removed during the run, and its record with it"
-    )
+    removed = "the folder was removed during the run, and its record with it"
+    again = f"free some disk space if it is full, then `cdpr report {folder}`"
+    then = f"{again} to write the missing files" if folder.is_dir() else removed
+    lines.append(f"  next: the verdict and the exit code are valid; {then}")
     for line in lines:
         err.print(line, markup=False, soft_wrap=True)
 

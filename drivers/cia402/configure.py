@@ -373,11 +373,8 @@ def _count_heartbeats(
     network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
 ) -> None:
     """How many entries of 1016h the drive has, as far as the profile uses them."""
-    name, client, needed = (
-        "consumer heartbeat entries",
-        network.client(node),
-        profile.watches_heartbeats,
-    )
+    name, needed = "consumer heartbeat entries", profile.watches_heartbeats
+    client = network.client(node)
     read = client.read if needed else client.read_if_there
     data = read(HEARTBEAT_CONSUMERS, 0, name, 1) if profile.has(HEARTBEAT_CONSUMERS, 1) else None
     count, most = int.from_bytes(data or b"", "little"), profile.heartbeat_entries
