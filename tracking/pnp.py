@@ -65,6 +65,29 @@ class BundlePose:
         return float(np.sqrt(np.average(self.corner_errors**2, weights=self.certainties)))
 
 
+def pose_slopes(camera: Camera, points: Array, pose: Pose) -> Array:
+    """Change of ideal pixels with a shift [m] and a turn [rad] about the camera's axes.
+
+    Args:
+        camera: The camera.
+        points: In the body's frame, shape (..., 3), [m].
+        pose: ``camera_from_body``.
+
+    Returns:
+        Shape (..., 2, 6), [px].
+    """
+    arms = points @ pose.rotation.T
+    there = arms + pose.position
+    by_point = np.zeros((*there.shape[:-1], 2, 3))
+    depth = there[..., 2]
+    for axis in range(2):
+        focal = camera.matrix[axis, axis]
+        by_point[..., axis, axis] = focal / depth
+        by_point[..., axis, 2] = -focal * there[..., axis] / depth**2
+    by_turn = _cross(arms[..., None, :], by_point)  # d(turn × arm) seen through by_point
+    return np.concatenate([by_point, by_turn], axis=-1)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Squares:
     """All tags' corners on the body, and their measured edges, stacked."""
@@ -93,17 +116,8 @@ class _Squares:
 
     def jacobian(self, pose: Pose) -> Array:
         """Change of the errors with a shift [m] and a turn [rad] about the camera's axes."""
-        arms = self.corners @ pose.rotation.T  # (t, 4, 3)
-        points = arms + pose.position
-        by_point = np.zeros((*points.shape[:2], 2, 3))
-        depth = points[..., 2]
-        for axis in range(2):
-            focal = self.camera.matrix[axis, axis]
-            by_point[..., axis, axis] = focal / depth
-            by_point[..., axis, 2] = -focal * points[..., axis] / depth**2
-        by_turn = _cross(arms[..., None, :], by_point)  # d(turn × arm) seen through by_point
-        flat = np.concatenate([by_point, by_turn], axis=-1).reshape(len(points), 8, 6)
-        return np.asarray(self.whitening @ flat)
+        slopes = pose_slopes(self.camera, self.corners, pose)
+        return np.asarray(self.whitening @ slopes.reshape(len(self.corners), 8, 6))
 
 
 def solve_pnp(

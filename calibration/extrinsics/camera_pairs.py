@@ -44,8 +44,8 @@ from model.errors import BadInput
 from model.pose import Array, Pose, carried, matrix_from_rotation_vector, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
-from tracking.camera_model import Image, ideal_from_pixels
-from tracking.pnp import moved
+from tracking.camera_model import Image, ideal_from_pixels, project_undistorted
+from tracking.pnp import moved, pose_slopes
 
 LEAST_PAIRS = 4
 GOOD_PAIRS = 12
@@ -105,23 +105,13 @@ def _board_pose(seen: Seen, camera: Camera) -> BodyLook | None:
     if not good:
         return None
     turn, place = cv2.solvePnPRefineLM(seen.points, ideal, camera.matrix, np.zeros(4), turn, place)
-    rotation = matrix_from_rotation_vector(np.ravel(turn))
-    pose = Pose(np.ravel(place).astype(np.float64), rotation)
-    points = seen.points @ rotation.T
-    depth = points + pose.position
-    by_point = np.zeros((len(points), 2, 3))
-    for axis in range(2):
-        focal = camera.matrix[axis, axis]
-        by_point[:, axis, axis] = focal / depth[:, 2]
-        by_point[:, axis, 2] = -focal * depth[:, axis] / depth[:, 2] ** 2
-    by_turn = np.cross(points[:, None, :], by_point)  # d(turn × arm) seen through by_point
-    slopes = np.concatenate([by_point, by_turn], axis=-1).reshape(-1, 6)
-    there = depth @ camera.matrix.T
-    errors = ideal - there[:, :2] / there[:, 2:]
+    pose = Pose(np.ravel(place).astype(np.float64), matrix_from_rotation_vector(np.ravel(turn)))
+    slopes = pose_slopes(camera, seen.points, pose).reshape(-1, 6)
+    errors = ideal - project_undistorted(camera, pose.apply(seen.points))
     freedom = max(errors.size - 6, 1)
     scatter = max(float(np.sum(errors**2)) / freedom, _LEAST_SCATTER**2)
     error = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
-    return BodyLook(pose, scatter * np.linalg.inv(slopes.T @ slopes), error)
+    return BodyLook(pose, np.asarray(scatter * np.linalg.inv(slopes.T @ slopes)), error)
 
 
 def locate_by_pairs(
