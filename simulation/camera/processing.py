@@ -25,6 +25,8 @@ SHARP_RADIUS = 1.2
 
 def veil_of(camera: Camera, optics: Optics) -> Image32:
     """Brightness that the lamp's halo adds to each pixel."""
+    if optics.halo == 0.0:
+        return np.zeros((camera.height, camera.width), np.float32)
     down, across = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     away = np.hypot(across - LAMP[0] * camera.width, down - LAMP[1] * camera.height)
     veil = 255.0 * optics.halo * np.exp(-away / (HALO_REACH * camera.width))
