@@ -1,4 +1,4 @@
-"""What ``summary.json`` and ``events.jsonl`` of a run folder must hold so that they can be read.
+"""What ``run.json``, ``summary.json`` and ``events.jsonl`` of a run folder must hold to be read.
 
 Keys that nothing reads are not looked at: a later version may add some. What is written is
 `executor.recording.summary`'s; a damaged or edited run folder ends in one message that names the
@@ -177,6 +177,40 @@ class SummaryDocument(_Record):
     final_state: str
     events: list[EventRecord]
     versions: dict[str, str]
+
+
+def _is_moment_somewhere(text: str) -> str:
+    if datetime.fromisoformat(text).tzinfo is None:
+        raise ValueError("has no time zone")
+    return text
+
+
+class CourseDocument(_Record):
+    """``run.json`` (schema_version 1)."""
+
+    schema_version: Literal[1]
+    started: Annotated[str, AfterValidator(_is_moment_somewhere)]
+    interface: str
+    simulated: bool
+    fast: bool
+    final_state: str
+    cause: str
+    cycles: Count
+
+
+def read_course(path: Path) -> CourseDocument:
+    """What ``run.json`` holds.
+
+    Raises:
+        BadInput: It cannot be read.
+        InvalidFile: With every key that cannot be used.
+    """
+    data = read_json(path, AGAIN)
+    try:
+        return CourseDocument.model_validate(data)
+    except ValidationError as error:
+        problems = problems_of(error, CourseDocument, {})
+        raise InvalidFile(str(path), problems, AGAIN) from None
 
 
 def read_summary(path: Path) -> dict[str, Any]:

@@ -16,10 +16,10 @@ from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
-from typing import Any
 
+from executor.recording.record_files import read_course
 from model.errors import BadInput
-from model.files.documents import read_text, write_atomic
+from model.files.documents import write_atomic
 
 #: Of the file, [bytes]: it is written so long at first, so that its end has room on a full disk.
 SIZE = 2048
@@ -52,27 +52,19 @@ class RunCourse:
         """Reads the file.
 
         Raises:
-            BadInput: It cannot be read, or was changed.
+            BadInput: It cannot be read.
+            InvalidFile: With every key that cannot be used.
         """
-        try:
-            return cls._of(json.loads(read_text(path)))
-        except (TypeError, ValueError) as error:
-            raise BadInput(
-                f"not a valid course of a run: {error}",
-                where=str(path),
-                why="the file was changed after the run",
-                next_step="restore the file",
-            ) from None
-
-    @classmethod
-    def _of(cls, data: Any) -> RunCourse:
-        if not isinstance(data, dict) or data.get("schema_version") != 1:
-            raise ValueError("schema_version is not 1")
-        values = {name: value for name, value in data.items() if name != "schema_version"}
-        course = cls(**{**values, "started": datetime.fromisoformat(str(values.get("started")))})
-        if course.started.tzinfo is None:
-            raise ValueError("'started' has no time zone")
-        return course
+        kept = read_course(path)
+        return cls(
+            datetime.fromisoformat(kept.started),
+            kept.interface,
+            kept.simulated,
+            kept.fast,
+            kept.final_state,
+            kept.cause,
+            kept.cycles,
+        )
 
     def save(self, path: Path) -> None:
         """Writes the whole file or nothing.

@@ -1,14 +1,16 @@
-"""A damaged `summary.json` or `events.jsonl` ends in one message that names what is wrong."""
+"""A damaged record of a run ends in one message that names what is wrong."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from executor.recording.run_course import RunCourse
 from executor.recording.run_folder import RunFolder
 from executor.report.run_data import read_run
 from model.errors import BadInput, InvalidFile
@@ -75,6 +77,23 @@ def test_a_value_that_no_run_writes_is_named(folder: RunFolder, key: str, value:
     with pytest.raises(InvalidFile) as caught:
         folder.summary()
     assert key.split(".")[0] in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        (key, value)
+        for key in ("started", "interface", "simulated", "fast", "final_state", "cause", "cycles")
+        for value in ([], {}, None, 1.5, -1, "yesterday", "2026-01-01T00:00:00")
+        if not (isinstance(value, str) and key in ("interface", "final_state", "cause"))
+    ],
+)
+def test_a_course_that_no_run_writes_is_named(tmp_path: Path, key: str, value: Any) -> None:
+    path = tmp_path / "run.json"
+    RunCourse(datetime(2026, 1, 1, tzinfo=UTC), "virtual", True, False).save(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(InvalidFile, match=key):
+        RunCourse.load(path)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"schema_version": 2}', "\0"])

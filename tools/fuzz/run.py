@@ -204,6 +204,8 @@ def _report(counts: Counter[str], keep: Path) -> int:
     }
     for key, count in sorted(counts.items()):
         print(f"{count:9d}  {key}")
+    for trace in sorted(keep.glob("*.txt")):
+        print(f"{trace.name}:\n{trace.read_text()}")
     if wrong:
         print(f"what went wrong is in {keep}")
     print(f"{counts['reader calls']} reader calls, {counts['verb calls']} verb calls: ", end="")
