@@ -114,8 +114,20 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
     finally:
         if isinstance(board, SharedRequests):
             board.close()
+    raise_unless_finished(stand, motion.supervisor, motion.rig)
+    return stand
+
+
+def raise_unless_finished(stand: WinchesStand, supervisor: Supervisor, rig: Rig) -> None:
+    """Tells how a motion ended, where it did not come to its end.
+
+    Raises:
+        Fault: It ended with a fault, which is latched; with its cause.
+        StoppedByOperator: The operator stopped it.
+        KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
+    """
     if stand.state in (State.STOPPED, State.FINISHED):
-        motion.supervisor.finish()
+        supervisor.finish()
     if stand.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="start again when ready")
     if stand.state is not State.FINISHED:
@@ -124,10 +136,9 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
             where="winches",
             why="the motion was stopped, all drives together; they hold",
             next_step="find the cause; simulated drives start fresh"
-            if is_simulated(motion.rig)
+            if is_simulated(rig)
             else "find the cause and look at the platform, then `cdpr reset RIG`",
         )
-    return stand
 
 
 def _supervised(

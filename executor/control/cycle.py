@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.drive_group import CycleStatus, GroupState
 from executor.control.sync_master import SyncMaster
@@ -68,6 +69,10 @@ class Cycle:
     def resting_targets(self) -> tuple[int, ...]:
         """Targets that move nothing."""
         return self.targets or self.actual
+
+    def allow(self, setpoints: NDArray[np.int32]) -> None:
+        """The gate lets the range of other set-points through from now on, shape (n, m)."""
+        self._limits = gate_limits(self._rig, setpoints, self._rig.document.bus.cycle_ms / 1000.0)
 
     def largest_way(self, first: Array, second: Array) -> float:
         """The longest cable between two sets of drive positions, [m]."""

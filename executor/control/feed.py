@@ -19,22 +19,23 @@ class Feed:
     than the table was made for.
     """
 
-    def __init__(self, rows: int, cycle: float, motion: Motion) -> None:
-        """A feed at row 0, at its full rate.
+    def __init__(self, rows: int, cycle: float, motion: Motion, *, rate: float = 1.0) -> None:
+        """A feed at row 0.
 
         Args:
             rows: Length of the table.
             cycle: [s].
             motion: Limits; at the path's full speed a change of rate keeps its acceleration and
                 jerk.
+            rate: At first; the full one for a table that begins at rest.
         """
         self.index = 0.0
         self._last = rows - 1
         self._acceleration = motion.acceleration / motion.speed * cycle  # [rows a cycle²]
         self._jerk = motion.jerk / motion.speed * cycle**2  # [rows a cycle³]
-        self._change = speed_change((1.0, 0.0), 1.0, self._acceleration, self._jerk)
+        self._change = speed_change((rate, 0.0), rate, self._acceleration, self._jerk)
         self._passed = 0.0  # of the change, [cycles]
-        self._wanted = 1.0
+        self._wanted = rate
         self._steady = True
 
     @property
@@ -56,6 +57,23 @@ class Feed:
     def at_rest(self) -> bool:
         """It will not advance any more, unless another rate is asked for."""
         return self.at_end or (self._steady and self.rate <= 0.0)
+
+    @property
+    def rows_to_rest(self) -> float:
+        """How far it advances if it begins to slow down now."""
+        _, *now = self._change.at(self._passed)
+        ramp = speed_change((now[0], now[1]), 0.0, self._acceleration, self._jerk)
+        return ramp.at(ramp.duration)[0]
+
+    def extend(self, rows: int) -> None:
+        """The table has become longer.
+
+        Raises:
+            ValueError: It has not.
+        """
+        if rows - 1 < self._last:
+            raise ValueError(f"a table of {self._last + 1} rows cannot become one of {rows}")
+        self._last = rows - 1
 
     def go_to(self, rate: float) -> None:
         """Begins to change to another rate; asking again for the same one changes nothing.

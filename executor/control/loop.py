@@ -294,15 +294,9 @@ class Loop:
     def _obey(self, wishes: OperatorRequests) -> None:
         """Does what the operator wants, as far as the state allows it."""
         state = self.machine.state
-        if wishes.stop and state in _STOPPABLE:
-            if wishes.for_what is not None:
-                text = f"{wishes.for_what.text}; slowing down {self.way}"
-                self._tell_cause(wishes.for_what.code, text)
-            else:
-                self._tell_cause("stop", f"stop requested; slowing down {self.way}")
-            self._feed.stop()
-            self.machine.on(Event.STOP)
-        elif wishes.hold and state is State.MOVING:
+        if self._obey_stop(wishes):
+            return
+        if wishes.hold and state is State.MOVING:
             self._feed.stop()
             self.machine.on(Event.HOLD)
             self._tell("hold", f"feed hold; slowing down {self.way}")
@@ -315,6 +309,19 @@ class Loop:
         elif state is State.MOVING and self._feed.wanted != wishes.speed:
             self._feed.go_to(wishes.speed)
             self._tell("speed", f"speed {self.way}: {wishes.speed:.0%} of the planned speed")
+
+    def _obey_stop(self, wishes: OperatorRequests) -> bool:
+        """Stops along the path where that is wished and possible."""
+        if not (wishes.stop and self.machine.state in _STOPPABLE):
+            return False
+        if wishes.for_what is not None:
+            text = f"{wishes.for_what.text}; slowing down {self.way}"
+            self._tell_cause(wishes.for_what.code, text)
+        else:
+            self._tell_cause("stop", f"stop requested; slowing down {self.way}")
+        self._feed.stop()
+        self.machine.on(Event.STOP)
+        return True
 
     def _tell_once(self, finding: Alarm) -> None:
         """A condition that persists is reported in its first cycle."""

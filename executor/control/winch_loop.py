@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -20,7 +21,7 @@ from executor.control.sync_master import SyncMaster
 from executor.control.winch_laws import WinchLaw
 from executor.operator_requests import OperatorRequests, RequestBoard
 from executor.realtime.clock import Clock
-from executor.realtime.job import Armed, Ended, ReadyDrives, Records
+from executor.realtime.job import Armed, Ended, MotionTask, Procedure, ReadyDrives, Records
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
@@ -152,12 +153,12 @@ class WinchesHere:
     """Moves winches in this process, in simulated time; a `WinchMover`."""
 
     def __init__(
-        self, motion: LawMotion, drives: ReadyDrives, clock: Clock, board: RequestBoard
+        self, motion: MotionTask, drives: ReadyDrives, clock: Clock, board: RequestBoard
     ) -> None:
         """Nothing is sent yet."""
         self._motion, self._drives, self._board = motion, drives, board
         self._master = SyncMaster(drives.rig, drives.group, clock)
-        self._loop: Loop | None = None
+        self._loop: Procedure | None = None
 
     def arm(self, records: Records) -> Armed:
         """See `WinchMover`.
@@ -173,7 +174,7 @@ class WinchesHere:
             on_cycle=lambda record: records.take_cycle(record, None),
             on_event=records.take_event,
         )
-        self._loop.arm()
+        self._loop.arm(partial(self._motion.require, self._drives))
         if self._board.read().stop:
             raise StoppedByOperator("stopped before anything moved")
         return Armed("", self._loop.stands_at)

@@ -1,18 +1,24 @@
 """What is said on a run's command socket: one JSON object a line, a question and an answer.
 
 The question names a ``command``: ``status``, ``stop``, ``hold``, ``resume``, or ``speed`` with
-``percent`` (1 to 100). The answer has ``ok``; when it is true ``status`` (see
+``percent`` (1 to 100). A session of jogs also takes ``held`` with ``press`` (a number, rising),
+``direction`` (x, y, z; normed by who takes it), ``frame`` (``world`` or ``platform``), ``step_mm``
+(one of `STEPS_MM`, or null as long as it is held) and ``percent`` of the jog speed; ``let_go`` with
+``press``; and ``end``. The answer has ``ok``; when it is true ``status`` (see
 `executor.remote.status`), otherwise ``what``, a sentence.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from typing import Annotated, Any, Literal, Protocol
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from executor.operator_requests import FASTEST, SLOWEST, RequestBoard
+from model.pose import Array
 
 
 class _Question(BaseModel):
@@ -32,15 +38,72 @@ class SpeedCommand(_Question):
     percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)]
 
 
-Command = Annotated[PlainCommand | SpeedCommand, Field(discriminator="command")]
-_COMMANDS: TypeAdapter[PlainCommand | SpeedCommand] = TypeAdapter(Command)
+Number = Annotated[int, Field(ge=1, le=2**53)]
+Share = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
+#: Steps of a jog that can be asked for, [mm].
+STEPS_MM = (0.1, 1.0, 10.0)
+
+
+class HeldCommand(_Question):
+    """A jog control is held."""
+
+    command: Literal["held"]
+    press: Number
+    direction: Annotated[list[Share], Field(min_length=3, max_length=3)]
+    frame: Literal["world", "platform"] = "world"
+    step_mm: float | None = None
+    percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)] = FASTEST
+
+    @model_validator(mode="after")
+    def _somewhere(self) -> HeldCommand:
+        if math.hypot(*self.direction) < 1e-3:
+            raise ValueError("the direction is zero")
+        if self.step_mm is not None and self.step_mm not in STEPS_MM:
+            raise ValueError(f"step_mm is none of {', '.join(map(str, STEPS_MM))}")
+        return self
+
+
+class LetGoCommand(_Question):
+    """A jog control is no longer held."""
+
+    command: Literal["let_go"]
+    press: Number
+
+
+class EndCommand(_Question):
+    """The session of jogs is to end."""
+
+    command: Literal["end"]
+
+
+JogCommand = HeldCommand | LetGoCommand | EndCommand
+Command = PlainCommand | SpeedCommand | JogCommand
+_COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="command")])
+
+
+class Presses(Protocol):
+    """Takes what is said of jog controls; see `executor.hold_to_run.presses.PressBoard`."""
+
+    def hold(
+        self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
+    ) -> bool:
+        """A control is held; False when that press is over."""
+        ...
+
+    def let_go(self, number: int) -> None:
+        """A control is no longer held."""
+        ...
+
+    def end(self) -> None:
+        """The session is to end."""
+        ...
 
 
 class NotACommand(ValueError):
     """What came over the socket is none; the text says why."""
 
 
-def parse_command(line: bytes) -> PlainCommand | SpeedCommand:
+def parse_command(line: bytes) -> Command:
     """The command in a line.
 
     Raises:
@@ -67,13 +130,25 @@ class Told(Protocol):
         ...
 
 
-def answer_to(line: bytes, board: RequestBoard, status: Told) -> bytes:
+def answer_to(
+    line: bytes, board: RequestBoard, status: Told, presses: Presses | None = None
+) -> bytes:
     """Does what a line asks for; the answer as it is sent.
 
     A command counts even where the run then cannot report its status.
+
+    Args:
+        line: What was asked.
+        board: Where wishes are put up.
+        status: What is reported.
+        presses: Of a session of jogs; None for any other motion.
     """
     try:
-        _put_up(parse_command(line), board)
+        command = parse_command(line)
+        if isinstance(command, JogCommand):
+            _jog(command, presses)
+        else:
+            _put_up(command, board)
         return word_of(status)
     except NotACommand as error:
         return _line({"ok": False, "what": f"not a command: {error}"})
@@ -98,3 +173,23 @@ def _put_up(command: PlainCommand | SpeedCommand, board: RequestBoard) -> None:
         board.ask_stop()
     elif command.command != "status":
         board.ask_hold(command.command == "hold")
+
+
+def _jog(command: JogCommand, presses: Presses | None) -> None:
+    if presses is None:
+        raise NotACommand("this run takes no jogs")
+    if isinstance(command, EndCommand):
+        presses.end()
+    elif isinstance(command, LetGoCommand):
+        presses.let_go(command.press)
+    else:
+        direction = np.array(command.direction, dtype=np.float64)
+        taken = presses.hold(
+            command.press,
+            direction / np.linalg.norm(direction),
+            in_platform=command.frame == "platform",
+            step=None if command.step_mm is None else command.step_mm / 1000.0,
+            percent=command.percent,
+        )
+        if not taken:
+            raise NotACommand(f"press {command.press} is over")

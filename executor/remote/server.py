@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterator, Sequence
 
 from executor.operator_requests import RequestBoard
-from executor.remote.protocol import Told, answer_to, word_of
+from executor.remote.protocol import Presses, Told, answer_to, word_of
 
 #: A question is a line no longer than this, [bytes].
 LONGEST_QUESTION = 1024
@@ -21,7 +21,10 @@ MOST_CLIENTS = 16
 
 @contextlib.contextmanager
 def serving(
-    listeners: Sequence[socket.socket], board: RequestBoard, status: Told
+    listeners: Sequence[socket.socket],
+    board: RequestBoard,
+    status: Told,
+    presses: Presses | None = None,
 ) -> Iterator[None]:
     """Answers every question on the sockets while the block runs.
 
@@ -29,9 +32,10 @@ def serving(
         listeners: Listening; they stay the caller's.
         board: Where wishes are put up.
         status: What is reported.
+        presses: Of a session of jogs; None for any other motion.
     """
     waker, woken = socket.socketpair()
-    server = _Server(listeners, woken, board, status)
+    server = _Server(listeners, woken, board, status, presses)
     thread = threading.Thread(target=server.run, name="cdpr-commands", daemon=True)
     thread.start()
     try:
@@ -49,8 +53,10 @@ class _Server:
         woken: socket.socket,
         board: RequestBoard,
         status: Told,
+        presses: Presses | None,
     ) -> None:
         self._board, self._status, self._woken = board, status, woken
+        self._presses = presses
         self._selector = selectors.DefaultSelector()
         self._selector.register(woken, selectors.EVENT_READ)
         self._begun: dict[socket.socket, bytes] = {}
@@ -116,7 +122,7 @@ class _Server:
             got = client.recv(LONGEST_QUESTION)
             *lines, rest = (self._begun[client] + got).split(b"\n")
             for line in lines:
-                client.sendall(answer_to(line, self._board, self._status))
+                client.sendall(answer_to(line, self._board, self._status, self._presses))
         except OSError:  # it went away, or does not read
             got, rest = b"", b""
         if not got or len(rest) > LONGEST_QUESTION:

@@ -12,7 +12,9 @@ the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``l
 is ``preparing`` (while `cdpr release` takes the torque off ``releasing``) and ``drives`` is empty;
 at the end ``cause`` says why it did not end well. Winches that move without a path (`cdpr home`,
 `cdpr jog --cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a
-percentage.
+percentage. A session of jogs has ``jog`` {``speed_mm_s`` (at most), ``position_mm``,
+``quaternion`` (where the platform was sent), ``room_mm`` (to the end of what is proved), ``limit``
+(why there is no more, or nothing)}, and neither rows nor a path.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -31,6 +33,7 @@ from executor.operator_requests import RequestBoard
 from executor.recording.run_folder import RunEvent
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.trajectory.prepare import PreparedRun
+from model.pose import Pose
 from model.rig import Rig
 
 #: Number of newest events reported.
@@ -235,3 +238,44 @@ class WinchStatus(MotionStatus):
             {"time_s": max(0.0, round(event.at - began, 3)), "code": event.code, "text": event.text}
             for event in list(self._events)
         ]
+
+
+class JogPlace(Protocol):
+    """Where a session of jogs is."""
+
+    @property
+    def pose(self) -> Pose:
+        """Where the platform was sent last, ``world_from_platform``."""
+        ...
+
+    @property
+    def room(self) -> float:
+        """To the end of what is proved, [m]."""
+        ...
+
+    @property
+    def limit(self) -> str:
+        """Why no more is proved; empty while there is more."""
+        ...
+
+
+class JogStatus(WinchStatus):
+    """Of a session of jogs."""
+
+    def __init__(
+        self, rig: Rig, board: RequestBoard, place: JogPlace, *, simulated_time: bool
+    ) -> None:
+        """A session that is being prepared."""
+        super().__init__(rig, board, simulated_time=simulated_time)
+        self._jog = place
+
+    def _place(self) -> dict[str, Any]:
+        pose = self._jog.pose
+        jog = {
+            "speed_mm_s": round(self._rig.motion.speed * 1e3, 3),
+            "position_mm": [round(float(v) * 1e3, 3) for v in pose.position],
+            "quaternion": [round(float(v), 7) for v in pose.quaternion],
+            "room_mm": round(self._jog.room * 1e3, 2),
+            "limit": self._jog.limit or None,
+        }
+        return {"row": None, "rows": None, "path_mm": None, "path_length_mm": None, "jog": jog}

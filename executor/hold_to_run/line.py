@@ -1,0 +1,165 @@
+"""A straight line from a pose, proved piece by piece, each as its drives will be sent it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.stopping_distance import require_stopping_room
+from executor.realtime.shared_memory import Ring, SharedMemory
+from executor.trajectory.path import Path, line
+from executor.trajectory.setpoints import (
+    CheckedTrajectory,
+    Setpoints,
+    build_table,
+    check_table,
+    fingerprint,
+)
+from executor.trajectory.time_scaling import TimeLaw, s_curve, time_law
+from model.pose import Array, Pose
+from model.rig import Rig
+from model.scene import Scene
+
+#: Rows of a piece: of the first, which must be proved at once, and of a later one at most.
+FIRST_ROWS, MOST_ROWS = 10, 40
+#: Short of a whole row: rounding then never makes one row more of a piece, [rows].
+_SHORT = 1e-6
+
+
+class JogLine:
+    """Where a jog goes, at even distances of one row, and what of it is proved."""
+
+    def __init__(self, rig: Rig, scene: Scene, start: Pose, direction: Array) -> None:
+        """Nothing is proved yet.
+
+        Args:
+            rig: The robot; its motion has the jog speed.
+            scene: What is in the way, and the load.
+            start: Where the platform is at rest, ``world_from_platform``.
+            direction: Unit vector in the world frame, shape (3,).
+        """
+        self._rig, self._scene, self._start = rig, scene, start
+        self._direction = direction
+        self._cycle = rig.document.bus.cycle_ms / 1000.0
+        self._spacing = rig.motion.speed * self._cycle
+        self._weight = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
+        self._travelled: Array = np.zeros(1)
+
+    @property
+    def rows(self) -> int:
+        """Of what is proved; 1 while nothing is."""
+        return len(self._travelled)
+
+    def pose(self, row: float) -> Pose:
+        """The pose at a place of what is proved."""
+        return self._at(self.travelled(row))
+
+    def travelled(self, row: float) -> float:
+        """Length up to a place of what is proved, [m]."""
+        return float(np.interp(row, np.arange(self.rows), self._travelled))
+
+    def go_on(self, rows: int) -> CheckedTrajectory:
+        """Proves the next rows, at the jog speed; the first of them is the last of what was proved.
+
+        Raises:
+            CdprError: They do not keep what scene and rig ask for; nothing is added.
+        """
+        begin = float(self._travelled[-1])
+        length = (rows - _SHORT) * self._spacing
+        speed = self._rig.motion.speed
+        steady = s_curve(length, (speed, speed), speed, self._rig.motion)
+        law = TimeLaw((steady,), (0.0,), np.array([0.0, length / speed]))
+        checked = self._proved(begin, length, law)
+        even = begin + self._spacing * np.arange(1, rows + 1)
+        self._travelled = np.concatenate([self._travelled, even])
+        return checked
+
+    def step(self, length: float) -> CheckedTrajectory:
+        """Proves a whole step, from rest to rest, [m]; the line has nothing else.
+
+        Raises:
+            CdprError: As for `go_on`.
+        """
+        path = self._path(0.0, length)
+        checked = self._proved(0.0, length, time_law(path, self._rig.motion))
+        self._travelled = checked.table.travelled
+        return checked
+
+    def _proved(self, begin: float, length: float, law: TimeLaw) -> CheckedTrajectory:
+        path = self._path(begin, length)
+        scene = self._scene.changed(start=self._at(begin), goal=self._at(begin + length), stops=())
+        table = build_table(self._rig, scene, [(path, law)], self._cycle)
+        checked = check_table(self._rig, scene, table)
+        require_stopping_room(self._rig, checked.report.proved_obstacle_clearance)
+        return checked
+
+    def _path(self, begin: float, length: float) -> Path:
+        return Path((line(self._at(begin), self._at(begin + length), self._weight),))
+
+    def _at(self, travelled: float) -> Pose:
+        return Pose(self._start.position + travelled * self._direction, self._start.rotation)
+
+
+# Proved pieces on their way to the process that moves the drives.
+
+
+_HEAD = struct.Struct("<QQ?71s")
+#: Pieces that may be under way.
+SLOTS = 64
+#: A step is no longer than this, [rows].
+LONGEST_STEP = 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """Rows of one press.
+
+    Attributes:
+        press: Its number.
+        first: Place of the first row on the line; the row before it was sent already.
+        from_rest: The rows speed up and slow down by themselves; others are at the jog speed.
+        rows: Set-points, int32, shape (n, m), [counts].
+        hash: Their fingerprint when they were checked.
+    """
+
+    press: int
+    first: int
+    from_rest: bool
+    rows: Setpoints
+    hash: str
+
+    def is_unchanged(self, cycle: float) -> bool:
+        """The rows are those that were checked, for that cycle [s]."""
+        return fingerprint(cycle, self.rows) == self.hash
+
+
+class PieceRing:
+    """Pieces in shared memory; one process puts them in, the other takes them out."""
+
+    def __init__(self, memory: SharedMemory, cables: int) -> None:
+        """Both sides over memory of `size`."""
+        self._ring, self._cables = Ring(memory, SLOTS), cables
+
+    @staticmethod
+    def size(cables: int) -> int:
+        """Of the memory, [bytes]."""
+        return Ring.size(_HEAD.size + 4 * cables * (LONGEST_STEP + 1), SLOTS)
+
+    def put(self, piece: Piece) -> None:
+        """Sends one.
+
+        Raises:
+            ValueError: It is too long.
+        """
+        head = _HEAD.pack(piece.press, piece.first, piece.from_rest, piece.hash.encode())
+        self._ring.put(head + np.ascontiguousarray(piece.rows).tobytes())
+
+    def take(self) -> Iterator[Piece]:
+        """Those that came since the last call, in order."""
+        for content in self._ring.take():
+            press, first, from_rest, digest = _HEAD.unpack_from(content)
+            rows = np.frombuffer(content, dtype=np.int32, offset=_HEAD.size)
+            yield Piece(press, first, from_rest, rows.reshape(-1, self._cables), digest.decode())

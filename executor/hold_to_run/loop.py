@@ -1,0 +1,188 @@
+"""Follows a proved line as long as a press is held; a task of the real-time process.
+
+It differs from a run in this alone: rows arrive while it goes on, it begins to slow down where no
+more are proved, and it does so at once when the press ends. At rest the drives stay enabled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from executor.control.feed import Feed, targets_at
+from executor.control.loop import Loop
+from executor.control.preconditions import require_still_referenced
+from executor.control.sync_master import SyncMaster
+from executor.hold_to_run.line import Piece, PieceRing
+from executor.hold_to_run.presses import Held, PressReader
+from executor.interlock.reference import HomingReference
+from executor.operator_requests import OperatorRequests
+from executor.realtime.job import ReadyDrives
+from executor.realtime.shared_memory import SharedMemory
+from executor.safety.gate import Purpose
+from executor.state_machine import CycleRecord, Event, LoopEvent, State
+from executor.trajectory.setpoints import CheckedSetpoints, Setpoints, fingerprint
+from model.errors import Fault
+from model.files.rig_file import RigDocument
+from model.pose import Pose
+from model.rig import rig_from_document
+
+#: It slows down where what is proved then lasts no longer than this beyond its rest, [rows].
+MARGIN = 4.0
+#: Two counts of the same pose may be rounded to neighbours, [counts].
+ROUNDED = 1
+
+
+class JogLoop(Loop):
+    """One session of jogs on one drive group."""
+
+    way = "along the jog"
+
+    def __init__(
+        self,
+        here: CheckedSetpoints,
+        master: SyncMaster,
+        *,
+        held: Callable[[float], Held],
+        pieces: Callable[[], Iterable[Piece]],
+        wishes: Callable[[], OperatorRequests],
+        on_cycle: Callable[[CycleRecord], None],
+        on_event: Callable[[LoopEvent], None],
+    ) -> None:
+        """Prepares the session; nothing is sent yet.
+
+        Args:
+            here: One row: where the platform is at rest.
+            master: As for `Loop`, as all but the next two.
+            held: What is held at a moment of the clock [s]; asked every cycle.
+            pieces: Those that arrived since it was asked last; asked every cycle.
+            wishes: Only its stop counts.
+            on_cycle: See `Loop`.
+            on_event: See `Loop`.
+        """
+        super().__init__(here, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+        self._held_now, self._pieces = held, pieces
+        self._feed = Feed(1, here.cycle, here.rig.motion, rate=0.0)
+        self._rows: Setpoints = here.setpoints
+        self._press, self._from_rest = 0, True
+
+    def _follow(self) -> None:
+        """One cycle on the line, or at rest."""
+        held = self._held_now(self._clock.now)
+        for piece in self._pieces():
+            if piece.press == held.press:
+                self._take(piece)
+        moving = self.machine.state is State.MOVING
+        if not (moving and held.press and held.press == self._press):
+            self._feed.stop()
+        elif not self._from_rest:
+            self._feed.go_to(held.share if self._has_room() else 0.0)
+        if not self._feed.at_rest:
+            self._send(Purpose.MOVE, targets_at(self._rows, self._feed.advance()))
+        elif not moving or held.ends:
+            self.machine.on(Event.AT_REST)
+        else:
+            self._send(Purpose.HOLD, self._exchange.resting_targets)
+
+    def _has_room(self) -> bool:
+        return self._feed.index + self._feed.rows_to_rest + MARGIN < len(self._rows) - 1
+
+    def _take(self, piece: Piece) -> None:
+        """Begins a line where the platform rests, or goes on with the one under way.
+
+        Raises:
+            Fault: The rows are not those that were checked.
+        """
+        if not piece.is_unchanged(self._course.cycle):
+            raise Fault(
+                "the set-points of a jog differ from those that were checked",
+                where="jog",
+                why="memory changed after the check: a defect of the program or the computer",
+                next_step="test the computer's memory",
+            )
+        if piece.first == 0:
+            if self._feed.at_rest and _meet(piece.rows[0], self._exchange.resting_targets):
+                self._begin(piece)
+        elif (
+            piece.press == self._press
+            and piece.first == len(self._rows) - 1
+            and _meet(piece.rows[0], self._rows[-1].tolist())
+        ):
+            self._rows = np.concatenate([self._rows, piece.rows[1:]])
+            self._feed.extend(len(self._rows))
+            self._exchange.allow(self._rows)
+
+    def _begin(self, piece: Piece) -> None:
+        self._press, self._from_rest, self._rows = piece.press, piece.from_rest, piece.rows
+        rate = 1.0 if piece.from_rest else 0.0
+        motion = self._course.rig.motion
+        self._feed = Feed(len(self._rows), self._course.cycle, motion, rate=rate)
+        self._exchange.allow(self._rows)
+
+    def _obey(self, wishes: OperatorRequests) -> None:
+        """Holding and speed are the held control's."""
+        self._obey_stop(wishes)
+
+
+def _meet(row: Setpoints, others: Sequence[int]) -> bool:
+    return bool(np.max(np.abs(row.astype(np.int64) - np.asarray(others))) <= ROUNDED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JogMotion:
+    """A session of jogs; see `MotionTask` in `executor.realtime.job`.
+
+    Attributes:
+        rig: The rig file, with the jog speed.
+        cables: How many.
+        cycle: [s].
+        begin: Where the drives are to stand, [counts].
+        presses: See `PressBoard`.
+        pieces: See `PieceRing`.
+        reference: Where the drives were referenced, if they were.
+    """
+
+    rig: RigDocument
+    cables: int
+    cycle: float
+    begin: tuple[int, ...]
+    presses: SharedMemory
+    pieces: SharedMemory
+    reference: HomingReference | None
+
+    def loop(
+        self,
+        drives: ReadyDrives,
+        master: SyncMaster,
+        *,
+        wishes: Callable[[], OperatorRequests],
+        on_cycle: Callable[[CycleRecord], None],
+        on_event: Callable[[LoopEvent], None],
+    ) -> Loop:
+        """See `MotionTask`."""
+        row = np.array([self.begin], dtype=np.int32)
+        rig = rig_from_document(self.rig)
+        here = CheckedSetpoints(rig, self.cycle, row, fingerprint(self.cycle, row))
+        return JogLoop(
+            here,
+            master,
+            held=PressReader(self.presses).read,
+            pieces=PieceRing(self.pieces, self.cables).take,
+            wishes=wishes,
+            on_cycle=on_cycle,
+            on_event=on_event,
+        )
+
+    def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
+        """See `MotionTask`."""
+        restarted = drives.group.restarted
+        require_still_referenced(drives.rig, self.reference, restarted, positions)
+
+    def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
+        """See `MotionTask`; nobody looks at the simulated platform."""
+        return None
+
+    def close(self) -> None:
+        """See `MotionTask`; the memory is the session's."""

@@ -1,0 +1,179 @@
+"""Which press of a jog control is held. One that ended is over for good, whatever arrives later.
+
+Every press has a number, which rises. Whoever holds a control says so again and again; a press of
+which nothing is heard for `TIMEOUT` has ended. Both processes judge by the same rule, each for
+itself: the one that hears the operator and the one that moves the drives.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import threading
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from executor.realtime.shared_memory import SharedMemory
+from model.pose import Array
+
+#: A press of which nothing is heard for so long has ended, [s].
+TIMEOUT = 0.150
+
+_ENTRY, _CHECK = struct.Struct("<QdB?"), struct.Struct("<I")
+_SIZE = _ENTRY.size + _CHECK.size
+
+
+class PressRule:
+    """Tells held presses from those that are over; a clock that jumps back ends one, too."""
+
+    def __init__(self) -> None:
+        """No press has been seen."""
+        self._over = 0
+
+    def held(self, number: int, heard: float, now: float) -> bool:
+        """Whether the press is held; asked of an earlier one, or once it was not, it is over.
+
+        Args:
+            number: Of the press, from 1.
+            heard: When it was last said to be held, [s]; NaN for one that was let go.
+            now: On the same clock, [s].
+        """
+        if number <= self._over:
+            return False
+        self._over = number - 1
+        if not 0.0 <= now - heard <= TIMEOUT:
+            self._over = number
+            return False
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What the loop is told.
+
+    Attributes:
+        press: Number of the press that is held; 0 for none.
+        share: Of the jog speed, from 0.01 to 1.
+        ends: The session is to end.
+    """
+
+    press: int = 0
+    share: float = 1.0
+    ends: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Press:
+    """What the operator asked for with a press; it does not change while the press lasts.
+
+    Attributes:
+        number: From 1, rising.
+        direction: Unit vector, shape (3,).
+        in_platform: It is given in the platform frame, otherwise in the world frame.
+        step: Length after which the jog ends by itself, [m]; None as long as it is held.
+        since: When it was first heard of, [s].
+    """
+
+    number: int
+    direction: Array
+    in_platform: bool
+    step: float | None
+    since: float
+
+
+class PressBoard:
+    """The supervisor's side: takes in what is said of presses, from any thread."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        """Nothing is held.
+
+        Args:
+            now: The clock of the loop, [s].
+        """
+        self.memory = SharedMemory.create(_SIZE)
+        self._now, self._rule, self._lock = now, PressRule(), threading.Lock()
+        self._press: Press | None = None
+        self._heard, self._percent, self._ends = math.nan, 100, False
+        self.last_heard = now()
+        """When anything was last said of a press, [s]."""
+        self._write()
+
+    def hold(
+        self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
+    ) -> bool:
+        """A control is held; False when that press is over, or ends with it.
+
+        Args:
+            number: Of the press.
+            direction: Unit vector, shape (3,); counts at the begin of a press.
+            in_platform: See `Press`, as the next one.
+            step: [m].
+            percent: Of the jog speed, from 1 to 100.
+        """
+        with self._lock:
+            now = self._now()
+            known = self._press is not None and self._press.number == number
+            if not self._rule.held(number, self._heard if known else now, now):
+                if known:
+                    self._let_go()
+                return False
+            if not known:
+                self._press = Press(number, direction, in_platform, step, now)
+            self._heard, self._percent, self.last_heard = now, percent, now
+            self._write()
+            return True
+
+    def let_go(self, number: int) -> None:
+        """A control is no longer held, nor will be with this number or an earlier one."""
+        with self._lock:
+            self._rule.held(number, math.nan, self._now())
+            if self._press is not None and self._press.number <= number:
+                self._let_go()
+
+    def end(self) -> None:
+        """The session is to end when the platform is at rest; nothing is held any more."""
+        with self._lock:
+            self._ends = True
+            self._let_go()
+
+    def held(self) -> Press | None:
+        """The press that is held now."""
+        with self._lock:
+            press, now = self._press, self._now()
+            if press is None or not self._rule.held(press.number, self._heard, now):
+                return None
+            return press
+
+    def close(self) -> None:
+        """Lets go of the memory; who still has it open keeps it."""
+        self.memory.close()
+
+    def _let_go(self) -> None:
+        self._heard = math.nan
+        self._write()
+
+    def _write(self) -> None:
+        number = 0 if self._press is None else self._press.number
+        entry = _ENTRY.pack(number, self._heard, self._percent, self._ends)
+        self.memory.view[:_SIZE] = entry + _CHECK.pack(zlib.crc32(entry))
+
+
+class PressReader:
+    """The loop's side."""
+
+    def __init__(self, memory: SharedMemory) -> None:
+        """Reads what `PressBoard` writes."""
+        self._memory, self._rule = memory, PressRule()
+        self._entry = _ENTRY.pack(0, math.nan, 100, False)
+
+    def read(self, now: float) -> Held:
+        """What is held now, on the loop's clock [s]; of a half-written entry, what was before."""
+        content = bytes(self._memory.view[:_SIZE])
+        entry, check = content[: _ENTRY.size], content[_ENTRY.size :]
+        if check == _CHECK.pack(zlib.crc32(entry)):
+            self._entry = entry
+        number, heard, percent, ends = _ENTRY.unpack(self._entry)
+        held = number > 0 and self._rule.held(number, heard, now)
+        share = min(max(percent, 1), 100) / 100.0
+        return Held(number if held else 0, share, ends)
