@@ -13,6 +13,7 @@ from cdpr.cli.output import err, out, show_facts, show_json
 from cdpr.cli.plan.facts import stop_facts
 from drivers.can_bus import IN_PROCESS
 from executor.cameras.sources import describe_cameras
+from executor.hold_to_run.session import JogProposal
 from executor.homing import ForgetProposal, HomeResult, HomingProposal
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
@@ -230,6 +231,23 @@ def show_cable(proposal: CableProposal, on: Console) -> None:
             ("cable", rig.drive_names[winch.node_id]),
             ("motion", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed:g} mm/s"),
             ("tension", limit),
+        ],
+        on,
+    )
+
+
+def show_jogging(proposal: JogProposal, on: Console) -> None:
+    """The drives that are about to be enabled for jogging."""
+    rig, scene = proposal.rig, proposal.scene
+    x, y, z = proposal.start.position * 1000.0
+    obstacles = ", ".join(one.name for one in scene.obstacles) or "none"
+    show_facts(
+        "ready to enable the drives for jogging",
+        [
+            ("rig", rig.name),
+            ("platform", f"at {x:.1f}, {y:.1f}, {z:.1f} mm"),
+            ("obstacles", obstacles),
+            ("motion", f"at most {rig.motion.speed * 1000:g} mm/s, as long as a control is held"),
         ],
         on,
     )

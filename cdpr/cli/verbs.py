@@ -143,6 +143,11 @@ OPERATE = (
         "operate.feed:speed",
     ),
     Verb(
+        "console",
+        "Open the operator's page: see the robot live, jog, teach, preview, run, hold, stop.",
+        "operate.console:console",
+    ),
+    Verb(
         "monitor",
         "Show a run live: state, drives, tensions, lateness, progress and events.",
         "operate.monitor:monitor",

@@ -37,7 +37,15 @@ class Answer:
 
 def ask_all(runs: Sequence[Reached], command: str, percent: int | None = None) -> list[Answer]:
     """Says the same to all runs, to all of them before any answer is waited for."""
-    line = make_line(command, percent)
+    return _ask_all(runs, make_line(command, percent=percent))
+
+
+def ask(run: Reached, line: bytes) -> Answer:
+    """Sends one run a line of `executor.remote.protocol.make_line`; what it said."""
+    return _ask_all([run], line)[0]
+
+
+def _ask_all(runs: Sequence[Reached], line: bytes) -> list[Answer]:
     told = [_told(run, line) for run in runs]
     return [
         _heard(run) if taken else Answer(run.process, None, ended=True)

@@ -116,10 +116,10 @@ def parse_command(line: bytes) -> Command:
         raise NotACommand("; ".join(str(problem["msg"]) for problem in problems)) from None
 
 
-def make_line(command: str, percent: int | None = None) -> bytes:
-    """A question as it is sent."""
-    question = {"command": command} if percent is None else {"command": command, "percent": percent}
-    return json.dumps(question).encode() + b"\n"
+def make_line(command: str, **values: Any) -> bytes:
+    """A question as it is sent; a value that is None is left out."""
+    given = {name: value for name, value in values.items() if value is not None}
+    return json.dumps({"command": command, **given}, allow_nan=False).encode() + b"\n"
 
 
 class Told(Protocol):

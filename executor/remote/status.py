@@ -120,13 +120,18 @@ class CyclesSoFar:
         ]
 
 
+def bus_name(rig: Rig) -> str:
+    """The bus of a rig as a status names it."""
+    bus = rig.document.bus
+    return f"{bus.interface} {bus.channel}".strip()
+
+
 def whose(rig: Rig, folder: Path | None) -> dict[str, Any]:
     """What is moved, by whom, and where it is on record."""
-    bus = rig.document.bus
     return {
         "process": os.getpid(),
         "rig": rig.name,
-        "bus": f"{bus.interface} {bus.channel}".strip(),
+        "bus": bus_name(rig),
         "folder": "" if folder is None else str(folder),
     }
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.facts import show_cable
+from cdpr.cli.facts import show_cable, show_jogging
 from cdpr.cli.operate.run import agreement, show, show_files
 from cdpr.cli.operate.supervision import RunSupervisor, SignalSupervisor, confirmation
 from cdpr.cli.options import (
@@ -27,6 +27,7 @@ from cdpr.cli.options import (
 from cdpr.cli.output import Terminal, out, show_json
 from executor import jogging
 from executor.drives import is_simulated, require_own_time
+from executor.hold_to_run.session import jog_session
 from executor.jogging import FASTEST, SPEED
 from model.errors import BadInput
 from model.files.documents import millimetres
@@ -84,6 +85,13 @@ def jog(
     mm: Annotated[
         float | None, typer.Option("--mm", help="length to pay out, at most 50; negative winds in")
     ] = None,
+    hold_to_run: Annotated[
+        bool,
+        typer.Option(
+            "--hold-to-run",
+            help="enable the drives and follow held controls, as of `cdpr console`, until it ends",
+        ),
+    ] = False,
     limit_n: Annotated[
         float | None, typer.Option(help="with --cable: tension limit of any cable (default: 60 %)")
     ] = None,
@@ -102,7 +110,9 @@ def jog(
 
     A jog is a run: planned, proved, checked and gated like any other, and it can be stopped, held
     and watched. With the interface 'virtual' the simulated platform hangs at home. With --cable one
-    winch alone is moved: for commissioning, with cables that carry no load.
+    winch alone is moved: for commissioning, with cables that carry no load. With --hold-to-run the
+    drives stay enabled, and the platform moves as long as a control is held, over the command
+    socket; `cdpr console` has such controls.
 
     [dim]Examples:[/dim]
 
@@ -124,6 +134,9 @@ def jog(
     require_unused(
         "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
+    if hold_to_run:
+        _held(the_rig, path, speed, fast, yes, without_real_time, as_json)
+        return
     by = None if path.by_mm is None else millimetres(list(path.by_mm))
     jogging.require_distance(by, to_home=path.to_home)
     the_scene = _scene(path.scene, path.no_scene, path.clearance_mm)
@@ -143,6 +156,38 @@ def jog(
         )
         show_files(result, as_json)
     raise typer.Exit(result.exit_code)
+
+
+def _held(
+    rig: Rig,
+    path: PathOptions,
+    speed: float,
+    fast: bool,
+    yes: bool,
+    without_real_time: bool,
+    as_json: bool,
+) -> None:
+    require_unused(
+        "cdpr jog",
+        {
+            "--by-mm": path.by_mm,
+            "--to-home": path.to_home,
+            "--output": path.output,
+            "--json": as_json,
+            "--fast": fast,
+        },
+        "held controls say where to go, in real time",
+    )
+    jog_session(
+        rig,
+        _scene(path.scene, path.no_scene, path.clearance_mm),
+        speed=speed,
+        need_real_time_rights=not without_real_time,
+        listener=Terminal(quiet=False),
+        confirm=confirmation(show_jogging, asks=not (is_simulated(rig) or yes), as_json=False),
+        supervisor=SignalSupervisor(),
+    )
+    out.print("the session is over; the drives hold")
 
 
 def _one_cable(

@@ -1,0 +1,125 @@
+"""`cdpr console`: the operator's page in a browser."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cdpr.cli.options import (
+    CalibrationOption,
+    ChannelOption,
+    InterfaceOption,
+    RigArgument,
+    WithoutRealTimeOption,
+    rig_on_bus,
+)
+from cdpr.cli.output import out
+from cdpr.console.session import Console, ConsoleFiles
+from model.errors import BadInput, HardwareMissing
+
+#: Only this machine's own browser reaches these.
+_LOCAL = ("127.0.0.1", "::1", "localhost")
+
+
+def console(
+    rig: RigArgument,
+    scene: Annotated[
+        Path | None,
+        typer.Option(help="scene file: obstacles and payload, to jog among"),
+    ] = None,
+    plan: Annotated[Path | None, typer.Option(help="plan file to show at first")] = None,
+    host: Annotated[
+        str,
+        typer.Option(help="address to listen on; any but this machine's own needs --allow-others"),
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port; 0 for a free one")] = 8402,
+    read_only: Annotated[
+        bool, typer.Option("--read-only", help="show only; STOP works all the same")
+    ] = False,
+    allow_others: Annotated[
+        bool,
+        typer.Option(
+            "--allow-others", help="let other machines connect: who knows the address can operate"
+        ),
+    ] = False,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    calibration: CalibrationOption = None,
+    without_real_time: WithoutRealTimeOption = False,
+) -> None:
+    """Open the operator's page: see the robot live, jog, teach, preview, run, hold, stop.
+
+    The page is served on this machine; open the address that is printed. What moves runs in
+    processes of its own, and goes on when the console ends. STOP on the page is a software stop: it
+    does not replace the emergency-stop button.
+
+    [dim]Examples:[/dim]
+
+      cdpr console configs/gachon_8_6.yaml --scene configs/environment_1.yaml
+
+      cdpr console rig.yaml --interface socketcan --channel can0 --read-only
+    """
+    if host not in _LOCAL and not allow_others:
+        raise BadInput(
+            f"{host} lets other machines connect",
+            where="--host",
+            why="the connection is not encrypted, and who knows the address can move the robot",
+            next_step="use an SSH tunnel, or pass --allow-others in a network that you trust",
+        )
+    try:
+        import uvicorn
+
+        from cdpr.console.server import ConsoleServer
+    except ImportError as error:
+        raise HardwareMissing(
+            f"the console needs {error.name}",
+            where="cdpr console",
+            next_step='install it: pip install "cdpr[console]"',
+        ) from None
+    options = [("--interface", interface), ("--channel", channel)]
+    options += [("--calibration", str(path)) for path in calibration or ()]
+    files = ConsoleFiles(
+        rig_file=rig,
+        rig=rig_on_bus(rig, interface, channel, calibration),
+        bus_options=tuple(text for name, value in options if value for text in (name, value)),
+        scene_file=scene,
+        without_real_time=without_real_time,
+        read_only=read_only,
+    )
+    shown = Console(files)
+    if plan is not None:
+        shown.load_plan(plan)
+    with _listening(host, port) as listener:
+        server = ConsoleServer(shown)
+        at = listener.getsockname()[1]
+        out.print(f"console of {files.rig.name}: http://{host}:{at}/?token={server.token}")
+        out.print("Ctrl-C ends the console, not what moves", soft_wrap=True)
+        config = uvicorn.Config(server.app(), log_level="warning", ws_max_size=4096)
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+@contextmanager
+def _listening(host: str, port: int) -> Iterator[socket.socket]:
+    """A socket for the pages.
+
+    Raises:
+        BadInput: The address cannot be used.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((host, port))
+        except OSError as error:
+            raise BadInput(
+                f"cannot listen on {host}:{port}: {error.strerror or error}",
+                where="--port",
+                why="another program uses the port, or the address is not this machine's",
+                next_step="pass another --port, or 0 for a free one",
+            ) from None
+        yield listener

@@ -1,0 +1,90 @@
+"""Which page may operate, and which press of a jog control is meant. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class _Page:
+    name: str
+    hold: int = 0
+    press: int = 0
+    over: int = 0
+
+
+class PageControl:
+    """Everybody may look and stop; one page at a time may operate."""
+
+    def __init__(self) -> None:
+        """No page is open."""
+        self._pages: dict[int, _Page] = {}
+        self._next_page, self._next_press = 1, 1
+        self.holder: int | None = None
+        """The page that has control."""
+
+    def join(self, name: str) -> int:
+        """A page was opened; its number. The name tells it from others for people."""
+        number, self._next_page = self._next_page, self._next_page + 1
+        self._pages[number] = _Page(name)
+        return number
+
+    def leave(self, page: int) -> int | None:
+        """A page is gone; the press that it held, if any, and its control end."""
+        held = self.let_go(page)
+        del self._pages[page]
+        if self.holder == page:
+            self.holder = None
+        return held
+
+    def take(self, page: int, *, moving: bool, force: bool = False) -> str:
+        """Gives a page control; why not, or nothing.
+
+        Args:
+            page: Which.
+            moving: Something moves.
+            force: Take it from a page that has it; only while nothing moves.
+        """
+        if self.holder not in (None, page):
+            assert self.holder is not None
+            if moving or not force:
+                holder = self._pages[self.holder].name
+                when = " while the robot moves" if moving and force else ""
+                return f"{holder} has control; it is not taken away{when}"
+            self.let_go(self.holder)
+        self.holder = page
+        return ""
+
+    def give(self, page: int) -> int | None:
+        """A page gives its control back; the press that it held ends."""
+        held = self.let_go(page)
+        if self.holder == page:
+            self.holder = None
+        return held
+
+    def holder_name(self) -> str | None:
+        """Who has control."""
+        return None if self.holder is None else self._pages[self.holder].name
+
+    def hold(self, page: int, hold: int) -> int | None:
+        """The press that a page's control is held with; None where it may not, or no longer.
+
+        Args:
+            page: Which.
+            hold: The page's own number of the press, rising from 1.
+        """
+        mine = self._pages[page]
+        if self.holder != page or hold <= mine.over or hold < mine.hold:
+            return None
+        if hold > mine.hold:
+            mine.hold, mine.press = hold, self._next_press
+            self._next_press += 1
+        return mine.press
+
+    def let_go(self, page: int, hold: int | None = None) -> int | None:
+        """The press that ends: of this number on the page, or the one that is held."""
+        mine = self._pages[page]
+        if hold is None:
+            hold = mine.hold
+        mine.over = max(mine.over, hold)
+        return mine.press if hold >= mine.hold > 0 else None

@@ -1,0 +1,394 @@
+"""What the console knows and does, whoever looks at it; no web server in here."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cdpr.console.commands import (
+    FileCommand,
+    Held,
+    IndexCommand,
+    LetGo,
+    Message,
+    MoveCommand,
+    NameCommand,
+    PlanCommand,
+    RenameCommand,
+    SpeedCommand,
+    TakeCommand,
+)
+from cdpr.console.control import PageControl
+from cdpr.console.preview import preview
+from cdpr.console.started import StartedVerb
+from cdpr.console.teach import TaughtPoses, scene_text
+from cdpr.console.view import RobotNow, RobotView, pose_data
+from cdpr.console.watch import RunWatch
+from drivers.can_bus import BusSettings
+from executor.drives import is_simulated
+from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.interlock import MotionInterlock
+from executor.remote.client import stop_runs
+from executor.remote.status import bus_name
+from executor.service import reference_status
+from model.errors import BadInput, CdprError, Refused
+from model.files.documents import write_atomic
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Scene, load_scene, nothing_in_the_way
+
+#: Latch and reference are read this often at most, [s].
+KEPT_EVERY = 0.5
+#: Folder of the plans and scenes that the console makes.
+MADE = Path("console")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConsoleFiles:
+    """What the console was started with.
+
+    Attributes:
+        rig_file: As it is given to verbs.
+        rig: The robot and its bus.
+        bus_options: Options of the command line for that bus.
+        scene_file: What is around; None where nobody said.
+        without_real_time: Verbs move even where real-time scheduling is denied.
+        read_only: Nothing but STOP.
+    """
+
+    rig_file: Path
+    rig: Rig
+    bus_options: tuple[str, ...]
+    scene_file: Path | None
+    without_real_time: bool
+    read_only: bool
+
+
+class Console:
+    """One console of one rig; safe to use from several threads."""
+
+    def __init__(self, files: ConsoleFiles) -> None:
+        """Nothing is looked at yet.
+
+        Raises:
+            BadInput: The scene, or the file of taught poses, cannot be read.
+        """
+        self.files, self.rig = files, files.rig
+        self.scene: Scene | None = (
+            None if files.scene_file is None else load_scene(files.scene_file)
+        )
+        self.control, self.verbs = PageControl(), StartedVerb()
+        self.watch = RunWatch(
+            f"{files.rig.document.bus.interface} {files.rig.document.bus.channel}".strip()
+        )
+        self.view = RobotView(files.rig, self.scene)
+        self.poses = TaughtPoses(MADE / "poses.json")
+        self.preview: dict[str, Any] | None = None
+        self._lock = threading.RLock()
+        self._line = ""
+        self._robot: RobotNow | None = None
+        self._kept_at, self._kept = float("-inf"), _Kept(None, False, None)
+
+    # What it shows.
+
+    def look(self) -> dict[str, Any]:
+        """The state of all that every page shows alike; call it about 20 times a second."""
+        look = self.watch.look()
+        with self._lock:
+            self._line = self.verbs.look()
+            if look.status is not None:
+                seen = self.view.take(look.status)
+                self._robot = seen or self._robot
+            self._read_kept()
+            return self._state(look.status, time.monotonic() - look.at)
+
+    def _state(self, status: dict[str, Any] | None, age: float) -> dict[str, Any]:
+        robot, rig = self._robot, self.view.rig
+        jog = None if status is None else status.get("jog")
+        return {
+            "kind": "state",
+            "read_only": self.files.read_only,
+            "rig": rig.name,
+            "bus": bus_name(rig),
+            "simulated": is_simulated(rig),
+            "latched": self._kept.latched,
+            "reference": {"counts": self._kept.referenced, "why_not": self._kept.why_not},
+            "busy": None
+            if self.verbs.verb is None
+            else {"verb": self.verbs.verb, "text": self._line},
+            "outcome": self._outcome(),
+            "motion": None if status is None else {**status, "age_s": round(age, 3)},
+            "platform": None if robot is None else pose_data(rig, robot.pose, "drives"),
+            "tensions_n": None if robot is None else [round(t, 2) for t in robot.tensions],
+            "tension_limits_n": [rig.min_tension, rig.max_tension],
+            "clearance_mm": self._clearance(),
+            "next_stop": self._next_stop(status),
+            "preview": None if self.preview is None else self.preview["name"],
+            "jog": self._jog(status, jog),
+            "poses": self.poses.told(),
+        }
+
+    def _busy(self) -> dict[str, Any] | None:
+        verb = self.verbs.verb
+        return None if verb is None else {"verb": verb, "text": self._line}
+
+    def _outcome(self) -> dict[str, Any] | None:
+        ended = self.verbs.outcome
+        if ended is None:
+            return None
+        return {
+            "verb": ended.verb,
+            "ok": ended.exit_code == 0,
+            "text": ended.text,
+            "report": None if ended.report is None else f"/runs/{ended.report}",
+            "fault_page": None if ended.fault is None else f"/help/{ended.fault}",
+        }
+
+    def _clearance(self) -> dict[str, Any] | None:
+        if self._robot is None or self._robot.clearance is None:
+            return None
+        distance, first, second = self._robot.clearance
+        required = self.view.required_clearance
+        return {
+            "now": round(distance * 1e3, 1),
+            "required": round(required * 1e3, 1),
+            "pair": [first, second],
+        }
+
+    def _next_stop(self, status: dict[str, Any] | None) -> dict[str, Any] | None:
+        if status is None or status.get("path_mm") is None:
+            return None
+        left = status["path_length_mm"] - status["path_mm"]
+        speed = self.view.rig.motion.speed * 1e3 * status["wished"]["speed_percent"] / 100.0
+        return {"name": "goal", "distance_mm": round(left, 1), "seconds": round(left / speed, 1)}
+
+    def _jog(self, status: dict[str, Any] | None, jog: dict[str, Any] | None) -> dict[str, Any]:
+        if status is None or jog is None:
+            return {
+                "ready": False,
+                "why_not": "the drives are not enabled for jogging",
+                "moving": False,
+                "limit": None,
+                "speed_mm_s": 20.0,
+            }
+        ready = status["state"] == "moving"
+        limit = jog["limit"] and f"stops in {jog['room_mm']:.1f} mm: {jog['limit']}"
+        return {
+            "ready": ready,
+            "why_not": None if ready else f"the drives are {status['state']}",
+            "moving": bool(status["feed_percent"]),
+            "limit": limit,
+            "speed_mm_s": jog["speed_mm_s"],
+        }
+
+    def _read_kept(self) -> None:
+        """Latch and reference of the bus, from their files."""
+        now = time.monotonic()
+        if now - self._kept_at < KEPT_EVERY:
+            return
+        self._kept_at = now
+        if is_simulated(self.rig):
+            self._kept = _Kept(None, True, None)
+            return
+        fault = FaultLatch(BusSettings.of(self.rig)).read()
+        under_way = self.watch.last.status is not None
+        try:
+            reference = reference_status(MotionInterlock(self.rig))
+            why = reference.why_not
+        except CdprError as error:
+            why = error.what
+        self._kept = _Kept(None if fault is None or under_way else fault.cause, not why, why)
+
+    # What it does.
+
+    def stop(self) -> str:
+        """Stops every run of this user; why not, or nothing."""
+        told = stop_runs()
+        if not (told.stopped or told.silent):
+            return "nothing moves"
+        return "" if not told.silent else "a run does not answer: press the emergency stop"
+
+    def command(self, page: int, message: Message) -> str:
+        """Does what a page asks for; why not, or nothing."""
+        if message.command == "stop":
+            return self.stop()
+        if self.files.read_only:
+            return "this console only shows"
+        try:
+            with self._lock:
+                return self._command(page, message)
+        except CdprError as error:
+            return str(error)
+
+    def load_plan(self, path: Path) -> None:
+        """Shows a plan before it is run.
+
+        Raises:
+            BadInput: It cannot be read, or is for another rig.
+        """
+        self.preview = None
+        self.preview = preview(path, self.rig)
+
+    def _command(self, page: int, message: Message) -> str:
+        if isinstance(message, TakeCommand):
+            moving = self.watch.last.status is not None
+            return self.control.take(page, moving=moving, force=message.force)
+        if message.command == "give_control":
+            self._end_press(self.control.give(page))
+            return ""
+        if self.control.holder != page:
+            return "take control first"
+        return self._operate(message)
+
+    def _operate(self, message: Message) -> str:
+        match message:
+            case SpeedCommand():
+                return self.watch.say("speed", percent=message.percent)
+            case FileCommand():
+                self.load_plan(_inside(message.file))
+            case PlanCommand():
+                self._plan(message)
+            case NameCommand():
+                self.poses.teach(message.name, self._pose_now())
+            case RenameCommand():
+                self.poses.rename(message.index, message.name)
+            case MoveCommand():
+                self.poses.move(message.index, message.to)
+            case IndexCommand():
+                self.poses.forget(message.index)
+            case _:
+                return self._plain(message.command)
+        return ""
+
+    def _plain(self, command: str) -> str:
+        said = {"hold": "hold", "resume": "resume", "jog_end": "end"}
+        if command in said:
+            return self.watch.say(said[command])
+        verbs: dict[str, Callable[[], str]] = {
+            "home": self._home,
+            "reset": self._reset,
+            "release": self._release,
+            "run": self._run,
+            "jog_begin": self._jog_begin,
+        }
+        return verbs[command]()
+
+    def _home(self) -> str:
+        cameras = [camera.name for camera in self.rig.cameras]
+        how = ["--camera", cameras[0]] if cameras and not is_simulated(self.rig) else ["--at-home"]
+        return self._start("home", [str(self.files.rig_file), *how])
+
+    def _reset(self) -> str:
+        return self._start("reset", [str(self.files.rig_file)], real_time=False)
+
+    def _release(self) -> str:
+        return self._start("release", [str(self.files.rig_file)])
+
+    def _run(self) -> str:
+        if self.preview is None or not self.preview["passed"]:
+            return "load a plan that passes first"
+        return self._start("run", [self.preview["name"], "--rig", str(self.files.rig_file)])
+
+    def _jog_begin(self) -> str:
+        scene = self.files.scene_file
+        around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
+        return self._start("jog", [str(self.files.rig_file), "--hold-to-run", *around])
+
+    def _start(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
+        if self.watch.last.status is not None:
+            return "the robot moves; wait, or stop it"
+        relaxed = ["--without-real-time"] if real_time and self.files.without_real_time else []
+        self.verbs.start(verb, [*arguments, *self.files.bus_options, *relaxed, "--yes"])
+        return ""
+
+    def _plan(self, message: PlanCommand) -> None:
+        scene = self._taught_scene() if message.scene is None else _inside(message.scene)
+        output = MADE / f"{scene.stem}.plan.json"
+        cost = [] if message.objective == "shortest" else ["--cost", message.objective]
+        self.preview = None
+        rig = str(self.files.rig_file)
+        self.verbs.start("plan", [rig, str(scene), "-o", str(output), "--force", *cost])
+
+    def _taught_scene(self) -> Path:
+        around = nothing_in_the_way(self.rig) if self.scene is None else self.scene
+        document = self.poses.scene(around, "taught")
+        path = MADE / "taught.yaml"
+        MADE.mkdir(exist_ok=True)
+        write_atomic(path, scene_text(document))
+        return path
+
+    def _pose_now(self) -> Pose:
+        if self._robot is None:
+            raise Refused(
+                "where the platform is has not been seen yet",
+                where="console",
+                next_step="enable the drives for jogging, or run a plan",
+            )
+        return self._robot.pose
+
+    # Jogging.
+
+    def held(self, page: int, message: Held) -> None:
+        """A page's jog control is held; what may not move does not."""
+        with self._lock:
+            press = None if self.files.read_only else self.control.hold(page, message.hold)
+        if press is None:
+            return
+        most = 1e3 * self.view.rig.motion.speed
+        jog = (self.watch.last.status or {}).get("jog")
+        if jog is not None:
+            most = float(jog["speed_mm_s"])
+        percent = min(max(round(100.0 * message.speed_mm_s / most), 1), 100)
+        length = math.hypot(*message.direction)
+        self.watch.say(
+            "held",
+            press=press,
+            direction=[v / length for v in message.direction],
+            frame=message.frame,
+            step_mm=message.step_mm,
+            percent=percent,
+        )
+
+    def let_go(self, page: int, message: LetGo) -> None:
+        """A page's jog control is no longer held."""
+        with self._lock:
+            press = self.control.let_go(page, message.hold)
+        self._end_press(press)
+
+    def leave(self, page: int) -> None:
+        """A page is gone, and what it held with it."""
+        with self._lock:
+            press = self.control.leave(page)
+        self._end_press(press)
+
+    def _end_press(self, press: int | None) -> None:
+        if press is not None:
+            self.watch.say("let_go", press=press)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    latched: str | None
+    referenced: bool
+    why_not: str | None
+
+
+def _inside(name: str) -> Path:
+    """A file below the folder that the console was started in.
+
+    Raises:
+        BadInput: It is elsewhere.
+    """
+    path = Path(name)
+    if not path.resolve().is_relative_to(Path.cwd().resolve()):
+        raise BadInput(
+            f"{name} is not below the folder in which the console runs",
+            where="console",
+            next_step="copy it there, or start the console elsewhere",
+        )
+    return path

@@ -1,0 +1,170 @@
+"""Poses that the operator taught: named, ordered, kept in a file, made into a scene to plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, TypeAdapter, ValidationError
+
+from model.errors import BadInput, InvalidFile
+from model.files.documents import Document, Name, PoseDocument, write_atomic
+from model.files.reading import parse_json, read_text
+from model.files.scene_file import SceneDocument, StopDocument
+from model.files.validation import problems_of
+from model.pose import Pose
+from model.scene import Scene
+
+#: Of the poses.
+MOST = 200
+AGAIN = "restore the file, or move it away to begin with no poses"
+
+
+class TaughtPose(PoseDocument):
+    """One pose with its name."""
+
+    name: Name
+
+
+class TaughtDocument(Document):
+    """The file."""
+
+    schema_version: Literal[1] = 1
+    poses: list[TaughtPose] = Field(default_factory=list)
+
+
+class TaughtPoses:
+    """Poses in an order, on disk after every change."""
+
+    def __init__(self, path: Path) -> None:
+        """Those that are in the file; none where there is no file.
+
+        Raises:
+            BadInput: It cannot be read.
+            InvalidFile: With what is wrong in it.
+        """
+        self._path = path
+        self._poses: list[TaughtPose] = []
+        if path.exists():
+            try:
+                document = TaughtDocument.model_validate(parse_json(read_text(path)))
+            except ValidationError as error:
+                problems = problems_of(error, TaughtDocument, {})
+                raise InvalidFile(str(path), problems, AGAIN) from None
+            except ValueError as error:
+                raise BadInput(str(error), where=str(path), next_step=AGAIN) from None
+            self._poses = list(document.poses)
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self._poses)
+
+    def told(self) -> list[dict[str, Any]]:
+        """As the page takes them."""
+        return [
+            {"name": p.name, "position_mm": p.position_mm, "quaternion": p.rotation_wxyz}
+            for p in self._poses
+        ]
+
+    def teach(self, name: str, pose: Pose) -> None:
+        """Adds a pose at the end.
+
+        Raises:
+            BadInput: There are too many, or the name is taken or none.
+        """
+        if len(self._poses) >= MOST:
+            raise _refusal(f"there are {MOST} poses already", "remove one that is not needed")
+        self._require_free(name)
+        document = PoseDocument.of(pose)
+        self._keep([*self._poses, _named(document, name)])
+
+    def rename(self, index: int, name: str) -> None:
+        """Gives a pose another name.
+
+        Raises:
+            BadInput: There is no such pose, or the name is taken or none.
+        """
+        self._require(index)
+        if name != self._poses[index].name:
+            self._require_free(name)
+        changed = list(self._poses)
+        changed[index] = _named(changed[index], name)
+        self._keep(changed)
+
+    def move(self, index: int, to: int) -> None:
+        """Puts a pose at another place of the order.
+
+        Raises:
+            BadInput: There is no such place.
+        """
+        self._require(index)
+        self._require(to)
+        changed = list(self._poses)
+        changed.insert(to, changed.pop(index))
+        self._keep(changed)
+
+    def forget(self, index: int) -> None:
+        """Removes a pose.
+
+        Raises:
+            BadInput: There is no such pose.
+        """
+        self._require(index)
+        self._keep([pose for k, pose in enumerate(self._poses) if k != index])
+
+    def scene(self, around: Scene, name: str) -> SceneDocument:
+        """From the first to the last through all others, among what is around.
+
+        Raises:
+            BadInput: There are fewer than two poses.
+        """
+        if len(self._poses) < 2:
+            raise _refusal(f"a path needs two poses, not {len(self._poses)}", "teach another one")
+        start, *stops, goal = self._poses
+        return around.document.model_copy(
+            update={
+                "name": name,
+                "start": start.bare(),
+                "stops": [StopDocument(**stop.model_dump()) for stop in stops],
+                "goal": goal.bare(),
+            }
+        )
+
+    def _keep(self, poses: list[TaughtPose]) -> None:
+        """On disk first."""
+        document = TaughtDocument(poses=poses)
+        write_atomic(self._path, document.model_dump_json(indent=1) + "\n")
+        self._poses = poses
+
+    def _require(self, index: int) -> None:
+        if not 0 <= index < len(self._poses):
+            raise _refusal(f"there is no pose {index + 1}", "look at the list again")
+
+    def _require_free(self, name: str) -> None:
+        if any(pose.name == name for pose in self._poses):
+            raise _refusal(f"there is a pose '{name}' already", "choose another name")
+
+
+def scene_text(document: SceneDocument) -> str:
+    """A scene file."""
+    data = document.model_dump(mode="json", exclude_defaults=True)
+    return yaml.safe_dump(
+        {"schema_version": document.schema_version, **data},
+        sort_keys=False,
+        allow_unicode=True,
+        default_flow_style=None,
+    )
+
+
+def _named(pose: PoseDocument, name: str) -> TaughtPose:
+    try:
+        checked = TypeAdapter(Name).validate_python(name)
+    except ValidationError:
+        raise _refusal(f"'{name}' is no name", "use 1 to 80 letters or digits") from None
+    given = {"position_mm": pose.position_mm, "rotation_wxyz": pose.rotation_wxyz}
+    return TaughtPose(name=checked, **given)
+
+
+def _refusal(what: str, next_step: str) -> BadInput:
+    return BadInput(what, where="taught poses", next_step=next_step)

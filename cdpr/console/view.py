@@ -1,0 +1,155 @@
+"""What the page shows of the robot, from what its drives say: pose, tensions, clearance."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from executor.interlock.interlock import MotionInterlock
+from executor.recording.run_folder import RunFolder
+from executor.report.scene import frame_surface, platform_surface
+from model.clearance import ClearanceModel
+from model.errors import CdprError
+from model.geometry.solids import solid_of
+from model.kinematics import cables_at, forward_kinematics
+from model.pages.scene import SceneFigure, SceneSurface, Stroke, grid_floor, scene_data
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Scene, nothing_in_the_way
+from model.winches import WinchMap
+
+#: Clearance is computed this often at most, [s].
+CLEARANCE_EVERY = 0.2
+
+
+def scene_figure(rig: Rig, scene: Scene | None, *strokes: Stroke) -> SceneFigure:
+    """The rig among its obstacles, without the platform at any moment."""
+    obstacles = () if scene is None else scene.obstacles
+    surfaces = [frame_surface(rig)]
+    for one in obstacles:
+        solid = solid_of(one)
+        surfaces.append(
+            SceneSurface(
+                "obstacles", "obstacle", solid.vertices, solid.faces, solid.edges, 0.62, one.name
+            )
+        )
+    points = [surface.vertices for surface in surfaces]
+    points += [stroke.segments.reshape(-1, 3) for stroke in strokes]
+    floor, _ = grid_floor(np.concatenate(points))
+    return SceneFigure(
+        surfaces=tuple(surfaces),
+        strokes=(floor, *strokes),
+        labels=(),
+        anchors=rig.anchors,
+        platform=platform_surface(rig),
+        moments=(),
+    )
+
+
+def scene_of(rig: Rig, scene: Scene | None) -> dict[str, Any]:
+    """What the page draws at first; see `model.pages.scene.scene_data`."""
+    return scene_data(scene_figure(rig, scene))
+
+
+def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
+    """The platform as the page takes it: mm, and where cables leave their pulleys."""
+    tilt = float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
+    turn = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
+    return {
+        "position_mm": np.round(pose.position * 1e3, 2).tolist(),
+        "tilt_deg": round(tilt, 3),
+        "turn_deg": round(turn, 3),
+        "rotation": np.round(pose.rotation, 6).reshape(-1).tolist(),
+        "exits_mm": np.round(cables_at(rig, pose).exits * 1e3, 2).tolist(),
+        "source": source,
+    }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotNow:
+    """The robot as its drives have it.
+
+    Attributes:
+        pose: ``world_from_platform``; None where their positions fit none.
+        tensions: By their torques, [N].
+        clearance: Smallest distance [m], and between what; None without obstacles.
+    """
+
+    pose: Pose
+    tensions: list[float]
+    clearance: tuple[float, str, str] | None
+
+
+class RobotView:
+    """Where the robot is, from one status to the next."""
+
+    def __init__(self, rig: Rig, scene: Scene | None) -> None:
+        """Not seen yet.
+
+        Args:
+            rig: The robot and its bus.
+            scene: What is around, unless a run says otherwise.
+        """
+        self._file_rig, self._file_scene = rig, scene
+        self._folder: str | None = None
+        self._looked = float("-inf")
+        self._clearance: tuple[float, str, str] | None = None
+        self._pose = rig.home
+        self._set(rig, scene)
+
+    def take(self, status: dict[str, Any]) -> RobotNow | None:
+        """The robot by a run's status; None before its first cycle."""
+        folder = status["folder"]
+        if folder != self._folder:
+            self._folder = folder
+            self._set_by(Path(folder) if folder else None)
+        drives = status["drives"]
+        if not drives or len(drives) != self.rig.cable_count:
+            return None
+        counts = np.array([drive["position_counts"] for drive in drives], dtype=np.float64)
+        tensions = np.array([drive["tension_n"] for drive in drives])
+        lengths = self._winches.strained(
+            self._winches.unstrained_from_counts(counts), np.maximum(tensions, 0.0)
+        )
+        try:
+            self._pose = forward_kinematics(self.rig, lengths, self._pose, tolerance=1e-6).pose
+        except CdprError:  # while cables hang slack, no pose fits
+            return None
+        return RobotNow(self._pose, tensions.tolist(), self._near(self._pose))
+
+    @property
+    def required_clearance(self) -> float:
+        """Of the scene, [m]."""
+        return self.scene.obstacle_clearance
+
+    def _near(self, pose: Pose) -> tuple[float, str, str] | None:
+        now = time.monotonic()
+        if now - self._looked >= CLEARANCE_EVERY:
+            self._looked = now
+            near = self._model.smallest(pose)
+            self._clearance = None if near is None else (near.distance, near.first, near.second)
+        return self._clearance
+
+    def _set_by(self, folder: Path | None) -> None:
+        """A run's folder says for which rig and scene it is; other motions go by the files."""
+        rig, scene = self._file_rig, self._file_scene
+        try:
+            if folder is not None and (folder / "plan.json").exists():
+                run = RunFolder.open_cut_short(folder)
+                rig, scene = run.rig(), run.plan().scene
+            else:
+                rig = MotionInterlock(rig).referenced_rig()
+        except CdprError:  # not homed yet, or the folder is not whole
+            pass
+        self._set(rig, scene)
+
+    def _set(self, rig: Rig, scene: Scene | None) -> None:
+        self.rig = rig
+        self.scene = nothing_in_the_way(rig) if scene is None else scene
+        self._winches = WinchMap(rig)
+        self._model = ClearanceModel(rig, self.scene)
+        self._pose = rig.home
