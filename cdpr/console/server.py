@@ -10,9 +10,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI, HTTPException, Request, WebSocket, WebSocketDisconnect
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cdpr.console.commands import Held, LetGo, NotAMessage, parse_message
 from cdpr.console.session import MADE, Console
@@ -52,23 +58,26 @@ class ConsoleServer:
         self._news = asyncio.Condition()
         self._seq = 0
 
-    def app(self) -> FastAPI:
+    def app(self) -> Starlette:
         """The application for any ASGI server."""
-        app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=self._living)
-        app.middleware("http")(self._guarded)
-        app.get("/")(self._page)
-        app.get("/static/{name:path}")(_static)
-        app.get("/scene")(self._scene)
-        app.get("/api/files")(self._files)
-        app.get("/api/preview")(self._preview)
-        app.get("/runs/{name:path}")(_run_file)
-        app.get("/help/{code}")(_help)
-        app.post("/stop")(self._stop)
-        app.websocket("/ws")(self._socket)
-        return app
+        return Starlette(
+            routes=[
+                Route("/", self._page),
+                Route("/static/{name:path}", _static),
+                Route("/scene", self._scene),
+                Route("/api/files", self._files),
+                Route("/api/preview", self._preview),
+                Route("/runs/{name:path}", _run_file),
+                Route("/help/{code}", _help),
+                Route("/stop", self._stop, methods=["POST"]),
+                WebSocketRoute("/ws", self._socket),
+            ],
+            middleware=[Middleware(BaseHTTPMiddleware, dispatch=self._guarded)],
+            lifespan=self._living,
+        )
 
     @asynccontextmanager
-    async def _living(self, _app: FastAPI) -> AsyncIterator[None]:
+    async def _living(self, _app: Starlette) -> AsyncIterator[None]:
         looking = asyncio.create_task(self._look())
         try:
             yield
@@ -114,23 +123,23 @@ class ConsoleServer:
 
     # What there is.
 
-    async def _page(self) -> Response:
+    async def _page(self, _request: Request) -> Response:
         text = _resource("index.html").replace("{{token}}", self.token)
         return HTMLResponse(text)
 
-    async def _scene(self) -> Response:
+    async def _scene(self, _request: Request) -> Response:
         data = await run_in_threadpool(scene_of, self._console.rig, self._console.scene)
         return JSONResponse(data)
 
-    async def _files(self) -> Response:
+    async def _files(self, _request: Request) -> Response:
         return JSONResponse(await run_in_threadpool(_plans_and_scenes))
 
-    async def _preview(self) -> Response:
+    async def _preview(self, _request: Request) -> Response:
         if self._console.preview is None:
             raise HTTPException(404, "no plan is loaded")
         return JSONResponse(self._console.preview)
 
-    async def _stop(self) -> Response:
+    async def _stop(self, _request: Request) -> Response:
         """For a page whose socket is lost; anybody may stop."""
         why_not = await run_in_threadpool(self._console.stop)
         return JSONResponse({"ok": not why_not, "what": why_not})
@@ -198,8 +207,9 @@ def _resource(name: str) -> str:
     return files("cdpr.console").joinpath("static", name).read_text(encoding="utf-8")
 
 
-async def _static(name: str) -> Response:
+async def _static(request: Request) -> Response:
     """Files of the page, and those that it shares with reports."""
+    name = request.path_params["name"]
     package = "model.pages" if name in ("base.css", "viewer.js") else "cdpr.console"
     root = files(package) if package == "model.pages" else files(package).joinpath("static")
     kind = _KINDS.get(Path(name).suffix)
@@ -211,16 +221,17 @@ async def _static(name: str) -> Response:
         raise HTTPException(404) from None
 
 
-async def _run_file(name: str) -> Response:
+async def _run_file(request: Request) -> Response:
     """A file of a run below the folder of runs."""
-    path, root = Path(name).resolve(), RUNS.resolve()
+    path, root = Path(request.path_params["name"]).resolve(), RUNS.resolve()
     if not (path.is_relative_to(root) and path.is_file()):
         raise HTTPException(404)
     return FileResponse(path)
 
 
-async def _help(code: str) -> Response:
+async def _help(request: Request) -> Response:
     """The page of help for an event or fault."""
+    code = request.path_params["code"]
     if code not in fault_codes():
         raise HTTPException(404)
     return Response(page_text(code), media_type=_KINDS[".md"])

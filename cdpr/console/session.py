@@ -33,6 +33,7 @@ from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
+from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
 from executor.service import reference_status
@@ -174,7 +175,7 @@ class Console:
                 "why_not": "the drives are not enabled for jogging",
                 "moving": False,
                 "limit": None,
-                "speed_mm_s": 20.0,
+                "speed_mm_s": 1e3 * FASTEST,
             }
         ready = status["state"] == "moving"
         limit = jog["limit"] and f"stops in {jog['room_mm']:.1f} mm: {jog['limit']}"
@@ -297,7 +298,8 @@ class Console:
     def _jog_begin(self) -> str:
         scene = self.files.scene_file
         around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
-        return self._start("jog", [str(self.files.rig_file), "--hold-to-run", *around])
+        speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
+        return self._start("jog", [str(self.files.rig_file), "--hold-to-run", *speed, *around])
 
     def _start(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
         if self.watch.last.status is not None:

@@ -134,6 +134,7 @@ class TaughtPoses:
     def _keep(self, poses: list[TaughtPose]) -> None:
         """On disk first."""
         document = TaughtDocument(poses=poses)
+        self._path.parent.mkdir(exist_ok=True)
         write_atomic(self._path, document.model_dump_json(indent=1) + "\n")
         self._poses = poses
 

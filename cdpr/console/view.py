@@ -60,7 +60,7 @@ def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
     tilt = float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
     turn = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
     return {
-        "position_mm": np.round(pose.position * 1e3, 2).tolist(),
+        "position_mm": (np.round(pose.position * 1e3, 2) + 0.0).tolist(),
         "tilt_deg": round(tilt, 3),
         "turn_deg": round(turn, 3),
         "rotation": np.round(pose.rotation, 6).reshape(-1).tolist(),
