@@ -1,0 +1,268 @@
+"""Jogging by hold-to-run in simulated time: it moves only while held, and only where it may."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from executor.hold_to_run import session as sessions
+from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, Piece, PieceRing
+from executor.hold_to_run.presses import TIMEOUT, PressBoard
+from executor.hold_to_run.session import STEPS, jog_session
+from executor.jogging import with_speed
+from executor.realtime.shared_memory import SharedMemory
+from executor.state_machine import CycleRecord, State
+from model.clearance import ClearanceModel
+from model.errors import CdprError, Fault, StoppedByOperator
+from model.kinematics import forward_kinematics
+from model.pose import Array, Pose
+from model.rig import Rig, load_rig
+from model.scene import Scene, load_scene
+from model.winches import WinchMap
+from tests.cli.plans import RIG
+
+AXES = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
+
+
+@cache
+def rig() -> Rig:
+    return load_rig(RIG)
+
+
+@cache
+def scene() -> Scene:
+    return load_scene(RIG.parent / "environment_1.yaml")
+
+
+@dataclass
+class Script:
+    """Holds controls by simulated time, and keeps what the loop did."""
+
+    holds: list[tuple[float, float, Callable[[PressBoard], object]]]
+    end: float
+    records: list[CycleRecord] = field(default_factory=list)
+
+    def __call__(self, record: CycleRecord, board: PressBoard) -> None:
+        self.records.append(record)
+        for begin, until, say in self.holds:
+            if begin <= record.at < until:
+                say(board)
+        if record.at >= self.end:
+            board.end()
+
+    def run(self, around: Scene | None = None, speed: float = 0.020) -> list[CycleRecord]:
+        jog_session(rig(), around, speed=speed, realtime=False, on_cycle=self)
+        return self.records
+
+
+def hold(
+    number: int, direction: Array, step: float | None = None, percent: int = 100
+) -> Callable[[PressBoard], object]:
+    return lambda board: board.hold(
+        number, direction, in_platform=False, step=step, percent=percent
+    )
+
+
+def positions(records: list[CycleRecord]) -> Array:
+    """Where the platform was sent, by an inverse of its own, shape (n, 3), [m]."""
+    winches, pose, found = WinchMap(rig()), rig().home, []
+    last: tuple[int, ...] = ()
+    for record in records:
+        if record.targets != last:
+            last = record.targets
+            stretched = winches.strained(
+                winches.unstrained_from_counts(np.array(last, dtype=np.float64)),
+                rig().tensions_by(record.torques),
+            )
+            pose = forward_kinematics(rig(), stretched, pose).pose
+        found.append(pose.position)
+    return np.array(found)
+
+
+def moved(records: list[CycleRecord]) -> list[bool]:
+    """Whether the targets of each cycle differ from those before it."""
+    targets = [record.targets for record in records]
+    return [False, *(a != b for a, b in pairwise(targets))]
+
+
+def test_it_goes_straight_while_held_and_stops_when_let_go() -> None:
+    x = np.array([1.0, 0.0, 0.0])
+    records = Script([(0.5, 1.5, hold(1, x))], 3.0).run(scene())
+    way = positions(records) - rig().home.position
+    at = np.array([record.at for record in records])
+    assert way[-1, 0] == pytest.approx(0.02, abs=0.005), "about a second at 20 mm/s"
+    assert np.abs(way[:, 1:]).max() < 2e-4
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    cycle = rig().document.bus.cycle_ms / 1000.0
+    assert steps.max() <= 0.020 * cycle * 1.2
+    still = np.array(moved(records))
+    assert not still[at < 0.5].any()
+    assert not still[at > 1.5 + TIMEOUT + 0.5].any(), "at rest after the time-out and the ramp"
+    assert still[(at > 0.6) & (at < 1.5)].mean() > 0.95
+    assert records[-1].state is State.SECURING
+
+
+@pytest.mark.parametrize("length", STEPS)
+def test_a_step_ends_where_it_should(length: float) -> None:
+    z = np.array([0.0, 0.0, 1.0])
+    records = Script([(0.5, 3.0, hold(1, z, step=length))], 3.5).run(scene())
+    way = positions(records)[-1] - positions(records[:5])[-1]
+    assert way[2] == pytest.approx(length, abs=3e-5)
+    assert np.abs(way[:2]).max() < 5e-5
+
+
+def test_a_step_that_is_let_go_ends_early() -> None:
+    z = np.array([0.0, 0.0, 1.0])
+    records = Script([(0.5, 0.7, hold(1, z, step=0.010))], 3.0).run(scene())
+    way = positions(records)[-1, 2] - rig().home.position[2]
+    assert 0.0005 < way < 0.008
+
+
+def test_the_speed_follows_the_share_that_is_held() -> None:
+    x = np.array([1.0, 0.0, 0.0])
+    slow = Script([(0.5, 1.5, hold(1, x, percent=25))], 3.0).run(scene())
+    assert positions(slow)[-1, 0] == pytest.approx(0.005, abs=0.0015)
+
+
+def test_it_comes_to_rest_before_an_obstacle_as_near_as_it_may() -> None:
+    """Towards the nearest body, until no more can be proved; the limit is the scene's."""
+    model, home = ClearanceModel(rig(), scene()), rig().home
+    near = model.smallest(home)
+    assert near is not None
+    towards = near.second_point - near.first_point
+    towards /= np.linalg.norm(towards)
+    records = Script([(0.5, 12.0, hold(1, towards))], 13.0).run(scene(), speed=0.010)
+    end = positions(records)[-1]
+    last = model.smallest(Pose(end, home.rotation))
+    assert last is not None
+    assert last.distance >= scene().obstacle_clearance - 1e-4
+    assert last.distance <= scene().obstacle_clearance + 0.004, "it is not stopped far before it"
+    assert not any(moved(records)[-60:])
+    rates = [record.rate for record in records if record.state is State.MOVING]
+    assert max(b - a for a, b in pairwise(rates)) < 0.5
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 5), st.integers(0, 4), st.integers(1, 12), st.booleans()),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_nothing_moves_unless_it_is_held(presses: list[tuple[int, int, int, bool]]) -> None:
+    """Random presses, steps, lengths and silences: a motion needs a hold that is 150 ms old."""
+    holds, begin = [], 0.5
+    spans = []
+    for number, (axis, step, length, silent) in enumerate(presses, start=1):
+        until = begin + 0.05 * length
+        way = None if step > 2 else STEPS[step]
+        say = hold(number, AXES[axis], step=way)
+        holds.append((begin, until, say))
+        if silent:  # heard of again after it was silent for too long: it must stay over
+            holds.append((until + 0.25, until + 0.5, say))
+            spans.append((begin, until))
+            begin = until + 0.6
+        else:
+            holds.append((until, until + 0.015, lambda board, n=number: board.let_go(n)))
+            spans.append((begin, until))
+            begin = until + 0.1
+    records = Script(holds, begin + 1.0).run(scene())
+    ramp = 0.35  # from the jog speed to rest
+    for record, moves in zip(records, moved(records), strict=True):
+        if moves and record.state is State.MOVING:
+            assert any(a <= record.at <= b + TIMEOUT + ramp for a, b in spans)
+    assert not any(moved(records)[-20:])
+
+
+def test_a_stop_ends_the_session_along_the_line() -> None:
+    x = np.array([1.0, 0.0, 0.0])
+    script = Script([(0.5, 3.0, hold(1, x))], 9.0)
+
+    class Stops(sessions.Supervisor):
+        def during(self, board, motion):  # type: ignore[no-untyped-def]
+            self.board = board
+            return motion()
+
+    stops = Stops()
+
+    def on_cycle(record: CycleRecord, board: PressBoard) -> None:
+        script(record, board)
+        if record.at > 1.2:
+            stops.board.ask_stop()
+
+    with pytest.raises(StoppedByOperator):
+        jog_session(rig(), scene(), realtime=False, on_cycle=on_cycle, supervisor=stops)
+    rates = [record.rate for record in script.records]
+    steps = np.abs(np.diff(rates))
+    assert script.records[-1].at < 2.5
+    assert steps.max() < 0.5, "it slows down, it does not break off"
+
+
+def test_rows_that_changed_on_their_way_are_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    put = PieceRing.put
+
+    def bend(ring: PieceRing, piece: Piece) -> None:
+        rows = piece.rows.copy()
+        rows[-1] += 1
+        put(ring, replace(piece, rows=rows))
+
+    monkeypatch.setattr(PieceRing, "put", bend)
+    x = np.array([1.0, 0.0, 0.0])
+    with pytest.raises(Fault, match="differ from those that were checked"):
+        Script([(0.5, 1.5, hold(1, x))], 3.0).run(scene())
+
+
+def test_a_session_ends_by_itself_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "IDLE", 0.8)
+    records = Script([], 99.0).run(scene())
+    assert 0.8 < records[-1].at < 2.0
+
+
+def test_a_line_is_proved_as_a_whole_would_be() -> None:
+    """Its pieces, end to end, are the set-points of the line; none is left out or there twice."""
+    slow = with_speed(rig(), 0.020)
+    line = JogLine(slow, scene(), rig().home, np.array([0.0, 1.0, 0.0]))
+    parts = [line.go_on(FIRST_ROWS), line.go_on(MOST_ROWS), line.go_on(3)]
+    rows = np.concatenate([parts[0].table.setpoints, *(p.table.setpoints[1:] for p in parts[1:])])
+    assert len(rows) == line.rows == FIRST_ROWS + MOST_ROWS + 3 + 1
+    for before, after in pairwise(parts):
+        assert np.abs(before.table.setpoints[-1] - after.table.setpoints[0]).max() <= 1
+    spacing = 0.020 * slow.document.bus.cycle_ms / 1000.0
+    end = line.pose(line.rows - 1).position - rig().home.position
+    assert end[1] == pytest.approx(spacing * (line.rows - 1), abs=1e-9)
+    assert np.abs(np.diff(rows.astype(np.int64), n=2, axis=0)).max() <= 4, "at an even speed"
+
+
+def test_what_cannot_be_proved_is_not_added() -> None:
+    slow = with_speed(rig(), 0.020)
+    line = JogLine(slow, scene(), rig().home, np.array([0.0, 0.0, -1.0]))
+    line.go_on(FIRST_ROWS)
+    with pytest.raises(CdprError):
+        line.go_on(6000)
+    assert line.rows == FIRST_ROWS + 1
+
+
+@given(st.integers(1, 2**40), st.integers(0, 2**31), st.booleans(), st.integers(1, 40))
+def test_pieces_arrive_as_they_were_sent(press: int, first: int, whole: bool, count: int) -> None:
+    memory = SharedMemory.create(PieceRing.size(8))
+    sender, receiver = PieceRing(memory, 8), PieceRing(memory, 8)
+    rows = np.arange(8 * count, dtype=np.int32).reshape(count, 8)
+    sender.put(Piece(press, first, whole, rows, "sha256:" + "a" * 64))
+    (got,) = receiver.take()
+    assert (got.press, got.first, got.from_rest, got.hash) == (
+        press,
+        first,
+        whole,
+        "sha256:" + "a" * 64,
+    )
+    assert np.array_equal(got.rows, rows)
+    assert list(receiver.take()) == []
+    memory.close()

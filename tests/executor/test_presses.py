@@ -1,0 +1,139 @@
+"""A press of a jog control that ended never moves anything again, whatever arrives later."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from executor.hold_to_run.presses import TIMEOUT, PressBoard, PressReader, PressRule
+
+UP = np.array([0.0, 0.0, 1.0])
+NUMBERS = st.integers(1, 6)
+TIMES = st.floats(0.0, 2.0)
+
+
+class Time:
+    """A clock that goes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 10.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def time() -> Time:
+    return Time()
+
+
+@pytest.fixture
+def board(time: Time) -> PressBoard:
+    return PressBoard(time)
+
+
+def hold(board: PressBoard, number: int, percent: int = 100) -> bool:
+    return board.hold(number, UP, in_platform=False, step=None, percent=percent)
+
+
+@given(st.lists(st.tuples(NUMBERS, TIMES, TIMES), max_size=30))
+def test_a_press_that_was_over_is_never_held_again(looks: list[tuple[int, float, float]]) -> None:
+    rule, over = PressRule(), set[int]()
+    for number, heard, now in looks:
+        held = rule.held(number, heard, now)
+        assert not (held and number in over)
+        assert not held or 0.0 <= now - heard <= TIMEOUT
+        over |= set(range(1, number)) if held else {number, *range(1, number)}
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(["hold", "let go", "wait"]), NUMBERS, TIMES), max_size=40)
+)
+def test_loop_and_board_never_hold_what_is_not_held(said: list[tuple[str, int, float]]) -> None:
+    """The oracle keeps for each press when it was last said to be held, and whether it ended."""
+    time = Time()
+    board = PressBoard(time)
+    reader = PressReader(board.memory)
+    heard: dict[int, float] = {}
+    newest, ended = 0, 0
+    for what, number, wait in said:
+        if what == "wait":
+            time.now += wait
+        elif what == "let go":
+            board.let_go(number)
+            ended = max(ended, number)
+        else:
+            hold(board, number)
+            late = number in heard and time.now - heard[number] > TIMEOUT
+            if late:
+                ended = max(ended, number)
+            if number > ended and number >= newest:
+                newest, heard[number] = number, time.now
+        told, press = reader.read(time.now), board.held()
+        for seen in (told.press, 0 if press is None else press.number):
+            assert seen in (0, newest)
+            assert seen == 0 or (seen > ended and time.now - heard[seen] <= TIMEOUT)
+        if newest > ended and time.now - heard[newest] > TIMEOUT:
+            ended = newest
+    board.close()
+
+
+def test_a_press_is_held_as_long_as_it_is_heard_of(board: PressBoard, time: Time) -> None:
+    reader = PressReader(board.memory)
+    for _ in range(50):
+        assert hold(board, 1)
+        time.now += 0.9 * TIMEOUT
+        assert reader.read(time.now).press == 1
+    time.now += 0.2 * TIMEOUT
+    assert reader.read(time.now).press == 0
+    assert not hold(board, 1), "a gap ends it for good"
+    assert hold(board, 2)
+    assert reader.read(time.now).press == 2
+
+
+def test_what_a_press_asked_for_first_stays(board: PressBoard) -> None:
+    hold(board, 1)
+    board.hold(1, -UP, in_platform=True, step=0.001, percent=50)
+    press = board.held()
+    assert press is not None
+    assert (press.direction == UP).all()
+    assert (press.in_platform, press.step) == (False, None)
+    assert PressReader(board.memory).read(10.0).share == 0.5, "but its speed may change"
+
+
+def test_the_end_of_a_session_ends_what_is_held(board: PressBoard, time: Time) -> None:
+    hold(board, 1)
+    board.end()
+    told = PressReader(board.memory).read(time.now)
+    assert told.ends
+    assert told.press == 0
+    assert board.held() is None
+
+
+def test_a_clock_that_jumps_back_holds_nothing(board: PressBoard, time: Time) -> None:
+    hold(board, 1)
+    time.now -= 5.0
+    assert PressReader(board.memory).read(time.now).press == 0
+
+
+@pytest.mark.parametrize("place", range(22))
+def test_an_entry_that_is_half_written_does_not_count(board: PressBoard, place: int) -> None:
+    hold(board, 1, percent=40)
+    reader = PressReader(board.memory)
+    assert reader.read(10.0).press == 1
+    before = board.memory.view[place]
+    board.memory.view[place] = before ^ 0xFF
+    assert reader.read(10.0).press == 1, "what was before counts until it is whole"
+    assert reader.read(10.0 + 2.0 * TIMEOUT).press == 0, "and is not held for ever"
+
+
+def test_nothing_is_held_at_first(board: PressBoard) -> None:
+    assert PressReader(board.memory).read(10.0).press == 0
+    assert board.held() is None
+    board.let_go(3)
+    assert not hold(board, 3), "what was let go before it was held is over"
+    assert math.isnan(board._heard)
