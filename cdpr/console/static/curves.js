@@ -2,16 +2,16 @@
 
 import { at, known, make, write } from "./elements.js";
 
-const SECONDS = 60, REDRAW_MS = 250, HEIGHT = 150, SERIES = 8;
+const SECONDS = 60, REDRAW_MS = 250, HEIGHT = 140, SERIES = 8;
 const colour = (role) => getComputedStyle(document.documentElement).getPropertyValue(`--${role}`).trim();
 
 /** Options of one plot: its lines are `{label, role, dash, limit}`; a limit does not set the range. */
 function options(lines, { x, zero = false }) {
-  const axis = (more) => ({ stroke: () => colour("muted"), grid: { stroke: () => colour("grid"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif", ...more });
+  const axis = (more) => ({ stroke: () => colour("muted"), grid: { stroke: () => colour("grid"), width: 1 }, ticks: { show: false }, values: (_, all) => all.map((v) => String(v).replace("-", "\u2212")), font: "11px system-ui, sans-serif", ...more });
   return {
     width: 300, height: HEIGHT, legend: { show: false }, cursor: { drag: { x: false, y: false } }, padding: [8, 10, 0, 0],
     scales: { x: { time: false, range: x }, y: { range: (_, low, high) => range(low, high, zero) } },
-    axes: [axis({ size: 24, gap: 2 }), axis({ size: 44, gap: 4 })],
+    axes: [axis({ size: 28, gap: 6 }), axis({ size: 42, gap: 4 })],
     series: [{}, ...lines.map(({ label, role, dash, limit }) => ({
       label, stroke: () => colour(role), width: 1.5, dash, auto: !limit, points: { show: false }, spanGaps: false,
     }))],
@@ -42,7 +42,7 @@ class Plot {
     }).observe(figure.querySelector(".plotted"));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot.redraw());
     const key = figure.querySelector(".keys");
-    const shown = lines.filter((line, k) => lines.findIndex((other) => other.label === line.label) === k);
+    const shown = lines.length > 1 ? lines.filter((line, k) => lines.findIndex((other) => other.label === line.label) === k) : [];
     key.replaceChildren(...shown.map(({ label, role }) => make("span", { class: "key" }, make("span", { class: `swatch role-${role}` }), label.replace("cable ", ""))));
   }
 

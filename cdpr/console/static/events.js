@@ -53,7 +53,7 @@ function cameraCells(camera) {
 }
 
 function driveCells(drive, cable) {
-  return [`${cable} (drive ${drive.node})`, drive.state, known(drive.position_counts, 0), known(drive.set_counts, 0), known(drive.tension_n, 1, "N")];
+  return [`${cable} (drive ${drive.node})`, known(drive.tension_n, 1, "N"), drive.state, known(drive.position_counts, 0), known(drive.set_counts, 0)];
 }
 
 /** Rows of a table, written over those that are there; the table goes when there is none. */

@@ -9,11 +9,11 @@ const LAMPS = {
     readOnly ? ["Read-only", "quiet"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
   drives: ({ motion, jog }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
-    if (!drives.length) return [jog.ready ? "Drives enabled" : "Drives: not reported", jog.ready ? "stop" : "quiet"];
-    return [`Drives enabled: ${on} of ${drives.length}`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
+    if (!drives.length) return [jog.ready ? "Drives enabled" : "Drives not reported", jog.ready ? "stop" : "quiet"];
+    return [`${on} of ${drives.length} drives enabled`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
   },
   homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
-  latch: ({ latched }) => (latched === null ? ["No fault latched", "pass"] : ["Fault latched", "fail"]),
+  latch: ({ latched }) => (latched === null ? ["No fault", "pass"] : ["Fault latched", "fail"]),
 };
 
 const STATES = {
@@ -66,7 +66,7 @@ export class Live {
     write(at("note-stop"), stop ? `${stop.name} in ${duration(stop.seconds)}` : "none ahead");
     tile("following", known(motion?.following_error_mm, 2));
     tile("lateness", known(motion?.lateness_ms, 2));
-    write(at("note-lateness"), `worst ${known(motion?.worst_lateness_ms, 2, "ms")}`);
+    write(at("note-lateness"), `worst ${known(motion?.worst_lateness_ms, 2)}`);
     tile("lost", known(motion?.lost_replies, 0));
     at("tile-lost").classList.toggle("bad", (motion?.lost_replies ?? 0) > 0);
   }

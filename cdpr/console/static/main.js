@@ -13,7 +13,7 @@ import { Scene } from "./scene.js";
 import { bindStop } from "./stop.js";
 import { Teach } from "./teach.js";
 
-const NOTICE_MS = 8000;
+const NOTICE_MS = { done: 4000, failed: 10000 };
 const connection = new Connection();
 const scene = new Scene();
 const situation = () => ({ state: connection.state, stale: connection.freshness().why, preview: operate.plan });
@@ -25,7 +25,7 @@ function say(text, failed = false) {
   at("notice").classList.toggle("failed", failed);
   at("notice").hidden = !text;
   clearTimeout(noticed);
-  noticed = setTimeout(() => (at("notice").hidden = true), NOTICE_MS);
+  noticed = setTimeout(() => (at("notice").hidden = true), failed ? NOTICE_MS.failed : NOTICE_MS.done);
 }
 
 async function command(name, fields) {

@@ -88,7 +88,7 @@ export class Operate {
     at("outcome").hidden = outcome === null;
     if (outcome === null) return;
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
-    write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not done"}`);
+    write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
     write(at("outcome-text"), outcome.text);
     const links = [link(outcome.report, "Report"), link(outcome.fault_page, "What this fault means")];
     at("outcome-links").replaceChildren(...links.filter(Boolean));
@@ -172,6 +172,9 @@ export class Operate {
     const rows = [["Plan", plan.name], ["Check", plan.verdict], ["Duration", duration(plan.duration_s)], ["Length", known(plan.length_mm, 0, "mm")]];
     const facts = make("dl", { class: "facts" }, ...rows.flatMap(([name, text]) => [make("dt", {}, name), make("dd", {}, text)]));
     const lines = [facts, "The drives are enabled and the platform moves. Keep clear of the platform and of its cables."];
-    if (await this.#confirmed("run", { title: "Run this plan?", lines, confirm: "Run: the platform moves" })) this.#page.command("run");
+    if (await this.#confirmed("run", { title: "Run this plan?", lines, confirm: "Run: the platform moves" })) {
+      this.#page.command("run");
+      at("motion").scrollIntoView({ block: "nearest" });
+    }
   }
 }

@@ -5,6 +5,9 @@ page does. It is an operational stop in black, which IEC 60204-1 prefers for one
 
 import { at, isTextField, write } from "./elements.js";
 
+const ANSWER_MS = 6000; // as long as an answer is shown
+const STOPPING = "Stopping along the path";
+
 /** Binds STOP; `pressed` hears of each press before it is sent. */
 export function bindStop(connection, pressed) {
   const button = at("stop"), answer = at("stop-answer");
@@ -20,6 +23,7 @@ export function bindStop(connection, pressed) {
     button.classList.remove("pressed");
     write(answer, ok ? what || "Stop requested" : what);
     answer.classList.toggle("failed", !ok);
+    if (ok) setTimeout(() => press === presses && write(answer, ""), ANSWER_MS);
   }
 
   button.addEventListener("pointerdown", (event) => {
@@ -48,8 +52,9 @@ export function bindStop(connection, pressed) {
     show: (motion) => {
       const asked = motion?.wished.stop && !["finished", "stopped", "latched"].includes(motion.state);
       button.classList.toggle("asked", Boolean(asked));
-      if (asked && !button.classList.contains("pressed")) write(answer, "Stopping along the path");
-      else if (!motion && presses && !button.classList.contains("pressed") && !answer.classList.contains("failed")) write(answer, "Nothing is moving");
+      if (button.classList.contains("pressed")) return;
+      if (asked) write(answer, STOPPING);
+      else if (answer.textContent === STOPPING) write(answer, "");
     },
   };
 }
