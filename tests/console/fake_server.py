@@ -1,10 +1,11 @@
-"""A server that speaks the console's protocol without any drives: the page's tests and its makers use it.
+"""A server that speaks the console's protocol without drives, for the page's tests and makers.
 
     python -m tests.console.fake_server --port 8402
 
-It moves the platform of the paper's rig on a circle and obeys commands in a simple way. `POST /fake` lays values over
-the states that it sends (`{"state": {…}}`), makes it silent or hang up (`{"silent": true}`, `{"hang_up": true}`);
-`GET /fake` gives what came in.
+It moves the platform of the paper's rig on a circle and obeys commands in a simple way. `POST
+/fake` lays values over the states that it sends (`{"state": {…}}`) and over its own (`{"set":
+{…}}`), makes it silent (`{"silent": true}`), hang up (`{"hang_up": true}`), refuse sockets
+(`{"refuse": true}`) or begin again (`{"renew": true}`). `GET /fake` gives what came in.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import itertools
 import json
 import math
 import socket
+import sys
 import time
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -32,10 +34,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from executor.report.scene import frame_surface, platform_surface
 from model.geometry.solids import box_solid
 from model.pages.page import resource
-from model.pages.scene import Label, Moment, SceneFigure, SceneSurface, Stroke, grid_floor, scene_data
+from model.pages.scene import (
+    Label,
+    Moment,
+    SceneFigure,
+    SceneSurface,
+    Stroke,
+    grid_floor,
+    scene_data,
+)
 from model.pose import Array, Pose
 from model.rig import load_rig
-from model.scene import load_scene
 from model.statics.gravity import working_tensions
 
 ROOT = Path(__file__).parents[2]
@@ -45,29 +54,40 @@ PERIOD_S = 0.05
 #: The circle: its centre and radius, [m], and the time of one round at full speed, [s].
 CENTRE, RADIUS, ROUND_S = np.array([0.05, 0.05, 0.4]), 0.14, 24.0
 #: The page may load nothing from outside and run nothing but its files.
-POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:"
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
+    " img-src 'self' data:"
+)
 RIG = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
-SCENE = load_scene(ROOT / "configs" / "environment_1.yaml")
 
 
 def on_circle(share: float) -> Array:
     """A point of the circle, [m]."""
     angle = 2.0 * math.pi * share
-    return CENTRE + RADIUS * np.array([math.cos(angle), math.sin(angle), 0.3 * math.sin(2.0 * angle)])
+    return CENTRE + RADIUS * np.array(
+        [math.cos(angle), math.sin(angle), 0.3 * math.sin(2.0 * angle)]
+    )
 
 
 def figure(moments: tuple[Moment, ...] = (), path: bool = False) -> SceneFigure:
     """The scene of the rig, or of the plan."""
     obstacles = tuple(
-        SceneSurface("obstacles", "obstacle", solid.vertices, solid.faces, solid.edges, 0.62, "obstacle_1")
-        for solid in [box_solid(np.array([0.04, 0.04, 0.225]), Pose.level(np.array([-0.15, 0.0, 0.225])))]
+        SceneSurface(
+            "obstacles", "obstacle", solid.vertices, solid.faces, solid.edges, 0.62, "obstacle_1"
+        )
+        for solid in [
+            box_solid(np.array([0.04, 0.04, 0.225]), Pose.level(np.array([-0.15, 0.0, 0.225])))
+        ]
     )
     frame = frame_surface(RIG)
     strokes: tuple[Stroke, ...] = (grid_floor(frame.vertices)[0],)
     labels: tuple[Label, ...] = ()
     if path:
         points = np.array([on_circle(k / 96) for k in range(97)])
-        strokes, labels = (Stroke.along("path", "ink", points, 4.5),), (Label("path", "start", points[0], "ring"),)
+        strokes, labels = (
+            (Stroke.along("path", "ink", points, 4.5),),
+            (Label("path", "start", points[0], "ring"),),
+        )
     surfaces = obstacles if path else (frame, *obstacles)
     return SceneFigure(surfaces, strokes, labels, RIG.anchors, platform_surface(RIG), moments)
 
@@ -82,8 +102,14 @@ def preview(name: str) -> dict[str, Any]:
     return {
         "name": name,
         "passed": passed,
-        "verdict": "passed its check" if passed else "collides: 3.1 mm to obstacle_1 where 10 mm are required",
-        "checks": ["clearance at least 10 mm on all 49 poses", "every wrench feasible", "speed, acceleration, jerk"],
+        "verdict": "passed its check"
+        if passed
+        else "collides: 3.1 mm to obstacle_1 where 10 mm are required",
+        "checks": [
+            "clearance at least 10 mm on all 49 poses",
+            "every wrench feasible",
+            "speed, acceleration, jerk",
+        ],
         "duration_s": ROUND_S,
         "length_mm": 921.4,
         **{key: data[key] for key in ("moments", "strokes", "surfaces", "labels")},
@@ -101,7 +127,8 @@ class Fake:
 
     def __init__(self) -> None:
         self.over: dict[str, Any] = {}
-        self.silent = False
+        self.silent = self.refuse = False
+        self.ticks = 0
         self.received: list[dict[str, Any]] = []
         self.stops = 0
         self.sockets: dict[WebSocket, str] = {}
@@ -124,12 +151,23 @@ class Fake:
 
     def tick(self) -> None:
         """One period of the motion."""
+        self.ticks += 1
         if self.moving:
-            wished = 0.0 if self.wished["stop"] or self.wished["hold"] else self.wished["speed_percent"] / 100.0
+            wished = (
+                0.0
+                if self.wished["stop"] or self.wished["hold"]
+                else self.wished["speed_percent"] / 100.0
+            )
             self.rate += float(np.clip(wished - self.rate, -0.1, 0.1))
             self.share = min(1.0, self.share + self.rate * PERIOD_S / ROUND_S)
             self.position = on_circle(self.share)
-            self.moving = "stopping" if self.wished["stop"] else "holding" if self.wished["hold"] else "moving"
+            self.moving = (
+                "stopping"
+                if self.wished["stop"]
+                else "holding"
+                if self.wished["hold"]
+                else "moving"
+            )
             if self.share >= 1.0 or (self.wished["stop"] and self.rate <= 0.0):
                 self._end(stopped=self.wished["stop"])
         if self.held and time.monotonic() - self.held_at > 0.15:
@@ -139,9 +177,22 @@ class Fake:
             self.position = np.clip(self.position + step, RIG.workspace_lower, RIG.workspace_upper)
 
     def _end(self, stopped: bool) -> None:
-        self.event("stop" if stopped else "end", "stopped by the operator" if stopped else "the end of the path")
-        text = "Stopped along the path by the operator." if stopped else "Passed.\nLeast clearance 12.4 mm."
-        self.outcome = {"verb": "run", "ok": not stopped, "text": text, "report": "/report", "fault_page": None}
+        self.event(
+            "stop" if stopped else "end",
+            "stopped by the operator" if stopped else "the end of the path",
+        )
+        text = (
+            "Stopped along the path by the operator."
+            if stopped
+            else "Passed.\nLeast clearance 12.4 mm."
+        )
+        self.outcome = {
+            "verb": "run",
+            "ok": not stopped,
+            "text": text,
+            "report": "/report",
+            "fault_page": None,
+        }
         self.moving, self.rate = None, 0.0
 
     def event(self, code: str, text: str) -> None:
@@ -153,13 +204,21 @@ class Fake:
         name = None if self.in_control is None else self.sockets.get(self.in_control)
         tensions = working_tensions(RIG, Pose.level(self.position)).tensions
         near = float(np.linalg.norm(self.position[:2] - [-0.15, 0.0]) - 0.115) * 1e3
-        jog = {"ready": self.jog_ready, "why_not": None, "moving": self.held is not None, "limit": None}
+        jog = {
+            "ready": self.jog_ready,
+            "why_not": None,
+            "moving": self.held is not None,
+            "limit": None,
+        }
         if self.held and near < 60.0:
             jog["limit"] = f"stops in {near - 10.0:.0f} mm: clearance to obstacle_1"
         busy = None
         if self.moving or self.jog_ready:
             verb = "run" if self.moving else "jog"
-            busy = {"verb": verb, "text": "on the path" if self.moving else "drives enabled for jogging"}
+            busy = {
+                "verb": verb,
+                "text": "on the path" if self.moving else "drives enabled for jogging",
+            }
         return {
             "kind": "state",
             "seq": next(self._seq),
@@ -169,7 +228,10 @@ class Fake:
             "simulated": True,
             "control": {"yours": reader is self.in_control, "held_by": name},
             "latched": self.latched,
-            "reference": {"counts": self.homed, "why_not": None if self.homed else "cable 3 was switched on again"},
+            "reference": {
+                "counts": self.homed,
+                "why_not": None if self.homed else "cable 3 was switched on again",
+            },
             "busy": busy,
             "outcome": self.outcome,
             "motion": self._motion(tensions),
@@ -183,7 +245,11 @@ class Fake:
             },
             "tensions_n": np.round(tensions, 2).tolist(),
             "tension_limits_n": [RIG.min_tension, RIG.max_tension],
-            "clearance_mm": {"now": round(near, 1), "required": 10.0, "pair": ["cable 5", "obstacle_1"]},
+            "clearance_mm": {
+                "now": round(near, 1),
+                "required": 10.0,
+                "pair": ["cable 5", "obstacle_1"],
+            },
             "next_stop": self._next_stop(),
             "preview": self.plan,
             "jog": {**jog, "speed_mm_s": self.held["speed_mm_s"] if self.held else 0.0},
@@ -195,7 +261,11 @@ class Fake:
         if not self.moving:
             return None
         left = 1.0 - self.share
-        return {"name": "goal", "distance_mm": round(921.4 * left, 1), "seconds": round(ROUND_S * left, 1)}
+        return {
+            "name": "goal",
+            "distance_mm": round(921.4 * left, 1),
+            "seconds": round(ROUND_S * left, 1),
+        }
 
     def _motion(self, tensions: Array) -> dict[str, Any] | None:
         if self.moving is None:
@@ -291,9 +361,15 @@ class Fake:
             self.plan = message.get("file") or message.get("scene") or "taught poses"
         elif command == "teach":
             position = np.round(self.position * 1e3, 1).tolist()
-            self.poses = [*self.poses, {"name": message["name"], "position_mm": position, "quaternion": [1, 0, 0, 0]}]
+            self.poses = [
+                *self.poses,
+                {"name": message["name"], "position_mm": position, "quaternion": [1, 0, 0, 0]},
+            ]
         elif command == "rename":
-            self.poses = [{**p, "name": message["name"]} if k == index else p for k, p in enumerate(self.poses)]
+            self.poses = [
+                {**p, "name": message["name"]} if k == index else p
+                for k, p in enumerate(self.poses)
+            ]
         elif command == "forget":
             self.poses = [p for k, p in enumerate(self.poses) if k != index]
         elif command == "move":
@@ -341,15 +417,23 @@ def application(fake: Fake) -> Starlette:
     async def hooks(request: Request) -> Response:
         if request.method == "POST":
             asked = await request.json()
+            if asked.get("renew"):
+                for left in list(fake.sockets):
+                    await left.close()
+                fake.__init__()  # type: ignore[misc]
             fake.over.update(asked.get("state", {}))
             fake.silent = asked.get("silent", fake.silent)
+            fake.refuse = asked.get("refuse", fake.refuse)
             for name, value in asked.get("set", {}).items():
                 setattr(fake, name, value)
             if asked.get("hang_up"):
-                for socket_ in list(fake.sockets):
-                    await socket_.close()
+                for left in list(fake.sockets):
+                    await left.close()
         position = np.round(fake.position * 1e3, 3).tolist()
-        return JSONResponse({"received": fake.received, "stops": fake.stops, "position_mm": position})
+        names = ("received", "stops", "ticks", "plan", "poses", "latched")
+        return JSONResponse(
+            {name: getattr(fake, name) for name in names} | {"position_mm": position}
+        )
 
     routes = [
         Route("/", index),
@@ -366,6 +450,8 @@ def application(fake: Fake) -> Starlette:
 
 async def speak(fake: Fake, page: WebSocket) -> None:
     """With one page, until it leaves."""
+    if fake.refuse:
+        return await page.close()
     await page.accept()
     fake.sockets[page] = f"page {len(fake.sockets) + 1}"
     try:
@@ -373,7 +459,9 @@ async def speak(fake: Fake, page: WebSocket) -> None:
             message = json.loads(await page.receive_text())
             ok, what = fake.take(page, message)
             if "id" in message:
-                await page.send_json({"kind": "answer", "to": message["id"], "ok": ok, "what": what})
+                await page.send_json(
+                    {"kind": "answer", "to": message["id"], "ok": ok, "what": what}
+                )
     except (WebSocketDisconnect, RuntimeError):  # the latter when it was hung up here
         pass
     finally:
@@ -406,13 +494,16 @@ async def moving(fake: Fake) -> AsyncIterator[None]:
 
 def main() -> None:
     """Serves until it is ended; prints its address."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="The console's protocol without drives.")
     parser.add_argument("--port", type=int, default=0)
     chosen = parser.parse_args()
     with socket.create_server(("127.0.0.1", chosen.port)) as listening:
         port = listening.getsockname()[1]
-        print(f"http://127.0.0.1:{port}/?token={TOKEN}", flush=True)
-        config = uvicorn.Config(application(Fake()), log_level="warning", timeout_graceful_shutdown=1)
+        sys.stdout.write(f"http://127.0.0.1:{port}/?token={TOKEN}\n")
+        sys.stdout.flush()
+        config = uvicorn.Config(
+            application(Fake()), log_level="warning", timeout_graceful_shutdown=1
+        )
         uvicorn.Server(config).run(sockets=[listening])
 
 
