@@ -78,7 +78,7 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
         quality.verdict,
         sections,
         tiles=_headline(result, quality),
-        scripts=("charts.js", "viewer.js"),
+        scripts=("charts.js", "viewer.js", "playback.js"),
         data={"scene-data": scene_data(scene)},
     )
 

@@ -45,7 +45,7 @@ def page(run: RunData) -> str:
     parts += [section(name, text, body) for name, text, body in sections]
     parts.append(f"<footer>{escape(_footer(run))}</footer>")
     lead = chips(run.summary) + contents((name, text) for name, text, _ in sections)
-    scripts = ("charts.js", "viewer.js")
+    scripts = ("charts.js", "viewer.js", "playback.js")
     return html_page(
         title,
         "\n".join(parts),

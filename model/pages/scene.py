@@ -1,6 +1,7 @@
 """A scene in 3-D: a still image as SVG, and the data with which `viewer.js` turns it.
 
-Both draw the same surfaces, strokes and labels, the far ones first, in the page's colours.
+Both draw the same surfaces, strokes and labels, the far ones first, in the page's colours. On a
+page with `viewer`, `playback.js` moves the platform through its moments; the console moves its own.
 """
 
 from __future__ import annotations

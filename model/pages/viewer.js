@@ -1,39 +1,52 @@
 "use strict";
-/* The scene of scene.py: drag to turn, buttons, two fingers or Ctrl and wheel to zoom, a slider for the time. */
-(() => {
-  const data = JSON.parse(document.getElementById("scene-data").textContent);
-  const canvas = document.getElementById("scene-canvas");
-  const context = canvas.getContext("2d");
-  const slider = document.getElementById("scene-time");
-  const play = document.getElementById("scene-play");
-  const speed = document.getElementById("scene-speed");
-  const readout = document.getElementById("scene-readout");
-  const boxes = [...document.querySelectorAll("[data-layer]")];
-  document.documentElement.classList.add("scripted");
+/* A scene of scene.py on a canvas: drag to turn, two fingers or Ctrl and wheel to zoom.
 
-  const first = { azimuth: data.view.azimuth, elevation: data.view.elevation, zoom: 1 };
-  const eye = { ...first };
-  const placed = data.moments.filter((_, k) => k % Math.max(1, Math.floor(data.moments.length / 20)) === 0);
-  const reach = [0, 1, 2].map((k) => Math.max(...data.platform.vertices.map((v) => Math.abs(v[k]))));
-  const seenPoints = [ // all that must be in the picture
-    ...data.surfaces.flatMap((surface) => surface.vertices),
-    ...data.strokes.filter((s) => s.layer !== "tree").flatMap((s) => s.segments.flatMap((b) => [b.slice(0, 3), b.slice(3)])),
-    ...data.labels.map((label) => label.at),
-    ...placed.flatMap(({ p }) => [-1, 1].map((sign) => p.map((v, k) => v + sign * reach[k]))),
-  ];
-  const bounds = [0, 1, 2].map((k) => [Math.min(...seenPoints.map((v) => v[k])), Math.max(...seenPoints.map((v) => v[k]))]);
-  const centre = bounds.map(([low, high]) => (low + high) / 2);
-  const size = Math.hypot(...bounds.map(([low, high]) => high - low));
-  const distance = 2.2 * size;
-  for (const stroke of data.strokes) if (!stroke.dash.length) stroke.segments = stroke.segments.flatMap((b) => pieces(b, size / 30));
+sceneViewer(canvas, data, shown) draws `data` (scene_data); `shown(layer)` says what is drawn. It returns
+  show(moment)     the platform at a moment, or none (null); with `tensions` cables take their colours;
+  update(parts)    other surfaces, strokes, labels or moments, kept in view;
+  zoom(factor), reset(), redraw().
+tensionColour(share) is a cable's colour, from 0 at the lower limit of its tension to 1 at the upper. */
+
+// Blue, grey and orange differ for every kind of colour vision; a cable beyond a limit is dashed as well.
+function tensionColour(share) {
+  const style = getComputedStyle(document.documentElement);
+  const hex = (role) => parseInt(style.getPropertyValue(`--${role}`).trim().slice(1), 16);
+  if (share < 0 || share > 1) return style.getPropertyValue("--limit").trim();
+  const [from, to] = share < 0.5 ? ["encoder", "cable"] : ["cable", "tag"], at = share < 0.5 ? 2 * share : 2 * share - 1;
+  const mix = (bits) => Math.round(((hex(from) >> bits) & 255) * (1 - at) + ((hex(to) >> bits) & 255) * at);
+  return `rgb(${mix(16)},${mix(8)},${mix(0)})`;
+}
+
+function sceneViewer(canvas, data, shown = () => true) {
+  const context = canvas.getContext("2d");
   const CABLE_PIECES = 10; // so that a cable can pass behind one obstacle and in front of another
   const MARGIN = 24; // px, for texts beside points
-  let now = 0;
-  let playing = false;
-  let before = 0;
-  let clock = 0;
+  const UNFITTED = ["tree", "trail"]; // layers that may lie outside the picture
+  const first = { azimuth: data.view.azimuth, elevation: data.view.elevation, zoom: 1 };
+  const eye = { ...first };
+  const reach = [0, 1, 2].map((k) => Math.max(...data.platform.vertices.map((v) => Math.abs(v[k]))));
+  let strokes, seenPoints, centre, size, distance; // of what is drawn; set by `update`
+  let now = null;
   let waiting = false;
   let colours = {};
+
+  function update(parts) {
+    data = { ...data, ...parts };
+    const placed = data.moments.filter((_, k) => k % Math.max(1, Math.floor(data.moments.length / 20)) === 0);
+    seenPoints = [ // all that must be in the picture
+      ...data.surfaces.flatMap((surface) => surface.vertices),
+      ...data.strokes.filter((s) => !UNFITTED.includes(s.layer)).flatMap((s) => s.segments.flatMap((b) => [b.slice(0, 3), b.slice(3)])),
+      ...data.labels.map((label) => label.at),
+      ...placed.flatMap(({ p }) => [-1, 1].map((sign) => p.map((v, k) => v + sign * reach[k]))),
+    ];
+    const bounds = [0, 1, 2].map((k) => [Math.min(...seenPoints.map((v) => v[k])), Math.max(...seenPoints.map((v) => v[k]))]);
+    centre = bounds.map(([low, high]) => (low + high) / 2);
+    size = Math.hypot(...bounds.map(([low, high]) => high - low));
+    distance = 2.2 * size;
+    strokes = data.strokes.map((stroke) =>
+      stroke.dash.length ? stroke : { ...stroke, segments: stroke.segments.flatMap((b) => pieces(b, size / 30)) });
+    redraw();
+  }
 
   function pieces(segment, longest) {
     const start = segment.slice(0, 3), end = segment.slice(3);
@@ -52,10 +65,6 @@
     const value = parseInt(hex.slice(1), 16);
     const mix = (channel) => Math.round(light < 1 ? channel * light : 255 - (255 - channel) * (2 - light));
     return `rgb(${mix(value >> 16)},${mix((value >> 8) & 255)},${mix(value & 255)})`;
-  }
-
-  function shown(layer) {
-    return boxes.every((box) => box.dataset.layer !== layer || box.checked);
   }
 
   // Turned, and as seen from the eye, in mm on the plane through the centre; y is up.
@@ -131,14 +140,14 @@
       for (const [a, b] of solid.edges) segment(seen[a], seen[b], colour, 1.2);
     };
     for (const solid of data.surfaces) if (shown(solid.layer)) surface(solid);
-    for (const stroke of data.strokes.filter((one) => shown(one.layer)))
+    for (const stroke of strokes.filter((one) => shown(one.layer)))
       for (const b of stroke.segments) {
         segment(project(b.slice(0, 3)), project(b.slice(3)), colours[stroke.role], stroke.width, stroke.opacity, stroke.dash);
         // A little nearer than it is, thin lines most: on the same track they cover the wide ones.
         if (stroke.ahead) items[items.length - 1].depth -= 0.002 * size * (9 - stroke.width);
         if (stroke.layer === "floor") items[items.length - 1].depth += size;
       }
-    if (shown("robot") && data.moments.length) robot(project, segment, surface);
+    if (shown("robot") && now) robot(project, segment, surface);
     return items;
   }
 
@@ -151,21 +160,25 @@
   }
 
   function cables() { // from outlet or pulley to anchor
-    const { r, p, exits } = data.moments[now];
+    const { r, p, exits } = now;
     const place = (v) => [0, 1, 2].map((k) => p[k] + r[3 * k] * v[0] + r[3 * k + 1] * v[1] + r[3 * k + 2] * v[2]);
     return { place, ends: data.anchors.map((anchor, i) => [exits[i], place(anchor)]) };
   }
 
   function robot(project, segment, surface) {
     const { place, ends } = cables();
-    for (const [start, end] of ends) {
+    const [low, high] = data.tension_limits || [0, 1];
+    ends.forEach(([start, end], i) => {
+      const tension = now.tensions?.[i] ?? null, share = tension === null ? null : (tension - low) / (high - low);
+      const beyond = share < 0 || share > 1;
+      const [colour, width] = share === null ? [colours.cable, 1.4] : [tensionColour(share), beyond ? 3.4 : 2.2];
       let last = project(start);
       for (let k = 1; k <= CABLE_PIECES; k++) {
         const next = project(start.map((v, c) => v + ((end[c] - v) * k) / CABLE_PIECES));
-        segment(last, next, colours.cable, 1.4);
+        segment(last, next, colour, width, 1, beyond ? [5, 5] : null);
         last = next;
       }
-    }
+    });
     surface({ ...data.platform, vertices: data.platform.vertices.map(place) });
   }
 
@@ -176,7 +189,7 @@
       const upper = solid.vertices.filter((v) => v[2] > top - 0.01);
       write(solid.name, project([0, 1, 2].map((k) => upper.reduce((sum, v) => sum + v[k], 0) / upper.length)));
     }
-    if (shown("numbers") && shown("robot") && data.moments.length)
+    if (shown("numbers") && shown("robot") && now)
       cables().ends.forEach(([start, end], i) => write(String(i + 1), project(start.map((v, c) => v + 0.25 * (end[c] - v)))));
   }
 
@@ -202,37 +215,6 @@
       waiting = true;
       requestAnimationFrame(draw);
     }
-  }
-
-  function show(index) {
-    now = Math.min(Math.max(index, 0), data.moments.length - 1);
-    const moment = data.moments[now];
-    slider.value = String(now);
-    slider.setAttribute("aria-valuetext", `${moment.t.toFixed(1)} seconds`);
-    readout.textContent = `${moment.t.toFixed(1)} s · ${moment.p.map((v) => v.toFixed(0)).join(", ")} mm${moment.text ? " · " + moment.text : ""}`;
-    redraw();
-  }
-
-  function tick(time) {
-    if (!playing) return;
-    clock += ((time - before) / 1000) * Number(speed.value);
-    before = time;
-    const last = data.moments.length - 1;
-    let index = now;
-    while (index < last && data.moments[index + 1].t <= clock) index++;
-    show(index);
-    if (index >= last) return setPlaying(false);
-    requestAnimationFrame(tick);
-  }
-
-  function setPlaying(on) {
-    playing = on;
-    play.textContent = on ? "Pause" : "Play";
-    if (!on) return;
-    if (now >= data.moments.length - 1) show(0);
-    clock = data.moments[now].t;
-    before = performance.now();
-    requestAnimationFrame(tick);
   }
 
   function zoom(factor) {
@@ -268,32 +250,29 @@
   }, { passive: false });
   const keys = {
     ArrowLeft: () => turn(-5, 0), ArrowRight: () => turn(5, 0), ArrowUp: () => turn(0, 5), ArrowDown: () => turn(0, -5),
-    "+": () => zoom(1.15), "-": () => zoom(1 / 1.15), " ": () => setPlaying(!playing),
+    "+": () => zoom(1.15), "-": () => zoom(1 / 1.15),
   };
   canvas.addEventListener("keydown", (event) => {
     if (!keys[event.key]) return;
     event.preventDefault();
     keys[event.key]();
   });
-  document.getElementById("scene-in").addEventListener("click", () => zoom(1.25));
-  document.getElementById("scene-out").addEventListener("click", () => zoom(0.8));
-  document.getElementById("scene-reset").addEventListener("click", () => {
-    Object.assign(eye, first);
-    redraw();
-  });
-  play.addEventListener("click", () => setPlaying(!playing));
-  slider.addEventListener("input", () => {
-    setPlaying(false);
-    show(Number(slider.value));
-  });
-  for (const box of boxes) box.addEventListener("change", redraw);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     readColours();
     redraw();
   });
   new ResizeObserver(redraw).observe(canvas);
   readColours();
-  if (data.moments.length) show(now);
-  else play.disabled = slider.disabled = true;
-  redraw();
-})();
+  update({});
+  return {
+    update, zoom, redraw,
+    show: (moment) => {
+      now = moment;
+      redraw();
+    },
+    reset: () => {
+      Object.assign(eye, first);
+      redraw();
+    },
+  };
+}

@@ -168,7 +168,7 @@ def test_texts_of_files_cannot_become_markup(tmp_path: Path, run: fake_run.FakeR
     clearance = replace(run.clearance, obstacles=names, obstacle=(evil,) * len(run.clearance))
     page = built(replace(run, context=context, clearance=clearance), tmp_path / "run")
     programs = [s for s in page.all("script") if s.get("type") != "application/json"]
-    assert len(programs) == 2
+    assert len(programs) == 3
     assert "alert(1)</script>" not in page.text
     assert not page.all("img")
     assert not [a for _, a in page.tags if "onerror" in a]

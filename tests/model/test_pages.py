@@ -86,7 +86,7 @@ def whole() -> str:
         viewer(scene, EVIL, [("path", EVIL, "ink", True)], EVIL),
     ]
     data = {"scene-data": scene_data(scene)}
-    return page(EVIL, "".join(parts), scripts=("charts.js", "viewer.js"), data=data)
+    return page(EVIL, "".join(parts), scripts=("charts.js", "viewer.js", "playback.js"), data=data)
 
 
 def test_bullets_show_commands_and_options_as_code() -> None:
@@ -122,7 +122,7 @@ def test_no_text_becomes_markup() -> None:
     text = whole()
     reader = Reader(text)
     programs = [s for s in reader.all("script") if s.get("type") != "application/json"]
-    assert len(programs) == 2
+    assert len(programs) == 3
     assert len(reader.all("img")) == 1
     assert not [a for _, a in reader.tags if "onerror" in a]
     for found in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.S):
@@ -146,7 +146,7 @@ def test_colours_are_defined_for_light_and_dark() -> None:
 
 def test_scripts_are_small_and_need_no_library() -> None:
     assert len(resource("charts.js").splitlines()) <= 150
-    for name in ("charts.js", "viewer.js"):
+    for name in ("charts.js", "viewer.js", "playback.js"):
         assert not re.findall(r"\b(fetch|import|XMLHttpRequest|eval|innerHTML)\b", resource(name))
 
 

@@ -1,0 +1,99 @@
+/* Which button is possible in which state, and why not: one table, and what it does to the page.
+
+`situation` is `{ state, stale }`: the server's last state, and why it does not count (text) or null. */
+
+import { mark } from "./elements.js";
+
+const MOVING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
+const ACTIVE = ["preparing", ...MOVING];
+const VERBS = { run: "A run is under way", home: "Homing is under way", reset: "A reset is under way", release: "The drives are being released", plan: "A plan is being made", jog: "Jogging is enabled: end it first" };
+
+export const isActive = (motion) => motion !== null && ACTIVE.includes(motion.state);
+const isJogging = ({ busy, jog }) => jog.ready || busy?.verb === "jog";
+
+/** Each is a reason why not, or null. Order in `BUTTONS` is the order in which reasons are given. */
+const REQUIREMENTS = {
+  fresh: ({ stale, state }) => stale ?? (state ? null : "Waiting for data"),
+  writable: ({ state }) => (state.read_only ? "This console is read-only" : null),
+  control: ({ state: { control } }) =>
+    control.yours ? null : control.held_by ? `${control.held_by} has control` : "Take control first",
+  not_mine: ({ state }) => (state.control.yours ? "You have control" : null),
+  latched: ({ state }) => (state.latched === null ? "No fault is latched" : null),
+  unlatched: ({ state }) => (state.latched === null ? null : "A fault is latched: reset it first"),
+  homed: ({ state: { reference } }) => (reference.counts ? null : reference.why_not || "The drives are not homed"),
+  idle: ({ state }) => {
+    if (state.busy) return VERBS[state.busy.verb] ?? "Something is under way";
+    if (state.jog.ready) return VERBS.jog;
+    return isActive(state.motion) ? "The platform is in motion" : null;
+  },
+  moves: ({ state: { motion } }) => (motion && MOVING.includes(motion.state) ? null : "Nothing is moving"),
+  path: ({ state }) => (isJogging(state) ? "A jog has no path: let go to stop it" : null),
+  going: ({ state: { motion } }) => (motion.wished.stop || ["stopping", "securing"].includes(motion.state) ? "It is stopping" : null),
+  unheld: ({ state: { motion } }) => (motion.wished.hold ? "It is held already" : null),
+  held: ({ state: { motion } }) => (motion.wished.hold ? null : "It is not held"),
+  planned: ({ state }) => (state.preview ? null : "Load or make a plan first"),
+  proved: ({ preview }) => (preview === undefined || !preview ? "The plan is being read" : preview.passed ? null : "The plan did not pass its check"),
+  jogging: ({ state }) => (isJogging(state) ? null : "Jogging is not enabled"),
+  jog_ready: ({ state: { jog } }) => (jog.ready ? null : jog.why_not || "Enable the drives for jogging first"),
+  located: ({ state }) => (state.platform ? null : "The platform’s position is not known"),
+  poses: ({ state }) => (state.poses.length ? null : "No pose is taught yet"),
+  two_poses: ({ state }) => (state.poses.length > 1 ? null : "Teach two poses first"),
+};
+
+const OPERATOR = ["fresh", "writable", "control"];
+
+/** What each button needs. STOP needs nothing. */
+export const BUTTONS = {
+  stop: [],
+  take_control: ["fresh", "writable", "not_mine"],
+  give_control: OPERATOR,
+  hold: [...OPERATOR, "path", "moves", "going", "unheld"],
+  resume: [...OPERATOR, "path", "moves", "going", "held"],
+  speed: [...OPERATOR, "path", "moves", "going"],
+  home: [...OPERATOR, "idle", "unlatched"],
+  reset: [...OPERATOR, "idle", "latched"],
+  release: [...OPERATOR, "idle"],
+  load_plan: [...OPERATOR, "idle"],
+  plan: [...OPERATOR, "idle"],
+  plan_poses: [...OPERATOR, "two_poses", "idle"],
+  run: [...OPERATOR, "idle", "unlatched", "homed", "planned", "proved"],
+  jog_begin: [...OPERATOR, "idle", "unlatched", "homed"],
+  jog_end: [...OPERATOR, "jogging"],
+  jog: [...OPERATOR, "unlatched", "jog_ready"],
+  jog_setting: ["fresh", "writable"],
+  teach: [...OPERATOR, "located"],
+  edit_pose: [...OPERATOR, "poses"],
+};
+
+/** Why a button is not possible now, or null. */
+export function whyNot(button, situation) {
+  for (const name of BUTTONS[button]) {
+    const reason = REQUIREMENTS[name](situation);
+    if (reason) return reason;
+  }
+  return null;
+}
+
+/** Marks every element that has `data-button`: it stays reachable, so that its reason can be read. */
+export function applyButtons(root, situation) {
+  const reasons = Object.fromEntries(Object.keys(BUTTONS).map((name) => [name, whyNot(name, situation)]));
+  for (const element of root.querySelectorAll("[data-button]")) {
+    const reason = reasons[element.dataset.button];
+    const button = element instanceof HTMLButtonElement;
+    if (!button) element.disabled = reason !== null;
+    mark(element, "aria-disabled", reason === null ? null : "true");
+    mark(element, "aria-description", reason);
+    mark(element, "title", reason ?? element.dataset.title ?? null);
+  }
+}
+
+/** A press of a button that is not possible does nothing but say why: `say(text)`. */
+export function guardButtons(root, say) {
+  root.addEventListener("click", (event) => {
+    const button = event.target instanceof Element && event.target.closest("button[aria-disabled=true]");
+    if (!button) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    say(`${button.dataset.name ?? button.textContent.trim()}: ${button.getAttribute("aria-description")}.`);
+  }, { capture: true });
+}

@@ -1,0 +1,119 @@
+/* Curves over time (uPlot): the last minute of tensions, clearance and following error, and the curves of a plan. */
+
+import { at, known, make, write } from "./elements.js";
+
+const SECONDS = 60, REDRAW_MS = 250, HEIGHT = 140, SERIES = 8;
+const colour = (role) => getComputedStyle(document.documentElement).getPropertyValue(`--${role}`).trim();
+
+/** Options of one plot: its lines are `{label, role, dash, limit}`; a limit does not set the range. */
+function options(lines, { x, zero = false }) {
+  const axis = (more) => ({ stroke: () => colour("muted"), grid: { stroke: () => colour("grid"), width: 1 }, ticks: { show: false }, values: (_, all) => all.map((v) => String(v).replace("-", "\u2212")), font: "11px system-ui, sans-serif", ...more });
+  return {
+    width: 300, height: HEIGHT, legend: { show: false }, cursor: { drag: { x: false, y: false } }, padding: [8, 10, 0, 0],
+    scales: { x: { time: false, range: x }, y: { range: (_, low, high) => range(low, high, zero) } },
+    axes: [axis({ size: 28, gap: 6 }), axis({ size: 42, gap: 4 })],
+    series: [{}, ...lines.map(({ label, role, dash, limit }) => ({
+      label, stroke: () => colour(role), width: 1.5, dash, auto: !limit, points: { show: false }, spanGaps: false,
+    }))],
+  };
+}
+
+function range(low, high, zero) {
+  if (low === null || high === null) return [0, 1];
+  const room = Math.max(0.08 * (high - low), 0.02 * Math.abs(high), 1e-3);
+  return [zero && low >= 0 ? 0 : low - room, high + room];
+}
+
+const tensionLines = (count) => [
+  ...Array.from({ length: count }, (_, k) => ({ label: `cable ${k + 1}`, role: `series${(k % SERIES) + 1}`, dash: k >= SERIES ? [5, 3] : undefined })),
+  { label: "limit", role: "limit", dash: [6, 4], limit: true }, { label: "limit", role: "limit", dash: [6, 4], limit: true },
+];
+const CLEARANCE = [{ label: "clearance", role: "encoder" }, { label: "required", role: "limit", dash: [6, 4] }];
+
+/** A figure whose plot is as wide as it is. */
+class Plot {
+  #plot;
+
+  constructor(figure, lines, more, data) {
+    this.#plot = new globalThis.uPlot(options(lines, more), data, figure.querySelector(".plotted"));
+    new ResizeObserver(([entry]) => {
+      const width = Math.floor(entry.contentRect.width);
+      if (width > 0 && width !== this.#plot.width) this.#plot.setSize({ width, height: HEIGHT });
+    }).observe(figure.querySelector(".plotted"));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot.redraw());
+    const key = figure.querySelector(".keys");
+    const shown = lines.length > 1 ? lines.filter((line, k) => lines.findIndex((other) => other.label === line.label) === k) : [];
+    key.replaceChildren(...shown.map(({ label, role }) => make("span", { class: "key" }, make("span", { class: `swatch role-${role}` }), label.replace("cable ", ""))));
+  }
+
+  draw(data) {
+    this.#plot.setData(data);
+  }
+
+  destroy() {
+    this.#plot.destroy();
+  }
+}
+
+/** The last minute. */
+export class Curves {
+  #rows = []; // {at, tensions, clearance, required, following}
+  #plots = null;
+  #drawn = 0;
+  #limits = [0, 0];
+
+  /** Takes a state that came at `now`, [ms]. */
+  show(state, now) {
+    const { tensions_n: tensions, clearance_mm: clearance, motion } = state;
+    this.#limits = state.tension_limits_n;
+    this.#rows.push({ at: now / 1000, tensions, clearance: clearance?.now ?? null, required: clearance?.required ?? null, following: motion?.following_error_mm ?? null });
+    while (this.#rows[0].at < now / 1000 - SECONDS) this.#rows.shift();
+    if (now - this.#drawn < REDRAW_MS || document.hidden || !at("live").checkVisibility()) return;
+    this.#drawn = now;
+    this.#draw(now / 1000);
+  }
+
+  #draw(now) {
+    const count = this.#rows.find((row) => row.tensions)?.tensions.length ?? 0;
+    if (!this.#plots) {
+      if (!count && !this.#rows.some((row) => row.clearance !== null)) return;
+      this.#make(count || SERIES);
+    }
+    const x = this.#rows.map((row) => row.at - now), of = (read) => this.#rows.map(read);
+    const { cables } = this.#plots;
+    const tensions = Array.from({ length: cables }, (_, k) => of((row) => row.tensions?.[k] ?? null));
+    this.#plots.tensions.draw([x, ...tensions, ...this.#limits.map((limit) => of(() => limit))]);
+    this.#plots.clearance.draw([x, of((row) => row.clearance), of((row) => row.required)]);
+    this.#plots.following.draw([x, of((row) => row.following)]);
+  }
+
+  #make(cables) {
+    const more = { x: [-SECONDS, 0] };
+    this.#plots = {
+      cables,
+      tensions: new Plot(at("curve-tensions"), tensionLines(cables), more, [[]]),
+      clearance: new Plot(at("curve-clearance"), CLEARANCE, { ...more, zero: true }, [[]]),
+      following: new Plot(at("curve-following"), [{ label: "following error", role: "encoder" }], { ...more, zero: true }, [[]]),
+    };
+  }
+}
+
+/** The curves of a plan; those that were there go. */
+export class PlanCurves {
+  #plots = [];
+
+  show(plan, limits) {
+    for (const plot of this.#plots) plot.destroy();
+    this.#plots = [];
+    at("plan-curves").hidden = !plan?.curves;
+    if (!plan?.curves) return;
+    const { time_s: time, clearance_mm: clearance, required_mm: required, tensions_n: tensions } = plan.curves;
+    const x = { x: [time[0] ?? 0, time.at(-1) ?? 1] };
+    this.#plots.push(new Plot(at("plan-tensions"), tensionLines(tensions.length), x, [time, ...tensions, ...limits.map((limit) => time.map(() => limit))]));
+    at("plan-clearance").hidden = clearance === null;
+    if (clearance === null) return;
+    this.#plots.push(new Plot(at("plan-clearance"), CLEARANCE, { ...x, zero: true }, [time, clearance, time.map(() => required)]));
+    const values = clearance.filter((v) => v !== null);
+    write(at("plan-clearance-least"), values.length ? `least ${known(Math.min(...values), 1, "mm")}` : "");
+  }
+}

@@ -1,0 +1,53 @@
+/* Small things of the page's tree: finding and making elements, writing texts and numbers. */
+
+export const at = (id) => document.getElementById(id);
+
+/** A new element with attributes, listeners (`onclick: …`) and children, which are nodes or plain texts. */
+export function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (value === true) element.setAttribute(name, "");
+    else if (value !== null && value !== false) element.setAttribute(name, value);
+  }
+  element.append(...children);
+  return element;
+}
+
+/** Writes a text where it differs: a screen reader would read what is written again. */
+export function write(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** Sets an attribute where it differs; null removes it. */
+export function mark(element, name, value) {
+  if (value === null) element.removeAttribute(name);
+  else if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+}
+
+/** A number with its unit, or a dash for one that is not known. */
+export function known(value, digits, unit = "") {
+  const number = value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "\u2212");
+  return unit && number !== "–" ? `${number}\u00a0${unit}` : number;
+}
+
+/** Seconds as people write them. */
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined) return "–";
+  const whole = Math.round(seconds);
+  return whole < 60 ? `${seconds.toFixed(1)}\u00a0s` : `${Math.floor(whole / 60)}\u00a0min ${whole % 60}\u00a0s`;
+}
+
+/** Whether a key typed there is text: a space belongs to it. */
+export function isTextField(target) {
+  if (!(target instanceof Element)) return false;
+  if (target.closest("textarea, [contenteditable='true']")) return true;
+  const other = ["button", "checkbox", "color", "file", "image", "radio", "range", "reset", "submit"];
+  return target instanceof HTMLInputElement && !other.includes(target.type);
+}
+
+/** A link within this server, in a tab of its own; null for any other address. */
+export function link(address, text) {
+  if (typeof address !== "string" || !address.startsWith("/") || address.startsWith("//")) return null;
+  return make("a", { href: address, target: "_blank", rel: "noopener" }, text);
+}

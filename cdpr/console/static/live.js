@@ -1,0 +1,107 @@
+/* Figures of this moment: lamps, position, clearance, next stop, tensions between their limits, how the loop keeps time. */
+
+import { isActive } from "./buttons.js";
+import { at, duration, known, make, mark, write } from "./elements.js";
+
+/** Lamps: what is shown, and whether that is good (pass), bad (fail), worth a look (stop) or neither (quiet). */
+const LAMPS = {
+  control: ({ control, read_only: readOnly }) =>
+    readOnly ? ["Read-only", "quiet"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
+  drives: ({ motion, jog }) => {
+    const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
+    if (!drives.length) return [jog.ready ? "Drives enabled" : "Drives not reported", jog.ready ? "stop" : "quiet"];
+    return [`${on} of ${drives.length} drives enabled`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
+  },
+  homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
+  latch: ({ latched }) => (latched === null ? ["No fault", "pass"] : ["Fault latched", "fail"]),
+};
+
+const STATES = {
+  preparing: "Preparing", enabling: "Enabling drives", approaching: "Approaching the start", moving: "Moving", holding: "Held",
+  stopping: "Stopping", securing: "Securing", finished: "Finished", stopped: "Stopped", latched: "Stopped by a fault", releasing: "Releasing",
+};
+
+/** What moves, in a few words. */
+export function motionText({ motion, busy, jog, latched }) {
+  if (motion) {
+    const share = motion.path_length_mm ? ` · ${Math.round((100 * motion.path_mm) / motion.path_length_mm)} %` : "";
+    return (STATES[motion.state] ?? motion.state) + (isActive(motion) ? share : "");
+  }
+  if (jog.ready) return jog.moving ? "Jogging" : "Ready to jog";
+  if (busy) return `Busy: ${busy.verb}`;
+  return latched === null ? "At rest" : "Fault latched";
+}
+
+export class Live {
+  #bars = []; // per cable {bar, value, row}
+
+  show(state) {
+    write(at("rig"), state.rig);
+    write(at("bus"), `${state.bus}${state.simulated ? " · simulated drives" : ""}`);
+    document.title = `${motionText(state)} – ${state.rig}`;
+    for (const [name, read] of Object.entries(LAMPS)) {
+      const [text, kind] = read(state), lamp = at(`lamp-${name}`);
+      write(lamp, text);
+      lamp.className = kind;
+    }
+    write(at("motion-text"), motionText(state));
+    this.#pose(state);
+    this.#motion(state);
+    this.#tensions(state);
+  }
+
+  #pose({ platform }) {
+    ["x", "y", "z"].forEach((axis, k) => tile(axis, known(platform?.position_mm[k], 1)));
+    tile("tilt", known(platform?.tilt_deg, 2));
+    const note = platform === null ? "not known" : platform.source === "plan" ? "by the plan" : `turn ${known(platform.turn_deg, 2)}°`;
+    write(at("note-tilt"), note);
+  }
+
+  #motion({ clearance_mm: clearance, next_stop: stop, motion }) {
+    tile("clearance", known(clearance?.now, 1));
+    const low = Boolean(clearance) && clearance.now < clearance.required;
+    at("tile-clearance").classList.toggle("bad", low);
+    write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${known(clearance.required, 0, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or not known");
+    tile("stop", stop ? known(stop.distance_mm, 0) : "–");
+    write(at("note-stop"), stop ? `${stop.name} in ${duration(stop.seconds)}` : "none ahead");
+    tile("following", known(motion?.following_error_mm, 2));
+    tile("lateness", known(motion?.lateness_ms, 2));
+    write(at("note-lateness"), `worst ${known(motion?.worst_lateness_ms, 2)}`);
+    tile("lost", known(motion?.lost_replies, 0));
+    at("tile-lost").classList.toggle("bad", (motion?.lost_replies ?? 0) > 0);
+  }
+
+  /** Bars reach from zero to a little above the upper limit; the allowed range is marked. */
+  #tensions({ tensions_n: tensions, tension_limits_n: [low, high] }) {
+    const list = at("tensions"), full = 1.1 * high;
+    if (tensions && this.#bars.length !== tensions.length) this.#make(tensions.length, list);
+    list.style.setProperty("--low", `${(100 * low) / full}%`);
+    list.style.setProperty("--high", `${(100 * high) / full}%`);
+    write(at("tension-limits"), `limits ${known(low, 0)} to ${known(high, 0, "N")}`);
+    this.#bars.forEach(({ bar, value, row }, k) => {
+      const tension = tensions?.[k] ?? null, trouble = tension === null ? null : tension < low ? "slack" : tension > high ? "too tight" : null;
+      bar.style.width = `${tension === null ? 0 : Math.min(100, Math.max(0, (100 * tension) / full))}%`;
+      bar.style.background = tension === null ? "" : globalThis.tensionColour((tension - low) / (high - low));
+      write(value, known(tension, 1, "N"));
+      row.classList.toggle("bad", trouble !== null);
+    });
+    const words = (tensions ?? []).flatMap((t, k) =>
+      t < low ? `Cable ${k + 1} is slack: ${known(t, 1, "N")}, at least ${known(low, 0, "N")}`
+        : t > high ? `Cable ${k + 1} is too tight: ${known(t, 1, "N")}, at most ${known(high, 0, "N")}` : []);
+    write(at("tension-trouble"), tensions ? words.join(". ") : "Not known: tensions are measured while drives are enabled.");
+    mark(at("tension-trouble"), "class", words.length ? "trouble" : "quiet");
+    at("tension-trouble").hidden = Boolean(tensions) && !words.length;
+  }
+
+  #make(count, list) {
+    this.#bars = Array.from({ length: count }, (_, k) => {
+      const bar = make("span", { class: "bar" }), value = make("span", { class: "value figure" });
+      return { bar, value, row: make("li", {}, make("span", { class: "cable" }, make("span", { class: "unseen" }, "Cable "), String(k + 1)), make("span", { class: "track", "aria-hidden": "true" }, bar), value) };
+    });
+    list.replaceChildren(...this.#bars.map(({ row }) => row));
+  }
+}
+
+function tile(name, text) {
+  write(at(`value-${name}`), text);
+}

@@ -1,0 +1,112 @@
+/* The console's page: puts its parts together, and shows each state to all of them. */
+
+import { applyButtons, guardButtons } from "./buttons.js";
+import { Connection } from "./connection.js";
+import { Curves } from "./curves.js";
+import { cancelDialog, checkDialog } from "./dialog.js";
+import { at, known, mark, write } from "./elements.js";
+import { Events } from "./events.js";
+import { bindJog } from "./jog.js";
+import { Live } from "./live.js";
+import { Operate } from "./operate.js";
+import { Scene } from "./scene.js";
+import { bindStop } from "./stop.js";
+import { Teach } from "./teach.js";
+
+const NOTICE_MS = { done: 4000, failed: 10000 };
+const connection = new Connection();
+const scene = new Scene();
+const situation = () => ({ state: connection.state, stale: connection.freshness().why, preview: operate.plan });
+let noticed = 0;
+
+/** A line above STOP for a while: what the server answered, or why something was not done. */
+function say(text, failed = false) {
+  write(at("notice"), text);
+  at("notice").classList.toggle("failed", failed);
+  at("notice").hidden = !text;
+  clearTimeout(noticed);
+  noticed = setTimeout(() => (at("notice").hidden = true), failed ? NOTICE_MS.failed : NOTICE_MS.done);
+}
+
+async function command(name, fields) {
+  const answer = await connection.command(name, fields);
+  if (answer.what || !answer.ok) say(answer.what || `“${name}” was refused.`, !answer.ok);
+  return answer;
+}
+
+const page = { command, situation, say, scene };
+const stopBar = bindStop(connection, () => {
+  cancelDialog();
+  jog.end("STOP");
+});
+const live = new Live(), curves = new Curves(), events = new Events(), teach = new Teach(page), operate = new Operate(page);
+const jog = bindJog(connection, situation, command);
+
+// Views: beside the live view on a wide screen, one of five on a narrow one.
+const tabs = [...document.querySelectorAll("[role=tab]")];
+const wide = matchMedia("(min-width: 900px)");
+
+function view(name) {
+  const chosen = wide.matches && name === "live" ? "operate" : name;
+  if (document.body.dataset.view !== chosen) jog.end("another view was chosen");
+  document.body.dataset.view = chosen;
+  for (const tab of tabs) {
+    const on = tab.dataset.view === chosen;
+    mark(tab, "aria-selected", String(on));
+    tab.tabIndex = on ? 0 : -1;
+  }
+}
+
+for (const tab of tabs) {
+  tab.addEventListener("click", () => view(tab.dataset.view));
+  tab.addEventListener("keydown", (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (!step) return;
+    const there = tabs.filter((one) => one.checkVisibility()), next = there[(there.indexOf(tab) + step + there.length) % there.length];
+    next.focus();
+    view(next.dataset.view);
+  });
+}
+wide.addEventListener("change", () => view(document.body.dataset.view));
+view("live");
+
+guardButtons(document.body, say);
+
+function showAge() {
+  const { why, age } = connection.freshness();
+  document.body.classList.toggle("stale", why !== null);
+  at("stale").hidden = why === null;
+  if (why) write(at("stale-text"), why);
+  // Not its age: that would be read out twenty times a second.
+  write(at("stale-said"), why ? "Figures are not current. Only STOP works." : "");
+  write(at("lamp-data"), age === null ? "No data" : `Data ${known(age, 1)}\u00a0s old`);
+  at("lamp-data").className = why ? "fail" : "pass";
+  // What is stale cannot be used, by keyboard or otherwise; an open question is withdrawn.
+  if (why) checkDialog();
+  if (at("dialog").hidden) at("main").inert = at("tabs").inert = why !== null;
+  applyButtons(document.body, situation());
+}
+
+let waiting = false;
+connection.addEventListener("age", showAge);
+connection.addEventListener("state", () => {
+  if (waiting) return;
+  waiting = true;
+  requestAnimationFrame(() => {
+    waiting = false;
+    const { state } = connection;
+    live.show(state);
+    scene.show(state);
+    curves.show(state, performance.now());
+    events.show(state);
+    operate.show(state);
+    teach.show(state);
+    jog.show(state);
+    stopBar.show(state.motion);
+    checkDialog();
+    showAge();
+  });
+});
+
+scene.start().catch(() => write(at("scene-note"), "The scene cannot be read from the server."));
+connection.start();

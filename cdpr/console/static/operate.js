@@ -1,0 +1,180 @@
+/* The operator's panel: control, latch, motion, drives, and a plan from its file to its run. */
+
+import { isActive, whyNot } from "./buttons.js";
+import { address } from "./connection.js";
+import { PlanCurves } from "./curves.js";
+import { ask } from "./dialog.js";
+import { at, duration, known, link, make, mark, write } from "./elements.js";
+import { motionText } from "./live.js";
+
+const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
+
+export class Operate {
+  plan = null; // that is loaded: what /api/preview gave
+  #page;
+  #preview = null; // id of the plan that is being read or was
+  #curves = new PlanCurves();
+  #outcome = "";
+  #busy = null;
+
+  /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
+  constructor(page) {
+    this.#page = page;
+    for (const [id, command] of [["take-control", "take_control"], ["give-control", "give_control"], ["hold", "hold"], ["resume", "resume"]])
+      at(id).addEventListener("click", () => page.command(command));
+    at("speed").addEventListener("input", () => write(at("speed-shown"), `${at("speed").value} %`));
+    at("speed").addEventListener("change", () => page.command("speed", { percent: Number(at("speed").value) }));
+    at("home").addEventListener("click", () => this.#home());
+    at("reset").addEventListener("click", () => this.#reset());
+    at("release").addEventListener("click", () => this.#release());
+    at("run").addEventListener("click", () => this.#run());
+    at("load-plan").addEventListener("click", () => at("plan-file").value && page.command("load_plan", { file: at("plan-file").value }));
+    at("make-plan").addEventListener("click", () => at("scene-file").value && page.command("plan", { scene: at("scene-file").value, objective: at("objective").value }));
+    at("plan-time").addEventListener("input", () => this.#look());
+    at("scene-live").addEventListener("click", () => this.#leave());
+    this.readFiles();
+  }
+
+  /** The files that can be loaded, and what is chosen stays chosen. */
+  async readFiles() {
+    const response = await fetch(address("/api/files")).catch(() => null);
+    if (!response?.ok) return;
+    const { scenes, plans } = await response.json();
+    for (const [id, names] of [["scene-file", scenes], ["plan-file", plans]]) {
+      const select = at(id), before = select.value;
+      select.replaceChildren(...(names.length ? names.map((name) => make("option", { value: name }, name)) : [make("option", { value: "" }, "none found")]));
+      if (names.includes(before)) select.value = before;
+    }
+  }
+
+  show(state) {
+    const { control, latched, motion, outcome, busy, preview } = state;
+    write(at("control-text"), state.read_only ? "This console is read-only: you see everything, and STOP works." : control.yours ? "You have control." : control.held_by ? `${control.held_by} has control. You see everything, and STOP works.` : "Control is free. Take it to command the robot.");
+    at("take-control").hidden = control.yours;
+    at("give-control").hidden = !control.yours;
+    at("latched").hidden = latched === null;
+    write(at("latched-cause"), latched ?? "");
+    this.#motion(state);
+    if (preview !== this.#preview) this.#read(preview);
+    if (isActive(motion)) this.#leave();
+    write(at("busy"), busy ? `${VERBS[busy.verb] ?? busy.verb}: ${busy.text || "…"}` : "");
+    at("busy").hidden = !busy;
+    if (this.#busy && !busy) this.readFiles();
+    this.#busy = busy?.verb ?? null;
+    this.#showOutcome(outcome);
+    write(at("homed-text"), state.reference.counts ? "The drives are homed." : `Not homed: ${state.reference.why_not || "reason not known"}.`);
+  }
+
+  #motion(state) {
+    const { motion } = state, along = motion?.path_length_mm ? motion.path_mm / motion.path_length_mm : null;
+    write(at("motion-state"), motionText(state));
+    at("progress").hidden = along === null;
+    if (along !== null) {
+      at("progress").value = along;
+      write(at("progress-text"), `${known(motion.path_mm, 0)} of ${known(motion.path_length_mm, 0, "mm")} · ${duration(motion.elapsed_s)} · feed ${known(motion.feed_percent, 0)} %`);
+    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : "Nothing is moving.");
+    write(at("motion-cause"), motion?.cause ?? "");
+    const asked = motion?.wished.speed_percent;
+    if (asked !== undefined && document.activeElement !== at("speed")) {
+      at("speed").value = asked;
+      write(at("speed-shown"), `${Math.round(asked)} %`);
+    }
+  }
+
+  #showOutcome(outcome) {
+    const text = JSON.stringify(outcome);
+    if (text === this.#outcome) return;
+    this.#outcome = text;
+    at("outcome").hidden = outcome === null;
+    if (outcome === null) return;
+    at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
+    write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
+    write(at("outcome-text"), outcome.text);
+    const links = [link(outcome.report, "Report"), link(outcome.fault_page, "What this fault means")];
+    at("outcome-links").replaceChildren(...links.filter(Boolean));
+  }
+
+  // The plan.
+
+  async #read(id) {
+    this.#preview = id;
+    this.plan = null;
+    this.#leave();
+    if (id !== null) {
+      const response = await fetch(address("/api/preview")).catch(() => null);
+      if (id !== this.#preview) return; // another one came meanwhile
+      if (response?.ok) this.plan = await response.json();
+      else this.#page.say("The plan cannot be read from the server.", true);
+    }
+    this.#showPlan();
+  }
+
+  #showPlan() {
+    const { plan } = this;
+    at("plan").hidden = plan === null;
+    this.#page.scene.load(plan);
+    this.#curves.show(plan, this.#page.situation().state.tension_limits_n);
+    if (!plan) return;
+    write(at("plan-name"), plan.name);
+    write(at("plan-verdict"), plan.verdict);
+    at("plan-box").className = `verdict ${plan.passed ? "pass" : "fail"}`;
+    write(at("plan-size"), `${known(plan.length_mm, 0, "mm")} in ${duration(plan.duration_s)}`);
+    at("plan-checks").replaceChildren(...plan.checks.map((text) => make("li", {}, text)));
+    const slider = at("plan-time");
+    slider.max = Math.max(plan.moments.length - 1, 0);
+    slider.value = 0;
+  }
+
+  #look() {
+    const moment = this.plan?.moments[Number(at("plan-time").value)];
+    if (!moment || isActive(this.#page.situation().state.motion)) return;
+    mark(at("plan-time"), "aria-valuetext", `${moment.t.toFixed(1)} seconds`);
+    this.#page.scene.look(moment);
+  }
+
+  #leave() {
+    if (at("scene-preview").hidden) return;
+    at("plan-time").value = 0;
+    this.#page.scene.look(null);
+  }
+
+  // What is asked before.
+
+  async #confirmed(button, question) {
+    const { say, situation } = this.#page;
+    return ask({ ...question, say, possible: () => whyNot(button, situation()) });
+  }
+
+  async #home() {
+    const lines = ["All winches wind in slowly until every cable is taut; the platform may move a little.", "The present homing reference is given up first."];
+    if (await this.#confirmed("home", { title: "Home the drives?", lines, confirm: "Home: winches move" })) this.#page.command("home");
+  }
+
+  async #reset() {
+    const { latched } = this.#page.situation().state;
+    const lines = [make("p", { class: "cause" }, make("b", {}, "Cause: "), latched), "Remove the cause first.", "Reset clears the latched fault and resets drives in fault. Nothing moves; drives that hold keep holding."];
+    if (await this.#confirmed("reset", { title: "Reset the latched fault?", lines, confirm: "Cause removed: reset" })) this.#page.command("reset");
+  }
+
+  async #release() {
+    const { platform } = this.#page.situation().state;
+    const height = platform ? ` It is at z = ${known(platform.position_mm[2], 0, "mm")} now.` : " Its position is not known.";
+    const lines = [
+      make("p", { class: "cause" }, "The platform drops unless it stands on a support or every winch has a brake."),
+      `Brakes close, then all drives lose their torque together.${height}`,
+      "Winches without brakes let their cables go, and the drives have to be homed again.",
+    ];
+    if (await this.#confirmed("release", { title: "Take the torque off all drives?", lines, confirm: "Supported: release" })) this.#page.command("release");
+  }
+
+  async #run() {
+    const { plan } = this;
+    const rows = [["Plan", plan.name], ["Check", plan.verdict], ["Duration", duration(plan.duration_s)], ["Length", known(plan.length_mm, 0, "mm")]];
+    const facts = make("dl", { class: "facts" }, ...rows.flatMap(([name, text]) => [make("dt", {}, name), make("dd", {}, text)]));
+    const lines = [facts, "The drives are enabled and the platform moves. Keep clear of the platform and of its cables."];
+    if (await this.#confirmed("run", { title: "Run this plan?", lines, confirm: "Run: the platform moves" })) {
+      this.#page.command("run");
+      at("motion").scrollIntoView({ block: "nearest" });
+    }
+  }
+}

@@ -1,0 +1,60 @@
+/* STOP: along the path, for everybody, from every view, on a stale page as well.
+
+It acts on pointerdown and on the space bar and Escape anywhere except in a text field, before anything else of the
+page does. It is an operational stop in black, which IEC 60204-1 prefers for one, and no emergency stop. */
+
+import { at, isTextField, write } from "./elements.js";
+
+const ANSWER_MS = 6000; // as long as an answer is shown
+const STOPPING = "Stopping along the path";
+
+/** Binds STOP; `pressed` hears of each press before it is sent. */
+export function bindStop(connection, pressed) {
+  const button = at("stop"), answer = at("stop-answer");
+  let presses = 0;
+
+  async function stop() {
+    const press = ++presses;
+    pressed();
+    button.classList.add("pressed");
+    write(answer, "STOP sent");
+    const { ok, what } = await connection.stop();
+    if (press !== presses) return;
+    button.classList.remove("pressed");
+    write(answer, ok ? what || "Stop requested" : what);
+    answer.classList.toggle("failed", !ok);
+    if (ok) setTimeout(() => press === presses && write(answer, ""), ANSWER_MS);
+  }
+
+  button.addEventListener("pointerdown", (event) => {
+    event.preventDefault();
+    stop();
+  });
+  button.addEventListener("click", (event) => {
+    if (event.detail === 0) stop(); // Enter, or a screen reader: no pointer was there before
+  });
+  const isStop = (event) => [" ", "Escape"].includes(event.key) && !event.isComposing && !isTextField(event.target);
+  window.addEventListener("keydown", (event) => {
+    if (!isStop(event)) return;
+    event.preventDefault(); // the focused button is not pressed, the page does not scroll
+    if (event.key === " ") event.stopImmediatePropagation();
+    if (!event.repeat) stop();
+  }, { capture: true });
+  window.addEventListener("keyup", (event) => {
+    if (isStop(event) && event.key === " ") event.preventDefault(); // buttons act on it
+  }, { capture: true });
+  // The space bar is taken, so boxes are ticked with Enter.
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Enter" && event.target instanceof HTMLInputElement && ["checkbox", "radio"].includes(event.target.type)) event.target.click();
+  });
+  return {
+    /** What the run says about it. */
+    show: (motion) => {
+      const asked = motion?.wished.stop && !["finished", "stopped", "latched"].includes(motion.state);
+      button.classList.toggle("asked", Boolean(asked));
+      if (button.classList.contains("pressed")) return;
+      if (asked) write(answer, STOPPING);
+      else if (answer.textContent === STOPPING) write(answer, "");
+    },
+  };
+}

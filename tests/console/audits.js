@@ -1,0 +1,69 @@
+/* What tests ask of the whole page; an object whose functions give texts that name what is wrong or what is there. */
+({
+  nameOf(e) {
+    return e.id || e.getAttribute("aria-label") || e.textContent.trim();
+  },
+
+  shown(selector) {
+    return [...document.querySelectorAll(selector)].filter((e) => e.checkVisibility());
+  },
+
+  /** Controls that could be used now, by mouse or keyboard. */
+  usable() {
+    return this.shown("button, input, select, a, canvas, summary")
+      .filter((e) => !e.disabled && !e.closest("[inert]") && !e.getAttribute("aria-disabled"))
+      .map(this.nameOf);
+  },
+
+  /** Controls that Tab must reach: of tabs and radio buttons one is, by arrows the others are. */
+  tabbable() {
+    return this.shown("button, input, select, canvas, summary, a")
+      .filter((e) => !e.disabled && e.type !== "radio" && e.role !== "tab")
+      .map(this.nameOf);
+  },
+
+  unnamed() {
+    return this.shown("button, input, select, canvas, [role=group], [role=tabpanel]")
+      .filter((e) => !["aria-label", "aria-labelledby"].some((name) => e.getAttribute(name)))
+      .filter((e) => !e.labels?.length && !e.textContent.trim())
+      .map((e) => e.outerHTML);
+  },
+
+  /** Too small for a finger. */
+  small() {
+    return this.shown("button, select, input[type=text]")
+      .filter((e) => e.getBoundingClientRect().height < 43.5 || e.getBoundingClientRect().width < 40)
+      .map(this.nameOf);
+  },
+
+  /** Texts that do not fit where they are. */
+  cut() {
+    return this.shown("button, .tiles dt, .tiles dd, .lamps span, #stop-words, #tensions .value")
+      .filter((e) => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1)
+      .map(this.nameOf);
+  },
+
+  /** Texts with less contrast than WCAG 2.2 asks for at level AA (1.4.3); what is disabled is exempt. */
+  weak() {
+    const parse = (colour) => colour.match(/[\d.]+/g).map(Number);
+    const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+    const luminance = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+    const behind = (e) => {
+      for (; e; e = e.parentElement) {
+        const colour = parse(getComputedStyle(e).backgroundColor);
+        if ((colour[3] ?? 1) > 0.99) return colour;
+      }
+      return [255, 255, 255];
+    };
+    const exempt = "[aria-disabled=true], :disabled, label:has(:disabled), .unseen, canvas, option, .uplot";
+    return this.shown("body *").flatMap((e) => {
+      const text = [...e.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim());
+      if (!text || e.closest(exempt)) return [];
+      const style = getComputedStyle(e), size = parseFloat(style.fontSize);
+      const needed = size >= 24 || (size >= 18.66 && style.fontWeight >= 700) ? 3 : 4.5;
+      const [low, high] = [luminance(parse(style.color)), luminance(behind(e))].sort((a, b) => a - b);
+      const ratio = (high + 0.05) / (low + 0.05);
+      return ratio < needed ? [`${this.nameOf(e)}: ${ratio.toFixed(2)}`] : [];
+    });
+  },
+})

@@ -1,0 +1,191 @@
+"""A browser on the console's page, served by the fake server: what the page's tests share."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import urllib.request
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+ROOT = Path(__file__).parents[2]
+ARGUMENTS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+VIEWS = ("live", "operate", "jog", "teach", "events")
+AUDITS = (Path(__file__).parent / "audits.js").read_text(encoding="utf-8")
+SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
+
+
+@dataclass
+class Fake:
+    """The fake server, from outside."""
+
+    address: str
+
+    @property
+    def origin(self) -> str:
+        return self.address.split("/?")[0]
+
+    def ask(self, **hooks: Any) -> dict[str, Any]:
+        """What it received so far, after ``hooks`` were set."""
+        data = json.dumps(hooks).encode() if hooks else None
+        with urllib.request.urlopen(f"{self.origin}/fake", data=data, timeout=10) as answer:
+            found = json.load(answer)
+        assert isinstance(found, dict)
+        return found
+
+    def received(self, kind: str) -> list[dict[str, Any]]:
+        """Messages of a kind, or commands of a name."""
+        return [m for m in self.ask()["received"] if kind in (m["kind"], m.get("command"))]
+
+    def wait(self, page: Page, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """What it has once that holds; fails after 5 s of the page's time."""
+        for _ in range(100):
+            found = self.ask()
+            if holds(found):
+                return found
+            page.wait_for_timeout(50)
+        raise AssertionError(f"did not come: {found['received'][-5:]}")
+
+    def let_pass(self, page: Page, ticks: int = 8) -> dict[str, Any]:
+        """Waits for as many periods of the server, 50 ms each."""
+        until = self.ask()["ticks"] + ticks
+        return self.wait(page, lambda found: bool(found["ticks"] >= until))
+
+
+@dataclass
+class Visit:
+    """A page, the server behind it, and what went wrong on it."""
+
+    page: Page
+    fake: Fake
+    errors: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+
+    def audit(self, name: str, of: str = "") -> list[str]:
+        """What one of `audits.js` finds on the page."""
+        script = AUDITS[AUDITS.index("({") :].rstrip()
+        found = self.page.evaluate(f"() => [({script}).{name}({of})].flat()")
+        assert isinstance(found, list)
+        return found
+
+    def view(self, name: str) -> None:
+        """Chooses a view, where it is not shown already."""
+        tab = self.page.locator(f"#tab-{name}")
+        if tab.is_visible():
+            tab.click()
+
+    def take_control(self) -> None:
+        self.view("operate")
+        self.page.locator("#take-control").click()
+        expect(self.page.locator("#lamp-control")).to_have_text("You have control")
+
+    def load(self, name: str = "plans/circle.json") -> None:
+        self.view("operate")
+        self.page.locator("#plan-file").select_option(name)
+        self.page.locator("#load-plan").click()
+        expect(self.page.locator("#plan-name")).to_have_text(name)
+
+    def run(self) -> None:
+        self.page.locator("#run").click()
+        self.page.locator(".confirm").click()
+        expect(self.page.locator("#motion-state")).to_contain_text("Moving")
+
+    def ready_to_jog(self) -> None:
+        self.take_control()
+        self.view("jog")
+        self.page.locator("#jog-begin").click()
+        expect(self.page.locator("#jog-state")).to_contain_text("Ready")
+
+    def hold(self, name: str = "+x") -> int:
+        """Presses a jog button by mouse; the number of the press."""
+        box = self.page.locator(f'[data-jog="{name}"]').bounding_box()
+        assert box
+        before = len(self.fake.received("held"))
+        self.page.mouse.move(box["x"] + 9, box["y"] + 9)
+        self.page.mouse.down()
+        found = self.fake.wait(self.page, lambda f: _count(f, "held") > before + 1)
+        return int(found["received"][-1]["hold"])
+
+
+def _count(found: dict[str, Any], kind: str) -> int:
+    return sum(m["kind"] == kind for m in found["received"])
+
+
+def chromium() -> str:
+    """The path of the system's Chromium; skips without one."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        if found := shutil.which(name):
+            return found
+    pytest.skip("NOT TESTED: the console's page needs a browser, and no Chromium is on PATH")
+
+
+@contextlib.contextmanager
+def browser_at(path: str) -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def fake_server() -> Iterator[Fake]:
+    """The fake server in a process of its own."""
+    command = [sys.executable, "-m", "tests.console.fake_server"]
+    with tempfile.TemporaryFile("w+") as errors:
+        server = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True
+        )
+        try:
+            assert server.stdout
+            address = server.stdout.readline().strip()
+            errors.seek(0)
+            assert address, errors.read()
+            yield Fake(address)
+        finally:
+            server.terminate()
+            server.wait(10)
+            assert server.stdout
+            server.stdout.close()
+
+
+@contextlib.contextmanager
+def visit(
+    browser: Browser, fake: Fake, size: str = "desk", scheme: str = "light"
+) -> Iterator[Visit]:
+    """A page in a fresh profile, at a server that is new; fails when the page logged an error."""
+    width, height = SIZES[size]
+    fake.ask(renew=True)
+    context = browser.new_context(
+        viewport={"width": width, "height": height},
+        color_scheme="dark" if scheme == "dark" else "light",
+        has_touch=size != "desk",
+    )
+    page = context.new_page()
+    found = Visit(page, fake)
+    page.on("pageerror", lambda error: found.errors.append(str(error)))
+    page.on("console", lambda m: found.errors.append(m.text) if m.type == "error" else None)
+    page.on("request", lambda request: found.asked.append(request.url))
+    page.goto(fake.address)
+    expect(page.locator("#value-x")).to_contain_text(".")
+    yield found
+    context.close()
+    unexpected = [text for text in found.errors if "WebSocket" not in text]
+    assert unexpected == []

@@ -1,0 +1,35 @@
+"""A browser and the fake server, one of each for a module; a page for a test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser
+
+from tests.console import browsing
+from tests.console.browsing import Fake, Visit, visit
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing.browser_at(browsing.chromium()) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def fake(browser: Browser) -> Iterator[Fake]:
+    with browsing.fake_server() as fake:
+        yield fake
+
+
+@pytest.fixture
+def desk(browser: Browser, fake: Fake) -> Iterator[Visit]:
+    with visit(browser, fake) as found:
+        yield found
+
+
+@pytest.fixture
+def phone(browser: Browser, fake: Fake) -> Iterator[Visit]:
+    with visit(browser, fake, "phone") as found:
+        yield found

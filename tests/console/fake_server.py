@@ -1,0 +1,511 @@
+"""A server that speaks the console's protocol without drives, for the page's tests and makers.
+
+    python -m tests.console.fake_server --port 8402
+
+It moves the platform of the paper's rig on a circle and obeys commands in a simple way. `POST
+/fake` lays values over the states that it sends (`{"state": {…}}`) and over its own (`{"set":
+{…}}`), makes it silent (`{"silent": true}`), hang up (`{"hang_up": true}`), refuse sockets
+(`{"refuse": true}`) or begin again (`{"renew": true}`). `GET /fake` gives what came in.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import itertools
+import json
+import math
+import socket
+import sys
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from executor.report.scene import frame_surface, platform_surface
+from model.geometry.solids import box_solid
+from model.pages.page import resource
+from model.pages.scene import (
+    Label,
+    Moment,
+    SceneFigure,
+    SceneSurface,
+    Stroke,
+    grid_floor,
+    scene_data,
+)
+from model.pose import Array, Pose
+from model.rig import load_rig
+from model.statics.gravity import working_tensions
+
+ROOT = Path(__file__).parents[2]
+STATIC = ROOT / "cdpr" / "console" / "static"
+TOKEN = "token-of-the-fake"
+PERIOD_S = 0.05
+#: The circle: its centre and radius, [m], and the time of one round at full speed, [s].
+CENTRE, RADIUS, ROUND_S = np.array([0.05, 0.05, 0.4]), 0.14, 24.0
+#: The page may load nothing from outside and run nothing but its files.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
+    " img-src 'self' data:"
+)
+RIG = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
+
+
+def on_circle(share: float) -> Array:
+    """A point of the circle, [m]."""
+    angle = 2.0 * math.pi * share
+    return CENTRE + RADIUS * np.array(
+        [math.cos(angle), math.sin(angle), 0.3 * math.sin(2.0 * angle)]
+    )
+
+
+def figure(moments: tuple[Moment, ...] = (), path: bool = False) -> SceneFigure:
+    """The scene of the rig, or of the plan."""
+    obstacles = tuple(
+        SceneSurface(
+            "obstacles", "obstacle", solid.vertices, solid.faces, solid.edges, 0.62, "obstacle_1"
+        )
+        for solid in [
+            box_solid(np.array([0.04, 0.04, 0.225]), Pose.level(np.array([-0.15, 0.0, 0.225])))
+        ]
+    )
+    frame = frame_surface(RIG)
+    strokes: tuple[Stroke, ...] = (grid_floor(frame.vertices)[0],)
+    labels: tuple[Label, ...] = ()
+    if path:
+        points = np.array([on_circle(k / 96) for k in range(97)])
+        strokes, labels = (
+            (Stroke.along("path", "ink", points, 4.5),),
+            (Label("path", "start", points[0], "ring"),),
+        )
+    surfaces = obstacles if path else (frame, *obstacles)
+    return SceneFigure(surfaces, strokes, labels, RIG.anchors, platform_surface(RIG), moments)
+
+
+def preview(name: str) -> dict[str, Any]:
+    """A loaded plan, with its curves."""
+    shares = [k / 48 for k in range(49)]
+    moments = tuple(Moment(ROUND_S * s, on_circle(s), np.eye(3), RIG.outlets) for s in shares)
+    data = scene_data(figure(moments, path=True))
+    tensions = np.array([working_tensions(RIG, Pose.level(on_circle(s))).tensions for s in shares])
+    passed = "colliding" not in name
+    return {
+        "name": name,
+        "passed": passed,
+        "verdict": "passed its check"
+        if passed
+        else "collides: 3.1 mm to obstacle_1 where 10 mm are required",
+        "checks": [
+            "clearance at least 10 mm on all 49 poses",
+            "every wrench feasible",
+            "speed, acceleration, jerk",
+        ],
+        "duration_s": ROUND_S,
+        "length_mm": 921.4,
+        **{key: data[key] for key in ("moments", "strokes", "surfaces", "labels")},
+        "curves": {
+            "time_s": [ROUND_S * s for s in shares],
+            "clearance_mm": [18.0 + 12.0 * math.cos(2.0 * math.pi * s) for s in shares],
+            "required_mm": 10.0,
+            "tensions_n": np.round(tensions.T, 2).tolist(),
+        },
+    }
+
+
+class Fake:
+    """The state that is sent, and what came in."""
+
+    def __init__(self) -> None:
+        self.over: dict[str, Any] = {}
+        self.silent = self.refuse = False
+        self.ticks = 0
+        self.received: list[dict[str, Any]] = []
+        self.stops = 0
+        self.sockets: dict[WebSocket, str] = {}
+        self.in_control: WebSocket | None = None
+        self.latched: str | None = None
+        self.homed = True
+        self.plan: str | None = None
+        self.poses: list[dict[str, Any]] = []
+        self.outcome: dict[str, Any] | None = None
+        self.share = self.rate = 0.0
+        self.wished = {"stop": False, "hold": False, "speed_percent": 100}
+        self.moving: str | None = None  # state of the motion
+        self.began = time.monotonic()
+        self.jog_ready = False
+        self.position = on_circle(0.0)
+        self.held: dict[str, Any] | None = None
+        self.held_at, self.spent = 0.0, -1
+        self.events: list[dict[str, Any]] = []
+        self._seq = itertools.count(1)
+
+    def tick(self) -> None:
+        """One period of the motion."""
+        self.ticks += 1
+        if self.moving:
+            wished = (
+                0.0
+                if self.wished["stop"] or self.wished["hold"]
+                else self.wished["speed_percent"] / 100.0
+            )
+            self.rate += float(np.clip(wished - self.rate, -0.1, 0.1))
+            self.share = min(1.0, self.share + self.rate * PERIOD_S / ROUND_S)
+            self.position = on_circle(self.share)
+            self.moving = (
+                "stopping"
+                if self.wished["stop"]
+                else "holding"
+                if self.wished["hold"]
+                else "moving"
+            )
+            if self.share >= 1.0 or (self.wished["stop"] and self.rate <= 0.0):
+                self._end(stopped=self.wished["stop"])
+        if self.held and time.monotonic() - self.held_at > 0.15:
+            self.spent, self.held = max(self.spent, self.held["hold"]), None
+        if self.held:
+            step = np.array(self.held["direction"]) * self.held["speed_mm_s"] * PERIOD_S / 1e3
+            self.position = np.clip(self.position + step, RIG.workspace_lower, RIG.workspace_upper)
+
+    def _end(self, stopped: bool) -> None:
+        self.event(
+            "stop" if stopped else "end",
+            "stopped by the operator" if stopped else "the end of the path",
+        )
+        text = (
+            "Stopped along the path by the operator."
+            if stopped
+            else "Passed.\nLeast clearance 12.4 mm."
+        )
+        self.outcome = {
+            "verb": "run",
+            "ok": not stopped,
+            "text": text,
+            "report": "/report",
+            "fault_page": None,
+        }
+        self.moving, self.rate = None, 0.0
+
+    def event(self, code: str, text: str) -> None:
+        at = round(time.monotonic() - self.began, 2)
+        self.events = [*self.events, {"time_s": at, "code": code, "text": text}][-12:]
+
+    def state(self, reader: WebSocket) -> dict[str, Any]:
+        """What one page is sent."""
+        name = None if self.in_control is None else self.sockets.get(self.in_control)
+        tensions = working_tensions(RIG, Pose.level(self.position)).tensions
+        near = float(np.linalg.norm(self.position[:2] - [-0.15, 0.0]) - 0.115) * 1e3
+        jog = {
+            "ready": self.jog_ready,
+            "why_not": None,
+            "moving": self.held is not None,
+            "limit": None,
+        }
+        if self.held and near < 60.0:
+            jog["limit"] = f"stops in {near - 10.0:.0f} mm: clearance to obstacle_1"
+        busy = None
+        if self.moving or self.jog_ready:
+            verb = "run" if self.moving else "jog"
+            busy = {
+                "verb": verb,
+                "text": "on the path" if self.moving else "drives enabled for jogging",
+            }
+        return {
+            "kind": "state",
+            "seq": next(self._seq),
+            "read_only": False,
+            "rig": RIG.name,
+            "bus": "udp_multicast 239.74.163.2",
+            "simulated": True,
+            "control": {"yours": reader is self.in_control, "held_by": name},
+            "latched": self.latched,
+            "reference": {
+                "counts": self.homed,
+                "why_not": None if self.homed else "cable 3 was switched on again",
+            },
+            "busy": busy,
+            "outcome": self.outcome,
+            "motion": self._motion(tensions),
+            "platform": {
+                "position_mm": np.round(self.position * 1e3, 2).tolist(),
+                "tilt_deg": 0.12,
+                "turn_deg": -0.31,
+                "rotation": np.eye(3).reshape(-1).tolist(),
+                "exits_mm": np.round(RIG.outlets * 1e3, 1).tolist(),
+                "source": "drives",
+            },
+            "tensions_n": np.round(tensions, 2).tolist(),
+            "tension_limits_n": [RIG.min_tension, RIG.max_tension],
+            "clearance_mm": {
+                "now": round(near, 1),
+                "required": 10.0,
+                "pair": ["cable 5", "obstacle_1"],
+            },
+            "next_stop": self._next_stop(),
+            "preview": self.plan,
+            "jog": {**jog, "speed_mm_s": self.held["speed_mm_s"] if self.held else 0.0},
+            "poses": self.poses,
+            **self.over,
+        }
+
+    def _next_stop(self) -> dict[str, Any] | None:
+        if not self.moving:
+            return None
+        left = 1.0 - self.share
+        return {
+            "name": "goal",
+            "distance_mm": round(921.4 * left, 1),
+            "seconds": round(ROUND_S * left, 1),
+        }
+
+    def _motion(self, tensions: Array) -> dict[str, Any] | None:
+        if self.moving is None:
+            return None
+        wobble = math.sin(7.0 * time.monotonic())
+        drives = [
+            {
+                "node": k,
+                "state": "operation enabled",
+                "position_counts": 1000 * k,
+                "set_counts": 1000 * k + 4,
+                "tension_n": round(float(t), 1),
+            }
+            for k, t in enumerate(tensions, start=1)
+        ]
+        camera = {
+            "name": "top",
+            "source": "rendered",
+            "pictures": 412,
+            "poses": 409,
+            "dropped": 1,
+            "pictures_per_second": 9.8,
+            "measuring_ms": 31.2,
+            "tags": [301, 305],
+            "trouble": None,
+        }
+        return {
+            "process": 4711,
+            "state": self.moving,
+            "cause": None,
+            "elapsed_s": round(time.monotonic() - self.began, 2),
+            "path_mm": round(921.4 * self.share, 1),
+            "path_length_mm": 921.4,
+            "feed_percent": round(100.0 * self.rate, 1),
+            "wished": self.wished,
+            "lateness_ms": round(0.06 + 0.02 * wobble, 3),
+            "worst_lateness_ms": 0.31,
+            "following_error_mm": round(0.21 + 0.05 * wobble, 3),
+            "lost_replies": 0,
+            "rejected_frames": 0,
+            "error_frames": 0,
+            "cameras": [camera],
+            "drives": drives,
+            "events": self.events,
+            "age_s": 0.01,
+        }
+
+    def take(self, page: WebSocket, message: dict[str, Any]) -> tuple[bool, str]:
+        """What a page asks for; whether it was done, and what to answer."""
+        self.received.append(message)
+        kind = message["kind"]
+        if kind == "held" and self.jog_ready and message["hold"] > self.spent:
+            self.held, self.held_at = message, time.monotonic()
+        if kind == "let_go":
+            self.spent, self.held = max(self.spent, message["hold"]), None
+        if kind != "command":
+            return True, ""
+        if message["command"] == "stop":
+            return self.stop()
+        if message["command"] == "take_control":
+            self.in_control = page
+            return True, "You have control."
+        if page is not self.in_control:
+            return False, "Take control first."
+        return self._obey(message)
+
+    def stop(self) -> tuple[bool, str]:
+        self.stops += 1
+        self.held = None
+        if self.moving:
+            self.wished = {**self.wished, "stop": True}
+        return True, "Stop requested." if self.moving else "Nothing is moving."
+
+    def _obey(self, message: dict[str, Any]) -> tuple[bool, str]:
+        command, index = message["command"], message.get("index", 0)
+        if command == "give_control":
+            self.in_control = None
+        elif command == "run":
+            self.moving, self.share, self.began, self.events = "moving", 0.0, time.monotonic(), []
+            self.wished, self.outcome = {"stop": False, "hold": False, "speed_percent": 100}, None
+            self.event("armed", "drives enabled, set-points checked")
+        elif command in ("hold", "resume"):
+            self.wished = {**self.wished, "hold": command == "hold"}
+        elif command == "speed":
+            self.wished = {**self.wished, "speed_percent": message["percent"]}
+        elif command in ("jog_begin", "jog_end"):
+            self.jog_ready = command == "jog_begin"
+        elif command == "reset":
+            self.latched = None
+        elif command in ("home", "release"):
+            self.homed = command == "home"
+        elif command in ("load_plan", "plan"):
+            self.plan = message.get("file") or message.get("scene") or "taught poses"
+        elif command == "teach":
+            position = np.round(self.position * 1e3, 1).tolist()
+            self.poses = [
+                *self.poses,
+                {"name": message["name"], "position_mm": position, "quaternion": [1, 0, 0, 0]},
+            ]
+        elif command == "rename":
+            self.poses = [
+                {**p, "name": message["name"]} if k == index else p
+                for k, p in enumerate(self.poses)
+            ]
+        elif command == "forget":
+            self.poses = [p for k, p in enumerate(self.poses) if k != index]
+        elif command == "move":
+            rest = [p for k, p in enumerate(self.poses) if k != index]
+            self.poses = [*rest[: message["to"]], self.poses[index], *rest[message["to"] :]]
+        else:
+            return False, f"no such command: {command}"
+        return True, f"{command.replace('_', ' ')}: done"
+
+
+def application(fake: Fake) -> Starlette:
+    """The routes of the console, and `/fake`."""
+    beside = {"base.css": "text/css", "viewer.js": "text/javascript"}
+
+    async def index(request: Request) -> Response:
+        text = (STATIC / "index.html").read_text(encoding="utf-8")
+        text = text.replace('name="token" content=""', f'name="token" content="{TOKEN}"')
+        return Response(text, media_type="text/html", headers={"Content-Security-Policy": POLICY})
+
+    async def static(request: Request) -> Response:
+        name = request.path_params["name"]
+        if name in beside:
+            return Response(resource(name), media_type=beside[name])
+        path = (STATIC / name).resolve()
+        inside = path.is_relative_to(STATIC) and path.is_file()
+        return FileResponse(path) if inside else PlainTextResponse("no such file", 404)
+
+    async def scene(request: Request) -> Response:
+        return JSONResponse({k: v for k, v in scene_data(figure()).items() if k != "moments"})
+
+    async def files(request: Request) -> Response:
+        return JSONResponse(
+            {
+                "scenes": ["configs/environment_1.yaml", "configs/hall_pillar.yaml"],
+                "plans": ["plans/circle.json", "plans/colliding.json"],
+            }
+        )
+
+    async def preview_of(request: Request) -> Response:
+        return JSONResponse(preview(fake.plan)) if fake.plan else PlainTextResponse("no plan", 404)
+
+    async def stop(request: Request) -> Response:
+        return JSONResponse({"what": fake.stop()[1]})
+
+    async def hooks(request: Request) -> Response:
+        if request.method == "POST":
+            asked = await request.json()
+            if asked.get("renew"):
+                for left in list(fake.sockets):
+                    await left.close()
+                fake.__init__()  # type: ignore[misc]
+            fake.over.update(asked.get("state", {}))
+            fake.silent = asked.get("silent", fake.silent)
+            fake.refuse = asked.get("refuse", fake.refuse)
+            for name, value in asked.get("set", {}).items():
+                setattr(fake, name, value)
+            if asked.get("hang_up"):
+                for left in list(fake.sockets):
+                    await left.close()
+        position = np.round(fake.position * 1e3, 3).tolist()
+        names = ("received", "stops", "ticks", "plan", "poses", "latched")
+        return JSONResponse(
+            {name: getattr(fake, name) for name in names} | {"position_mm": position}
+        )
+
+    routes = [
+        Route("/", index),
+        Route("/static/{name:path}", static),
+        Route("/scene", scene),
+        Route("/api/files", files),
+        Route("/api/preview", preview_of),
+        Route("/stop", stop, methods=["POST"]),
+        Route("/fake", hooks, methods=["GET", "POST"]),
+        WebSocketRoute("/ws", lambda page: speak(fake, page)),
+    ]
+    return Starlette(routes=routes, lifespan=lambda app: moving(fake))
+
+
+async def speak(fake: Fake, page: WebSocket) -> None:
+    """With one page, until it leaves."""
+    if fake.refuse:
+        return await page.close()
+    await page.accept()
+    fake.sockets[page] = f"page {len(fake.sockets) + 1}"
+    try:
+        while True:
+            message = json.loads(await page.receive_text())
+            ok, what = fake.take(page, message)
+            if "id" in message:
+                await page.send_json(
+                    {"kind": "answer", "to": message["id"], "ok": ok, "what": what}
+                )
+    except (WebSocketDisconnect, RuntimeError):  # the latter when it was hung up here
+        pass
+    finally:
+        fake.sockets.pop(page, None)
+        if fake.in_control is page:
+            fake.in_control = None
+
+
+@contextlib.asynccontextmanager
+async def moving(fake: Fake) -> AsyncIterator[None]:
+    """The platform moves, and every page is sent the state, 20 times a second."""
+
+    async def go_on() -> None:
+        while True:
+            fake.tick()
+            for page in list(fake.sockets):
+                if not fake.silent:
+                    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                        await page.send_json(fake.state(page))
+            await asyncio.sleep(PERIOD_S)
+
+    task = asyncio.create_task(go_on())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def main() -> None:
+    """Serves until it is ended; prints its address."""
+    parser = argparse.ArgumentParser(description="The console's protocol without drives.")
+    parser.add_argument("--port", type=int, default=0)
+    chosen = parser.parse_args()
+    with socket.create_server(("127.0.0.1", chosen.port)) as listening:
+        port = listening.getsockname()[1]
+        sys.stdout.write(f"http://127.0.0.1:{port}/?token={TOKEN}\n")
+        sys.stdout.flush()
+        config = uvicorn.Config(
+            application(Fake()), log_level="warning", timeout_graceful_shutdown=1
+        )
+        uvicorn.Server(config).run(sockets=[listening])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,364 @@
+"""The console's page in a real browser: STOP, stale data, what it asks before, what it shows."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.console.browsing import ROOT, SIZES, VIEWS, Fake, Visit, visit
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+STALE = re.compile("No data from the console’s server")
+
+
+# STOP.
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_stop_is_at_the_same_place_in_every_view(browser: Browser, fake: Fake, size: str) -> None:
+    """The lower left corner; whole, large enough for a finger, and in front of everything."""
+    with visit(browser, fake, size) as found:
+        boxes = []
+        for view in VIEWS:
+            found.view(view)
+            boxes.append(found.page.locator("#stop").bounding_box())
+        assert all(box == boxes[0] for box in boxes)
+        box = boxes[0]
+        assert box
+        assert box["x"] < 20
+        assert box["y"] + box["height"] <= SIZES[size][1]
+        assert min(box["width"], box["height"]) >= 60
+        in_front = """b => document.elementFromPoint(b.x + b.width / 2, b.y + b.height / 2)
+          .closest('#stop') !== null"""
+        assert found.page.evaluate(in_front, box)
+        expect(found.page.locator("#stop-words")).to_be_in_viewport(ratio=1)
+
+
+def test_stop_acts_when_it_is_touched_and_needs_no_control(phone: Visit) -> None:
+    """At pointerdown, not when the finger is lifted; once, though the browser adds a click."""
+    assert phone.fake.ask()["stops"] == 0
+    phone.page.locator("#stop").dispatch_event("pointerdown", {"pointerId": 1, "button": 0})
+    phone.fake.wait(phone.page, lambda f: bool(f["stops"] == 1))
+    phone.page.locator("#stop").tap()
+    phone.fake.wait(phone.page, lambda f: bool(f["stops"] == 2))
+    assert phone.fake.let_pass(phone.page)["stops"] == 2
+
+
+@pytest.mark.parametrize(
+    "focused", ["body", "#tab-jog", "#take-control", "#scene-canvas", "#plan-file", "#stop"]
+)
+def test_the_space_bar_stops_and_does_nothing_else(desk: Visit, focused: str) -> None:
+    if focused != "body":
+        desk.page.locator(focused).focus()
+    desk.page.keyboard.press(" ")
+    desk.fake.wait(desk.page, lambda f: bool(f["stops"] == 1))
+    found = desk.fake.let_pass(desk.page)
+    assert [m["command"] for m in found["received"]] == ["stop"]
+    expect(desk.page.locator("#tab-operate")).to_have_attribute("aria-selected", "true")
+
+
+def test_enter_on_stop_and_escape_stop_as_well(desk: Visit) -> None:
+    desk.page.locator("#stop").focus()
+    desk.page.keyboard.press("Enter")
+    desk.page.keyboard.press("Escape")
+    desk.fake.wait(desk.page, lambda f: bool(f["stops"] == 2))
+
+
+def test_in_a_text_field_a_space_is_a_space(desk: Visit) -> None:
+    desk.take_control()
+    desk.view("teach")
+    desk.page.locator("#teach-name").press_sequentially("above the box")
+    expect(desk.page.locator("#teach-name")).to_have_value("above the box")
+    assert desk.fake.let_pass(desk.page)["stops"] == 0
+
+
+def test_stop_works_on_a_stale_page(desk: Visit) -> None:
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale-text")).to_have_text(STALE)
+    desk.page.locator("#stop").click()
+    desk.fake.wait(desk.page, lambda f: bool(f["stops"] >= 1))
+
+
+def test_stop_goes_by_http_when_the_socket_is_lost(desk: Visit) -> None:
+    desk.fake.ask(refuse=True, hang_up=True)
+    expect(desk.page.locator("#stale-text")).to_have_text(re.compile("Connection lost"))
+    desk.page.keyboard.press(" ")
+    found = desk.fake.wait(desk.page, lambda f: bool(f["stops"] == 1))
+    assert found["received"] == []
+    expect(desk.page.locator("#stop-answer")).to_have_text("Stop requested.")
+
+
+def test_stop_that_reaches_no_one_says_so(desk: Visit) -> None:
+    desk.page.route("**/stop", lambda route: route.abort())
+    desk.fake.ask(refuse=True, hang_up=True)
+    expect(desk.page.locator("#stale-text")).to_have_text(re.compile("Connection lost"))
+    desk.page.locator("#stop").click()
+    expect(desk.page.locator("#stop-answer")).to_contain_text("use the emergency-stop button")
+    desk.errors.clear()  # the request that failed
+
+
+def test_stop_answers_an_open_question_with_no(desk: Visit) -> None:
+    desk.take_control()
+    desk.load()
+    desk.page.locator("#run").click()
+    expect(desk.page.locator("#dialog")).to_be_visible()
+    desk.page.locator("#stop").click()
+    expect(desk.page.locator("#dialog")).to_be_hidden()
+    assert desk.fake.received("run") == []
+
+
+def test_stop_does_not_look_like_an_emergency_stop(desk: Visit) -> None:
+    """Neither red nor yellow, nor round; ISO 13850 keeps those for the button on the machine."""
+    colours = desk.page.evaluate(
+        """() => ["stop", "stop-bar"].flatMap(id => {
+             const s = getComputedStyle(document.getElementById(id));
+             return [s.backgroundColor, s.borderTopColor, s.color];
+           })"""
+    )
+    for colour in colours:
+        red, green, blue = (int(v) for v in re.findall(r"\d+", colour)[:3])
+        assert max(red, green, blue) - min(red, green, blue) < 40, colour
+    radius = desk.page.evaluate(
+        "() => parseFloat(getComputedStyle(document.getElementById('stop')).borderRadius)"
+    )
+    assert radius <= 12
+    expect(desk.page.locator("#stop-words")).to_have_text(
+        "Software stop. The emergency-stop button is on the machine."
+    )
+
+
+# Stale data.
+
+
+def test_stale_data_say_so_over_the_whole_view_and_leave_only_stop(desk: Visit) -> None:
+    desk.take_control()
+    assert len(desk.audit("usable")) > 10
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale .band")).to_be_visible(timeout=1500)
+    expect(desk.page.locator("#stale-text")).to_have_text(STALE)
+    assert desk.audit("usable") == ["stop"]
+    box = desk.page.locator("#stale .band").bounding_box()
+    assert box
+    assert box["width"] == SIZES["desk"][0]
+    muted = """e => getComputedStyle(e).color
+      === getComputedStyle(document.querySelector('.quiet')).color"""
+    for figure in ("#value-x", "#value-clearance", ".value.figure"):
+        assert desk.page.locator(figure).first.evaluate(muted), figure
+    desk.fake.ask(silent=False)
+    expect(desk.page.locator("#stale")).to_be_hidden()
+    assert len(desk.audit("usable")) > 10
+
+
+def test_the_age_grows_by_the_page_s_own_clock(desk: Visit) -> None:
+    """Whatever the computer's clock does meanwhile."""
+    desk.page.evaluate("() => { Date.now = () => 0; }")
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale-text")).to_have_text(re.compile(r"for 1\.[0-9] s"))
+
+
+def test_a_run_that_does_not_report_is_stale_though_the_server_speaks(desk: Visit) -> None:
+    desk.take_control()
+    desk.load()
+    desk.run()
+    motion = {"process": 1, "state": "moving", "cause": None, "path_mm": 1.0, "path_length_mm": 2.0}
+    wished = {"stop": False, "hold": False, "speed_percent": 100}
+    more = {"wished": wished, "cameras": [], "drives": [], "events": [], "feed_percent": 100.0}
+    desk.fake.ask(state={"motion": {**motion, **more, "elapsed_s": 1.0, "age_s": 0.9}})
+    expect(desk.page.locator("#stale-text")).to_have_text(re.compile("No data from the run"))
+    desk.fake.ask(
+        state={"motion": {**motion, **more, "elapsed_s": 1.0, "age_s": 9.0, "state": "finished"}}
+    )
+    expect(desk.page.locator("#stale")).to_be_hidden()
+
+
+def test_after_a_reconnection_nothing_goes_on_by_itself(desk: Visit) -> None:
+    desk.ready_to_jog()
+    desk.hold()
+    before = len(desk.fake.ask()["received"])
+    desk.fake.ask(hang_up=True)
+    expect(desk.page.locator("#stale")).to_be_visible()
+    expect(desk.page.locator("#stale")).to_be_hidden()
+    after = desk.fake.let_pass(desk.page)["received"][before:]
+    # What was on its way when the socket was closed; nothing since, though the mouse is still down.
+    assert len([m for m in after if m["kind"] == "held"]) <= 3
+    assert [m for m in after if m["kind"] == "command"] == []
+    count = len(desk.fake.ask()["received"])
+    assert len(desk.fake.let_pass(desk.page)["received"]) == count
+    expect(desk.page.locator("#lamp-control")).to_have_text("Control is free")
+
+
+# What is asked before.
+
+
+def test_reset_shows_the_cause_and_asks(desk: Visit) -> None:
+    cause = "slack: cable 3 tension 1.8 N"
+    desk.fake.ask(set={"latched": cause})
+    desk.take_control()
+    desk.page.locator("#reset").click()
+    expect(desk.page.locator("#dialog .cause")).to_contain_text(cause)
+    expect(desk.page.get_by_role("button", name="Cancel")).to_be_focused()
+    desk.page.get_by_role("button", name="Cancel").click()
+    assert desk.fake.received("reset") == []
+    desk.page.locator("#reset").click()
+    desk.page.locator(".confirm").click()
+    expect(desk.page.locator("#lamp-latch")).to_have_text("No fault")
+    assert len(desk.fake.received("reset")) == 1
+
+
+def test_release_says_what_drops_and_asks(desk: Visit) -> None:
+    desk.take_control()
+    desk.page.locator("#release").click()
+    expect(desk.page.locator("#dialog")).to_contain_text("The platform drops unless")
+    desk.page.locator(".confirm").click()
+    desk.fake.wait(desk.page, lambda f: f["received"][-1]["command"] == "release")
+
+
+def test_run_asks_with_verdict_duration_and_length(desk: Visit) -> None:
+    desk.take_control()
+    desk.load()
+    desk.page.locator("#run").click()
+    for text in ("plans/circle.json", "passed its check", "24.0", "921"):
+        expect(desk.page.locator("#dialog .facts")).to_contain_text(text)
+    desk.page.locator(".confirm").click()
+    expect(desk.page.locator("#motion-state")).to_contain_text("Moving")
+    desk.page.locator("#hold").click()
+    expect(desk.page.locator("#motion-state")).to_contain_text("Held")
+    desk.page.locator("#resume").click()
+    expect(desk.page.locator("#motion-state")).to_contain_text("Moving")
+    desk.page.keyboard.press(" ")
+    expect(desk.page.locator("#outcome-text")).to_have_text(
+        "Stopped along the path by the operator."
+    )
+    assert desk.page.locator("#outcome-links a").get_attribute("href") == "/report"
+
+
+def test_a_question_goes_when_its_answer_no_longer_counts(desk: Visit) -> None:
+    desk.take_control()
+    desk.load()
+    desk.page.locator("#run").click()
+    desk.fake.ask(set={"latched": "late"})
+    expect(desk.page.locator("#dialog")).to_be_hidden()
+    expect(desk.page.locator("#notice")).to_contain_text("withdrawn: A fault is latched")
+    assert desk.fake.received("run") == []
+
+
+def test_a_plan_that_failed_its_check_cannot_be_run(desk: Visit) -> None:
+    desk.take_control()
+    desk.load("plans/colliding.json")
+    expect(desk.page.locator("#plan-verdict")).to_contain_text("collides: 3.1 mm")
+    desk.page.locator("#run").click()
+    expect(desk.page.locator("#notice")).to_contain_text("The plan did not pass its check")
+    expect(desk.page.locator("#dialog")).to_be_hidden()
+
+
+def test_looking_through_a_plan_is_marked_and_ends_when_something_moves(desk: Visit) -> None:
+    desk.take_control()
+    desk.load()
+    desk.page.locator("#plan-time").fill("20")
+    expect(desk.page.locator("#scene-preview")).to_contain_text("Preview, not live.")
+    desk.run()
+    expect(desk.page.locator("#scene-preview")).to_be_hidden()
+
+
+# Teaching.
+
+
+def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> None:
+    desk.take_control()
+    desk.view("teach")
+    for name in ("one", "two", "three"):
+        desk.page.locator("#teach-name").fill(name)
+        desk.page.locator("#teach").click()
+        expect(desk.page.locator("#poses li").last.locator("input")).to_have_value(name)
+    desk.page.get_by_role("button", name="Move three up").click()
+    desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["one", "three", "two"])
+    desk.page.get_by_role("button", name="Forget one").click()
+    desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "two"])
+    desk.page.get_by_role("textbox", name="Name of pose 2").fill("home")
+    desk.page.get_by_role("textbox", name="Name of pose 2").press("Enter")
+    desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "home"])
+    desk.page.locator("#poses-objective").select_option("clearance")
+    desk.page.locator("#plan-poses").click()
+    found = desk.fake.wait(desk.page, lambda f: f["plan"] is not None)["received"][-1]
+    assert (found["from_poses"], found["objective"]) == (True, "clearance")
+
+
+# What it shows.
+
+
+def test_cables_beyond_a_limit_are_named_in_newtons(desk: Visit) -> None:
+    desk.fake.ask(state={"tensions_n": [20, 20, 1.8, 20, 20, 20, 104.2, 20]})
+    trouble = desk.page.locator("#tension-trouble")
+    expect(trouble).to_contain_text(re.compile(r"Cable 3 is slack: 1\.8\sN, at least 5\sN"))
+    expect(trouble).to_contain_text(re.compile(r"Cable 7 is too tight: 104\.2\sN, at most 100\sN"))
+    expect(desk.page.locator("#tensions li.bad")).to_have_count(2)
+
+
+def test_nothing_known_is_shown_as_not_known(desk: Visit) -> None:
+    keys = ("platform", "tensions_n", "clearance_mm", "next_stop", "preview", "motion", "busy")
+    desk.fake.ask(state={**dict.fromkeys(keys), "reference": {"counts": False, "why_not": None}})
+    for name in ("x", "tilt", "clearance", "stop", "following", "lost"):
+        expect(desk.page.locator(f"#value-{name}")).to_have_text("–")
+    expect(desk.page.locator("#tension-trouble")).to_contain_text("Not known")
+
+
+def test_texts_of_the_server_never_become_markup(desk: Visit) -> None:
+    evil = "<img src=x onerror=alert(1)>"
+    event = {"time_s": 1.0, "code": evil, "text": evil}
+    outcome = {
+        "verb": "run",
+        "ok": False,
+        "text": evil,
+        "report": "javascript:alert(1)",
+        "fault_page": "//evil.example/",
+    }
+    motion = {
+        "process": 1,
+        "state": evil,
+        "cause": evil,
+        "events": [event],
+        "age_s": 0.0,
+        "elapsed_s": 1.0,
+    }
+    wished = {"stop": False, "hold": False, "speed_percent": 50}
+    more = {
+        "path_mm": None,
+        "path_length_mm": None,
+        "feed_percent": 1.0,
+        "wished": wished,
+        "cameras": [],
+        "drives": [],
+    }
+    pose = {"name": evil, "position_mm": [0, 0, 0], "quaternion": [1, 0, 0, 0]}
+    desk.fake.ask(
+        state={
+            "rig": evil,
+            "bus": evil,
+            "latched": evil,
+            "outcome": outcome,
+            "poses": [pose],
+            "motion": {**motion, **more},
+        }
+    )
+    expect(desk.page.locator("#rig")).to_have_text(evil)
+    expect(desk.page.locator("#outcome-text")).to_have_text(evil)
+    expect(desk.page.locator("#outcome-links a")).to_have_count(0)
+    desk.view("events")
+    expect(desk.page.locator("#events li").first).to_contain_text(evil)
+    expect(desk.page.locator("img")).to_have_count(0)
+
+
+def test_a_code_leads_to_its_page_of_help(desk: Visit) -> None:
+    """Every page of docs/faults has its link, and no other code has one."""
+    pages = {path.stem for path in (ROOT / "docs" / "faults").glob("*.md")} - {"index"}
+    help_ = desk.page.evaluate("async () => [...(await import('/static/events.js')).HELP]")
+    assert set(help_) == pages
+
+
+def test_the_page_asks_nothing_from_outside(desk: Visit) -> None:
+    desk.take_control()
+    desk.load()
+    allowed = (desk.fake.origin, desk.fake.origin.replace("http", "ws"), "data:")
+    assert [url for url in desk.asked if not url.startswith(allowed)] == []

@@ -1,0 +1,224 @@
+"""The page's controls, in a real browser: which is possible when, and who can use them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.console.browsing import SIZES, VIEWS, Fake, Visit, visit
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+def state_of(**changes: Any) -> dict[str, Any]:
+    """A state at rest, with control, homed, and with a plan."""
+    return {
+        "read_only": False,
+        "control": {"yours": True, "held_by": "A"},
+        "latched": None,
+        "reference": {"counts": True, "why_not": None},
+        "busy": None,
+        "motion": None,
+        "platform": {},
+        "preview": "1",
+        "jog": {"ready": False, "why_not": None, "moving": False},
+        "poses": [{}, {}],
+        **changes,
+    }
+
+
+def moving(state: str, **wished: Any) -> dict[str, Any]:
+    return {
+        "state": state,
+        "wished": {"stop": False, "hold": False, "speed_percent": 100, **wished},
+    }
+
+
+RUN = {"verb": "run", "text": ""}
+REST = {"home", "release", "load_plan", "plan", "plan_poses", "run", "jog_begin"}
+ALWAYS = {"stop", "jog_setting"}
+TAUGHT = {"teach", "edit_pose", "give_control"}
+#: Name, situation, and the buttons that are possible in it; all others are not.
+TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
+    ("at rest", {}, ALWAYS | TAUGHT | REST),
+    ("stale", {"stale": "No data for 0.9 s"}, {"stop"}),
+    ("never heard", {"state": None, "stale": "Waiting for data"}, {"stop"}),
+    ("read-only", {"read_only": True}, {"stop"}),
+    ("control is free", {"control": {"yours": False, "held_by": None}}, ALWAYS | {"take_control"}),
+    (
+        "another has control",
+        {"control": {"yours": False, "held_by": "B"}},
+        ALWAYS | {"take_control"},
+    ),
+    (
+        "latched",
+        {"latched": "slack"},
+        (ALWAYS | TAUGHT | REST | {"reset"}) - {"home", "run", "jog_begin"},
+    ),
+    (
+        "latched, run over",
+        {"latched": "x", "motion": moving("latched")},
+        (ALWAYS | TAUGHT | REST | {"reset"}) - {"home", "run", "jog_begin"},
+    ),
+    (
+        "not homed",
+        {"reference": {"counts": False, "why_not": "x"}},
+        (ALWAYS | TAUGHT | REST) - {"run", "jog_begin"},
+    ),
+    ("no plan", {"preview": None}, (ALWAYS | TAUGHT | REST) - {"run"}),
+    ("plan failed", {"plan": {"passed": False}}, (ALWAYS | TAUGHT | REST) - {"run"}),
+    ("plan not read yet", {"plan": None}, (ALWAYS | TAUGHT | REST) - {"run"}),
+    ("planning", {"busy": {"verb": "plan", "text": ""}}, ALWAYS | TAUGHT),
+    (
+        "homing",
+        {"busy": {"verb": "home", "text": ""}, "motion": moving("moving")},
+        ALWAYS | TAUGHT | {"hold", "speed"},
+    ),
+    ("preparing", {"busy": RUN, "motion": moving("preparing")}, ALWAYS | TAUGHT),
+    ("moving", {"busy": RUN, "motion": moving("moving")}, ALWAYS | TAUGHT | {"hold", "speed"}),
+    ("moved by another program", {"motion": moving("moving")}, ALWAYS | TAUGHT | {"hold", "speed"}),
+    (
+        "held",
+        {"busy": RUN, "motion": moving("holding", hold=True)},
+        ALWAYS | TAUGHT | {"resume", "speed"},
+    ),
+    ("stopping", {"busy": RUN, "motion": moving("stopping", stop=True)}, ALWAYS | TAUGHT),
+    ("stopped", {"motion": moving("stopped", stop=True)}, ALWAYS | TAUGHT | REST),
+    (
+        "jogging",
+        {"busy": {"verb": "jog", "text": ""}, "jog": {"ready": True, "why_not": None}},
+        ALWAYS | TAUGHT | {"jog", "jog_end"},
+    ),
+    (
+        "jogging, in motion",
+        {
+            "busy": {"verb": "jog", "text": ""},
+            "jog": {"ready": True, "why_not": None},
+            "motion": moving("moving"),
+        },
+        ALWAYS | TAUGHT | {"jog", "jog_end"},
+    ),
+    ("jogging begins", {"busy": {"verb": "jog", "text": ""}}, ALWAYS | TAUGHT | {"jog_end"}),
+    ("position not known", {"platform": None}, (ALWAYS | TAUGHT | REST) - {"teach"}),
+    ("one pose", {"poses": [{}]}, (ALWAYS | TAUGHT | REST) - {"plan_poses"}),
+    ("no pose", {"poses": []}, (ALWAYS | TAUGHT | REST) - {"plan_poses", "edit_pose"}),
+]
+
+
+def test_the_table_of_buttons(desk: Visit) -> None:
+    """State × button: what is possible, and a reason for everything that is not."""
+    ask = """async (situation) => {
+      const { BUTTONS, whyNot } = await import("/static/buttons.js");
+      const names = Object.keys(BUTTONS);
+      return Object.fromEntries(names.map((name) => [name, whyNot(name, situation)]));
+    }"""
+    for name, changes, possible in TABLE:
+        stale, plan = changes.get("stale"), changes.get("plan", {"passed": True})
+        state = (
+            None
+            if "state" in changes
+            else state_of(**{k: v for k, v in changes.items() if k not in ("stale", "plan")})
+        )
+        reasons = desk.page.evaluate(ask, {"state": state, "stale": stale, "preview": plan})
+        assert {button for button, reason in reasons.items() if reason is None} == possible, name
+        assert all(reason for button, reason in reasons.items() if button not in possible), name
+    tried = {button for _, _, possible in TABLE for button in possible}
+    assert tried == set(reasons), "a button that no state of the table allows"
+
+
+def test_every_button_is_in_the_table_and_says_why_it_is_not_possible(desk: Visit) -> None:
+    desk.fake.ask(state={"control": {"yours": False, "held_by": "page 7"}})
+    hold = desk.page.locator("#hold")
+    expect(hold).to_have_attribute("aria-disabled", "true")
+    expect(hold).to_have_attribute("title", "page 7 has control")
+    expect(hold).to_have_attribute("aria-description", "page 7 has control")
+    hold.click()
+    expect(desk.page.locator("#notice")).to_have_text("Hold: page 7 has control.")
+    names = desk.page.evaluate(
+        "() => [...document.querySelectorAll('[data-button]')].map(e => e.dataset.button)"
+    )
+    known = desk.page.evaluate(
+        "async () => Object.keys((await import('/static/buttons.js')).BUTTONS)"
+    )
+    assert set(names) <= set(known)
+    assert desk.fake.received("hold") == []
+
+
+# For everybody.
+
+
+def fill_everything(found: Visit) -> None:
+    """A page that shows as much as it can."""
+    found.take_control()
+    found.load()
+    found.view("teach")
+    found.page.locator("#teach").click()
+    expect(found.page.locator("#poses li")).to_have_count(1)
+    found.view("operate")
+    found.run()
+    found.fake.ask(
+        set={"latched": "slack: cable 3"},
+        state={"tensions_n": [20, 20, 1.8, 20, 20, 20, 104.2, 20]},
+    )
+    found.fake.ask(
+        set={
+            "outcome": {
+                "verb": "plan",
+                "ok": True,
+                "text": "done",
+                "report": None,
+                "fault_page": None,
+            }
+        }
+    )
+    expect(found.page.locator("#latched")).to_be_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", ["phone", "desk"])
+def test_texts_have_the_contrast_of_wcag_aa(
+    browser: Browser, fake: Fake, size: str, scheme: str
+) -> None:
+    """4.5 to 1 for every text, 3 to 1 for large ones; also when data are stale."""
+    with visit(browser, fake, size, scheme) as found:
+        fill_everything(found)
+        weak = []
+        for view in VIEWS:
+            found.view(view)
+            weak += found.audit("weak")
+        found.fake.ask(silent=True)
+        expect(found.page.locator("#stale")).to_be_visible()
+        weak += found.audit("weak")
+        assert weak == []
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_nothing_is_cut_off_and_touch_targets_are_large(
+    browser: Browser, fake: Fake, size: str
+) -> None:
+    with visit(browser, fake, size) as found:
+        fill_everything(found)
+        for view in VIEWS:
+            found.view(view)
+            assert (
+                found.page.evaluate("() => document.documentElement.scrollWidth - innerWidth") <= 0
+            ), view
+            assert found.audit("small") == [], view
+            assert found.audit("cut") == [], view
+
+
+def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
+    """Every control that is shown, in every view, by Tab or, for tabs and radios, by an arrow."""
+    fill_everything(desk)
+    for view in VIEWS[1:]:
+        desk.view(view)
+        wanted = set(desk.audit("tabbable"))
+        reached: set[str] = set()
+        desk.page.evaluate("() => document.activeElement.blur()")
+        for _ in range(90):
+            desk.page.keyboard.press("Tab")
+            reached |= set(desk.audit("nameOf", "document.activeElement"))
+        assert wanted - reached == set(), view
+        assert desk.audit("unnamed") == [], view

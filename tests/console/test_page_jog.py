@@ -1,0 +1,195 @@
+"""Jogging from the page, in a real browser: whatever ends a press ends it for good."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.console.browsing import Visit
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+def end_by_event(target: str, event: str) -> Callable[[Visit], None]:
+    return lambda found: found.page.evaluate(f"() => {target}.dispatchEvent(new {event})")
+
+
+def hidden(found: Visit) -> None:
+    found.page.evaluate(
+        """() => {
+             Object.defineProperty(document, "hidden", { get: () => true, configurable: true });
+             document.dispatchEvent(new Event("visibilitychange"));
+           }"""
+    )
+
+
+BUTTON = "document.querySelector('[data-jog=\"+x\"]')"
+ENDS: dict[str, Callable[[Visit], Any]] = {
+    "pointer up": lambda found: found.page.mouse.up(),
+    "pointer cancelled": end_by_event(
+        BUTTON, "PointerEvent('pointercancel', { pointerId: 1, bubbles: true })"
+    ),
+    "capture lost": lambda found: found.page.evaluate(f"() => {BUTTON}.releasePointerCapture(1)"),
+    "window blurred": end_by_event("window", "Event('blur')"),
+    "page hidden": hidden,
+    "page left": end_by_event("window", "Event('pagehide')"),
+    "second pointer": end_by_event(
+        "document.body", "PointerEvent('pointerdown', { pointerId: 7, bubbles: true })"
+    ),
+    "second mouse button": lambda found: found.page.mouse.down(button="right"),
+    "menu": end_by_event(BUTTON, "MouseEvent('contextmenu', { bubbles: true })"),
+    "second key": lambda found: found.page.keyboard.press("ArrowUp"),
+    "other view": lambda found: found.page.evaluate(
+        "() => document.getElementById('tab-teach').click()"
+    ),
+    "STOP by key": lambda found: found.page.keyboard.press(" "),
+    "stale": lambda found: found.fake.ask(silent=True),
+    "control lost": lambda found: found.fake.ask(
+        state={"control": {"yours": False, "held_by": "B"}}
+    ),
+    "fault": lambda found: found.fake.ask(state={"latched": "slack"}),
+    "not ready any more": lambda found: found.fake.ask(
+        state={
+            "jog": {
+                "ready": False,
+                "why_not": "ended",
+                "moving": False,
+                "limit": None,
+                "speed_mm_s": 0,
+            }
+        }
+    ),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_held_jog_ends_for_good(desk: Visit, end: str) -> None:
+    """One `let_go` with its number, and not one `held` after it, though the mouse stays down."""
+    desk.ready_to_jog()
+    number = desk.hold()
+    ENDS[end](desk)
+    desk.fake.wait(desk.page, lambda f: any(m["kind"] == "let_go" for m in f["received"]))
+    desk.fake.ask(silent=False)
+    found = [
+        m for m in desk.fake.let_pass(desk.page)["received"] if m["kind"] in ("held", "let_go")
+    ]
+    assert found[-1] == {"kind": "let_go", "hold": number}
+    assert [m["kind"] for m in found].count("let_go") == 1
+
+
+def test_what_a_held_message_says(desk: Visit) -> None:
+    desk.ready_to_jog()
+    desk.page.locator("input[name=jog-step][value='1']").check(force=True)
+    desk.page.locator("input[name=jog-frame][value=platform]").check(force=True)
+    desk.page.locator("#jog-speed").fill("25")
+    first = desk.hold("-z")
+    desk.page.mouse.up()
+    desk.page.locator("input[name=jog-step][value=null]").check(force=True)
+    second = desk.hold("+y")
+    desk.page.mouse.up()
+    held = desk.fake.received("held")
+    assert second > first
+    assert {m["hold"] for m in held} == {first, second}
+    assert [m["seq"] for m in held] == sorted({m["seq"] for m in held})
+    one, other = held[0], held[-1]
+    assert one["direction"] == [0, 0, -1]
+    assert (one["frame"], one["step_mm"], one["speed_mm_s"]) == ("platform", 1, 25)
+    assert other["direction"] == [0, 1, 0]
+    assert other["step_mm"] is None
+
+
+def test_numbers_of_presses_rise_over_a_reload(desk: Visit) -> None:
+    desk.ready_to_jog()
+    first = desk.hold()
+    desk.page.mouse.up()
+    desk.fake.ask(set={"jog_ready": False})
+    desk.page.reload()
+    expect(desk.page.locator("#value-x")).to_contain_text(".")
+    desk.ready_to_jog()
+    assert desk.hold() > first
+    desk.page.mouse.up()
+
+
+def test_keys_jog_only_while_the_pad_has_the_focus(desk: Visit) -> None:
+    desk.ready_to_jog()
+    desk.page.locator("#jog-speed").focus()
+    desk.page.keyboard.press("ArrowRight")
+    desk.page.locator("#scene-canvas").focus()
+    desk.page.keyboard.press("PageUp")
+    assert [m for m in desk.fake.let_pass(desk.page)["received"] if m["kind"] == "held"] == []
+    desk.page.locator("#jog-pad").focus()
+    desk.page.keyboard.down("PageUp")
+    found = desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")
+    assert found["received"][-1]["direction"] == [0, 0, 1]
+    desk.page.keyboard.up("PageUp")
+    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
+
+
+def test_a_key_ends_when_the_focus_goes(desk: Visit) -> None:
+    desk.ready_to_jog()
+    desk.page.locator("#jog-pad").focus()
+    desk.page.keyboard.down("ArrowLeft")
+    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")
+    desk.page.locator("#jog-speed").focus()
+    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
+
+
+def test_the_second_of_two_fingers_begins_nothing(phone: Visit) -> None:
+    """The first one ends, and the second has to be lifted and put down again."""
+    phone.ready_to_jog()
+    press = """([name, id]) => document.querySelector(`[data-jog="${name}"]`).dispatchEvent(
+      new PointerEvent("pointerdown", { pointerId: id, bubbles: true, button: 0, buttons: 1 }))"""
+    phone.page.evaluate("() => { Element.prototype.setPointerCapture = () => {}; }")
+    phone.page.evaluate(press, ["+x", 11])
+    phone.fake.wait(phone.page, lambda f: f["received"][-1]["kind"] == "held")
+    phone.page.evaluate(press, ["+y", 12])
+    phone.fake.wait(phone.page, lambda f: f["received"][-1]["kind"] == "let_go")
+    assert phone.fake.let_pass(phone.page)["received"][-1]["kind"] == "let_go"
+
+
+GAMEPAD = """() => {
+  const buttons = Array.from({ length: 17 }, () => ({ pressed: false }));
+  window.fakePad = { connected: true, mapping: "standard", axes: [0, 0, 0, 0], buttons };
+  navigator.getGamepads = () => [window.fakePad];
+}"""
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        "() => { fakePad.axes = [0.1, 0, 0, 0]; }",
+        "() => { fakePad.buttons[4].pressed = false; }",
+        "() => { navigator.getGamepads = () => [null]; }",
+        "() => { window.dispatchEvent(new Event('gamepaddisconnected')); }",
+    ],
+    ids=["stick centred", "shoulder released", "gone", "disconnected"],
+)
+def test_a_gamepad_jogs_with_a_shoulder_button_and_from_the_centre(desk: Visit, end: str) -> None:
+    desk.ready_to_jog()
+    desk.page.evaluate(GAMEPAD)
+    desk.page.locator("#jog-gamepad").check()
+    desk.page.evaluate("() => { fakePad.axes = [0, -0.5, 0, 0]; }")
+    desk.fake.let_pass(desk.page)
+    assert desk.fake.received("held") == []  # no shoulder button
+    desk.page.evaluate("() => { fakePad.buttons[4].pressed = true; }")
+    desk.fake.let_pass(desk.page)
+    assert desk.fake.received("held") == []  # the stick was not at its centre before
+    desk.page.evaluate("() => { fakePad.axes = [0, 0, 0, 0]; }")
+    desk.fake.let_pass(desk.page, 4)
+    desk.page.evaluate("() => { fakePad.axes = [0, -0.5, 0, 0]; }")
+    found = desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")["received"][-1]
+    assert found["direction"] == [0, 1, 0]
+    assert found["speed_mm_s"] == pytest.approx(5.0)
+    desk.page.evaluate(end)
+    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
+    assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go"
+
+
+def test_a_limit_near_the_platform_is_shown(desk: Visit) -> None:
+    desk.ready_to_jog()
+    jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 4.0}
+    desk.fake.ask(state={"jog": {**jog, "limit": "stops in 12 mm: clearance to pillar"}})
+    expect(desk.page.locator("#jog-limit")).to_have_text("stops in 12 mm: clearance to pillar")
