@@ -31,7 +31,7 @@ RATE = 20.0
 #: A page that does not take its states for so long is let go, [s].
 PATIENCE = 2.0
 _POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:;"
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:;"
     " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _KINDS = {
@@ -124,8 +124,7 @@ class ConsoleServer:
     # What there is.
 
     async def _page(self, _request: Request) -> Response:
-        text = _resource("index.html").replace("{{token}}", self.token)
-        return HTMLResponse(text)
+        return HTMLResponse(_resource("index.html"))
 
     async def _scene(self, _request: Request) -> Response:
         data = await run_in_threadpool(scene_of, self._console.rig, self._console.scene)
@@ -165,7 +164,7 @@ class ConsoleServer:
             await run_in_threadpool(self._console.leave, page)
 
     async def _tell(self, socket: WebSocket, page: int) -> None:
-        seen = -1
+        seen = 0  # before the first look there is nothing to tell
         while True:
             async with self._news:
                 while self._seq == seen:
@@ -223,7 +222,7 @@ async def _static(request: Request) -> Response:
 
 async def _run_file(request: Request) -> Response:
     """A file of a run below the folder of runs."""
-    path, root = Path(request.path_params["name"]).resolve(), RUNS.resolve()
+    path, root = (RUNS / request.path_params["name"]).resolve(), RUNS.resolve()
     if not (path.is_relative_to(root) and path.is_file()):
         raise HTTPException(404)
     return FileResponse(path)

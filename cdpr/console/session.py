@@ -34,6 +34,7 @@ from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
 from executor.jogging import FASTEST
+from executor.recording.run_course import RUNS
 from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
 from executor.service import reference_status
@@ -146,7 +147,7 @@ class Console:
             "verb": ended.verb,
             "ok": ended.exit_code == 0,
             "text": ended.text,
-            "report": None if ended.report is None else f"/runs/{ended.report}",
+            "report": None if ended.report is None else _address_of(ended.report),
             "fault_page": None if ended.fault is None else f"/help/{ended.fault}",
         }
 
@@ -378,6 +379,12 @@ class _Kept:
     latched: str | None
     referenced: bool
     why_not: str | None
+
+
+def _address_of(report: Path) -> str | None:
+    """Where the console serves a report; only those below the folder of runs."""
+    path, root = report.resolve(), RUNS.resolve()
+    return f"/runs/{path.relative_to(root)}" if path.is_relative_to(root) else None
 
 
 def _inside(name: str) -> Path:

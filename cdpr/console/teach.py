@@ -160,7 +160,7 @@ def scene_text(document: SceneDocument) -> str:
 
 def _named(pose: PoseDocument, name: str) -> TaughtPose:
     try:
-        checked = TypeAdapter(Name).validate_python(name)
+        checked = TypeAdapter(Name).validate_python(name.strip())
     except ValidationError:
         raise _refusal(f"'{name}' is no name", "use 1 to 80 letters or digits") from None
     given = {"position_mm": pose.position_mm, "rotation_wxyz": pose.rotation_wxyz}

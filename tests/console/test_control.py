@@ -1,0 +1,107 @@
+"""Who may operate, and which press is meant, for any order of pages, presses and leavings."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from cdpr.console.control import PageControl
+
+
+class ControlMachine(RuleBasedStateMachine):
+    """Pages come, go, take, give, hold and let go; the oracle keeps what was forwarded."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.control = PageControl()
+        self.pages: set[int] = set()
+        self.begun: dict[int, tuple[int, int]] = {}
+        self.ended: set[int] = set()
+        self.newest = 0
+
+    @rule()
+    def join(self) -> None:
+        page = self.control.join(f"page {len(self.pages)}")
+        assert page not in self.pages
+        self.pages.add(page)
+
+    @rule(number=st.integers(0, 5))
+    def leave(self, number: int) -> None:
+        if page := self._page(number):
+            self._end(self.control.leave(page))
+            self.pages.discard(page)
+
+    @rule(number=st.integers(0, 5), moving=st.booleans(), force=st.booleans())
+    def take(self, number: int, moving: bool, force: bool) -> None:
+        if page := self._page(number):
+            before = self.control.holder
+            refused = self.control.take(page, moving=moving, force=force)
+            if before not in (None, page) and (moving or not force):
+                assert refused
+                assert self.control.holder == before
+            else:
+                assert self.control.holder == page
+                if before is not None and before != page:
+                    self._end_all_of(before)
+
+    @rule(number=st.integers(0, 5))
+    def give(self, number: int) -> None:
+        if page := self._page(number):
+            self._end(self.control.give(page))
+            assert self.control.holder != page
+
+    @rule(number=st.integers(0, 5), hold=st.integers(1, 5))
+    def hold(self, number: int, hold: int) -> None:
+        if page := self._page(number):
+            press = self.control.hold(page, hold)
+            if press is None:
+                return
+            assert self.control.holder == page, "only who has control"
+            assert press not in self.ended, "what ended is over"
+            assert self.begun.setdefault(press, (page, hold)) == (page, hold)
+            assert press >= self.newest, "numbers rise"
+            self.newest = press
+
+    @rule(number=st.integers(0, 5), hold=st.integers(1, 5))
+    def let_go(self, number: int, hold: int) -> None:
+        if page := self._page(number):
+            self._end(self.control.let_go(page, hold))
+            assert self.control.hold(page, hold) is None
+
+    @invariant()
+    def one_holder(self) -> None:
+        assert self.control.holder is None or self.control.holder in self.pages
+
+    def _page(self, number: int) -> int | None:
+        return sorted(self.pages)[number % len(self.pages)] if self.pages else None
+
+    def _end(self, press: int | None) -> None:
+        if press is not None:
+            self.ended.add(press)
+
+    def _end_all_of(self, page: int) -> None:
+        self.ended |= {press for press, (owner, _) in self.begun.items() if owner == page}
+
+
+TestControl = ControlMachine.TestCase
+
+
+@given(st.integers(1, 1000))
+def test_a_press_that_was_let_go_before_it_arrived_is_over(hold: int) -> None:
+    control = PageControl()
+    page = control.join("a")
+    control.take(page, moving=False)
+    control.let_go(page, hold)
+    assert control.hold(page, hold) is None
+    assert control.hold(page, hold + 1) is not None
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_holder_is_named_when_control_is_refused(moving: bool) -> None:
+    control = PageControl()
+    first, second = control.join("10.0.0.1"), control.join("10.0.0.2")
+    assert control.take(first, moving=moving) == ""
+    assert "10.0.0.1" in control.take(second, moving=moving)
+    assert control.holder_name() == "10.0.0.1"

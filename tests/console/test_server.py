@@ -1,0 +1,347 @@
+"""The console's server: who may look, who may operate, and what it makes of anything else."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from cdpr.console.server import ConsoleServer
+from cdpr.console.session import Console, ConsoleFiles
+from model.rig import load_rig
+from tests.cli.plans import RIG, write_short_plan
+from tests.console import fake_server
+
+
+class Served:
+    """A console of the paper's rig, simulated in the process of a verb; a server around it."""
+
+    def __init__(self, *, read_only: bool = False) -> None:
+        rig = load_rig(RIG)
+        files = ConsoleFiles(RIG, rig, (), RIG.parent / "environment_1.yaml", True, read_only)
+        self.console = Console(files)
+        self.said: list[tuple[str, dict[str, Any]]] = []
+        self.started: list[tuple[str, list[str]]] = []
+        self.console.watch.say = self._say  # type: ignore[method-assign]
+        self.console.verbs.start = self._start  # type: ignore[method-assign]
+        self.server = ConsoleServer(self.console)
+
+    def _say(self, command: str, **values: Any) -> str:
+        self.said.append((command, values))
+        return ""
+
+    def _start(self, verb: str, arguments: Any) -> None:
+        self.started.append((verb, list(arguments)))
+
+    def get(self, path: str, *, token: bool = True, **headers: str) -> tuple[int, bytes, Any]:
+        address = f"http://{self.host}{path}"
+        if token:
+            address += f"{'&' if '?' in path else '?'}token={self.server.token}"
+        request = urllib.request.Request(address, headers=headers)
+        try:
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                return answer.status, answer.read(), answer.headers
+        except urllib.error.HTTPError as error:
+            return error.code, error.read(), error.headers
+
+    def page(self, token: str | None = None, origin: str | None = "") -> ClientConnection:
+        address = f"ws://{self.host}/ws?token={self.server.token if token is None else token}"
+        return connect(address, origin=f"http://{self.host}" if origin == "" else origin)  # type: ignore[arg-type]
+
+    host = ""
+
+
+@contextmanager
+def serving(served: Served) -> Iterator[Served]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    served.host = f"127.0.0.1:{listener.getsockname()[1]}"
+    config = uvicorn.Config(served.server.app(), log_level="error", ws_max_size=4096)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=lambda: server.run(sockets=[listener]))
+    thread.start()
+    try:
+        yield served
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("console")
+    write_short_plan(folder / "short.json")
+    (folder / "secret.txt").write_text("secret")
+    (folder / "runs" / "one").mkdir(parents=True)
+    (folder / "runs" / "one" / "report.html").write_text("<p>a report")
+    return folder
+
+
+@pytest.fixture
+def served(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    monkeypatch.chdir(folder)
+    with serving(Served()) as served:
+        yield served
+
+
+def state(page: ClientConnection) -> dict[str, Any]:
+    """The next state; answers before it are left out."""
+    while True:
+        message = json.loads(page.recv(timeout=10))
+        if message["kind"] == "state":
+            assert isinstance(message, dict)
+            return message
+
+
+def told(page: ClientConnection, text: str) -> dict[str, Any]:
+    """The answer to what is sent."""
+    page.send(text)
+    while True:
+        message = json.loads(page.recv(timeout=30))
+        if message["kind"] == "answer":
+            assert isinstance(message, dict)
+            return message
+
+
+def command(page: ClientConnection, name: str, **values: Any) -> dict[str, Any]:
+    return told(page, json.dumps({"kind": "command", "id": 7, "command": name, **values}))
+
+
+def held(hold: int) -> str:
+    return json.dumps(
+        {
+            "kind": "held",
+            "hold": hold,
+            "direction": [0.0, 0.0, 1.0],
+            "frame": "world",
+            "step_mm": None,
+            "speed_mm_s": 5.0,
+            "seq": 1,
+        }
+    )
+
+
+@pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
+def test_nothing_is_told_without_the_token(served: Served, path: str) -> None:
+    assert served.get(path, token=False)[0] == 403
+    assert served.get(f"{path}?token=wrong", token=False)[0] == 403
+    assert served.get(path)[0] == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1"])
+def test_another_origin_gets_nothing(served: Served, origin: str) -> None:
+    assert served.get("/scene", Origin=origin)[0] == 403
+    with pytest.raises(InvalidStatus):
+        served.page(origin=origin)
+
+
+def test_a_socket_needs_token_and_origin(served: Served) -> None:
+    for token, origin in (("wrong", ""), ("", ""), (None, None)):
+        with pytest.raises((InvalidStatus, ConnectionClosed)):
+            served.page(token, origin).recv(timeout=10)
+    with served.page() as page:
+        assert state(page)["rig"] == "gachon_8_6"
+
+
+def test_the_page_loads_nothing_from_elsewhere(served: Served) -> None:
+    status, body, headers = served.get("/")
+    assert status == 200
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert b"http://" not in body.replace(b"http://www.w3.org", b"")
+    assert b"https://" not in body
+    assert headers["Cache-Control"] == "no-store"
+
+
+def test_every_file_that_the_page_names_is_there(served: Served) -> None:
+    body = served.get("/")[1].decode()
+    names = [part.split('"')[0] for part in body.split('"/static/')[1:]]
+    assert len(names) >= 4
+    for name in names:
+        status, _, headers = served.get(f"/static/{name}", token=False)
+        assert status == 200, name
+        assert headers["X-Content-Type-Options"] == "nosniff"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../server.py",
+        "/static/%2e%2e/server.py",
+        "/static//etc/passwd",
+        "/static/vendor",
+        "/runs/../secret.txt",
+        "/runs/%2e%2e/secret.txt",
+        "/runs/one",
+        "/help/../secret",
+        "/help/no_such_code",
+        "/nothing",
+    ],
+)
+def test_no_other_file_is_given(served: Served, path: str) -> None:
+    status, body, _ = served.get(path)
+    assert status == 404
+    assert b"secret" not in body
+    assert b"root:" not in body
+
+
+def test_help_is_given_by_code(served: Served) -> None:
+    status, body, _ = served.get("/help/drive_silent")
+    assert status == 200
+    assert b"# " in body
+
+
+def test_the_fake_server_tells_what_this_one_tells(served: Served) -> None:
+    """What the page's own tests rest on; a key that one has and the other lacks is found here."""
+    with served.page() as page:
+        real = state(page)
+    fake = fake_server.Fake().state(None)  # type: ignore[arg-type]
+    assert set(real) == set(fake)
+
+
+def test_one_page_at_a_time_operates(served: Served) -> None:
+    with served.page() as first, served.page() as second:
+        assert "take control" in command(first, "home")["what"]
+        assert command(first, "take_control")["ok"]
+        refused = command(second, "take_control")
+        assert not refused["ok"]
+        assert "127.0.0.1" in refused["what"]
+        assert state(second)["control"]["yours"] is False
+        assert not command(second, "home")["ok"]
+        assert command(first, "home")["ok"]
+        assert [verb for verb, _ in served.started] == ["home"]
+        assert command(second, "take_control", force=True)["ok"]
+        assert not command(first, "home")["ok"]
+        assert command(second, "give_control")["ok"]
+
+
+def test_control_ends_with_its_page(served: Served) -> None:
+    with served.page() as first:
+        assert command(first, "take_control")["ok"]
+    with served.page() as second:
+        while state(second)["control"]["held_by"] is not None:
+            pass
+        assert command(second, "take_control")["ok"]
+
+
+def test_everybody_may_stop(served: Served) -> None:
+    with served.page() as first, served.page() as second:
+        command(first, "take_control")
+        for page in (first, second):
+            assert command(page, "stop")["what"] == "nothing moves"
+    request = urllib.request.Request(f"http://{served.host}/stop", method="POST")
+    with urllib.request.urlopen(request, timeout=10) as answer:
+        assert json.load(answer) == {"ok": False, "what": "nothing moves"}
+    request.add_header("Origin", "http://evil.example")
+    with pytest.raises(urllib.error.HTTPError):
+        urllib.request.urlopen(request, timeout=10)
+
+
+def test_a_held_control_is_passed_on_for_who_has_control_only(served: Served) -> None:
+    with served.page() as first, served.page() as second:
+        command(first, "take_control")
+        second.send(held(1))
+        first.send(held(3))
+        first.send(held(3))
+        first.send(held(2))
+        assert command(first, "stop")  # answers come in order
+        holds = [values["press"] for name, values in served.said if name == "held"]
+        assert len(holds) == 2
+        assert len(set(holds)) == 1
+        first.send(json.dumps({"kind": "let_go", "hold": 3}))
+        first.send(held(3))
+        command(first, "stop")
+        assert [name for name, _ in served.said].count("held") == 2, "what was let go is over"
+        assert served.said[-1] == ("let_go", {"press": holds[0]})
+
+
+def test_what_a_page_held_ends_when_the_page_is_gone(served: Served) -> None:
+    with served.page() as first:
+        command(first, "take_control")
+        first.send(held(1))
+        command(first, "stop")
+    with served.page() as second:
+        while state(second)["control"]["held_by"] is not None:
+            pass
+    assert [name for name, _ in served.said] == ["held", "let_go"]
+
+
+def test_nothing_runs_that_was_not_seen_to_pass(served: Served) -> None:
+    with served.page() as page:
+        command(page, "take_control")
+        assert "passes" in command(page, "run")["what"]
+        assert not command(page, "load_plan", file="../elsewhere.json")["ok"]
+        assert not command(page, "load_plan", file="secret.txt")["ok"]
+        assert command(page, "load_plan", file="short.json")["ok"]
+        assert state(page)["preview"] == "short.json"
+        shown = json.loads(served.get("/api/preview")[1])
+        assert shown["passed"]
+        assert len(shown["moments"]) == len(shown["curves"]["time_s"])
+        assert command(page, "run")["ok"]
+        verb, arguments = served.started[-1]
+        assert (verb, arguments[0]) == ("run", "short.json")
+        assert "--yes" in arguments
+
+
+SMALL = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**60), 2**60) | st.floats() | st.text(max_size=20),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(
+                ["kind", "command", "id", "hold", "direction", "seq", "file", "percent"]
+            ),
+            inner,
+            max_size=6,
+        )
+    ),
+    max_leaves=8,
+)
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(said=SMALL)
+def test_nonsense_is_refused_and_nothing_starts(served: Served, said: Any) -> None:
+    with served.page() as page:
+        answer = told(page, json.dumps(said))
+        assert not answer["ok"]
+        assert answer["what"]
+    assert not served.started
+    assert not served.said
+
+
+def test_a_message_that_is_too_long_ends_the_socket_alone(served: Served) -> None:
+    with served.page() as long, served.page() as other:
+        long.send("x" * 100_000)
+        with pytest.raises(ConnectionClosed):
+            list(long)
+        assert state(other)["kind"] == "state"
+
+
+def test_a_console_that_only_shows_does_nothing_but_stop(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    with serving(Served(read_only=True)) as served, served.page() as page:
+        assert state(page)["read_only"]
+        for name in ("take_control", "home", "run", "jog_begin", "hold", "release", "reset"):
+            assert "only shows" in command(page, name)["what"]
+        assert command(page, "stop")["what"] == "nothing moves"
+        assert not served.started
+        assert not served.said

@@ -1,0 +1,112 @@
+"""Taught poses: what is in the file is what is in the list, whatever is done to them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdpr.console.teach import MOST, TaughtPoses, scene_text
+from model.errors import BadInput, CdprError
+from model.pose import Pose
+from model.rig import load_rig
+from model.scene import load_scene, nothing_in_the_way
+from tests.cli.plans import RIG
+
+STEP = st.tuples(
+    st.sampled_from(["teach", "rename", "move", "forget"]), st.integers(0, 5), st.integers(0, 5)
+)
+
+
+def pose(k: int) -> Pose:
+    return Pose.level(np.array([0.001 * k, -0.002 * k, 0.4 + 0.001 * k]))
+
+
+@given(st.lists(STEP, max_size=25))
+def test_list_and_file_agree_with_a_plain_list(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
+) -> None:
+    path = tmp_path_factory.mktemp("taught") / "console" / "poses.json"
+    taught, names = TaughtPoses(path), list[str]()
+    for number, (what, index, other) in enumerate(steps):
+        name = f"pose {other}"
+        expected = list(names)
+        ok = index < len(names)
+        if what == "teach":
+            ok = name not in names
+            expected.append(name)
+        elif what == "rename":
+            ok = ok and (names[index] == name or name not in names)
+            expected[index : index + 1] = [name]
+        elif what == "move":
+            ok = ok and other < len(names)
+            if ok:
+                expected.insert(other, expected.pop(index))
+        else:
+            expected[index : index + 1] = []
+        try:
+            if what == "teach":
+                taught.teach(name, pose(number))
+            elif what == "rename":
+                taught.rename(index, name)
+            elif what == "move":
+                taught.move(index, other)
+            else:
+                taught.forget(index)
+        except BadInput:
+            assert not ok
+        else:
+            assert ok
+            names = expected
+        assert [one["name"] for one in taught.told()] == names
+        assert TaughtPoses(path).told() == taught.told()
+
+
+def test_they_become_a_scene_that_is_read_again(tmp_path: Path) -> None:
+    taught = TaughtPoses(tmp_path / "poses.json")
+    for k, name in enumerate(("above", "at the part", "goal")):
+        taught.teach(name, pose(k))
+    around = load_scene(RIG.parent / "environment_1.yaml")
+    path = tmp_path / "taught.yaml"
+    path.write_text(scene_text(taught.scene(around, "taught")))
+    scene = load_scene(path)
+    assert [stop.name for stop in scene.stops] == ["at the part"]
+    assert scene.start.distance_to(pose(0)) < 1e-9
+    assert scene.goal.distance_to(pose(2)) < 1e-9
+    assert [one.name for one in scene.obstacles] == [one.name for one in around.obstacles]
+    assert yaml.safe_load(path.read_text())["schema_version"] == 1
+
+
+def test_one_pose_is_no_path(tmp_path: Path) -> None:
+    taught = TaughtPoses(tmp_path / "poses.json")
+    taught.teach("alone", pose(1))
+    with pytest.raises(BadInput, match="two poses"):
+        taught.scene(nothing_in_the_way(load_rig(RIG)), "taught")
+
+
+@pytest.mark.parametrize("name", ["", "a\nb", "\0", " "])
+def test_a_name_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(BadInput, match="name"):
+        TaughtPoses(tmp_path / "poses.json").teach(name, pose(1))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"poses": [{"name": "a"}]}', '{"poses": 3}'])
+def test_a_damaged_file_is_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "poses.json"
+    path.write_text(text)
+    with pytest.raises(CdprError, match=r"poses\.json"):
+        TaughtPoses(path)
+
+
+def test_there_is_an_end_to_them(tmp_path: Path) -> None:
+    path = tmp_path / "poses.json"
+    one = {"position_mm": [0.0, 0.0, 400.0], "rotation_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    poses = [{"name": f"p{k}", **one} for k in range(MOST)]
+    path.write_text(json.dumps({"schema_version": 1, "poses": poses}))
+    with pytest.raises(BadInput, match=str(MOST)):
+        TaughtPoses(path).teach("one more", pose(1))
