@@ -129,7 +129,7 @@ class Console:
             "tensions_n": None if robot is None else [round(t, 2) for t in robot.tensions],
             "tension_limits_n": [rig.min_tension, rig.max_tension],
             "clearance_mm": self._clearance(),
-            "next_stop": self._next_stop(status),
+            "next_stop": None if status is None else status["next_stop"],
             "preview": None if self.preview is None else self.preview["name"],
             "jog": self._jog(status, jog),
             "poses": self.poses.told(),
@@ -161,13 +161,6 @@ class Console:
             "required": round(required * 1e3, 1),
             "pair": [first, second],
         }
-
-    def _next_stop(self, status: dict[str, Any] | None) -> dict[str, Any] | None:
-        if status is None or status.get("path_mm") is None:
-            return None
-        left = status["path_length_mm"] - status["path_mm"]
-        speed = self.view.rig.motion.speed * 1e3 * status["wished"]["speed_percent"] / 100.0
-        return {"name": "goal", "distance_mm": round(left, 1), "seconds": round(left / speed, 1)}
 
     def _jog(self, status: dict[str, Any] | None, jog: dict[str, Any] | None) -> dict[str, Any]:
         if status is None or jog is None:

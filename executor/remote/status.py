@@ -1,20 +1,21 @@
 """How a run stands at this moment, for `cdpr monitor` and the programs that read its JSON.
 
 Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, ``cause``,
-``elapsed_s``, ``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``feed_percent`` (of
-the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
+``elapsed_s``, ``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``next_stop``
+{``name`` (``goal`` at last), ``distance_mm``, ``seconds`` (at the wished speed)}, ``feed_percent``
+(of the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
 ``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``rejected_frames``,
 ``error_frames``, ``cameras`` [{``name``, ``source``, ``pictures``, ``poses``, ``dropped``,
 ``pictures_per_second`` (of the run's time), ``measuring_ms``, ``tags`` (seen last), ``trouble``
-(what keeps it from measuring, or nothing)}], ``drives`` [{``node``, ``state``,
-``position_counts``, ``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``,
-``text``}], the newest last. A number that is not known is null; before the first cycle ``state``
-is ``preparing`` (while `cdpr release` takes the torque off ``releasing``) and ``drives`` is empty;
-at the end ``cause`` says why it did not end well. Winches that move without a path (`cdpr home`,
-`cdpr jog --cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a
-percentage. A session of jogs has ``jog`` {``speed_mm_s`` (at most), ``position_mm``,
-``quaternion`` (where the platform was sent), ``room_mm`` (to the end of what is proved), ``limit``
-(why there is no more, or nothing)}, and neither rows nor a path.
+(what keeps it from measuring, or nothing)}], ``drives`` [{``node``, ``state``, ``position_counts``,
+``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``, ``text``}], the newest last. A
+number that is not known is null; before the first cycle ``state`` is ``preparing`` (while `cdpr
+release` takes the torque off ``releasing``) and ``drives`` is empty; at the end ``cause`` says why
+it did not end well. Winches that move without a path (`cdpr home`, `cdpr jog --cable`) have no
+``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a percentage. A session of jogs
+has ``jog`` {``speed_mm_s`` (at most), ``position_mm``, ``quaternion`` (where the platform was
+sent), ``room_mm`` (to the end of what is proved), ``limit`` (why there is no more, or nothing)},
+and neither rows nor a path.
 """
 
 from __future__ import annotations
@@ -209,12 +210,33 @@ class RunStatus(MotionStatus):
         table, record = self._prepared.checked.table, self._cycles.last
         whole = {"rows": len(table), "path_length_mm": round(self._prepared.length * 1e3, 3)}
         if record is None:
-            return {"row": None, "path_mm": None, **whole}
+            return {"row": None, "path_mm": None, "next_stop": None, **whole}
         path = float(np.interp(record.index, np.arange(len(table)), table.travelled))
-        return {"row": round(record.index, 2), "path_mm": round(path * 1e3, 3), **whole}
+        return {
+            "row": round(record.index, 2),
+            "path_mm": round(path * 1e3, 3),
+            "next_stop": self._next_stop(record.index, path),
+            **whole,
+        }
+
+    def _next_stop(self, row: float, path: float) -> dict[str, Any]:
+        """The scene's next stop, or the goal."""
+        table, stops = self._prepared.checked.table, self._prepared.scene.stops
+        ahead = [(stand.first, stop.name) for stand, stop in zip(table.stands, stops, strict=True)]
+        ahead.append((len(table) - 1, "goal"))
+        last, name = next(one for one in ahead if one[0] >= row or one[1] == "goal")
+        left = (last - row) * table.cycle / self._board.read().speed
+        return {
+            "name": name,
+            "distance_mm": round((float(table.travelled[last]) - path) * 1e3, 1),
+            "seconds": round(left, 1),
+        }
 
     def _told(self) -> list[dict[str, Any]]:
         return [asdict(event) for event in list(self._events)]
+
+
+_NO_PATH = {"path_mm": None, "path_length_mm": None, "next_stop": None}
 
 
 class WinchStatus(MotionStatus):
@@ -235,7 +257,7 @@ class WinchStatus(MotionStatus):
 
     def _place(self) -> dict[str, Any]:
         row = None if self._cycles.last is None else round(self._cycles.last.index, 1)
-        return {"row": row, "rows": 100, "path_mm": None, "path_length_mm": None}
+        return {"row": row, "rows": 100, **_NO_PATH}
 
     def _told(self) -> list[dict[str, Any]]:
         began = self._cycles.began
@@ -283,4 +305,4 @@ class JogStatus(WinchStatus):
             "room_mm": round(self._jog.room * 1e3, 2),
             "limit": self._jog.limit or None,
         }
-        return {"row": None, "rows": None, "path_mm": None, "path_length_mm": None, "jog": jog}
+        return {"row": None, "rows": None, **_NO_PATH, "jog": jog}

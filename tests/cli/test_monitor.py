@@ -34,6 +34,7 @@ def status(**changes: Any) -> dict[str, Any]:
         "rows": 323,
         "path_mm": 10.0,
         "path_length_mm": 58.3,
+        "next_stop": {"name": "goal", "distance_mm": 48.3, "seconds": 4.8},
         "feed_percent": 0.0,
         "wished": {"stop": False, "hold": True, "speed_percent": 50},
         "lateness_ms": 0.06,
@@ -112,7 +113,7 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     now = told.as_dict()
     assert now.keys() == status().keys()
     assert {key for key, value in now.items() if value is None} == {
-        *("path_mm", "path_length_mm", "cause")
+        *("path_mm", "path_length_mm", "next_stop", "cause")
     }
     assert now["elapsed_s"] == pytest.approx(0.02)
     assert now["events"] == [{"time_s": 0.01, "code": "moving", "text": "winding in"}]

@@ -49,7 +49,7 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
         ("stop", None, OperatorRequests(speed=0.4, stop=True)),
         ("resume", None, OperatorRequests(speed=0.4, stop=True)),
     ):
-        assert _answer(make_line(command, percent), board)["ok"] is True
+        assert _answer(make_line(command, percent=percent), board)["ok"] is True
         assert board.read() == wishes
 
 
@@ -89,14 +89,14 @@ def test_no_bytes_do_anything_but_a_command(line):
 
 @given(percent=st.integers(1, 100))
 def test_a_speed_travels_as_it_was_said(percent):
-    command = parse_command(make_line("speed", percent))
+    command = parse_command(make_line("speed", percent=percent))
     assert command.percent == percent  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("percent", [0, 101])
 def test_a_speed_that_is_none_is_no_command(percent):
     with pytest.raises(NotACommand):
-        parse_command(make_line("speed", percent))
+        parse_command(make_line("speed", percent=percent))
 
 
 @pytest.fixture
@@ -254,3 +254,73 @@ def test_a_run_that_ends_says_once_more_how_it_stands(
         assert ask_all(runs, "status")[0].ended
         assert last_word(runs[0]) == now
         assert last_word(runs[0]) is None
+
+
+class _Presses:
+    """Keeps what it is told; takes every press but the last."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[Any, ...]] = []
+
+    def hold(
+        self, number: int, direction: Any, *, in_platform: bool, step: float | None, percent: int
+    ) -> bool:
+        self.told.append((number, direction.tolist(), in_platform, step, percent))
+        return number < 9
+
+    def let_go(self, number: int) -> None:
+        self.told.append(("let go", number))
+
+    def end(self) -> None:
+        self.told.append(("end",))
+
+
+def _said(presses: _Presses | None, **question: Any) -> dict[str, Any]:
+    line = json.dumps(question).encode()
+    answer = json.loads(answer_to(line, LocalRequests(), STATUS, presses))
+    assert isinstance(answer, dict)
+    return answer
+
+
+def test_a_session_of_jogs_takes_what_is_said_of_presses() -> None:
+    presses = _Presses()
+    held = {"command": "held", "press": 3, "direction": [0, 0.6, 0.8], "frame": "platform"}
+    assert _said(presses, **held, step_mm=0.1, percent=25)["ok"]
+    assert _said(presses, command="held", press=4, direction=[1, 1, 0])["ok"]
+    assert _said(presses, command="let_go", press=4)["ok"]
+    assert _said(presses, command="end")["ok"]
+    first, second, *others = presses.told
+    assert first == (3, [0.0, pytest.approx(0.6), pytest.approx(0.8)], True, 0.0001, 25)
+    assert second == (4, pytest.approx([0.5**0.5, 0.5**0.5, 0.0]), False, None, 100)
+    assert others == [("let go", 4), ("end",)]
+    assert "over" in _said(presses, command="held", press=9, direction=[1, 0, 0])["what"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"press": 0},
+        {"press": "1"},
+        {"direction": [0, 0, 0]},
+        {"direction": [1, 0]},
+        {"direction": [2, 0, 0]},
+        {"frame": "tool"},
+        {"step_mm": 5.0},
+        {"percent": 0},
+        {"percent": 101},
+        {"more": 1},
+    ],
+)
+def test_a_press_that_is_none_is_refused(wrong: dict[str, Any]) -> None:
+    presses = _Presses()
+    good = {"command": "held", "press": 1, "direction": [1, 0, 0]}
+    assert _said(presses, **good)["ok"]
+    presses.told.clear()
+    assert not _said(presses, **{**good, **wrong})["ok"]
+    assert not presses.told
+
+
+@pytest.mark.parametrize("command", ["held", "let_go", "end"])
+def test_any_other_motion_takes_no_jogs(command: str) -> None:
+    values = {"held": {"press": 1, "direction": [1, 0, 0]}, "let_go": {"press": 1}, "end": {}}
+    assert "takes no jogs" in _said(None, command=command, **values[command])["what"]
