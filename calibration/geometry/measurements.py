@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.results import data_hash
-from model.errors import BadInput
-from model.files.reading import CsvFile
+from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, matrix_from_quaternion, read_only, skew
 from model.rig import Rig
 from model.statics.gravity import PRETENSION_SHARE, working_tensions
@@ -242,7 +241,7 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
         BadInput: It cannot be read, or a column is missing, too many, or not of finite numbers; the
             times do not rise; a quaternion is none.
     """
-    table = _Table(path)
+    table = CsvTable(path)
     counts = table.of([f"actual_{i}_counts" for i in range(1, cables + 1)])
     if f"actual_{cables + 1}_counts" in table.names:
         raise table.bad(f"the rig has {cables} cables, the file more", "pass data of this rig")
@@ -273,69 +272,21 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     )
 
 
-class _Table:
-    """Named columns of texts."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        rows = CsvFile(path).rows
-        self.names = tuple(name.strip() for name in rows[0]) if rows else ()
-        self._rows = rows[1:]
-        if not self._rows:
-            raise self.bad(
-                "the file holds no measurement", "write a header line, then lines of values"
-            )
-        twice = {name for name in self.names if self.names.count(name) > 1}
-        if twice:
-            raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
-        for number, row in enumerate(self._rows, start=2):
-            if len(row) != len(self.names):
-                what = f"line {number} has {len(row)} values for {len(self.names)} columns"
-                raise self.bad(what, "give every line one value per column")
-
-    def of(self, names: list[str] | tuple[str, ...]) -> Array:
-        """Columns side by side, shape (n, len(names)); all finite."""
-        for name in names:
-            if name not in self.names:
-                raise self.bad(f"the column {name!r} is missing", "see docs/data-formats.md")
-        return np.array(
-            [[self._number(row, name, k) for name in names] for k, row in self._lines()]
-        )
-
-    def _lines(self) -> list[tuple[int, list[str]]]:
-        return list(enumerate(self._rows, start=2))
-
-    def _number(self, row: list[str], name: str, line: int) -> float:
-        text = row[self.names.index(name)]
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            what = f"line {line}, {name}: {text!r} is not a finite number"
-            raise self.bad(what, "leave out lines that were not measured")
-        return value
-
-    def bad(self, what: str, next_step: str) -> BadInput:
-        """The error about this file."""
-        return BadInput(what, where=str(self._path), next_step=next_step)
-
-
-def _require_rising(table: _Table) -> None:
+def _require_rising(table: CsvTable) -> None:
     times = table.of(["time_s"])[:, 0]
     falls = np.flatnonzero(np.diff(times) <= 0.0)
     if len(falls):
-        what = f"line {falls[0] + 3}: time_s does not rise"
+        what = f"line {table.line(int(falls[0]) + 1)}: time_s does not rise"
         raise table.bad(what, "sort the lines by time, or leave out the column")
 
 
-def _rotations(table: _Table) -> Array:
+def _rotations(table: CsvTable) -> Array:
     quaternions = table.of(_ROTATION)
     sizes = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(np.abs(sizes - 1.0) > 1e-3)
     if len(wrong):
         k = int(wrong[0])
-        what = f"line {k + 2}: the quaternion's length is {sizes[k]:.6g}"
+        what = f"line {table.line(k)}: the quaternion's length is {sizes[k]:.6g}"
         raise table.bad(what, "give unit quaternions qw, qx, qy, qz of world_from_platform")
     return np.array(
         [matrix_from_quaternion(q / s) for q, s in zip(quaternions, sizes, strict=True)]

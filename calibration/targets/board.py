@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from model.errors import BadInput
-from model.files.reading import CsvFile
+from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, read_only
 from model.rig import Camera
 from tracking.camera_model import Image
@@ -94,37 +94,18 @@ def read_corners(path: Path) -> dict[str, Seen]:
         BadInput: The file cannot be read, a column is missing, a number is none, or pictures show
             fewer than `LEAST_POINTS`.
     """
-    rows = CsvFile(path).rows
-    names = [name.strip() for name in rows[0]] if rows else []
-    if missing := [name for name in _COLUMNS if name not in names]:
-        raise BadInput(
-            f"the column {missing[0]!r} is missing",
-            where=str(path),
-            why=f"a file of corners has {', '.join(_COLUMNS)}",
-            next_step="see docs/data-formats.md",
-        )
-    places = [names.index(name) for name in _COLUMNS]
-    found: dict[str, list[list[float]]] = {}
-    for number, row in enumerate(rows[1:], start=2):
-        try:
-            picture, *texts = (row[place] for place in places)
-            values = [float(text) for text in texts]
-        except (ValueError, IndexError):
-            values = []
-        if not values or not np.isfinite(values).all():
-            raise BadInput(
-                f"line {number} does not hold a picture and four finite numbers",
-                where=str(path),
-                next_step="leave out lines of corners that were not detected",
-            )
-        found.setdefault(picture.strip(), []).append(values)
+    table = CsvTable(path)
+    pictures, numbers = table.texts(_COLUMNS[0]), table.of(_COLUMNS[1:])
+    found: dict[str, list[Array]] = {}
+    for picture, values in zip(pictures, numbers, strict=True):
+        found.setdefault(picture, []).append(values)
     seen = {}
     for picture, corners in found.items():
         if len(corners) < LEAST_POINTS:
             continue
-        numbers = np.array(corners)
-        flat = np.column_stack([numbers[:, 2:] / 1e3, np.zeros(len(numbers))])
-        seen[picture] = Seen(read_only(flat), read_only(numbers[:, :2]))
+        corners_of = np.array(corners)
+        flat = np.column_stack([corners_of[:, 2:] / 1e3, np.zeros(len(corners_of))])
+        seen[picture] = Seen(read_only(flat), read_only(corners_of[:, :2]))
     if not seen:
         raise BadInput(
             f"no picture has {LEAST_POINTS} corners",

@@ -105,11 +105,12 @@ class TableFile:
 
     def __init__(self, path: Path, text: str | None = None) -> None:
         self._path = path
-        rows = CsvFile(path, text).rows
+        file = CsvFile(path, text)
+        rows = file.rows
         if not rows:
             raise self._bad("the file is empty; the first line must name the columns")
         self.names = tuple(rows[0])
-        for number, row in enumerate(rows[1:], start=2):
+        for number, row in zip(file.lines[1:], rows[1:], strict=True):
             if len(row) != len(self.names):
                 raise self._bad(
                     f"line {number} has {len(row)} values for {len(self.names)} columns"

@@ -188,7 +188,7 @@ class CsvFile:
         text: Its content, where the caller has read it already.
 
     Attributes:
-        rows: Lists of texts, empty lines left out as `csv` leaves them.
+        rows: Lists of texts, empty lines left out.
         lines: The line in which each row ends, counted from 1.
 
     Raises:
@@ -200,8 +200,9 @@ class CsvFile:
         self.rows: list[list[str]] = []
         self.lines: list[int] = []
         for line, row in _rows(text, path):
-            self.rows.append(row)
-            self.lines.append(line)
+            if row:
+                self.rows.append(row)
+                self.lines.append(line)
 
 
 def _rows(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -46,7 +46,7 @@ def test_pictures_with_few_corners_are_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("", "'picture' is missing"),
+        ("", "no values"),
         ("picture,x_px,y_px,board_x_mm\na,1,2,3\n", "'board_y_mm' is missing"),
         (f"{HEAD}\na,1,2,3\n", "line 2"),
         (f"{HEAD}\na,1,2,3,nan\n", "line 2"),

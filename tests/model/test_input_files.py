@@ -62,8 +62,10 @@ def test_json_that_no_program_of_ours_writes_is_refused(text: str) -> None:
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_a_csv_file_is_the_same_whatever_its_line_ends(tmp_path: Path, end: str) -> None:
-    (tmp_path / "a.csv").write_bytes(f"a,b{end}1,2{end}3,4{end}".encode())
-    assert CsvFile(tmp_path / "a.csv").rows == [["a", "b"], ["1", "2"], ["3", "4"]]
+    (tmp_path / "a.csv").write_bytes(f"a,b{end}1,2{end}{end}3,4{end}".encode())
+    file = CsvFile(tmp_path / "a.csv")
+    assert file.rows == [["a", "b"], ["1", "2"], ["3", "4"]]
+    assert file.lines == [1, 2, 4], "as an editor counts them"
 
 
 def test_a_field_that_never_ends_is_told_with_its_line(tmp_path: Path) -> None:
