@@ -248,7 +248,7 @@ def test_a_plan_that_failed_its_check_cannot_be_run(desk: Visit) -> None:
     desk.take_control()
     desk.load("plans/colliding.json")
     expect(desk.page.locator("#plan-verdict")).to_contain_text("collides: 3.1 mm")
-    desk.page.locator("#run").click()
+    desk.page.locator("#run").click(force=True)
     expect(desk.page.locator("#notice")).to_contain_text("The plan did not pass its check")
     expect(desk.page.locator("#dialog")).to_be_hidden()
 
