@@ -99,6 +99,14 @@ def test_stop_that_reaches_no_one_says_so(desk: Visit) -> None:
     desk.errors.clear()  # the request that failed
 
 
+def test_a_stop_without_an_answer_says_so(desk: Visit) -> None:
+    """The server hangs: the socket is open, and nothing comes back."""
+    desk.page.route("**/stop", lambda route: None)
+    desk.page.evaluate("() => { WebSocket.prototype.send = () => {}; }")
+    desk.page.locator("#stop").click()
+    expect(desk.page.locator("#stop-answer")).to_contain_text("No answer to STOP for 1 s")
+
+
 def test_stop_answers_an_open_question_with_no(desk: Visit) -> None:
     desk.take_control()
     desk.load()

@@ -71,13 +71,13 @@ export class Connection extends EventTarget {
     });
   }
 
-  /** Asks for a stop along the path by every route that is there; true when one of them took it. */
+  /** Asks for a stop along the path by every route that is there; the first good answer, or else why not. */
   async stop() {
     const routes = [];
     if (this.open) routes.push(this.command("stop"));
     if (!this.open || this.freshness().why) routes.push(posted("/stop"));
-    const answers = await Promise.all(routes);
-    return answers.find((answer) => answer.ok) ?? answers[0];
+    const done = routes.map((route) => route.then((answer) => (answer.ok ? answer : Promise.reject(answer))));
+    return Promise.any(done).catch(({ errors }) => errors[0]);
   }
 
   #connect() {

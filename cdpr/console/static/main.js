@@ -77,6 +77,7 @@ function showAge() {
   document.body.classList.toggle("stale", why !== null);
   at("stale").hidden = why === null;
   if (why) write(at("stale-text"), why);
+  at("stale-hint").hidden = connection.open;
   // Not its age: that would be read out twenty times a second.
   write(at("stale-said"), why ? "Figures are not current. Only STOP works." : "");
   write(at("lamp-data"), age === null ? "No data" : `Data ${known(age, 1)}\u00a0s old`);

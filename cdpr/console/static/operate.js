@@ -16,14 +16,21 @@ export class Operate {
   #curves = new PlanCurves();
   #outcome = "";
   #busy = null;
+  #sliding = false; // the speed is being chosen: what the run says must not move it
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
     this.#page = page;
     for (const [id, command] of [["take-control", "take_control"], ["give-control", "give_control"], ["hold", "hold"], ["resume", "resume"]])
       at(id).addEventListener("click", () => page.command(command));
-    at("speed").addEventListener("input", () => write(at("speed-shown"), `${at("speed").value} %`));
-    at("speed").addEventListener("change", () => page.command("speed", { percent: Number(at("speed").value) }));
+    at("speed").addEventListener("input", () => {
+      this.#sliding = true;
+      write(at("speed-shown"), `${at("speed").value} %`);
+    });
+    at("speed").addEventListener("change", async () => {
+      await page.command("speed", { percent: Number(at("speed").value) });
+      this.#sliding = false;
+    });
     at("home").addEventListener("click", () => this.#home());
     at("reset").addEventListener("click", () => this.#reset());
     at("release").addEventListener("click", () => this.#release());
@@ -75,7 +82,7 @@ export class Operate {
     } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
-    if (asked !== undefined && document.activeElement !== at("speed")) {
+    if (asked !== undefined && !this.#sliding) {
       at("speed").value = asked;
       write(at("speed-shown"), `${Math.round(asked)} %`);
     }
@@ -157,11 +164,12 @@ export class Operate {
   }
 
   async #release() {
-    const { platform } = this.#page.situation().state;
+    const { platform, tensions_n: tensions } = this.#page.situation().state;
+    const load = tensions ? ` The tightest cable carries ${known(Math.max(...tensions), 0, "N")}.` : "";
     const height = platform ? ` It is at z = ${known(platform.position_mm[2], 0, "mm")} now.` : " Its position is not known.";
     const lines = [
       make("p", { class: "cause" }, "The platform drops unless it stands on a support or every winch has a brake."),
-      `Brakes close, then all drives lose their torque together.${height}`,
+      `Brakes close, then all drives lose their torque together.${height}${load}`,
       "Winches without brakes let their cables go, and the drives have to be homed again.",
     ];
     if (await this.#confirmed("release", { title: "Take the torque off all drives?", lines, confirm: "Supported: release" })) this.#page.command("release");

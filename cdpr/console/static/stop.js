@@ -6,6 +6,7 @@ page does. It is an operational stop in black, which IEC 60204-1 prefers for one
 import { at, isTextField, write } from "./elements.js";
 
 const ANSWER_MS = 6000; // as long as an answer is shown
+const SILENT_MS = 1000; // after it the operator must know that nothing answers
 const STOPPING = "Stopping along the path";
 
 /** Binds STOP; `pressed` hears of each press before it is sent. */
@@ -13,12 +14,20 @@ export function bindStop(connection, pressed) {
   const button = at("stop"), answer = at("stop-answer");
   let presses = 0;
 
+  function fail(text) {
+    write(answer, text);
+    answer.classList.add("failed");
+  }
+
   async function stop() {
     const press = ++presses;
     pressed();
     button.classList.add("pressed");
     write(answer, "STOP sent");
+    answer.classList.remove("failed");
+    const silence = setTimeout(() => press === presses && fail(`No answer to STOP for ${SILENT_MS / 1000} s: use the emergency-stop button.`), SILENT_MS);
     const { ok, what } = await connection.stop();
+    clearTimeout(silence);
     if (press !== presses) return;
     button.classList.remove("pressed");
     write(answer, ok ? what || "Stop requested" : what);
