@@ -363,6 +363,14 @@ def test_a_code_leads_to_its_page_of_help(desk: Visit) -> None:
     pages = {path.stem for path in (ROOT / "docs" / "faults").glob("*.md")} - {"index"}
     help_ = desk.page.evaluate("async () => [...(await import('/static/events.js')).HELP]")
     assert set(help_) == pages
+    desk.take_control()
+    desk.load()
+    desk.run()
+    desk.fake.ask(set={"events": [{"time_s": 1.5, "code": "slack", "text": "cable 3"}]})
+    desk.view("events")
+    link = desk.page.get_by_role("link", name="slack")
+    assert (link.get_attribute("href") or "").startswith("/help/slack?token=")
+    assert link.get_attribute("target") == "_blank"
 
 
 def test_the_page_asks_nothing_from_outside(desk: Visit) -> None:

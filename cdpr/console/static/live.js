@@ -103,5 +103,7 @@ export class Live {
 }
 
 function tile(name, text) {
-  write(at(`value-${name}`), text);
+  const value = at(`value-${name}`);
+  write(value, text);
+  value.closest("dd").classList.toggle("unknown", text === "–");
 }

@@ -64,6 +64,7 @@ export class Operate {
     this.#motion(state);
     if (preview !== this.#preview) this.#read(preview);
     if (isActive(motion)) this.#leave();
+    at("plan-look").hidden = this.plan === null || isActive(motion);
     write(at("busy"), busy ? `${VERBS[busy.verb] ?? busy.verb}: ${busy.text || "…"}` : "");
     at("busy").hidden = !busy;
     if (this.#busy && !busy) this.readFiles();
@@ -118,7 +119,7 @@ export class Operate {
 
   #showPlan() {
     const { plan } = this;
-    at("plan").hidden = plan === null;
+    at("plan").hidden = at("plan-look").hidden = plan === null;
     this.#page.scene.load(plan);
     this.#curves.show(plan, this.#page.situation().state.tension_limits_n);
     if (!plan) return;
