@@ -87,7 +87,7 @@ def test_stop_goes_by_http_when_the_socket_is_lost(desk: Visit) -> None:
     desk.page.keyboard.press(" ")
     found = desk.fake.wait(desk.page, lambda f: bool(f["stops"] == 1))
     assert found["received"] == []
-    expect(desk.page.locator("#stop-answer")).to_have_text("Stop requested.")
+    expect(desk.page.locator("#stop-answer")).to_have_text("nothing moves")
 
 
 def test_stop_that_reaches_no_one_says_so(desk: Visit) -> None:
@@ -239,7 +239,10 @@ def test_run_asks_with_verdict_duration_and_length(desk: Visit) -> None:
     expect(desk.page.locator("#outcome-text")).to_have_text(
         "Stopped along the path by the operator."
     )
-    assert desk.page.locator("#outcome-links a").get_attribute("href") == "/report"
+    assert (
+        desk.page.locator("#outcome-links a").get_attribute("href")
+        == "/report?token=token-of-the-fake"
+    )
 
 
 def test_a_question_goes_when_its_answer_no_longer_counts(desk: Visit) -> None:
@@ -378,3 +381,18 @@ def test_the_page_asks_nothing_from_outside(desk: Visit) -> None:
     desk.load()
     allowed = (desk.fake.origin, desk.fake.origin.replace("http", "ws"), "data:")
     assert [url for url in desk.asked if not url.startswith(allowed)] == []
+
+
+def test_control_is_taken_from_another_page_only_after_a_question(
+    browser: Browser, desk: Visit
+) -> None:
+    desk.take_control()
+    other = browser.new_context().new_page()
+    other.goto(desk.fake.address)
+    expect(other.locator("#lamp-control")).to_have_text("Control: page 1")
+    other.locator("#take-control").click()
+    expect(other.locator("#dialog")).to_contain_text("page 1 has control, and loses it at once")
+    other.locator(".confirm").click()
+    expect(other.locator("#lamp-control")).to_have_text("You have control")
+    expect(desk.page.locator("#lamp-control")).to_have_text("Control: page 2")
+    other.context.close()

@@ -21,7 +21,8 @@ export class Operate {
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
     this.#page = page;
-    for (const [id, command] of [["take-control", "take_control"], ["give-control", "give_control"], ["hold", "hold"], ["resume", "resume"]])
+    at("take-control").addEventListener("click", () => this.#takeControl());
+    for (const [id, command] of [["give-control", "give_control"], ["hold", "hold"], ["resume", "resume"]])
       at(id).addEventListener("click", () => page.command(command));
     at("speed").addEventListener("input", () => {
       this.#sliding = true;
@@ -64,7 +65,7 @@ export class Operate {
     this.#motion(state);
     if (preview !== this.#preview) this.#read(preview);
     if (isActive(motion)) this.#leave();
-    at("plan-look").hidden = this.plan === null || isActive(motion);
+    at("plan-look").hidden = !(this.plan?.moments.length > 1) || isActive(motion);
     write(at("busy"), busy ? `${VERBS[busy.verb] ?? busy.verb}: ${busy.text || "…"}` : "");
     at("busy").hidden = !busy;
     if (this.#busy && !busy) this.readFiles();
@@ -98,7 +99,7 @@ export class Operate {
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
     write(at("outcome-text"), outcome.text);
-    const links = [link(outcome.report, "Report"), link(outcome.fault_page, "What this fault means")];
+    const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
     at("outcome-links").replaceChildren(...links.filter(Boolean));
   }
 
@@ -119,7 +120,7 @@ export class Operate {
 
   #showPlan() {
     const { plan } = this;
-    at("plan").hidden = at("plan-look").hidden = plan === null;
+    at("plan").hidden = plan === null;
     this.#page.scene.load(plan);
     this.#curves.show(plan, this.#page.situation().state.tension_limits_n);
     if (!plan) return;
@@ -151,6 +152,13 @@ export class Operate {
   async #confirmed(button, question) {
     const { say, situation } = this.#page;
     return ask({ ...question, say, possible: () => whyNot(button, situation()) });
+  }
+
+  async #takeControl() {
+    const holder = this.#page.situation().state.control.held_by;
+    if (holder === null) return this.#page.command("take_control");
+    const lines = [`${holder} has control, and loses it at once. Speak to who is there first.`, "It is not taken away while the robot moves."];
+    if (await this.#confirmed("take_control", { title: "Take control away?", lines, confirm: "Take control" })) this.#page.command("take_control", { force: true });
   }
 
   async #home() {

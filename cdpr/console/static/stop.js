@@ -9,8 +9,8 @@ const ANSWER_MS = 6000; // as long as an answer is shown
 const SILENT_MS = 1000; // after it the operator must know that nothing answers
 const STOPPING = "Stopping along the path";
 
-/** Binds STOP; `pressed` hears of each press before it is sent. */
-export function bindStop(connection, pressed) {
+/** Binds STOP; `pressed` hears of each press before it is sent, and `atRest()` is true while nothing is known to move. */
+export function bindStop(connection, pressed, atRest) {
   const button = at("stop"), answer = at("stop-answer");
   let presses = 0;
 
@@ -30,9 +30,10 @@ export function bindStop(connection, pressed) {
     clearTimeout(silence);
     if (press !== presses) return;
     button.classList.remove("pressed");
-    write(answer, ok ? what || "Stop requested" : what);
-    answer.classList.toggle("failed", !ok);
-    if (ok) setTimeout(() => press === presses && write(answer, ""), ANSWER_MS);
+    const harmless = ok || atRest();
+    write(answer, what || "Stop requested");
+    answer.classList.toggle("failed", !harmless);
+    if (harmless) setTimeout(() => press === presses && write(answer, ""), ANSWER_MS);
   }
 
   button.addEventListener("pointerdown", (event) => {
