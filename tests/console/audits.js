@@ -10,20 +10,20 @@
 
   /** Controls that could be used now, by mouse or keyboard. */
   usable() {
-    return this.shown("button, input, select, a, canvas, summary")
+    return this.shown("button, input, select, a, canvas[tabindex], summary")
       .filter((e) => !e.disabled && !e.closest("[inert]") && !e.getAttribute("aria-disabled"))
       .map(this.nameOf);
   },
 
   /** Controls that Tab must reach: of tabs and radio buttons one is, by arrows the others are. */
   tabbable() {
-    return this.shown("button, input, select, canvas, summary, a")
+    return this.shown("button, input, select, canvas[tabindex], summary, a")
       .filter((e) => !e.disabled && e.type !== "radio" && e.role !== "tab")
       .map(this.nameOf);
   },
 
   unnamed() {
-    return this.shown("button, input, select, canvas, [role=group], [role=tabpanel]")
+    return this.shown("button, input, select, canvas[tabindex], [role=group], [role=tabpanel]")
       .filter((e) => !["aria-label", "aria-labelledby"].some((name) => e.getAttribute(name)))
       .filter((e) => !e.labels?.length && !e.textContent.trim())
       .map((e) => e.outerHTML);

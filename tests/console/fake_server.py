@@ -252,7 +252,7 @@ class Fake:
             },
             "next_stop": self._next_stop(),
             "preview": self.plan,
-            "jog": {**jog, "speed_mm_s": self.held["speed_mm_s"] if self.held else 0.0},
+            "jog": {**jog, "speed_mm_s": 20.0},
             "poses": self.poses,
             **self.over,
         }
@@ -326,6 +326,8 @@ class Fake:
         if message["command"] == "stop":
             return self.stop()
         if message["command"] == "take_control":
+            if self.in_control not in (None, page) and not message.get("force"):
+                return False, "another page has control"
             self.in_control = page
             return True, "You have control."
         if page is not self.in_control:
@@ -337,7 +339,8 @@ class Fake:
         self.held = None
         if self.moving:
             self.wished = {**self.wished, "stop": True}
-        return True, "Stop requested." if self.moving else "Nothing is moving."
+        active = self.moving is not None or self.jog_ready
+        return active, "" if active else "nothing moves"
 
     def _obey(self, message: dict[str, Any]) -> tuple[bool, str]:
         command, index = message["command"], message.get("index", 0)
@@ -412,7 +415,8 @@ def application(fake: Fake) -> Starlette:
         return JSONResponse(preview(fake.plan)) if fake.plan else PlainTextResponse("no plan", 404)
 
     async def stop(request: Request) -> Response:
-        return JSONResponse({"what": fake.stop()[1]})
+        ok, what = fake.stop()
+        return JSONResponse({"ok": ok, "what": what})
 
     async def hooks(request: Request) -> Response:
         if request.method == "POST":

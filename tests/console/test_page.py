@@ -87,7 +87,7 @@ def test_stop_goes_by_http_when_the_socket_is_lost(desk: Visit) -> None:
     desk.page.keyboard.press(" ")
     found = desk.fake.wait(desk.page, lambda f: bool(f["stops"] == 1))
     assert found["received"] == []
-    expect(desk.page.locator("#stop-answer")).to_have_text("Stop requested.")
+    expect(desk.page.locator("#stop-answer")).to_have_text("nothing moves")
 
 
 def test_stop_that_reaches_no_one_says_so(desk: Visit) -> None:
@@ -97,6 +97,14 @@ def test_stop_that_reaches_no_one_says_so(desk: Visit) -> None:
     desk.page.locator("#stop").click()
     expect(desk.page.locator("#stop-answer")).to_contain_text("use the emergency-stop button")
     desk.errors.clear()  # the request that failed
+
+
+def test_a_stop_without_an_answer_says_so(desk: Visit) -> None:
+    """The server hangs: the socket is open, and nothing comes back."""
+    desk.page.route("**/stop", lambda route: None)
+    desk.page.evaluate("() => { WebSocket.prototype.send = () => {}; }")
+    desk.page.locator("#stop").click()
+    expect(desk.page.locator("#stop-answer")).to_contain_text("No answer to STOP for 1 s")
 
 
 def test_stop_answers_an_open_question_with_no(desk: Visit) -> None:
@@ -231,7 +239,10 @@ def test_run_asks_with_verdict_duration_and_length(desk: Visit) -> None:
     expect(desk.page.locator("#outcome-text")).to_have_text(
         "Stopped along the path by the operator."
     )
-    assert desk.page.locator("#outcome-links a").get_attribute("href") == "/report"
+    assert (
+        desk.page.locator("#outcome-links a").get_attribute("href")
+        == "/report?token=token-of-the-fake"
+    )
 
 
 def test_a_question_goes_when_its_answer_no_longer_counts(desk: Visit) -> None:
@@ -248,7 +259,7 @@ def test_a_plan_that_failed_its_check_cannot_be_run(desk: Visit) -> None:
     desk.take_control()
     desk.load("plans/colliding.json")
     expect(desk.page.locator("#plan-verdict")).to_contain_text("collides: 3.1 mm")
-    desk.page.locator("#run").click()
+    desk.page.locator("#run").click(force=True)
     expect(desk.page.locator("#notice")).to_contain_text("The plan did not pass its check")
     expect(desk.page.locator("#dialog")).to_be_hidden()
 
@@ -355,6 +366,14 @@ def test_a_code_leads_to_its_page_of_help(desk: Visit) -> None:
     pages = {path.stem for path in (ROOT / "docs" / "faults").glob("*.md")} - {"index"}
     help_ = desk.page.evaluate("async () => [...(await import('/static/events.js')).HELP]")
     assert set(help_) == pages
+    desk.take_control()
+    desk.load()
+    desk.run()
+    desk.fake.ask(set={"events": [{"time_s": 1.5, "code": "slack", "text": "cable 3"}]})
+    desk.view("events")
+    link = desk.page.get_by_role("link", name="slack")
+    assert (link.get_attribute("href") or "").startswith("/help/slack?token=")
+    assert link.get_attribute("target") == "_blank"
 
 
 def test_the_page_asks_nothing_from_outside(desk: Visit) -> None:
@@ -362,3 +381,18 @@ def test_the_page_asks_nothing_from_outside(desk: Visit) -> None:
     desk.load()
     allowed = (desk.fake.origin, desk.fake.origin.replace("http", "ws"), "data:")
     assert [url for url in desk.asked if not url.startswith(allowed)] == []
+
+
+def test_control_is_taken_from_another_page_only_after_a_question(
+    browser: Browser, desk: Visit
+) -> None:
+    desk.take_control()
+    other = browser.new_context().new_page()
+    other.goto(desk.fake.address)
+    expect(other.locator("#lamp-control")).to_have_text("Control: page 1")
+    other.locator("#take-control").click()
+    expect(other.locator("#dialog")).to_contain_text("page 1 has control, and loses it at once")
+    other.locator(".confirm").click()
+    expect(other.locator("#lamp-control")).to_have_text("You have control")
+    expect(desk.page.locator("#lamp-control")).to_have_text("Control: page 2")
+    other.context.close()

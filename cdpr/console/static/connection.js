@@ -1,7 +1,8 @@
 /* The connection to the server and the age of what it sent, by the page's own monotonic clock.
 
 Nothing is kept for later: a message that cannot be sent now is never sent. After a reconnection nothing goes on
-by itself. Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed". */
+by itself. Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed", "refused" (a
+message that the server did not understand; `detail` says why). */
 
 export const STALE_S = 0.5;
 const TICK_MS = 50, ANSWER_MS = 5000, RECONNECT_MS = [250, 500, 1000, 2000];
@@ -71,13 +72,13 @@ export class Connection extends EventTarget {
     });
   }
 
-  /** Asks for a stop along the path by every route that is there; true when one of them took it. */
+  /** Asks for a stop along the path by every route that is there; the first good answer, or else why not. */
   async stop() {
     const routes = [];
     if (this.open) routes.push(this.command("stop"));
     if (!this.open || this.freshness().why) routes.push(posted("/stop"));
-    const answers = await Promise.all(routes);
-    return answers.find((answer) => answer.ok) ?? answers[0];
+    const done = routes.map((route) => route.then((answer) => (answer.ok ? answer : Promise.reject(answer))));
+    return Promise.any(done).catch(({ errors }) => errors[0]);
   }
 
   #connect() {
@@ -97,7 +98,12 @@ export class Connection extends EventTarget {
   }
 
   #take(message) {
-    if (message.kind === "answer") return this.#answers.get(message.to)?.(message);
+    if (message.kind === "answer") {
+      const give = this.#answers.get(message.to);
+      if (give) give(message);
+      else if (!message.ok) this.dispatchEvent(new CustomEvent("refused", { detail: message.what }));
+      return;
+    }
     if (message.kind !== "state") return;
     this.state = message;
     this.#received = performance.now();
@@ -115,7 +121,7 @@ export class Connection extends EventTarget {
 async function posted(path) {
   try {
     const response = await fetch(path, { method: "POST", keepalive: true, cache: "no-store" });
-    return { ok: response.ok, what: response.ok ? "Stop requested." : `The server refused the stop (${response.status}).` };
+    return response.ok ? await response.json() : { ok: false, what: `The server refused the stop (${response.status}).` };
   } catch {
     return { ok: false, what: "STOP did not reach the server: use the emergency-stop button." };
   }

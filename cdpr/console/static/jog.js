@@ -51,11 +51,13 @@ export function bindJog(connection, situation, command) {
   return {
     end: (why) => hold.end(why),
     show: ({ jog, platform, clearance_mm: clearance }) => {
-      const here = ["x", "y", "z"].map((axis, k) => `${axis} ${known(platform?.position_mm[k], 1)}`).join("  ");
-      write(at("jog-here"), `${here} mm · clearance ${known(clearance?.now, 0, "mm")}`);
+      const here = ["x", "y", "z"].map((axis, k) => `${axis}\u00a0${known(platform?.position_mm[k], 1)}`).join("  ");
+      write(at("jog-here"), `${here}\u00a0mm · clearance ${known(clearance?.now, 0, "mm")}`);
       pad.classList.toggle("ready", jog.ready);
-      const text = jog.ready ? (jog.moving ? `Moving${jog.speed_mm_s ? ` at ${known(jog.speed_mm_s, 1, "mm/s")}` : ""}` : "Ready: hold a button to move") : jog.why_not || "The drives are not enabled for jogging";
+      const text = jog.ready ? (jog.moving ? "Moving" : "Ready: hold a button to move") : jog.why_not || "The drives are not enabled for jogging";
       write(at("jog-state"), text);
+      if (jog.speed_mm_s) mark(at("jog-speed"), "max", String(jog.speed_mm_s)); // the fastest that it may be
+      showSpeed();
       write(at("jog-limit"), jog.limit ?? "");
       at("jog-limit").hidden = !jog.limit;
     },

@@ -23,11 +23,11 @@ const STATES = {
 
 /** What moves, in a few words. */
 export function motionText({ motion, busy, jog, latched }) {
+  if (jog.ready) return jog.moving ? "Jogging" : "Ready to jog";
   if (motion) {
     const share = motion.path_length_mm ? ` · ${Math.round((100 * motion.path_mm) / motion.path_length_mm)} %` : "";
     return (STATES[motion.state] ?? motion.state) + (isActive(motion) ? share : "");
   }
-  if (jog.ready) return jog.moving ? "Jogging" : "Ready to jog";
   if (busy) return `Busy: ${busy.verb}`;
   return latched === null ? "At rest" : "Fault latched";
 }
@@ -103,5 +103,7 @@ export class Live {
 }
 
 function tile(name, text) {
-  write(at(`value-${name}`), text);
+  const value = at(`value-${name}`);
+  write(value, text);
+  value.closest("dd").classList.toggle("unknown", text === "–");
 }

@@ -1,6 +1,6 @@
 /* The console's page: puts its parts together, and shows each state to all of them. */
 
-import { applyButtons, guardButtons } from "./buttons.js";
+import { applyButtons, guardButtons, isActive } from "./buttons.js";
 import { Connection } from "./connection.js";
 import { Curves } from "./curves.js";
 import { cancelDialog, checkDialog } from "./dialog.js";
@@ -38,6 +38,9 @@ const page = { command, situation, say, scene };
 const stopBar = bindStop(connection, () => {
   cancelDialog();
   jog.end("STOP");
+}, () => {
+  const { state, stale } = situation();
+  return !stale && !state.jog.ready && !isActive(state.motion);
 });
 const live = new Live(), curves = new Curves(), events = new Events(), teach = new Teach(page), operate = new Operate(page);
 const jog = bindJog(connection, situation, command);
@@ -77,6 +80,7 @@ function showAge() {
   document.body.classList.toggle("stale", why !== null);
   at("stale").hidden = why === null;
   if (why) write(at("stale-text"), why);
+  at("stale-hint").hidden = connection.open;
   // Not its age: that would be read out twenty times a second.
   write(at("stale-said"), why ? "Figures are not current. Only STOP works." : "");
   write(at("lamp-data"), age === null ? "No data" : `Data ${known(age, 1)}\u00a0s old`);
@@ -88,6 +92,7 @@ function showAge() {
 }
 
 let waiting = false;
+connection.addEventListener("refused", ({ detail }) => say(detail, true));
 connection.addEventListener("age", showAge);
 connection.addEventListener("state", () => {
   if (waiting) return;

@@ -16,14 +16,22 @@ export class Operate {
   #curves = new PlanCurves();
   #outcome = "";
   #busy = null;
+  #sliding = false; // the speed is being chosen: what the run says must not move it
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
     this.#page = page;
-    for (const [id, command] of [["take-control", "take_control"], ["give-control", "give_control"], ["hold", "hold"], ["resume", "resume"]])
+    at("take-control").addEventListener("click", () => this.#takeControl());
+    for (const [id, command] of [["give-control", "give_control"], ["hold", "hold"], ["resume", "resume"]])
       at(id).addEventListener("click", () => page.command(command));
-    at("speed").addEventListener("input", () => write(at("speed-shown"), `${at("speed").value} %`));
-    at("speed").addEventListener("change", () => page.command("speed", { percent: Number(at("speed").value) }));
+    at("speed").addEventListener("input", () => {
+      this.#sliding = true;
+      write(at("speed-shown"), `${at("speed").value} %`);
+    });
+    at("speed").addEventListener("change", async () => {
+      await page.command("speed", { percent: Number(at("speed").value) });
+      this.#sliding = false;
+    });
     at("home").addEventListener("click", () => this.#home());
     at("reset").addEventListener("click", () => this.#reset());
     at("release").addEventListener("click", () => this.#release());
@@ -57,6 +65,7 @@ export class Operate {
     this.#motion(state);
     if (preview !== this.#preview) this.#read(preview);
     if (isActive(motion)) this.#leave();
+    at("plan-look").hidden = !(this.plan?.moments.length > 1) || isActive(motion);
     write(at("busy"), busy ? `${VERBS[busy.verb] ?? busy.verb}: ${busy.text || "…"}` : "");
     at("busy").hidden = !busy;
     if (this.#busy && !busy) this.readFiles();
@@ -75,7 +84,7 @@ export class Operate {
     } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
-    if (asked !== undefined && document.activeElement !== at("speed")) {
+    if (asked !== undefined && !this.#sliding) {
       at("speed").value = asked;
       write(at("speed-shown"), `${Math.round(asked)} %`);
     }
@@ -90,7 +99,7 @@ export class Operate {
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
     write(at("outcome-text"), outcome.text);
-    const links = [link(outcome.report, "Report"), link(outcome.fault_page, "What this fault means")];
+    const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
     at("outcome-links").replaceChildren(...links.filter(Boolean));
   }
 
@@ -145,6 +154,13 @@ export class Operate {
     return ask({ ...question, say, possible: () => whyNot(button, situation()) });
   }
 
+  async #takeControl() {
+    const holder = this.#page.situation().state.control.held_by;
+    if (holder === null) return this.#page.command("take_control");
+    const lines = [`${holder} has control, and loses it at once. Speak to who is there first.`, "It is not taken away while the robot moves."];
+    if (await this.#confirmed("take_control", { title: "Take control away?", lines, confirm: "Take control" })) this.#page.command("take_control", { force: true });
+  }
+
   async #home() {
     const lines = ["All winches wind in slowly until every cable is taut; the platform may move a little.", "The present homing reference is given up first."];
     if (await this.#confirmed("home", { title: "Home the drives?", lines, confirm: "Home: winches move" })) this.#page.command("home");
@@ -157,11 +173,12 @@ export class Operate {
   }
 
   async #release() {
-    const { platform } = this.#page.situation().state;
+    const { platform, tensions_n: tensions } = this.#page.situation().state;
+    const load = tensions ? ` The tightest cable carries ${known(Math.max(...tensions), 0, "N")}.` : "";
     const height = platform ? ` It is at z = ${known(platform.position_mm[2], 0, "mm")} now.` : " Its position is not known.";
     const lines = [
       make("p", { class: "cause" }, "The platform drops unless it stands on a support or every winch has a brake."),
-      `Brakes close, then all drives lose their torque together.${height}`,
+      `Brakes close, then all drives lose their torque together.${height}${load}`,
       "Winches without brakes let their cables go, and the drives have to be homed again.",
     ];
     if (await this.#confirmed("release", { title: "Take the torque off all drives?", lines, confirm: "Supported: release" })) this.#page.command("release");

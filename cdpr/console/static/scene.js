@@ -16,6 +16,7 @@ export class Scene {
   #base = null;
   #plan = null;
   #trail = [];
+  #shown = "";
   #moment = null; // of the plan, while it is looked through
   #hidden = new Set(HIDDEN_AT_FIRST);
 
@@ -32,11 +33,13 @@ export class Scene {
   }
 
   /** The platform where it is now; a plan that is looked through is left for it as soon as something moves. */
-  show({ platform, tensions_n: tensions, tension_limits_n: limits, motion }) {
+  show({ platform, tensions_n: tensions, tension_limits_n: limits, motion, jog }) {
     if (!this.#view) return;
-    if (motion && platform?.source === "drives") this.#drive(platform.position_mm);
+    if ((motion || jog.moving) && platform?.source === "drives") this.#drive(platform.position_mm);
     if (this.#moment) return;
-    this.#view.show(platform && { p: platform.position_mm, r: platform.rotation, exits: platform.exits_mm, tensions });
+    const shown = JSON.stringify([platform, tensions?.map((tension) => Math.round(2 * tension))]);
+    if (shown !== this.#shown) this.#view.show(platform && { p: platform.position_mm, r: platform.rotation, exits: platform.exits_mm, tensions });
+    this.#shown = shown; // at rest nothing is drawn again
     if (limits.join() !== this.#base.tension_limits?.join()) {
       this.#base.tension_limits = limits;
       this.#draw();
@@ -46,7 +49,7 @@ export class Scene {
   /** A loaded plan, or null: what it draws takes the place of the rig's own layers of the same names. */
   load(plan) {
     this.#plan = plan;
-    this.#moment = null;
+    this.look(null);
     if (!this.#view) return;
     this.#draw();
     this.#layers();
@@ -55,6 +58,7 @@ export class Scene {
   /** A moment of the plan, shown instead of the platform; null goes back to it. */
   look(moment) {
     this.#moment = moment;
+    this.#shown = "";
     at("scene-preview").hidden = moment === null;
     if (moment) {
       write(at("scene-preview-text"), `Plan at ${duration(moment.t)}: ${moment.p.map((v) => known(v, 0)).join(", ")} mm`);

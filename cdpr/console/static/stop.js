@@ -6,24 +6,34 @@ page does. It is an operational stop in black, which IEC 60204-1 prefers for one
 import { at, isTextField, write } from "./elements.js";
 
 const ANSWER_MS = 6000; // as long as an answer is shown
+const SILENT_MS = 1000; // after it the operator must know that nothing answers
 const STOPPING = "Stopping along the path";
 
-/** Binds STOP; `pressed` hears of each press before it is sent. */
-export function bindStop(connection, pressed) {
+/** Binds STOP; `pressed` hears of each press before it is sent, and `atRest()` is true while nothing is known to move. */
+export function bindStop(connection, pressed, atRest) {
   const button = at("stop"), answer = at("stop-answer");
   let presses = 0;
+
+  function fail(text) {
+    write(answer, text);
+    answer.classList.add("failed");
+  }
 
   async function stop() {
     const press = ++presses;
     pressed();
     button.classList.add("pressed");
     write(answer, "STOP sent");
+    answer.classList.remove("failed");
+    const silence = setTimeout(() => press === presses && fail(`No answer to STOP for ${SILENT_MS / 1000} s: use the emergency-stop button.`), SILENT_MS);
     const { ok, what } = await connection.stop();
+    clearTimeout(silence);
     if (press !== presses) return;
     button.classList.remove("pressed");
-    write(answer, ok ? what || "Stop requested" : what);
-    answer.classList.toggle("failed", !ok);
-    if (ok) setTimeout(() => press === presses && write(answer, ""), ANSWER_MS);
+    const harmless = ok || atRest();
+    write(answer, what || "Stop requested");
+    answer.classList.toggle("failed", !harmless);
+    if (harmless) setTimeout(() => press === presses && write(answer, ""), ANSWER_MS);
   }
 
   button.addEventListener("pointerdown", (event) => {

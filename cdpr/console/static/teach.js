@@ -14,7 +14,7 @@ export class Teach {
       at("teach").click();
     });
     at("teach").addEventListener("click", async () => {
-      const name = at("teach-name").value.trim() || `pose ${at("poses").children.length + 1}`;
+      const name = at("teach-name").value.trim() || this.#freeName();
       const { ok } = await page.command("teach", { name });
       if (ok) at("teach-name").value = "";
     });
@@ -31,6 +31,11 @@ export class Teach {
     const focused = document.activeElement?.dataset?.key;
     at("poses").replaceChildren(...poses.map((pose, k) => this.#row(pose, k, poses.length)));
     if (focused) at("poses").querySelector(`[data-key="${focused}"]`)?.focus();
+  }
+
+  #freeName() {
+    const taken = JSON.parse(this.#shown || "[]").map((pose) => pose.name);
+    return taken.concat("").map((_, k) => `pose ${k + 1}`).find((name) => !taken.includes(name));
   }
 
   #row({ name, position_mm: position }, index, count) {
