@@ -119,7 +119,7 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
 
 
 def raise_unless_finished(stand: WinchesStand, supervisor: Supervisor, rig: Rig) -> None:
-    """Tells how a motion ended, where it did not come to its end.
+    """Raises what a motion ended with, where it did not finish.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.

@@ -24,7 +24,7 @@ class PageControl:
         """The page that has control."""
 
     def join(self, name: str) -> int:
-        """A page was opened; its number. The name tells it from others for people."""
+        """A page was opened; its number. People know it by the name."""
         number, self._next_page = self._next_page, self._next_page + 1
         self._pages[number] = _Page(name)
         return number

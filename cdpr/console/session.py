@@ -1,4 +1,4 @@
-"""What the console knows and does, whoever looks at it; no web server in here."""
+"""What the console knows and does for all of its pages; no web server in here."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ConsoleFiles:
         rig_file: As it is given to verbs.
         rig: The robot and its bus.
         bus_options: Options of the command line for that bus.
-        scene_file: What is around; None where nobody said.
+        scene_file: What is around; None where it was not given.
         without_real_time: Verbs move even where real-time scheduling is denied.
         read_only: Nothing but STOP.
     """

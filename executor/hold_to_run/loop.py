@@ -181,7 +181,7 @@ class JogMotion:
         require_still_referenced(drives.rig, self.reference, restarted, positions)
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `MotionTask`; nobody looks at the simulated platform."""
+        """See `MotionTask`; the simulated platform is not looked at."""
         return None
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """Which press of a jog control is held. One that ended is over for good, whatever arrives later.
 
-Every press has a number, which rises. Whoever holds a control says so again and again; a press of
-which nothing is heard for `TIMEOUT` has ended. Both processes judge by the same rule, each for
+Every press has a number, which rises. A held control is reported again and again; a press of which
+nothing is heard for `TIMEOUT` has ended. Both processes judge by the same rule, each for
 itself: the one that hears the operator and the one that moves the drives.
 """
 
@@ -25,7 +25,7 @@ _SIZE = _ENTRY.size + _CHECK.size
 
 
 class PressRule:
-    """Tells held presses from those that are over; a clock that jumps back ends one, too."""
+    """Separates held presses from those that are over; a clock that jumps back ends one, too."""
 
     def __init__(self) -> None:
         """No press has been seen."""
@@ -50,7 +50,7 @@ class PressRule:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What the loop is told.
+    """What the loop is given.
 
     Attributes:
         press: Number of the press that is held; 0 for none.

@@ -47,6 +47,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "simulation/factory.py",
     },
     "an extra may not be installed": {
+        "cdpr/cli/operate/console.py",
         "drivers/odrive/dbc.py",
         "planner/parallel.py",
         "tracking/detection/libraries.py",
