@@ -1,0 +1,132 @@
+"""Jogging by hold-to-run in real time over UDP: from a press to the first set-point, and to rest.
+
+    python benchmarks/jog_latency.py [--presses 60] [--scene configs/environment_1.yaml]
+
+Presses go by turns along both directions of each axis, held for 0.6 s. Measured on the loop's clock
+are the time from the first word of a press to the first cycle that sends other targets, and from
+the release to the last one, which includes the ramp from 20 mm/s. Not a test: it takes minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from executor.hold_to_run.presses import PressBoard  # noqa: E402
+from executor.hold_to_run.session import jog_session  # noqa: E402
+from executor.state_machine import CycleRecord, State  # noqa: E402
+from model.rig import Rig, load_rig  # noqa: E402
+from model.scene import load_scene  # noqa: E402
+from tests.cli.plans import RIG  # noqa: E402
+
+HELD, PAUSE, SAID = 0.6, 0.9, 0.05
+CHANNEL = "239.74.163.91"
+
+
+@dataclass
+class Operator:
+    """Holds a control by turns, in a thread of its own, and keeps when."""
+
+    presses: int
+    spans: list[tuple[float, float]] = field(default_factory=list)
+    moved: list[float] = field(default_factory=list)
+    _last: tuple[int, ...] = ()
+    _thread: threading.Thread | None = None
+
+    def on_cycle(self, record: CycleRecord, board: PressBoard) -> None:
+        """Begins when the drives are ready; keeps the times of cycles with other targets."""
+        if record.state is not State.MOVING:
+            return
+        if self._last and record.targets != self._last:
+            self.moved.append(record.at)
+        self._last = record.targets
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._hold, args=(board,))
+            self._thread.start()
+
+    def _hold(self, board: PressBoard) -> None:
+        time.sleep(1.0)
+        for number in range(1, self.presses + 1):
+            direction = np.zeros(3)
+            direction[(number - 1) // 2 % 3] = 1.0 if number % 2 else -1.0
+            began = time.monotonic()
+            while time.monotonic() < began + HELD:
+                board.hold(number, direction, in_platform=False, step=None, percent=100)
+                time.sleep(SAID)
+            ended = time.monotonic()
+            board.let_go(number)
+            self.spans.append((began, ended))
+            time.sleep(PAUSE)
+        board.end()
+
+
+@contextmanager
+def drives() -> Iterator[None]:
+    """Simulated drives in a process of their own."""
+    verb = "from cdpr.cli import main; main()"
+    bus = ["--interface", "udp_multicast", "--channel", CHANNEL]
+    process = subprocess.Popen(
+        [sys.executable, "-c", verb, "sim", str(RIG), *bus],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait()
+
+
+def main() -> int:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--presses", type=int, default=60)
+    parser.add_argument("--scene", type=Path, default=ROOT / "configs" / "environment_1.yaml")
+    options = parser.parse_args()
+    rig: Rig = load_rig(RIG).with_bus("udp_multicast", CHANNEL)
+    operator = Operator(options.presses)
+    with tempfile.TemporaryDirectory() as place:
+        os.environ["XDG_STATE_HOME"] = place
+        os.chdir(place)
+        with drives():
+            jog_session(
+                rig,
+                load_scene(options.scene),
+                need_real_time_rights=False,
+                on_cycle=operator.on_cycle,
+            )
+    moved = np.array(operator.moved)
+    first, rest, lost = [], [], 0
+    for began, ended in operator.spans:
+        mine = moved[(moved > began) & (moved < ended + PAUSE)]
+        if not len(mine):
+            lost += 1
+            continue
+        first.append(1e3 * (mine[0] - began))
+        rest.append(1e3 * (mine[-1] - ended))
+    for name, values in (("press to first set-point", first), ("release to rest", rest)):
+        p50, p90, most = np.percentile(values, (50, 90, 100))
+        print(f"{name:26} median {p50:6.1f}  p90 {p90:6.1f}  most {most:6.1f} ms")
+    print(f"{len(operator.spans)} presses, {lost} without a motion")
+    return 1 if lost else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
