@@ -45,6 +45,7 @@ class Operator:
     presses: int
     spans: list[tuple[float, float]] = field(default_factory=list)
     moved: list[float] = field(default_factory=list)
+    silent: int = 0
     _last: tuple[int, ...] = ()
     _thread: threading.Thread | None = None
 
@@ -66,7 +67,8 @@ class Operator:
             direction[(number - 1) // 2 % 3] = 1.0 if number % 2 else -1.0
             began = time.monotonic()
             while time.monotonic() < began + HELD:
-                board.hold(number, direction, in_platform=False, step=None, percent=100)
+                taken = board.hold(number, direction, in_platform=False, step=None, percent=100)
+                self.silent += not taken
                 time.sleep(SAID)
             ended = time.monotonic()
             board.let_go(number)
@@ -124,7 +126,8 @@ def main() -> int:
     for name, values in (("press to first set-point", first), ("release to rest", rest)):
         p50, p90, most = np.percentile(values, (50, 90, 100))
         print(f"{name:26} median {p50:6.1f}  p90 {p90:6.1f}  most {most:6.1f} ms")
-    print(f"{len(operator.spans)} presses, {lost} without a motion")
+    print(f"{len(operator.spans)} presses, {lost} without a motion;", end=" ")
+    print(f"{operator.silent} words came too late to be taken")
     return 1 if lost else 0
 
 

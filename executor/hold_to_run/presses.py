@@ -72,14 +72,14 @@ class Press:
         direction: Unit vector, shape (3,).
         in_platform: It is given in the platform frame, otherwise in the world frame.
         step: Length after which the jog ends by itself, [m]; None as long as it is held.
-        since: When it was first heard of, [s].
+        free_since: From when on no earlier press was held, [s].
     """
 
     number: int
     direction: Array
     in_platform: bool
     step: float | None
-    since: float
+    free_since: float
 
 
 class PressBoard:
@@ -95,6 +95,7 @@ class PressBoard:
         self._now, self._rule, self._lock = now, PressRule(), threading.Lock()
         self._press: Press | None = None
         self._heard, self._percent, self._ends = math.nan, 100, False
+        self._free_since = -math.inf
         self.last_heard = now()
         """When anything was last said of a press, [s]."""
         self._write()
@@ -119,7 +120,8 @@ class PressBoard:
                     self._let_go()
                 return False
             if not known:
-                self._press = Press(number, direction, in_platform, step, now)
+                self._end_press(now)
+                self._press = Press(number, direction, in_platform, step, self._free_since)
             self._heard, self._percent, self.last_heard = now, percent, now
             self._write()
             return True
@@ -150,8 +152,14 @@ class PressBoard:
         self.memory.close()
 
     def _let_go(self) -> None:
-        self._heard = math.nan
+        self._end_press(self._now())
         self._write()
+
+    def _end_press(self, now: float) -> None:
+        """No press is held from now on; one that fell silent ended before."""
+        if not math.isnan(self._heard):
+            self._free_since = min(now, self._heard + TIMEOUT)
+        self._heard = math.nan
 
     def _write(self) -> None:
         number = 0 if self._press is None else self._press.number

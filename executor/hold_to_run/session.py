@@ -52,7 +52,7 @@ from model.winches import WinchMap
 
 #: Rows are proved ahead for so long beyond the way to rest, [s].
 AHEAD = 0.4
-#: Cycles after the begin of a press until what the loop reports is certainly not of an earlier one.
+#: Cycles after the end of a press until what the loop reports is certainly not of it any more.
 CERTAIN = 2.0
 #: A session in which nothing is held for so long ends by itself, [s]: cables relax.
 IDLE = 300.0
@@ -118,7 +118,7 @@ class JogProver:
         if press.number != self._press:
             rests = record.rate == 0.0 or record.index >= self._line.rows - 1
             # What this cycle did was decided up to a cycle before it began.
-            if rests and record.at - press.since > CERTAIN * self._cycle:
+            if rests and record.at - press.free_since > CERTAIN * self._cycle:
                 self._row = record.index
                 self._begin(press)
         elif not self._is_whole and self._line.rows - 1 - record.index < self._wanted_rows:

@@ -137,3 +137,22 @@ def test_nothing_is_held_at_first(board: PressBoard) -> None:
     board.let_go(3)
     assert not hold(board, 3), "what was let go before it was held is over"
     assert math.isnan(board._heard)
+
+
+def test_a_press_knows_since_when_no_earlier_one_was_held(board: PressBoard, time: Time) -> None:
+    def free_since(number: int) -> float:
+        hold(board, number)
+        press = board.held()
+        assert press is not None
+        return press.free_since
+
+    assert free_since(1) == -math.inf
+    time.now += 0.1
+    assert free_since(2) == time.now, "the first was held until now"
+    board.let_go(2)
+    ended = time.now
+    time.now += 3.0
+    assert free_since(3) == ended
+    heard = time.now
+    time.now += 3.0
+    assert free_since(4) == pytest.approx(heard + TIMEOUT), "it fell silent"
