@@ -1,0 +1,205 @@
+"""The console with simulated drives on a bus: jog, teach, plan, run, hold, go on, stop.
+
+What is waited for are states of the console, 20 a second: no test here counts seconds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from executor.remote.client import stop_runs
+from executor.remote.registry import find_runs
+from tests.cli.plans import CONFIGS
+from tests.scenarios.test_processes import program
+
+pytestmark = pytest.mark.slow
+
+#: States until something must have happened.
+PATIENCE = 1500
+
+
+class Operator:
+    """Somebody at the page, without a page."""
+
+    def __init__(self, page: ClientConnection) -> None:
+        self._page, self._press = page, 0
+        self.state: dict[str, Any] = {}
+
+    def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        """The first state in which something holds."""
+        for _ in range(PATIENCE):
+            message = json.loads(self._page.recv(timeout=60))
+            if message["kind"] == "state":
+                self.state = message
+                if holds(message):
+                    return self.state
+        raise AssertionError(f"it did not happen: {self.state}")
+
+    def command(self, name: str, **values: Any) -> dict[str, Any]:
+        """What the console answers."""
+        self._page.send(json.dumps({"kind": "command", "id": 1, "command": name, **values}))
+        while True:
+            message = json.loads(self._page.recv(timeout=60))
+            if message["kind"] == "answer":
+                assert isinstance(message, dict)
+                return message
+
+    def does(self, name: str, **values: Any) -> dict[str, Any]:
+        """Starts a verb and waits for its end."""
+        assert self.command(name, **values)["ok"]
+        self.until(lambda state: state["busy"] is not None or state["outcome"] is not None)
+        return self.until(lambda state: state["busy"] is None)["outcome"]
+
+    def jog(self, axis: int, way_mm: float) -> None:
+        """Holds a control until the platform has gone so far; anew where the press ended."""
+        begin = self.until(lambda state: state["platform"])["platform"]["position_mm"][axis]
+        direction = [0.0, 0.0, 0.0]
+        direction[axis] = 1.0 if way_mm > 0.0 else -1.0
+        tries = iter(range(PATIENCE))
+
+        def gone(state: dict[str, Any]) -> bool:
+            if next(tries) % 40 == 0:
+                self._press += 1
+            self.held(direction)
+            way = state["platform"]["position_mm"][axis] - begin
+            return bool(way / way_mm >= 1.0)
+
+        self.until(gone)
+        self._page.send(json.dumps({"kind": "let_go", "hold": self._press}))
+        self.until(lambda state: not state["jog"]["moving"])
+
+    def held(self, direction: list[float]) -> None:
+        """One word of a press."""
+        word = {"kind": "held", "hold": self._press, "direction": direction, "frame": "world"}
+        word |= {"step_mm": None, "speed_mm_s": 20.0, "seq": 1}
+        self._page.send(json.dumps(word))
+
+
+@contextmanager
+def console(rig: Path, bus: tuple[str, ...]) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The program, and the address that it prints."""
+    scene = CONFIGS / "environment_1.yaml"
+    options = ("--scene", scene, *bus, "--port", "0", "--without-real-time")
+    with program("console", rig, *options) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert "http://" in line, process.communicate()
+        yield process, "http://" + line.split("http://")[1].strip()
+
+
+@contextmanager
+def operator(address: str) -> Iterator[Operator]:
+    host, _, token = address.removeprefix("http://").partition("/?token=")
+    with connect(f"ws://{host}/ws?token={token}", origin=f"http://{host}") as page:  # type: ignore[arg-type]
+        found = Operator(page)
+        found.until(lambda _: True)
+        assert found.command("take_control")["ok"]
+        yield found
+
+
+@pytest.fixture
+def bus(slow_rig: Path) -> Iterator[tuple[str, ...]]:
+    """Of simulated drives in a process of their own."""
+    channel = f"239.74.163.22:{40000 + os.getpid() % 20000}"
+    options = ("--interface", "udp_multicast", "--channel", channel)
+    with program("sim", slow_rig, *options) as drives:
+        assert drives.stdout is not None
+        assert "8 simulated drives" in drives.stdout.readline()
+        yield options
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_taught_path_is_planned_run_held_continued_and_stopped(
+    slow_rig: Path, bus: tuple[str, ...], place: Path
+) -> None:
+    with console(slow_rig, bus) as (process, address), operator(address) as me:
+        assert me.command("jog_begin")["ok"]
+        me.until(lambda state: state["jog"]["ready"])
+        assert me.command("teach", name="low")["ok"]
+        me.jog(2, 12.0)
+        assert me.command("teach", name="high")["ok"]
+        me.jog(0, 12.0)
+        assert me.command("teach", name="beside")["ok"]
+        assert me.command("jog_end")["ok"]
+        ended = me.until(lambda state: state["busy"] is None)["outcome"]
+        assert ended["ok"], ended["text"]
+        assert [pose["name"] for pose in me.state["poses"]] == ["low", "high", "beside"]
+        assert me.command("move", index=2, to=0)["ok"]
+
+        planned = me.does("plan")
+        assert planned["ok"], planned["text"]
+        assert me.command("load_plan", file="console/taught.plan.json")["ok"]
+        assert me.command("run")["ok"]
+        me.until(lambda state: state["motion"] and state["motion"]["state"] == "moving")
+        assert me.command("hold")["ok"]
+        held = me.until(lambda state: state["motion"] and state["motion"]["feed_percent"] == 0.0)
+        assert held["motion"]["state"] == "holding"
+        assert held["motion"]["next_stop"]["name"] in ("low", "goal")
+        assert me.command("resume")["ok"]
+        me.until(lambda state: state["motion"] and state["motion"]["feed_percent"] > 50.0)
+        stop = urllib.request.Request(f"{address.split('/?')[0]}/stop", method="POST")
+        with urllib.request.urlopen(stop, timeout=30) as answer:
+            assert json.load(answer) == {"ok": True, "what": ""}
+        ended = me.until(lambda state: state["outcome"] and state["busy"] is None)["outcome"]
+        assert not ended["ok"]
+        assert "STOPPED" in ended["text"]
+        assert ended["report"].startswith("/runs/")
+        assert process.poll() is None
+    assert list((place / "runs").glob("*/report.html"))
+
+
+def test_what_moves_goes_on_without_the_console_but_no_press_does(
+    slow_rig: Path, bus: tuple[str, ...], place: Path
+) -> None:
+    with console(slow_rig, bus) as (process, address), operator(address) as me:
+        assert me.command("jog_begin")["ok"]
+        me.until(lambda state: state["jog"]["ready"])
+        me.jog(2, 2.0)
+        me._press += 1
+        me.until(lambda state: me.held([1.0, 0.0, 0.0]) or state["jog"]["moving"])
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        with find_runs() as runs:
+            assert len(runs) == 1, "the session is there all the same"
+        # Its record is whole when the session has ended; nothing moves in its last cycles.
+        assert stop_runs().stopped
+        rows: list[str] = []
+        record = place / "runs" / "jog-session"
+        while find_any():
+            pass
+        rows = (record / "winches.csv").read_text().splitlines()
+        events = (record / "events.jsonl").read_text()
+        assert '"code": "held"' in events
+        targets = [row.split(",")[3:11] for row in rows[-10:]]
+        assert all(target == targets[0] for target in targets)
+
+
+def find_any() -> bool:
+    """Whether a motion is under way; each look waits for the answer of the system."""
+    with find_runs() as runs:
+        return bool(runs)
+
+
+def test_a_stop_that_nobody_needs_says_so(
+    slow_rig: Path, bus: tuple[str, ...], place: Path
+) -> None:
+    with console(slow_rig, bus) as (_, address), operator(address) as me:
+        assert me.command("stop")["what"] == "nothing moves"
+        assert "nothing moves" in me.command("hold")["what"]
+        assert "plan" in me.command("run")["what"]
