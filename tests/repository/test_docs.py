@@ -125,3 +125,16 @@ def test_every_key_of_a_file_is_documented(
     words = set(re.findall(r"\w+", (ROOT / "docs" / page).read_text()))
     assert len(keys(model)) > 8
     assert not keys(model) - elsewhere - words
+
+
+OURS = re.compile(
+    r"\b(?:tests|benchmarks|tools|examples|executor|planner|model)/[\w/]+\.(?:py|js)\b"
+)
+
+
+@pytest.mark.parametrize(
+    "page", ["README.md", "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")], ids=str
+)
+def test_every_file_that_a_page_names_is_there(page: str | Path) -> None:
+    named = set(OURS.findall((ROOT / page).read_text("utf-8")))
+    assert sorted(name for name in named if not (ROOT / name).exists()) == []
