@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 
@@ -16,17 +17,23 @@ class _Page:
 class PageControl:
     """Everybody may look and stop; one page at a time may operate."""
 
-    def __init__(self) -> None:
-        """No page is open."""
+    def __init__(self, now_ms: Callable[[], int]) -> None:
+        """No page is open.
+
+        Args:
+            now_ms: A clock that all consoles of this computer share, [ms]: presses are numbered by
+                it, so that no console goes on with the press of another, or of one before it.
+        """
         self._pages: dict[int, _Page] = {}
-        self._next_page, self._next_press = 1, 1
+        self._now_ms = now_ms
+        self._next_page, self._last_press = 1, 0
         self.holder: int | None = None
         """The page that has control."""
 
-    def join(self, name: str) -> int:
-        """A page was opened; its number. People know it by the name."""
+    def join(self, host: str) -> int:
+        """A page was opened on a computer; its number."""
         number, self._next_page = self._next_page, self._next_page + 1
-        self._pages[number] = _Page(name)
+        self._pages[number] = _Page(f"page {number} on {host}")
         return number
 
     def leave(self, page: int) -> int | None:
@@ -77,8 +84,8 @@ class PageControl:
         if self.holder != page or hold <= mine.over or hold < mine.hold:
             return None
         if hold > mine.hold:
-            mine.hold, mine.press = hold, self._next_press
-            self._next_press += 1
+            self._last_press = max(self._last_press + 1, self._now_ms())
+            mine.hold, mine.press = hold, self._last_press
         return mine.press
 
     def let_go(self, page: int, hold: int | None = None) -> int | None:

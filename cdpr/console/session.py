@@ -84,14 +84,14 @@ class Console:
         self.scene: Scene | None = (
             None if files.scene_file is None else load_scene(files.scene_file)
         )
-        self.control, self.verbs = PageControl(), StartedVerb()
+        self.control, self.verbs = PageControl(_milliseconds), StartedVerb()
         self.watch = RunWatch(
             f"{files.rig.document.bus.interface} {files.rig.document.bus.channel}".strip()
         )
         self.view = RobotView(files.rig, self.scene)
         self.poses = TaughtPoses(MADE / "poses.json")
         self.preview: dict[str, Any] | None = None
-        self._lock = threading.RLock()
+        self._control_lock, self._one_at_a_time = threading.Lock(), threading.Lock()
         self._line = ""
         self._robot: RobotNow | None = None
         self._kept_at, self._kept = float("-inf"), _Kept(None, False, None)
@@ -101,13 +101,12 @@ class Console:
     def look(self) -> dict[str, Any]:
         """The state of all that every page shows alike; call it about 20 times a second."""
         look = self.watch.look()
-        with self._lock:
-            self._line = self.verbs.look()
-            if look.status is not None:
-                seen = self.view.take(look.status)
-                self._robot = seen or self._robot
-            self._read_kept()
-            return self._state(look.status, time.monotonic() - look.at)
+        self._line = self.verbs.look()
+        if look.status is not None:
+            seen = self.view.take(look.status)
+            self._robot = seen or self._robot
+        self._read_kept()
+        return self._state(look.status, time.monotonic() - look.at)
 
     def _state(self, status: dict[str, Any] | None, age: float) -> dict[str, Any]:
         robot, rig = self._robot, self.view.rig
@@ -190,9 +189,9 @@ class Console:
         if is_simulated(self.rig):
             self._kept = _Kept(None, True, None)
             return
-        fault = FaultLatch(BusSettings.of(self.rig)).read()
-        under_way = self.watch.last.status is not None
+        fault, under_way = None, self.watch.last.status is not None
         try:
+            fault = FaultLatch(BusSettings.of(self.rig)).read()
             reference = reference_status(MotionInterlock(self.rig))
             why = reference.why_not
         except CdprError as error:
@@ -215,8 +214,7 @@ class Console:
         if self.files.read_only:
             return "this console only shows"
         try:
-            with self._lock:
-                return self._command(page, message)
+            return self._command(page, message)
         except CdprError as error:
             return str(error)
 
@@ -232,13 +230,17 @@ class Console:
     def _command(self, page: int, message: Message) -> str:
         if isinstance(message, TakeCommand):
             moving = self.watch.last.status is not None
-            return self.control.take(page, moving=moving, force=message.force)
+            with self._control_lock:
+                return self.control.take(page, moving=moving, force=message.force)
         if message.command == "give_control":
-            self._end_press(self.control.give(page))
+            with self._control_lock:
+                press = self.control.give(page)
+            self._end_press(press)
             return ""
-        if self.control.holder != page:
-            return "take control first"
-        return self._operate(message)
+        with self._one_at_a_time:
+            if self.control.holder != page:
+                return "take control first"
+            return self._operate(message)
 
     def _operate(self, message: Message) -> str:
         match message:
@@ -331,7 +333,7 @@ class Console:
 
     def held(self, page: int, message: Held) -> None:
         """A page's jog control is held; what may not move does not."""
-        with self._lock:
+        with self._control_lock:
             press = None if self.files.read_only else self.control.hold(page, message.hold)
         if press is None:
             return
@@ -352,13 +354,13 @@ class Console:
 
     def let_go(self, page: int, message: LetGo) -> None:
         """A page's jog control is no longer held."""
-        with self._lock:
+        with self._control_lock:
             press = self.control.let_go(page, message.hold)
         self._end_press(press)
 
     def leave(self, page: int) -> None:
         """A page is gone, and what it held with it."""
-        with self._lock:
+        with self._control_lock:
             press = self.control.leave(page)
         self._end_press(press)
 
@@ -372,6 +374,10 @@ class _Kept:
     latched: str | None
     referenced: bool
     why_not: str | None
+
+
+def _milliseconds() -> int:
+    return time.time_ns() // 1_000_000
 
 
 def _address_of(report: Path) -> str | None:

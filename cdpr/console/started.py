@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,7 @@ class StartedVerb:
 
     def __init__(self) -> None:
         """Nothing was started."""
+        self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._output = Path()
         self.verb: str | None = None
@@ -56,13 +58,22 @@ class StartedVerb:
         Raises:
             Refused: Another one is under way.
         """
-        self.look()
-        if self.verb is not None:
-            raise Refused(
-                f"`cdpr {self.verb}` is still under way",
-                where="console",
-                next_step="wait until it has ended, or stop it",
-            )
+        with self._lock:
+            self._look()
+            if self.verb is not None:
+                raise Refused(
+                    f"`cdpr {self.verb}` is still under way",
+                    where="console",
+                    next_step="wait until it has ended, or stop it",
+                )
+            self._start(verb, arguments)
+
+    def look(self) -> str:
+        """The newest line that the verb printed; notices its end."""
+        with self._lock:
+            return self._look()
+
+    def _start(self, verb: str, arguments: Sequence[str]) -> None:
         descriptor, name = tempfile.mkstemp(prefix=f"cdpr-{verb}-", suffix=".log")
         command = [sys.executable, "-c", "from cdpr.cli import main; main()", verb, *arguments]
         try:
@@ -78,8 +89,7 @@ class StartedVerb:
             os.close(descriptor)
         self._output, self.verb, self.outcome = Path(name), verb, None
 
-    def look(self) -> str:
-        """The newest line that the verb printed; notices its end."""
+    def _look(self) -> str:
         if self._process is None or self.verb is None:
             return ""
         text = self._output.read_text(encoding="utf-8", errors="replace")

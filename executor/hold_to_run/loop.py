@@ -105,6 +105,9 @@ class JogLoop(Loop):
         if piece.first == 0:
             if self._feed.at_rest and _meet(piece.rows[0], self._exchange.resting_targets):
                 self._begin(piece)
+            else:
+                text = f"press {piece.press}: its line does not begin where the platform rests"
+                self._tell("jog_not_begun", text)
         elif (
             piece.press == self._press
             and piece.first == len(self._rows) - 1

@@ -15,11 +15,16 @@ class ControlMachine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.control = PageControl()
+        self.now = 1
+        self.control = PageControl(lambda: self.now)
         self.pages: set[int] = set()
         self.begun: dict[int, tuple[int, int]] = {}
         self.ended: set[int] = set()
         self.newest = 0
+
+    @rule(jump=st.integers(-50, 200))
+    def clock(self, jump: int) -> None:
+        self.now += jump
 
     @rule()
     def join(self) -> None:
@@ -90,7 +95,7 @@ TestControl = ControlMachine.TestCase
 
 @given(st.integers(1, 1000))
 def test_a_press_that_was_let_go_before_it_arrived_is_over(hold: int) -> None:
-    control = PageControl()
+    control = PageControl(lambda: 1)
     page = control.join("a")
     control.take(page, moving=False)
     control.let_go(page, hold)
@@ -100,8 +105,22 @@ def test_a_press_that_was_let_go_before_it_arrived_is_over(hold: int) -> None:
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_holder_is_named_when_control_is_refused(moving: bool) -> None:
-    control = PageControl()
+    control = PageControl(lambda: 1)
     first, second = control.join("10.0.0.1"), control.join("10.0.0.2")
     assert control.take(first, moving=moving) == ""
     assert "10.0.0.1" in control.take(second, moving=moving)
-    assert control.holder_name() == "10.0.0.1"
+    assert control.holder_name() == "page 1 on 10.0.0.1"
+
+
+def test_two_consoles_at_once_never_number_a_press_alike() -> None:
+    """A console that begins anew, or a second one, goes on with no press of another."""
+    times = iter(range(1_000, 2_000))
+    consoles = [PageControl(lambda: next(times)) for _ in range(2)]
+    pages = [control.join("a") for control in consoles]
+    for control, page in zip(consoles, pages, strict=True):
+        control.take(page, moving=False)
+    seen: list[int | None] = []
+    for hold in range(1, 20):
+        seen += [c.hold(p, hold) for c, p in zip(consoles, pages, strict=True)]
+    assert len(set(seen)) == len(seen)
+    assert None not in seen
