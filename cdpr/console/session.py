@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cdpr.console.commands import (
     FileCommand,
     Held,
@@ -39,7 +41,7 @@ from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
 from executor.service import reference_status
 from model.errors import BadInput, CdprError, Refused
-from model.files.documents import write_atomic
+from model.files.documents import millimetres, write_atomic
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, load_scene, nothing_in_the_way
@@ -308,6 +310,8 @@ class Console:
         scene = self._taught_scene() if message.scene is None else _inside(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
         cost = [] if message.objective == "shortest" else ["--cost", message.objective]
+        if load_scene(scene).rotation_limits is not None:
+            cost.append("--free-rotation")
         self.preview = None
         rig = str(self.files.rig_file)
         self.verbs.start("plan", [rig, str(scene), "-o", str(output), "--force", *cost])
@@ -321,6 +325,10 @@ class Console:
         return path
 
     def _pose_now(self) -> Pose:
+        jog = (self.watch.last.status or {}).get("jog")
+        if jog is not None:  # where it was sent, to the last digit: jogs do not turn it
+            place, turn = millimetres(jog["position_mm"]), np.array(jog["quaternion"])
+            return Pose.from_quaternion(place, turn / np.linalg.norm(turn))
         if self._robot is None:
             raise Refused(
                 "where the platform is has not been seen yet",

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
 from model.errors import BadInput, InvalidFile
 from model.files.documents import Document, Name, PoseDocument, write_atomic
 from model.files.reading import parse_json, read_text
-from model.files.scene_file import SceneDocument, StopDocument
+from model.files.scene_file import RotationLimitsDocument, SceneDocument, StopDocument
 from model.files.validation import problems_of
 from model.pose import Pose
+from model.rotation_limits import largest_rotations
 from model.scene import Scene
 
 #: Of the poses.
 MOST = 200
+#: Orientations that differ by less are meant to be the same, [deg]: drives do not hold them nearer.
+ALIKE_DEG = 0.1
 AGAIN = "restore the file, or move it away to begin with no poses"
 
 
@@ -116,20 +121,35 @@ class TaughtPoses:
     def scene(self, around: Scene, name: str) -> SceneDocument:
         """From the first to the last through all others, among what is around.
 
+        Poses that are turned alike within `ALIKE_DEG` are all given the first one's orientation;
+        for others the scene has rotation limits, and is to be planned with free rotation.
+
         Raises:
             BadInput: There are fewer than two poses.
         """
         if len(self._poses) < 2:
             raise _refusal(f"a path needs two poses, not {len(self._poses)}", "teach another one")
-        start, *stops, goal = self._poses
+        first = self._poses[0].pose()
+        apart = max(np.degrees(first.angle_to(one.pose())) for one in self._poses)
+        limits = None if apart <= ALIKE_DEG else self._rotation_limits()
+        alike = {"rotation_wxyz": self._poses[0].rotation_wxyz} if limits is None else {}
+        start, *stops, goal = (pose.model_copy(update=alike) for pose in self._poses)
         return around.document.model_copy(
             update={
                 "name": name,
                 "start": start.bare(),
                 "stops": [StopDocument(**stop.model_dump()) for stop in stops],
                 "goal": goal.bare(),
+                "rotation_limits": limits,
             }
         )
+
+    def _rotation_limits(self) -> RotationLimitsDocument:
+        """What all poses and the shortest ways between them keep, and a little more."""
+        quaternions = [one.pose().quaternion for one in self._poses]
+        turned = np.degrees([largest_rotations(a, b) for a, b in pairwise(quaternions)])
+        tilt, turn = (turned.max(axis=0) + 1.0).tolist()
+        return RotationLimitsDocument(tilt_deg=min(90.0, tilt), turn_deg=min(180.0, turn))
 
     def _keep(self, poses: list[TaughtPose]) -> None:
         """On disk first."""

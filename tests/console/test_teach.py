@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from cdpr.console.teach import MOST, TaughtPoses, scene_text
 from model.errors import BadInput, CdprError
-from model.pose import Pose
+from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import load_rig
-from model.scene import load_scene, nothing_in_the_way
+from model.scene import load_scene, nothing_in_the_way, scene_from_document
 from tests.cli.plans import RIG
 
 STEP = st.tuples(
@@ -80,6 +80,32 @@ def test_they_become_a_scene_that_is_read_again(tmp_path: Path) -> None:
     assert scene.goal.distance_to(pose(2)) < 1e-9
     assert [one.name for one in scene.obstacles] == [one.name for one in around.obstacles]
     assert yaml.safe_load(path.read_text())["schema_version"] == 1
+
+
+def test_orientations_that_noise_tells_apart_are_made_one(tmp_path: Path) -> None:
+    """The planner of scenes without free rotation wants the very same orientation."""
+    taught = TaughtPoses(tmp_path / "poses.json")
+    for k in range(3):
+        noise = matrix_from_rotation_vector(np.array([2e-4, -3e-4, 4e-4]) * k)
+        taught.teach(f"p{k}", Pose(pose(k).position, noise))
+    document = taught.scene(nothing_in_the_way(load_rig(RIG)), "taught")
+    assert document.rotation_limits is None
+    scene = scene_from_document(document)
+    assert scene.start.angle_to(scene.goal) == 0.0
+    assert scene.start.angle_to(scene.stops[0].pose) == 0.0
+
+
+def test_poses_that_are_turned_keep_their_orientation(tmp_path: Path) -> None:
+    taught = TaughtPoses(tmp_path / "poses.json")
+    turn = matrix_from_rotation_vector(np.array([0.0, 0.1, 0.2]))
+    taught.teach("level", pose(0))
+    taught.teach("turned", Pose(pose(1).position, turn))
+    document = taught.scene(nothing_in_the_way(load_rig(RIG)), "taught")
+    scene = scene_from_document(document)
+    assert scene.goal.angle_to(Pose(pose(1).position, turn)) < 1e-6
+    limits = scene.rotation_limits
+    assert limits is not None
+    assert limits.excess(scene.start, scene.goal) is None
 
 
 def test_one_pose_is_no_path(tmp_path: Path) -> None:

@@ -46,18 +46,18 @@ class Operator:
                     return self.state
         raise AssertionError(f"it did not happen: {self.state}")
 
-    def command(self, name: str, **values: Any) -> dict[str, Any]:
+    def command(self, command: str, **values: Any) -> dict[str, Any]:
         """What the console answers."""
-        self._page.send(json.dumps({"kind": "command", "id": 1, "command": name, **values}))
+        self._page.send(json.dumps({"kind": "command", "id": 1, "command": command, **values}))
         while True:
             message = json.loads(self._page.recv(timeout=60))
             if message["kind"] == "answer":
                 assert isinstance(message, dict)
                 return message
 
-    def does(self, name: str, **values: Any) -> dict[str, Any]:
+    def does(self, command: str, **values: Any) -> dict[str, Any]:
         """Starts a verb and waits for its end."""
-        assert self.command(name, **values)["ok"]
+        assert self.command(command, **values)["ok"]
         self.until(lambda state: state["busy"] is not None or state["outcome"] is not None)
         return self.until(lambda state: state["busy"] is None)["outcome"]
 

@@ -115,6 +115,7 @@ def _listening(host: str, port: int) -> Iterator[socket.socket]:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, port))
+            listener.listen(64)  # before the address is printed
         except OSError as error:
             raise BadInput(
                 f"cannot listen on {host}:{port}: {error.strerror or error}",
