@@ -26,7 +26,9 @@ from tests.scenarios.test_processes import program
 pytestmark = pytest.mark.slow
 
 #: States until something must have happened.
-PATIENCE = 1500
+PATIENCE = 3000
+#: Programs that a test left are ended after this, [s].
+ENDS_WITHIN_S = 400.0
 
 
 class Operator:
@@ -91,7 +93,7 @@ def console(rig: Path, bus: tuple[str, ...]) -> Iterator[tuple[subprocess.Popen[
     """The program, and the address that it prints."""
     scene = CONFIGS / "environment_1.yaml"
     options = ("--scene", scene, *bus, "--port", "0", "--without-real-time")
-    with program("console", rig, *options) as process:
+    with program("console", rig, *options, within=ENDS_WITHIN_S) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert "http://" in line, process.communicate()
@@ -113,7 +115,7 @@ def bus(slow_rig: Path) -> Iterator[tuple[str, ...]]:
     """Of simulated drives in a process of their own."""
     channel = f"239.74.163.22:{40000 + os.getpid() % 20000}"
     options = ("--interface", "udp_multicast", "--channel", channel)
-    with program("sim", slow_rig, *options) as drives:
+    with program("sim", slow_rig, *options, within=ENDS_WITHIN_S) as drives:
         assert drives.stdout is not None
         assert "8 simulated drives" in drives.stdout.readline()
         yield options

@@ -28,7 +28,9 @@ pytestmark = pytest.mark.slow
 
 
 @contextmanager
-def program(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
+def program(
+    *arguments: str | Path, within: float = ENDS_WITHIN_S
+) -> Iterator[subprocess.Popen[str]]:
     """`cdpr ARGUMENTS` in a process of its own, which does not outlive the block."""
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *map(str, arguments)],
@@ -38,7 +40,7 @@ def program(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
         text=True,
         start_new_session=True,
     )
-    deadline = threading.Timer(ENDS_WITHIN_S, process.kill)
+    deadline = threading.Timer(within, process.kill)
     deadline.start()
     try:
         yield process
