@@ -39,6 +39,7 @@ export class Operate {
     at("load-plan").addEventListener("click", () => at("plan-file").value && page.command("load_plan", { file: at("plan-file").value }));
     at("make-plan").addEventListener("click", () => at("scene-file").value && page.command("plan", { scene: at("scene-file").value, objective: at("objective").value }));
     at("plan-time").addEventListener("input", () => this.#look());
+    at("outcome-seen").addEventListener("click", () => (at("outcome").hidden = true));
     at("scene-live").addEventListener("click", () => this.#leave());
     this.readFiles();
   }
@@ -99,6 +100,7 @@ export class Operate {
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
     write(at("outcome-text"), outcome.text);
+    at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // its end says how it went
     const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
     at("outcome-links").replaceChildren(...links.filter(Boolean));
   }
