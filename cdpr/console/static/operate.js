@@ -82,7 +82,7 @@ export class Operate {
     if (along !== null) {
       at("progress").value = along;
       write(at("progress-text"), `${known(motion.path_mm, 0)} of ${known(motion.path_length_mm, 0, "mm")} · ${duration(motion.elapsed_s)} · feed ${known(motion.feed_percent, 0)} %`);
-    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : "Nothing is moving.");
+    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.jog.moving ? "" : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
     if (asked !== undefined && !this.#sliding) {
@@ -94,11 +94,13 @@ export class Operate {
   #showOutcome(outcome) {
     const text = JSON.stringify(outcome);
     if (text === this.#outcome) return;
+    const isNews = this.#outcome !== "";
     this.#outcome = text;
     at("outcome").hidden = outcome === null;
     if (outcome === null) return;
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
+    if (isNews && !outcome.ok) this.#page.say(`${at("outcome-title").textContent}: ${outcome.text.trim().split("\n").at(-1).trim()}`, true);
     write(at("outcome-text"), outcome.text);
     at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // its end says how it went
     const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));

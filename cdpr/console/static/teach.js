@@ -18,7 +18,7 @@ export class Teach {
       const { ok } = await page.command("teach", { name });
       if (ok) at("teach-name").value = "";
     });
-    at("plan-poses").addEventListener("click", () => page.command("plan", { from_poses: true, objective: at("poses-objective").value }));
+    at("plan-poses").addEventListener("click", () => page.command("plan", { scene: null, objective: at("poses-objective").value }));
   }
 
   show({ poses, platform }) {
