@@ -243,6 +243,8 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     desk.fake.ask(set={"latched": "slack", "homed": True})
     page.locator("#reset").click()
     page.locator(".confirm").click()
+    page.locator("summary", has_text="Make a plan").click()
+    page.locator("input[name=scene-file]").first.check(force=True)
     page.locator("#make-plan").click()
     desk.view("teach")
     for _ in range(2):

@@ -4,7 +4,7 @@ import { isActive, whyNot } from "./buttons.js";
 import { address } from "./connection.js";
 import { PlanCurves } from "./curves.js";
 import { ask } from "./dialog.js";
-import { at, duration, known, link, make, mark, write } from "./elements.js";
+import { at, chosen, duration, known, link, make, mark, write } from "./elements.js";
 import { motionText } from "./live.js";
 
 const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
@@ -36,8 +36,8 @@ export class Operate {
     at("reset").addEventListener("click", () => this.#reset());
     at("release").addEventListener("click", () => this.#release());
     at("run").addEventListener("click", () => this.#run());
-    at("load-plan").addEventListener("click", () => at("plan-file").value && page.command("load_plan", { file: at("plan-file").value }));
-    at("make-plan").addEventListener("click", () => at("scene-file").value && page.command("plan", { scene: at("scene-file").value, objective: at("objective").value }));
+    at("load-plan").addEventListener("click", () => this.#withFile("plan-file", (file) => page.command("load_plan", { file })));
+    at("make-plan").addEventListener("click", () => this.#withFile("scene-file", (scene) => page.command("plan", { scene, objective: chosen("objective") })));
     at("plan-time").addEventListener("input", () => this.#look());
     at("outcome-seen").addEventListener("click", () => (at("outcome").hidden = true));
     at("scene-live").addEventListener("click", () => this.#leave());
@@ -49,11 +49,18 @@ export class Operate {
     const response = await fetch(address("/api/files")).catch(() => null);
     if (!response?.ok) return;
     const { scenes, plans } = await response.json();
-    for (const [id, names] of [["scene-file", scenes], ["plan-file", plans]]) {
-      const select = at(id), before = select.value;
-      select.replaceChildren(...(names.length ? names.map((name) => make("option", { value: name }, name)) : [make("option", { value: "" }, "none found")]));
-      if (names.includes(before)) select.value = before;
+    for (const [group, button, names] of [["scene-file", "plan", scenes], ["plan-file", "load_plan", plans]]) {
+      const before = chosen(group);
+      // No <select>: its open list would keep the space bar, and on a phone cover STOP.
+      const rows = names.map((name) => make("label", {}, make("input", { type: "radio", name: group, value: name, "data-button": button, checked: name === before }), make("span", {}, name)));
+      at(`${group}s`).replaceChildren(...(rows.length ? rows : [make("p", { class: "quiet" }, "No file found in the folder of the console.")]));
     }
+  }
+
+  #withFile(group, use) {
+    const file = chosen(group);
+    if (file) use(file);
+    else this.#page.say("Choose a file first.");
   }
 
   show(state) {
