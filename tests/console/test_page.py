@@ -400,7 +400,7 @@ def test_control_is_taken_from_another_page_only_after_a_question(
 
 
 def test_how_a_verb_ended_is_said_in_every_view_until_it_is_dismissed(phone: Visit) -> None:
-    text = "ready\n" * 30 + "error: a cycle began 1.4 cycles late"
+    text = "ready\n" * 30 + "error: a cycle began 1.4 cycles late\n  next: try again\nreport: a"
     outcome = {"verb": "jog", "ok": False, "text": text, "report": None, "fault_page": None}
     phone.view("jog")
     phone.fake.ask(set={"outcome": outcome})

@@ -9,6 +9,12 @@ import { motionText } from "./live.js";
 
 const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
 
+/** Of what a verb printed, the line that says how it went: the last that is neither indented nor an address. */
+function headline(text) {
+  const lines = text.trim().split("\n");
+  return lines.findLast((line) => /^\S/.test(line) && !line.startsWith("report:")) ?? lines.at(-1);
+}
+
 export class Operate {
   plan = null; // that is loaded: what /api/preview gave
   #page;
@@ -107,7 +113,7 @@ export class Operate {
     if (outcome === null) return;
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
-    if (isNews && !outcome.ok) this.#page.say(`${at("outcome-title").textContent}: ${outcome.text.trim().split("\n").at(-1).trim()}`, true);
+    if (isNews && !outcome.ok) this.#page.say(`${at("outcome-title").textContent}: ${headline(outcome.text)}`, true);
     write(at("outcome-text"), outcome.text);
     at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // its end says how it went
     const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
