@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -212,3 +213,16 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             expect(found.page.locator("#jog-limit")).to_have_text(limit)
             expect(found.page.locator("#outcome")).to_be_visible()
             assert found.page.locator("#jog-pad").bounding_box() == before
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_sequences_hold_only_what_is_pressed(desk: Visit, seed: int) -> None:
+    """100 000 events: nothing is held unpressed, refused, after its end or after a gap."""
+    sequences = (Path(__file__).parent / "hold_sequences.js").read_text(encoding="utf-8")
+    script = sequences.split("*/", 1)[1].strip()
+    found = desk.page.evaluate(
+        f"async (seed) => ({script})((await import('/static/hold.js')).Hold, 100000, seed)", seed
+    )
+    assert found["wrong"] == []
+    assert found["held"] > 10_000
+    assert found["ended"] > 5_000
