@@ -209,10 +209,15 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             changes = {"jog": {**jog, "limit": limit}, "latched": "slack: cable 3 " * 4}
             busy = {"verb": "jog", "text": "a long line of what is under way " * 3}
             more = {"outcome": {**outcome, "fault_page": "/help/slack"}, "busy": busy}
-            found.fake.ask(state={**changes, **more})
+            found.hold()
+            found.page.evaluate("() => window.dispatchEvent(new Event('blur'))")
+            found.page.mouse.up()
+            expect(found.page.locator("#jog-said")).to_contain_text("Ended: the window lost")
+            lamps = {"reference": {"counts": False, "why_not": "cable 3 was switched on again"}}
+            found.fake.ask(state={**changes, **more, **lamps})
             expect(found.page.locator("#jog-limit")).to_have_text(limit)
             expect(found.page.locator("#outcome")).to_be_visible()
-            assert found.page.locator("#jog-pad").bounding_box() == before
+            assert found.page.locator("#jog-pad").bounding_box() == before, size
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -9,6 +9,11 @@ import { motionText } from "./live.js";
 
 const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
 
+function isInView(element) {
+  const { top, bottom } = element.getBoundingClientRect();
+  return bottom > top && top >= 0 && bottom <= at("stop-bar").getBoundingClientRect().top;
+}
+
 /** Of what a verb printed, the line that says how it went: the last that is neither indented nor an address. */
 function headline(text) {
   const lines = text.trim().split("\n");
@@ -113,11 +118,11 @@ export class Operate {
     if (outcome === null) return;
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
-    if (isNews && !outcome.ok) this.#page.say(`${at("outcome-title").textContent}: ${headline(outcome.text)}`, true);
     write(at("outcome-text"), outcome.text);
     at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // its end says how it went
     const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
     at("outcome-links").replaceChildren(...links.filter(Boolean));
+    if (isNews && !outcome.ok && !isInView(at("outcome"))) this.#page.say(`${at("outcome-title").textContent}: ${headline(outcome.text)}`, true);
   }
 
   // The plan.
