@@ -31,7 +31,7 @@
 
   /** Too small for a finger. */
   small() {
-    return this.shown("button, select, input[type=text]")
+    return this.shown("button, input[type=text], .choices label")
       .filter((e) => e.getBoundingClientRect().height < 43.5 || e.getBoundingClientRect().width < 40)
       .map(this.nameOf);
   },

@@ -99,7 +99,7 @@ class Visit:
 
     def load(self, name: str = "plans/circle.json") -> None:
         self.view("operate")
-        self.page.locator("#plan-file").select_option(name)
+        self.page.locator(f"input[name=plan-file][value='{name}']").check(force=True)
         self.page.locator("#load-plan").click()
         expect(self.page.locator("#plan-name")).to_have_text(name)
 

@@ -47,7 +47,8 @@ def test_stop_acts_when_it_is_touched_and_needs_no_control(phone: Visit) -> None
 
 
 @pytest.mark.parametrize(
-    "focused", ["body", "#tab-jog", "#take-control", "#scene-canvas", "#plan-file", "#stop"]
+    "focused",
+    ["body", "#tab-jog", "#take-control", "#scene-canvas", "#load-box summary", "#stop"],
 )
 def test_the_space_bar_stops_and_does_nothing_else(desk: Visit, focused: str) -> None:
     if focused != "body":
@@ -290,10 +291,10 @@ def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> No
     desk.page.get_by_role("textbox", name="Name of pose 2").fill("home")
     desk.page.get_by_role("textbox", name="Name of pose 2").press("Enter")
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "home"])
-    desk.page.locator("#poses-objective").select_option("clearance")
+    desk.page.locator("input[name=poses-objective][value=clearance]").check(force=True)
     desk.page.locator("#plan-poses").click()
     found = desk.fake.wait(desk.page, lambda f: f["plan"] is not None)["received"][-1]
-    assert (found["from_poses"], found["objective"]) == (True, "clearance")
+    assert (found["scene"], found["objective"]) == (None, "clearance")
 
 
 # What it shows.
@@ -396,3 +397,29 @@ def test_control_is_taken_from_another_page_only_after_a_question(
     expect(other.locator("#lamp-control")).to_have_text("You have control")
     expect(desk.page.locator("#lamp-control")).to_have_text("Control: page 2")
     other.context.close()
+
+
+def test_how_a_verb_ended_is_said_in_every_view_until_it_is_dismissed(phone: Visit) -> None:
+    text = "ready\n" * 30 + "error: a cycle began 1.4 cycles late\n  next: try again\nreport: a"
+    outcome = {"verb": "jog", "ok": False, "text": text, "report": None, "fault_page": None}
+    phone.view("jog")
+    phone.fake.ask(set={"outcome": outcome})
+    expect(phone.page.locator("#notice")).to_have_text(
+        "Jogging: not completed: error: a cycle began 1.4 cycles late"
+    )
+    for view in VIEWS:
+        phone.view(view)
+        expect(phone.page.locator("#outcome-title")).to_be_visible()
+    # Its end is shown, not its beginning.
+    end = "e => e.scrollTop + e.clientHeight >= e.scrollHeight - 2"
+    assert phone.page.locator("#outcome-text").evaluate(end)
+    phone.page.locator("#outcome-seen").click()
+    expect(phone.page.locator("#outcome")).to_be_hidden()
+    phone.fake.let_pass(phone.page)
+    expect(phone.page.locator("#outcome")).to_be_hidden()
+
+
+def test_nothing_on_the_page_can_keep_the_space_bar_or_cover_stop(desk: Visit) -> None:
+    """The list of a `select` is a window of the browser's: it takes every key and every touch."""
+    takers = "select, iframe, dialog, [popover], input[list], input[type=file], input[type=color]"
+    expect(desk.page.locator(takers)).to_have_count(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
@@ -222,3 +223,55 @@ def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
             reached |= set(desk.audit("nameOf", "document.activeElement"))
         assert wanted - reached == set(), view
         assert desk.audit("unnamed") == [], view
+
+
+def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
+    """The fake server takes anything; what the real one takes is in `cdpr.console.commands`."""
+    commands = pytest.importorskip("cdpr.console.commands", reason="the console has no server yet")
+    page = desk.page
+    desk.take_control()
+    desk.load()
+    desk.run()
+    page.locator("#speed").fill("50")
+    page.locator("#hold").click()
+    page.locator("#resume").click()
+    page.keyboard.press(" ")
+    expect(page.locator("#outcome")).to_be_visible()
+    for name in ("home", "release"):
+        page.locator(f"#{name}").click()
+        page.locator(".confirm").click()
+    desk.fake.ask(set={"latched": "slack", "homed": True})
+    page.locator("#reset").click()
+    page.locator(".confirm").click()
+    page.locator("summary", has_text="Make a plan").click()
+    page.locator("input[name=scene-file]").first.check(force=True)
+    page.locator("#make-plan").click()
+    desk.view("teach")
+    for _ in range(2):
+        page.locator("#teach").click()
+        expect(page.locator("#notice")).to_have_text("teach: done")
+    page.get_by_role("button", name="Move pose 2 up").click()
+    page.get_by_role("textbox", name="Name of pose 1").fill("grip")
+    page.get_by_role("textbox", name="Name of pose 1").press("Enter")
+    page.locator("#plan-poses").click()
+    page.get_by_role("button", name="Forget pose 1").click()
+    desk.view("jog")
+    page.locator("#jog-begin").click()
+    expect(page.locator("#jog-state")).to_contain_text("Ready")
+    for step in ("0.1", "1", "10", "null"):
+        page.locator(f"input[name=jog-step][value='{step}']").check(force=True)
+        desk.hold()
+        page.mouse.up()
+    page.locator("#jog-end").click()
+    desk.view("operate")
+    page.locator("#give-control").click()
+    expect(page.locator("#lamp-control")).to_have_text("Control is free")
+    said = desk.fake.ask()["received"]
+    names = {m.get("command", m["kind"]) for m in said}
+    assert names == {
+        *("take_control", "give_control", "load_plan", "plan", "run", "speed", "hold", "resume"),
+        *("stop", "home", "release", "reset", "teach", "move", "rename", "forget"),
+        *("jog_begin", "held", "let_go", "jog_end"),
+    }
+    for message in said:
+        commands.parse_message(json.dumps(message))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
-from tests.console.browsing import Visit
+from tests.console.browsing import SIZES, Fake, Visit, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -58,7 +59,7 @@ ENDS: dict[str, Callable[[Visit], Any]] = {
                 "why_not": "ended",
                 "moving": False,
                 "limit": None,
-                "speed_mm_s": 0,
+                "speed_mm_s": 20,
             }
         }
     ),
@@ -84,7 +85,7 @@ def test_what_a_held_message_says(desk: Visit) -> None:
     desk.ready_to_jog()
     desk.page.locator("input[name=jog-step][value='1']").check(force=True)
     desk.page.locator("input[name=jog-frame][value=platform]").check(force=True)
-    desk.page.locator("#jog-speed").fill("25")
+    desk.page.locator("#jog-speed").fill("15")
     first = desk.hold("-z")
     desk.page.mouse.up()
     desk.page.locator("input[name=jog-step][value=null]").check(force=True)
@@ -96,7 +97,7 @@ def test_what_a_held_message_says(desk: Visit) -> None:
     assert [m["seq"] for m in held] == sorted({m["seq"] for m in held})
     one, other = held[0], held[-1]
     assert one["direction"] == [0, 0, -1]
-    assert (one["frame"], one["step_mm"], one["speed_mm_s"]) == ("platform", 1, 25)
+    assert (one["frame"], one["step_mm"], one["speed_mm_s"]) == ("platform", 1, 15)
     assert other["direction"] == [0, 1, 0]
     assert other["step_mm"] is None
 
@@ -182,7 +183,7 @@ def test_a_gamepad_jogs_with_a_shoulder_button_and_from_the_centre(desk: Visit, 
     desk.page.evaluate("() => { fakePad.axes = [0, -0.5, 0, 0]; }")
     found = desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")["received"][-1]
     assert found["direction"] == [0, 1, 0]
-    assert found["speed_mm_s"] == pytest.approx(5.0)
+    assert found["speed_mm_s"] == pytest.approx(2.5)
     desk.page.evaluate(end)
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
     assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go"
@@ -190,6 +191,43 @@ def test_a_gamepad_jogs_with_a_shoulder_button_and_from_the_centre(desk: Visit, 
 
 def test_a_limit_near_the_platform_is_shown(desk: Visit) -> None:
     desk.ready_to_jog()
-    jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 4.0}
+    jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 20.0}
     desk.fake.ask(state={"jog": {**jog, "limit": "stops in 12 mm: clearance to pillar"}})
     expect(desk.page.locator("#jog-limit")).to_have_text("stops in 12 mm: clearance to pillar")
+
+
+def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fake) -> None:
+    """A finger that comes down again must not find another direction."""
+    for size in SIZES:
+        with visit(browser, fake, size) as found:
+            found.view("jog")
+            before = found.page.locator("#jog-pad").bounding_box()
+            found.ready_to_jog()
+            jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 20.0}
+            limit = "stops in 17.1 mm: obstacle clearance too small, platform – obstacle_1"
+            outcome = {"verb": "jog", "ok": False, "text": "a\n" * 20, "report": None}
+            changes = {"jog": {**jog, "limit": limit}, "latched": "slack: cable 3 " * 4}
+            busy = {"verb": "jog", "text": "a long line of what is under way " * 3}
+            more = {"outcome": {**outcome, "fault_page": "/help/slack"}, "busy": busy}
+            found.hold()
+            found.page.evaluate("() => window.dispatchEvent(new Event('blur'))")
+            found.page.mouse.up()
+            expect(found.page.locator("#jog-said")).to_contain_text("Ended: the window lost")
+            lamps = {"reference": {"counts": False, "why_not": "cable 3 was switched on again"}}
+            found.fake.ask(state={**changes, **more, **lamps})
+            expect(found.page.locator("#jog-limit")).to_have_text(limit)
+            expect(found.page.locator("#outcome")).to_be_visible()
+            assert found.page.locator("#jog-pad").bounding_box() == before, size
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_sequences_hold_only_what_is_pressed(desk: Visit, seed: int) -> None:
+    """100 000 events: nothing is held unpressed, refused, after its end or after a gap."""
+    sequences = (Path(__file__).parent / "hold_sequences.js").read_text(encoding="utf-8")
+    script = sequences.split("*/", 1)[1].strip()
+    found = desk.page.evaluate(
+        f"async (seed) => ({script})((await import('/static/hold.js')).Hold, 100000, seed)", seed
+    )
+    assert found["wrong"] == []
+    assert found["held"] > 10_000
+    assert found["ended"] > 5_000

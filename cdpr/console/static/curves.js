@@ -6,11 +6,11 @@ const SECONDS = 60, REDRAW_MS = 250, HEIGHT = 140, SERIES = 8;
 const colour = (role) => getComputedStyle(document.documentElement).getPropertyValue(`--${role}`).trim();
 
 /** Options of one plot: its lines are `{label, role, dash, limit}`; a limit does not set the range. */
-function options(lines, { x, zero = false }) {
+function options(lines, { x, zero = false, least = 0 }) {
   const axis = (more) => ({ stroke: () => colour("muted"), grid: { stroke: () => colour("grid"), width: 1 }, ticks: { show: false }, values: (_, all) => all.map((v) => String(v).replace("-", "\u2212")), font: "11px system-ui, sans-serif", ...more });
   return {
     width: 300, height: HEIGHT, legend: { show: false }, cursor: { drag: { x: false, y: false } }, padding: [8, 10, 0, 0],
-    scales: { x: { time: false, range: x }, y: { range: (_, low, high) => range(low, high, zero) } },
+    scales: { x: { time: false, range: x }, y: { range: (_, low, high) => range(low, Math.max(high, least), zero) } },
     axes: [axis({ size: 28, gap: 6 }), axis({ size: 42, gap: 4 })],
     series: [{}, ...lines.map(({ label, role, dash, limit }) => ({
       label, stroke: () => colour(role), width: 1.5, dash, auto: !limit, points: { show: false }, spanGaps: false,
@@ -93,7 +93,7 @@ export class Curves {
       cables,
       tensions: new Plot(at("curve-tensions"), tensionLines(cables), more, [[]]),
       clearance: new Plot(at("curve-clearance"), CLEARANCE, { ...more, zero: true }, [[]]),
-      following: new Plot(at("curve-following"), [{ label: "following error", role: "encoder" }], { ...more, zero: true }, [[]]),
+      following: new Plot(at("curve-following"), [{ label: "following error", role: "encoder" }], { ...more, zero: true, least: 0.1 }, [[]]),
     };
   }
 }

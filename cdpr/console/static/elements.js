@@ -14,6 +14,11 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** The value of the radio button of a name that is chosen, or null. */
+export function chosen(name) {
+  return document.querySelector(`input[name="${name}"]:checked`)?.value ?? null;
+}
+
 /** Writes a text where it differs: a screen reader would read what is written again. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;

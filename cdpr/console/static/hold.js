@@ -1,4 +1,4 @@
-/* Hold-to-run: one press, from its begin to its end, as messages; no page in here.
+/* Hold-to-run: one press, from its begin to its end, as messages; no page in here, and the clock is given.
 
 A press has a source (a pointer, a key, a stick). While it lasts `held` goes out every 50 ms, and `let_go` at once when
 it ends, by whatever. A press that ended never comes back: the source has to be released and pressed again. */
@@ -7,9 +7,18 @@ const EVERY_MS = 50;
 /** The server has ended a jog after 150 ms without a word: a page that was held up longer must not go on. */
 const LONGEST_GAP_MS = 150;
 
+/** The page's clock: milliseconds that only rise, and something done again and again until it is cancelled. */
+const CLOCK = {
+  now: () => performance.now(),
+  every: (milliseconds, act) => {
+    const timer = setInterval(act, milliseconds);
+    return () => clearInterval(timer);
+  },
+};
+
 export class Hold {
   #options;
-  #timer = null;
+  #cancel = null;
   #press = null; // {number, source, direction, share}
   // Rises with each press, over a reload as well.
   #number = Date.now();
@@ -18,10 +27,11 @@ export class Hold {
 
   /**
    * `send(message)` is false when it could not be sent; `whyNot()` says why no jog is possible, or null;
-   * `settings()` gives `{frame, step_mm, speed_mm_s}`; `changed(press, why)` hears of each begin (null) and end.
+   * `settings()` gives `{frame, step_mm, speed_mm_s}`; `changed(press, why)` hears of each begin (null) and end;
+   * `clock` is for tests.
    */
   constructor(options) {
-    this.#options = { now: () => performance.now(), ...options };
+    this.#options = { clock: CLOCK, ...options };
   }
 
   get source() {
@@ -38,8 +48,8 @@ export class Hold {
     const why = this.#options.whyNot();
     if (why) return this.#options.changed(null, why);
     this.#press = { number: ++this.#number, source, direction: unit(direction), share };
-    this.#last = this.#options.now();
-    this.#timer = setInterval(() => this.#tick(), EVERY_MS);
+    this.#last = this.#options.clock.now();
+    this.#cancel = this.#options.clock.every(EVERY_MS, () => this.#tick());
     this.#options.changed(this.#press, null);
     this.#say();
   }
@@ -58,14 +68,14 @@ export class Hold {
   end(why) {
     if (!this.#press) return;
     const { number } = this.#press;
-    clearInterval(this.#timer);
-    this.#press = this.#timer = null;
+    this.#cancel();
+    this.#press = this.#cancel = null;
     this.#options.send({ kind: "let_go", hold: number });
     this.#options.changed(null, why);
   }
 
   #tick() {
-    const now = this.#options.now(), gap = now - this.#last;
+    const now = this.#options.clock.now(), gap = now - this.#last;
     if (gap > LONGEST_GAP_MS) return this.end(`this page was held up for ${Math.round(gap)} ms`);
     const why = this.#options.whyNot();
     if (why) return this.end(why);

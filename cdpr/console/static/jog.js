@@ -1,6 +1,6 @@
 /* The jog panel: buttons, keys and a gamepad, each of which holds the one press of hold.js. */
 
-import { at, known, mark, write } from "./elements.js";
+import { at, chosen, known, mark, write } from "./elements.js";
 import { Hold } from "./hold.js";
 import { whyNot } from "./buttons.js";
 
@@ -18,8 +18,7 @@ function vectorOf(name) {
  * when the page changes under the operator's hands, and `show(state)`.
  */
 export function bindJog(connection, situation, command) {
-  const panel = at("panel-jog"), pad = at("jog-pad"), said = at("jog-said");
-  const chosen = (name) => panel.querySelector(`input[name=${name}]:checked`).value;
+  const pad = at("jog-pad"), said = at("jog-said");
   const hold = new Hold({
     send: (message) => connection.send(message),
     whyNot: () => (document.hasFocus() && !document.hidden ? whyNot("jog", situation()) : "this page does not have the focus"),

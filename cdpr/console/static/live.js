@@ -9,8 +9,8 @@ const LAMPS = {
     readOnly ? ["Read-only", "quiet"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
   drives: ({ motion, jog }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
-    if (!drives.length) return [jog.ready ? "Drives enabled" : "Drives not reported", jog.ready ? "stop" : "quiet"];
-    return [`${on} of ${drives.length} drives enabled`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
+    if (!drives.length) return [jog.ready ? "Drives on" : "Drives not heard", jog.ready ? "stop" : "quiet"];
+    return [`${on} of ${drives.length} drives on`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
   },
   homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
   latch: ({ latched }) => (latched === null ? ["No fault", "pass"] : ["Fault latched", "fail"]),

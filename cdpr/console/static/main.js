@@ -51,8 +51,12 @@ const wide = matchMedia("(min-width: 900px)");
 
 function view(name) {
   const chosen = wide.matches && name === "live" ? "operate" : name;
-  if (document.body.dataset.view !== chosen) jog.end("another view was chosen");
-  document.body.dataset.view = chosen;
+  if (document.body.dataset.view !== chosen) {
+    jog.end("another view was chosen");
+    document.body.dataset.view = chosen;
+    at("panels").scrollTop = 0;
+    if (!wide.matches) window.scrollTo(0, 0);
+  }
   for (const tab of tabs) {
     const on = tab.dataset.view === chosen;
     mark(tab, "aria-selected", String(on));

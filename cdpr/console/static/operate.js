@@ -4,10 +4,21 @@ import { isActive, whyNot } from "./buttons.js";
 import { address } from "./connection.js";
 import { PlanCurves } from "./curves.js";
 import { ask } from "./dialog.js";
-import { at, duration, known, link, make, mark, write } from "./elements.js";
+import { at, chosen, duration, known, link, make, mark, write } from "./elements.js";
 import { motionText } from "./live.js";
 
 const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
+
+function isInView(element) {
+  const { top, bottom } = element.getBoundingClientRect();
+  return bottom > top && top >= 0 && bottom <= at("stop-bar").getBoundingClientRect().top;
+}
+
+/** Of what a verb printed, the line that says how it went: the last that is neither indented nor an address. */
+function headline(text) {
+  const lines = text.trim().split("\n");
+  return lines.findLast((line) => /^\S/.test(line) && !line.startsWith("report:")) ?? lines.at(-1);
+}
 
 export class Operate {
   plan = null; // that is loaded: what /api/preview gave
@@ -36,9 +47,10 @@ export class Operate {
     at("reset").addEventListener("click", () => this.#reset());
     at("release").addEventListener("click", () => this.#release());
     at("run").addEventListener("click", () => this.#run());
-    at("load-plan").addEventListener("click", () => at("plan-file").value && page.command("load_plan", { file: at("plan-file").value }));
-    at("make-plan").addEventListener("click", () => at("scene-file").value && page.command("plan", { scene: at("scene-file").value, objective: at("objective").value }));
+    at("load-plan").addEventListener("click", () => this.#withFile("plan-file", (file) => page.command("load_plan", { file })));
+    at("make-plan").addEventListener("click", () => this.#withFile("scene-file", (scene) => page.command("plan", { scene, objective: chosen("objective") })));
     at("plan-time").addEventListener("input", () => this.#look());
+    at("outcome-seen").addEventListener("click", () => (at("outcome").hidden = true));
     at("scene-live").addEventListener("click", () => this.#leave());
     this.readFiles();
   }
@@ -48,11 +60,18 @@ export class Operate {
     const response = await fetch(address("/api/files")).catch(() => null);
     if (!response?.ok) return;
     const { scenes, plans } = await response.json();
-    for (const [id, names] of [["scene-file", scenes], ["plan-file", plans]]) {
-      const select = at(id), before = select.value;
-      select.replaceChildren(...(names.length ? names.map((name) => make("option", { value: name }, name)) : [make("option", { value: "" }, "none found")]));
-      if (names.includes(before)) select.value = before;
+    for (const [group, button, names] of [["scene-file", "plan", scenes], ["plan-file", "load_plan", plans]]) {
+      const before = chosen(group);
+      // No <select>: its open list would keep the space bar, and on a phone cover STOP.
+      const rows = names.map((name) => make("label", {}, make("input", { type: "radio", name: group, value: name, "data-button": button, checked: name === before }), make("span", {}, name)));
+      at(`${group}s`).replaceChildren(...(rows.length ? rows : [make("p", { class: "quiet" }, "No file found in the folder of the console.")]));
     }
+  }
+
+  #withFile(group, use) {
+    const file = chosen(group);
+    if (file) use(file);
+    else this.#page.say("Choose a file first.");
   }
 
   show(state) {
@@ -81,7 +100,7 @@ export class Operate {
     if (along !== null) {
       at("progress").value = along;
       write(at("progress-text"), `${known(motion.path_mm, 0)} of ${known(motion.path_length_mm, 0, "mm")} · ${duration(motion.elapsed_s)} · feed ${known(motion.feed_percent, 0)} %`);
-    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : "Nothing is moving.");
+    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.jog.moving ? "" : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
     if (asked !== undefined && !this.#sliding) {
@@ -93,14 +112,17 @@ export class Operate {
   #showOutcome(outcome) {
     const text = JSON.stringify(outcome);
     if (text === this.#outcome) return;
+    const isNews = this.#outcome !== "";
     this.#outcome = text;
     at("outcome").hidden = outcome === null;
     if (outcome === null) return;
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
     write(at("outcome-text"), outcome.text);
+    at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // its end says how it went
     const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
     at("outcome-links").replaceChildren(...links.filter(Boolean));
+    if (isNews && !outcome.ok && !isInView(at("outcome"))) this.#page.say(`${at("outcome-title").textContent}: ${headline(outcome.text)}`, true);
   }
 
   // The plan.

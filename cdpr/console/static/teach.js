@@ -1,6 +1,6 @@
 /* Taught poses: store where the platform is, name, order and remove them, plan a path through them. */
 
-import { at, known, make, write } from "./elements.js";
+import { at, chosen, known, make, write } from "./elements.js";
 
 export class Teach {
   #page;
@@ -18,7 +18,7 @@ export class Teach {
       const { ok } = await page.command("teach", { name });
       if (ok) at("teach-name").value = "";
     });
-    at("plan-poses").addEventListener("click", () => page.command("plan", { from_poses: true, objective: at("poses-objective").value }));
+    at("plan-poses").addEventListener("click", () => page.command("plan", { scene: null, objective: chosen("poses-objective") }));
   }
 
   show({ poses, platform }) {
