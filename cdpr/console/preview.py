@@ -89,12 +89,12 @@ def _checks(prepared: PreparedRun) -> list[str]:
     return told
 
 
-def _clearances(rig: Rig, plan: Plan, poses: list[Pose]) -> list[float] | None:
+def _clearances(rig: Rig, plan: Plan, poses: list[Pose]) -> list[float | None] | None:
     if not plan.scene.obstacles:
         return None
     model = ClearanceModel(rig, plan.scene)
     near = [model.smallest(pose) for pose in poses]
-    return [round(one.distance * 1e3, 2) for one in near if one is not None]
+    return [None if one is None else round(one.distance * 1e3, 2) for one in near]
 
 
 def _drawn(rig: Rig, plan: Plan, moments: list[tuple[float, Pose]]) -> dict[str, Any]:

@@ -60,6 +60,7 @@ class ConsoleFiles:
         rig_file: As it is given to verbs.
         rig: The robot and its bus.
         bus_options: Options of the command line for that bus.
+        cameras: Sources that measure runs, the first one homing, too; empty for none.
         scene_file: What is around; None where it was not given.
         without_real_time: Verbs move even where real-time scheduling is denied.
         read_only: Nothing but STOP.
@@ -68,6 +69,7 @@ class ConsoleFiles:
     rig_file: Path
     rig: Rig
     bus_options: tuple[str, ...]
+    cameras: tuple[str, ...]
     scene_file: Path | None
     without_real_time: bool
     read_only: bool
@@ -278,8 +280,7 @@ class Console:
         return verbs[command]()
 
     def _home(self) -> str:
-        cameras = [camera.name for camera in self.rig.cameras]
-        how = ["--camera", cameras[0]] if cameras and not is_simulated(self.rig) else ["--at-home"]
+        how = ["--camera", self.files.cameras[0]] if self.files.cameras else ["--at-home"]
         return self._start("home", [str(self.files.rig_file), *how])
 
     def _reset(self) -> str:
@@ -291,7 +292,11 @@ class Console:
     def _run(self) -> str:
         if self.preview is None or not self.preview["passed"]:
             return "load a plan that passes first"
-        return self._start("run", [self.preview["name"], "--rig", str(self.files.rig_file)])
+        cameras = [text for source in self.files.cameras for text in ("--camera", source)]
+        if not (cameras or is_simulated(self.rig)):
+            cameras = ["--no-camera"]
+        rig = ["--rig", str(self.files.rig_file)]
+        return self._start("run", [self.preview["name"], *rig, *cameras])
 
     def _jog_begin(self) -> str:
         scene = self.files.scene_file

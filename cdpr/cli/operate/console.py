@@ -47,6 +47,14 @@ def console(
             "--allow-others", help="let other machines connect: who knows the address can operate"
         ),
     ] = False,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--camera",
+            help="measures runs, the first one homing: SOURCE or NAME=SOURCE; repeatable",
+            metavar="SOURCE",
+        ),
+    ] = None,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     calibration: CalibrationOption = None,
@@ -87,6 +95,7 @@ def console(
         rig_file=rig,
         rig=rig_on_bus(rig, interface, channel, calibration),
         bus_options=tuple(text for name, value in options if value for text in (name, value)),
+        cameras=tuple(camera or ()),
         scene_file=scene,
         without_real_time=without_real_time,
         read_only=read_only,
