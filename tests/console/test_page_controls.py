@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, expect
 
+from cdpr.console import commands
 from tests.console.browsing import SIZES, VIEWS, Fake, Visit, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -227,7 +228,6 @@ def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
 
 def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     """The fake server takes anything; what the real one takes is in `cdpr.console.commands`."""
-    commands = pytest.importorskip("cdpr.console.commands", reason="the console has no server yet")
     page = desk.page
     desk.take_control()
     desk.load()
