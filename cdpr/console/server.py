@@ -85,7 +85,7 @@ class ConsoleServer:
             looking.cancel()
             with suppress(asyncio.CancelledError):
                 await looking
-            self._console.watch.close()
+            await run_in_threadpool(self._console.close)
 
     async def _look(self) -> None:
         """The state of all, again and again; where looking fails, pages see old data and say so."""

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,8 @@ from executor.jogging import FASTEST
 from executor.recording.run_course import RUNS
 from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
-from executor.service import reference_status
+from executor.service import StatusResult, reference_status
+from executor.service import status as read_status
 from model.errors import BadInput, CdprError, Refused
 from model.files.documents import millimetres, write_atomic
 from model.pose import Pose
@@ -98,6 +100,9 @@ class Console:
         self._control_lock, self._one_at_a_time = threading.Lock(), threading.Lock()
         self._line = ""
         self._robot: RobotNow | None = None
+        self._at_rest: Future[StatusResult] | None = None
+        self._asks = ThreadPoolExecutor(1, "cdpr-drives")
+        self._was_busy = True  # so that the drives are asked at first
         self._kept_at, self._kept = float("-inf"), _Kept(None, False, None)
 
     # What it shows.
@@ -109,8 +114,31 @@ class Console:
         if look.status is not None:
             seen = self.view.take(look.status)
             self._robot = seen or self._robot
+        self._ask_at_rest(look.status is not None or self.verbs.verb is not None)
         self._read_kept()
         return self._state(look.status, time.monotonic() - look.at)
+
+    def close(self) -> None:
+        """Lets go of what it watches; what moves goes on."""
+        self._asks.shutdown()
+        self.watch.close()
+
+    def _ask_at_rest(self, busy: bool) -> None:
+        """Reads the drives once whenever nothing moves any more; they may be silent, or not there.
+
+        No verb is started meanwhile: it would find the drives being read.
+        """
+        if self._at_rest is not None and self._at_rest.done():
+            answer, self._at_rest = self._at_rest, None
+            if answer.exception() is None and not busy:
+                self._robot = self.view.at_rest(answer.result()) or self._robot
+        ended, self._was_busy = self._was_busy and not busy, busy
+        if ended and self._at_rest is None and not is_simulated(self.rig):
+            self._at_rest = self._asks.submit(self._read_drives)
+
+    def _read_drives(self) -> StatusResult:
+        with self._one_at_a_time:
+            return read_status(self.rig)
 
     def _state(self, status: dict[str, Any] | None, age: float) -> dict[str, Any]:
         robot, rig = self._robot, self.view.rig

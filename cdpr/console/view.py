@@ -12,6 +12,7 @@ import numpy as np
 from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_folder import RunFolder
 from executor.report.scene import frame_surface, platform_surface
+from executor.service import StatusResult
 from model.clearance import ClearanceModel
 from model.errors import CdprError
 from model.geometry.solids import solid_of
@@ -120,6 +121,15 @@ class RobotView:
         except CdprError:  # while cables hang slack, no pose fits
             return None
         return RobotNow(self._pose, tensions.tolist(), self._near(self._pose))
+
+    def at_rest(self, status: StatusResult) -> RobotNow | None:
+        """The robot as its drives were read while nothing moves; None where no pose is known."""
+        if status.pose is None or status.drives is None:
+            return None
+        self._pose = status.pose
+        self._looked = float("-inf")
+        tensions = [drive.tension for drive in status.drives]
+        return RobotNow(status.pose, tensions, self._near(status.pose))
 
     @property
     def required_clearance(self) -> float:

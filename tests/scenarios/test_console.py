@@ -131,6 +131,9 @@ def test_a_taught_path_is_planned_run_held_continued_and_stopped(
     slow_rig: Path, bus: tuple[str, ...], place: Path
 ) -> None:
     with console(slow_rig, bus) as (process, address), operator(address) as me:
+        at_rest = me.until(lambda state: state["platform"])
+        assert at_rest["motion"] is None, "the drives are asked at first, too"
+        assert at_rest["platform"]["position_mm"] == pytest.approx([0.0, 0.0, 445.0], abs=0.1)
         assert me.command("jog_begin")["ok"]
         me.until(lambda state: state["jog"]["ready"])
         assert me.command("teach", name="low")["ok"]
