@@ -139,7 +139,7 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
         ("quaternion", "line 3: the quaternion's length is"),
         ("more", "the rig has 8 cables, the file more"),
         ("twice", "the column 'actual_1_counts' appears twice"),
-        ("empty", "the file holds no measurement"),
+        ("empty", "the file holds no values"),
         ("deviation", "a standard deviation is not positive"),
     ],
 )

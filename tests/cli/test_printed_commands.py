@@ -74,6 +74,7 @@ NOT_RUN = {
     "calibrate extrinsics": "needs photographs: tests/cli/test_calibrate_extrinsics.py",
     "calibrate readout": "needs a moving tag: tests/calibration/test_readout.py",
     "calibrate tags": "needs photographs: tests/cli/test_calibrate_tags.py",
+    "console": "serves until Ctrl-C: tests/scenarios/test_console.py",
     "demo": "tools/run_docs.py runs it",
     "hold": "needs a run under way: tests/scenarios/test_operator_wishes.py",
     "monitor": "needs a run under way: tests/cli/test_monitor.py",
