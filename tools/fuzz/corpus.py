@@ -55,8 +55,36 @@ def build(folder: Path) -> dict[str, list[Path]]:
         "endpoints": [folder / "flat_endpoints.json"],
         "dbc": [ROOT / "drivers/odrive/cansimple.dbc"],
         "eds": sorted((ROOT / "simulation/drives/eds").glob("*.eds")),
+        "taught": [_taught(folder)],
+        "message": _messages(folder),
         "profile": sorted((ROOT / "drivers/cia402/profiles").glob("*.yaml")),
     }
+
+
+def _taught(folder: Path) -> Path:
+    from cdpr.console.teach import TaughtPoses
+    from model.rig import load_rig
+
+    path = folder / "taught.json"
+    poses = TaughtPoses(path)
+    for name in ("low", "high"):
+        poses.teach(name, load_rig(ROOT / "configs/gachon_8_6.yaml").home)
+    return path
+
+
+def _messages(folder: Path) -> list[Path]:
+    """What pages say to the console, and programs to the command socket."""
+    held = '"direction": [0.0, 0.6, 0.8], "frame": "world", "step_mm": 0.1'
+    texts = (
+        f'{{"kind": "held", "hold": 3, {held}, "speed_mm_s": 5.0, "seq": 7}}',
+        '{"kind": "command", "id": 3, "command": "speed", "percent": 50}',
+        f'{{"command": "held", "press": 3, {held}, "percent": 50}}',
+    )
+    found = []
+    for number, text in enumerate(texts):
+        found.append(folder / f"message-{number}.json")
+        found[-1].write_text(text)
+    return found
 
 
 def _corners(folder: Path) -> Path:

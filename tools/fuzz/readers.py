@@ -34,6 +34,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     from calibration.intrinsics.exchange import imported_camera
     from calibration.load import load_result
     from calibration.targets.board import read_corners
+    from cdpr.console.teach import TaughtPoses
     from drivers.cameras.files import read_picture
     from drivers.cameras.live import VideoFile
     from drivers.can_bus import BusSettings
@@ -71,6 +72,8 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         "endpoints": lambda path: read_endpoints(path, odrive),
         "dbc": read_layouts,
         "eds": read_eds.__wrapped__,
+        "taught": TaughtPoses,
+        "message": _message,
         "profile": lambda path: load_yaml(path, ProfileDocument),
     }
     found = [
@@ -92,6 +95,18 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     ]
     unfinished = [Reader(f"cut:{seed.name}", seed, _cut, cut / seed.name) for seed in corpus["cut"]]
     return found + whole + again + unfinished
+
+
+def _message(path: Path) -> None:
+    """A message to the console, or a line on the command socket; neither may fail otherwise."""
+    from cdpr.console.commands import NotAMessage, parse_message
+    from executor.remote.protocol import NotACommand, parse_command
+
+    content = path.read_bytes()
+    with suppress(NotACommand):
+        parse_command(content)
+    with suppress(NotAMessage):
+        parse_message(content.decode(errors="replace"))
 
 
 def _at(file: Any, path: Path) -> Any:

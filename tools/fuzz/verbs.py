@@ -34,7 +34,7 @@ LEFT_OUT = ("stop", "hold", "resume", "speed")
 #: What these are asked for may take longer than a call may; they are ended after it, uncounted.
 LONG = (
     "demo", "plan", "run", "sim", "bench", "workspace", "monitor", "home", "jog", "track",
-    "calibrate", "check", "doctor",
+    "calibrate", "check", "doctor", "console",
 )  # fmt: skip
 VALUES = (
     "0",
