@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import tempfile
 import threading
 import urllib.error
 import urllib.request
@@ -88,6 +89,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "runs" / "one").mkdir(parents=True)
     (folder / "runs" / "one" / "report.html").write_text("<p>a report")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No run of another test is seen here."""
+    for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
 
 
 @pytest.fixture
