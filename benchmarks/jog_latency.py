@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -45,6 +44,7 @@ class Operator:
     presses: int
     spans: list[tuple[float, float]] = field(default_factory=list)
     moved: list[float] = field(default_factory=list)
+    lateness: list[float] = field(default_factory=list)
     silent: int = 0
     _last: tuple[int, ...] = ()
     _thread: threading.Thread | None = None
@@ -53,6 +53,7 @@ class Operator:
         """Begins when the drives are ready; keeps the times of cycles with other targets."""
         if record.state is not State.MOVING:
             return
+        self.lateness.append(record.lateness)
         if self._last and record.targets != self._last:
             self.moved.append(record.at)
         self._last = record.targets
@@ -92,7 +93,7 @@ def drives() -> Iterator[None]:
     try:
         yield
     finally:
-        process.send_signal(signal.SIGINT)
+        process.terminate()
         process.wait()
 
 
@@ -126,6 +127,10 @@ def main() -> int:
     for name, values in (("press to first set-point", first), ("release to rest", rest)):
         p50, p90, most = np.percentile(values, (50, 90, 100))
         print(f"{name:26} median {p50:6.1f}  p90 {p90:6.1f}  most {most:6.1f} ms")
+    late = np.percentile(operator.lateness, (50, 99.9, 100))
+    print(
+        f"{'lateness of cycles':26} median {late[0]:.3f}  p99.9 {late[1]:.3f}  most {late[2]:.3f}"
+    )
     print(f"{len(operator.spans)} presses, {lost} without a motion;", end=" ")
     print(f"{operator.silent} words came too late to be taken")
     return 1 if lost else 0
