@@ -108,24 +108,40 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
         CdprError: Nothing was enabled, for the reason given.
     """
-    board = SharedRequests() if motion.realtime else LocalRequests()
-    try:
-        stand = motion.supervisor.during(board, partial(_supervised, motion, board, at_rest))
-    finally:
-        if isinstance(board, SharedRequests):
-            board.close()
-    raise_unless_finished(stand, motion.supervisor, motion.rig)
-    return stand
+    return with_board(
+        motion.rig,
+        motion.supervisor,
+        lambda board: _supervised(motion, board, at_rest),
+        realtime=motion.realtime,
+    )
 
 
-def raise_unless_finished(stand: WinchesStand, supervisor: Supervisor, rig: Rig) -> None:
-    """Raises what a motion ended with, where it did not finish.
+def with_board(
+    rig: Rig,
+    supervisor: Supervisor,
+    move: Callable[[LocalRequests | SharedRequests], WinchesStand],
+    *,
+    realtime: bool,
+) -> WinchesStand:
+    """Moves with a board of wishes that the supervisor can write to.
+
+    Args:
+        rig: The robot.
+        supervisor: Turns interrupts into stops.
+        move: Moves until the drives hold by themselves.
+        realtime: The board is shared with another process.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
         StoppedByOperator: The operator stopped it.
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
     """
+    board = SharedRequests() if realtime else LocalRequests()
+    try:
+        stand = supervisor.during(board, lambda: move(board))
+    finally:
+        if isinstance(board, SharedRequests):
+            board.close()
     if stand.state in (State.STOPPED, State.FINISHED):
         supervisor.finish()
     if stand.state is State.STOPPED:
@@ -139,6 +155,7 @@ def raise_unless_finished(stand: WinchesStand, supervisor: Supervisor, rig: Rig)
             if is_simulated(rig)
             else "find the cause and look at the platform, then `cdpr reset RIG`",
         )
+    return stand
 
 
 def _supervised(

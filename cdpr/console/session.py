@@ -28,7 +28,7 @@ from cdpr.console.commands import (
 )
 from cdpr.console.control import PageControl
 from cdpr.console.preview import preview
-from cdpr.console.started import StartedVerb
+from cdpr.console.started import StartedVerb, file_here
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, pose_data
 from cdpr.console.watch import RunWatch
@@ -42,7 +42,7 @@ from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
 from executor.service import StatusResult, reference_status
 from executor.service import status as read_status
-from model.errors import BadInput, CdprError, Refused
+from model.errors import CdprError, Refused
 from model.files.documents import millimetres, write_atomic
 from model.pose import Pose
 from model.rig import Rig
@@ -62,6 +62,7 @@ class ConsoleFiles:
         rig_file: As it is given to verbs.
         rig: The robot and its bus.
         bus_options: Options of the command line for that bus.
+        calibration_options: Those for the results of calibrations that the rig has.
         cameras: Sources that measure runs, the first one homing, too; empty for none.
         scene_file: What is around; None where it was not given.
         without_real_time: Verbs move even where real-time scheduling is denied.
@@ -71,6 +72,7 @@ class ConsoleFiles:
     rig_file: Path
     rig: Rig
     bus_options: tuple[str, ...]
+    calibration_options: tuple[str, ...]
     cameras: tuple[str, ...]
     scene_file: Path | None
     without_real_time: bool
@@ -279,7 +281,7 @@ class Console:
             case SpeedCommand():
                 return self.watch.say("speed", percent=message.percent)
             case FileCommand():
-                self.load_plan(_inside(message.file))
+                self.load_plan(file_here(message.file))
             case PlanCommand():
                 self._plan(message)
             case NameCommand():
@@ -336,18 +338,20 @@ class Console:
         if self.watch.last.status is not None:
             return "the robot moves; wait, or stop it"
         relaxed = ["--without-real-time"] if real_time and self.files.without_real_time else []
-        self.verbs.start(verb, [*arguments, *self.files.bus_options, *relaxed, "--yes"])
+        rig = (*self.files.bus_options, *self.files.calibration_options)
+        self.verbs.start(verb, [*arguments, *rig, *relaxed, "--yes"])
         return ""
 
     def _plan(self, message: PlanCommand) -> None:
-        scene = self._taught_scene() if message.scene is None else _inside(message.scene)
+        scene = self._taught_scene() if message.scene is None else file_here(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
         cost = [] if message.objective == "shortest" else ["--cost", message.objective]
         if load_scene(scene).rotation_limits is not None:
             cost.append("--free-rotation")
         self.preview = None
         rig = str(self.files.rig_file)
-        self.verbs.start("plan", [rig, str(scene), "-o", str(output), "--force", *cost])
+        options = ["-o", str(output), "--force", *cost, *self.files.calibration_options]
+        self.verbs.start("plan", [rig, str(scene), *options])
 
     def _taught_scene(self) -> Path:
         around = nothing_in_the_way(self.rig) if self.scene is None else self.scene
@@ -425,19 +429,3 @@ def _address_of(report: Path) -> str | None:
     """Where the console serves a report; only those below the folder of runs."""
     path, root = report.resolve(), RUNS.resolve()
     return f"/runs/{path.relative_to(root)}" if path.is_relative_to(root) else None
-
-
-def _inside(name: str) -> Path:
-    """A file below the folder that the console was started in.
-
-    Raises:
-        BadInput: It is elsewhere.
-    """
-    path = Path(name)
-    if not path.resolve().is_relative_to(Path.cwd().resolve()):
-        raise BadInput(
-            f"{name} is not below the folder in which the console runs",
-            where="console",
-            next_step="copy it there, or start the console elsewhere",
-        )
-    return path

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from model.errors import Refused
+from model.errors import BadInput, Refused
 
 #: Of what a verb printed, this much is shown, [characters].
 SHOWN = 4000
@@ -111,3 +111,19 @@ def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
         report=Path(report[-1]) if report else None,
         fault=fault[-1] if fault else None,
     )
+
+
+def file_here(name: str) -> Path:
+    """A file below the folder that the console was started in.
+
+    Raises:
+        BadInput: It is elsewhere.
+    """
+    path = Path(name)
+    if not path.resolve().is_relative_to(Path.cwd().resolve()):
+        raise BadInput(
+            f"{name} is not below the folder in which the console runs",
+            where="console",
+            next_step="copy it there, or start the console elsewhere",
+        )
+    return path

@@ -19,9 +19,11 @@ from executor.trajectory.setpoints import (
     fingerprint,
 )
 from executor.trajectory.time_scaling import TimeLaw, s_curve, time_law
+from model.errors import Refused
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
+from model.statics.dexterity import rms_anchor_radius
 
 #: Rows of a piece: of the first, which must be proved at once, and of a later one at most.
 FIRST_ROWS, MOST_ROWS = 10, 40
@@ -45,7 +47,7 @@ class JogLine:
         self._direction = direction
         self._cycle = rig.document.bus.cycle_ms / 1000.0
         self._spacing = rig.motion.speed * self._cycle
-        self._weight = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
+        self._weight = rms_anchor_radius(rig.anchors)
         self._travelled: Array = np.zeros(1)
 
     @property
@@ -83,8 +85,15 @@ class JogLine:
         Raises:
             CdprError: As for `go_on`.
         """
-        path = self._path(0.0, length)
-        checked = self._proved(0.0, length, time_law(path, self._rig.motion))
+        law = time_law(self._path(0.0, length), self._rig.motion)
+        if law.duration > (LONGEST_STEP - 1) * self._cycle:
+            raise Refused(
+                f"a step of {length * 1000:g} mm takes {law.duration:.1f} s at this speed",
+                where="jog",
+                why=f"a step lasts {LONGEST_STEP - 1} cycles at most",
+                next_step="hold the control instead, or begin the session with a higher speed",
+            )
+        checked = self._proved(0.0, length, law)
         self._travelled = checked.table.travelled
         return checked
 

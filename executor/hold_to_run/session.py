@@ -40,7 +40,7 @@ from executor.remote.server import serving
 from executor.remote.status import JogStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import Supervisor, require_confirmed
-from executor.winch_runs import raise_unless_finished
+from executor.winch_runs import with_board
 from model.errors import CdprError
 from model.kinematics import cable_lengths
 from model.pose import Pose
@@ -56,8 +56,6 @@ AHEAD = 0.4
 CERTAIN = 2.0
 #: A session in which nothing is held for so long ends by itself, [s]: cables relax.
 IDLE = 300.0
-#: Steps that can be asked for, [m].
-STEPS = (0.0001, 0.001, 0.010)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,14 +196,7 @@ def jog_session(
     start = ready.home if is_simulated(ready) else measured_pose(ready, around)
     require_confirmed(confirm, JogProposal(ready, around, start))
     session = _Session(ready, around, start, realtime, need_real_time_rights, listener, on_cycle)
-    followed = supervisor or Supervisor()
-    board = SharedRequests() if realtime else LocalRequests()
-    try:
-        stand = followed.during(board, partial(session.run, board))
-    finally:
-        if isinstance(board, SharedRequests):
-            board.close()
-    raise_unless_finished(stand, followed, ready)
+    with_board(ready, supervisor or Supervisor(), session.run, realtime=realtime)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,7 +32,9 @@ class Served:
 
     def __init__(self, *, read_only: bool = False) -> None:
         rig = load_rig(RIG)
-        files = ConsoleFiles(RIG, rig, (), (), RIG.parent / "environment_1.yaml", True, read_only)
+        files = ConsoleFiles(
+            RIG, rig, (), (), (), RIG.parent / "environment_1.yaml", True, read_only
+        )
         self.console = Console(files)
         self.said: list[tuple[str, dict[str, Any]]] = []
         self.started: list[tuple[str, list[str]]] = []

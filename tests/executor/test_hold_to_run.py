@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from executor.hold_to_run import session as sessions
 from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, Piece, PieceRing
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
-from executor.hold_to_run.session import STEPS, jog_session
+from executor.hold_to_run.session import jog_session
 from executor.jogging import with_speed
 from executor.realtime.shared_memory import SharedMemory
+from executor.remote.protocol import STEPS_MM
 from executor.state_machine import CycleRecord, State
 from model.clearance import ClearanceModel
 from model.errors import CdprError, Fault, StoppedByOperator
@@ -28,6 +29,7 @@ from model.scene import Scene, load_scene
 from model.winches import WinchMap
 from tests.cli.plans import RIG
 
+STEPS = tuple(step / 1000.0 for step in STEPS_MM)
 AXES = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
 
 
@@ -266,3 +268,11 @@ def test_pieces_arrive_as_they_were_sent(press: int, first: int, whole: bool, co
     assert np.array_equal(got.rows, rows)
     assert list(receiver.take()) == []
     memory.close()
+
+
+def test_a_step_that_takes_too_long_is_a_limit_and_no_fault() -> None:
+    z = np.array([0.0, 0.0, 1.0])
+    script = Script([(0.5, 1.5, hold(1, z, step=0.010))], 2.0)
+    records = script.run(scene(), speed=0.0005)
+    assert not any(moved(records))
+    assert records[-1].state is State.SECURING

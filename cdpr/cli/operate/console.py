@@ -90,11 +90,13 @@ def console(
             next_step='install it: pip install "cdpr[console]"',
         ) from None
     options = [("--interface", interface), ("--channel", channel)]
-    options += [("--calibration", str(path)) for path in calibration or ()]
     files = ConsoleFiles(
         rig_file=rig,
         rig=rig_on_bus(rig, interface, channel, calibration),
         bus_options=tuple(text for name, value in options if value for text in (name, value)),
+        calibration_options=tuple(
+            text for path in calibration or () for text in ("--calibration", str(path))
+        ),
         cameras=tuple(camera or ()),
         scene_file=scene,
         without_real_time=without_real_time,
