@@ -1,4 +1,4 @@
-"""What ``run.json``, ``summary.json`` and ``events.jsonl`` of a run folder must hold to be read.
+"""Files of a run folder: what they must hold to be read, and lines added whole or not at all.
 
 Keys that nothing reads are not looked at: a later version may add some. What is written is
 `executor.recording.summary`'s; a damaged or edited run folder ends in one message that names the
@@ -7,7 +7,9 @@ key.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +17,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from model.errors import BadInput, InvalidFile
-from model.files.reading import parse_json, read_json
+from model.files.documents import keep_names
+from model.files.reading import parse_json, read_bytes, read_json, read_text
 from model.files.validation import problems_of
 
 AGAIN = "restore the file, or run the plan again into a new folder"
@@ -249,3 +252,38 @@ def read_events(path: Path, lines: Sequence[str]) -> list[EventRecord]:
             what = "not an event"
             raise BadInput(what, where=f"{path}:{number}", next_step=AGAIN) from None
     return events
+
+
+def append_lines(path: Path, text: str, *, fsync: bool) -> None:
+    """Adds whole lines or nothing; with ``fsync`` they are on disk when this returns.
+
+    Raises:
+        OSError: The disk is full or gone.
+    """
+    with path.open("ab", buffering=0) as stream:
+        before = os.fstat(stream.fileno()).st_size
+        try:
+            data = memoryview(text.encode())
+            while data:
+                data = data[stream.write(data) :]
+            if fsync:
+                os.fsync(stream.fileno())
+                if before == 0:  # the file may be new
+                    keep_names(path.parent)
+        except OSError:
+            with suppress(OSError):
+                stream.truncate(before)  # the next line would be added to half a line
+            raise
+
+
+def whole_lines(path: Path) -> list[str]:
+    """The lines of a file that was appended to; a last one that was cut is left out.
+
+    Raises:
+        BadInput: It cannot be read, or is no text.
+    """
+    data = read_bytes(path)
+    try:
+        return data[: data.rfind(b"\n") + 1].decode().split("\n")[:-1]
+    except UnicodeDecodeError:
+        return read_text(path).split("\n")  # says what is wrong with it

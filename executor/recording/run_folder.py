@@ -20,12 +20,18 @@ from executor.recording.clearance import ClearanceTable
 from executor.recording.cycle_table import CycleTable, no_cycles
 from executor.recording.fused import FusedTable
 from executor.recording.pose_table import PoseTable
-from executor.recording.record_files import AGAIN, read_events, read_summary
+from executor.recording.record_files import (
+    AGAIN,
+    append_lines,
+    read_events,
+    read_summary,
+    whole_lines,
+)
 from executor.recording.run_course import RunCourse
 from model.errors import BadInput, Fault, InvalidFile
-from model.files.documents import keep_names, problems_of, write_atomic
+from model.files.documents import problems_of, write_atomic
 from model.files.plan_file import PlanDocument
-from model.files.reading import PICTURE_LIMIT, read_bytes, read_json, read_text
+from model.files.reading import PICTURE_LIMIT, read_bytes, read_json
 from model.files.rig_file import RigDocument
 from model.plan import Plan, load_plan, save_plan
 from model.rig import Rig, rig_from_document
@@ -237,8 +243,12 @@ class RunFolder:
         table.write_csv(self.path / CYCLES)
 
     def cycles(self) -> CycleTable:
-        """Reads ``cycles.csv``."""
-        return CycleTable.read_csv(self.path / CYCLES)
+        """Reads ``cycles.csv``.
+
+        Raises:
+            BadInput: It was changed, or has other cables than ``rig.json``.
+        """
+        return self._of_this_rig(CycleTable.read_csv(self.path / CYCLES))
 
     def cycles_cut_short(self, cable_count: int) -> CycleTable:
         """Reads what a killed program wrote of ``cycles.csv``: its whole lines, or none.
@@ -248,8 +258,21 @@ class RunFolder:
         """
         if not (self.path / CYCLES).is_file():
             return no_cycles(cable_count)
-        lines = self._whole_lines(CYCLES)
-        return CycleTable.of_lines(self.path / CYCLES, lines) if lines else no_cycles(cable_count)
+        lines = whole_lines(self.path / CYCLES)
+        if not lines:
+            return no_cycles(cable_count)
+        return self._of_this_rig(CycleTable.of_lines(self.path / CYCLES, lines))
+
+    def _of_this_rig(self, table: CycleTable) -> CycleTable:
+        cables = self.rig().cable_count
+        if table.cable_count != cables:
+            raise BadInput(
+                f"{CYCLES} has {table.cable_count} cables, {RIG} has {cables}",
+                where=str(self.path),
+                why="files of different runs are mixed, or a file was changed after the run",
+                next_step=AGAIN,
+            )
+        return table
 
     def write_course(self, course: RunCourse) -> None:
         """Writes ``run.json``, with room for its end.
@@ -343,7 +366,7 @@ class RunFolder:
             BadInput: Another line cannot be read.
         """
         path = self.path / EVENTS
-        return [RunEvent(**dict(event)) for event in read_events(path, self._whole_lines(EVENTS))]
+        return [RunEvent(**dict(event)) for event in read_events(path, whole_lines(path))]
 
     def write_events(self, events: Sequence[RunEvent]) -> None:
         """Writes ``events.jsonl`` whole, where some could not be appended.
@@ -400,33 +423,10 @@ class RunFolder:
             ) from None
 
     def _append(self, name: str, text: str, *, fsync: bool) -> None:
-        """Adds whole lines or nothing."""
         try:
-            with (self.path / name).open("ab", buffering=0) as stream:
-                before = os.fstat(stream.fileno()).st_size
-                try:
-                    data = memoryview(text.encode())
-                    while data:
-                        data = data[stream.write(data) :]
-                    if fsync:
-                        os.fsync(stream.fileno())
-                        if before == 0:  # the file may be new
-                            keep_names(self.path)
-                except OSError:
-                    with suppress(OSError):
-                        stream.truncate(before)  # the next line would be added to half a line
-                    raise
+            append_lines(self.path / name, text, fsync=fsync)
         except OSError as error:
             raise self._not_written(name, error) from None
-
-    def _whole_lines(self, name: str) -> list[str]:
-        """The lines of a file that was appended to; a last one that was cut is left out."""
-        path = self.path / name
-        try:
-            data = read_bytes(path)
-            return data[: data.rfind(b"\n") + 1].decode().split("\n")[:-1]
-        except UnicodeDecodeError:
-            return read_text(path).split("\n")  # says what is wrong with it
 
     def _write_json(self, name: str, data: Any) -> None:
         text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)

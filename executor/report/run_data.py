@@ -59,19 +59,16 @@ def read_run(folder: RunFolder) -> RunData:
 
 
 def _require_agreement(run: RunData) -> None:
-    """The files are of one run: the same stops, and as many cables."""
+    """The files are of one run: the same stops."""
     stops = [stop.name for stop in run.plan.scene.stops]
     said = [stop["name"] for stop in run.summary["stops"]]
-    cables = len(run.rig.winches)
     if said != stops:
-        what = f"summary.json has the stops {said}, plan.json {stops}"
-    elif run.cycles.tensions.shape[1] != cables:
-        what = f"cycles.csv is of {run.cycles.tensions.shape[1]} cables, rig.json of {cables}"
-    else:
-        return
-    raise BadInput(
-        what, where=str(run.folder.path), why="files of different runs are mixed", next_step=AGAIN
-    )
+        raise BadInput(
+            f"summary.json has the stops {said}, plan.json {stops}",
+            where=str(run.folder.path),
+            why="files of different runs are mixed",
+            next_step=AGAIN,
+        )
 
 
 # The little Markdown of the pages about faults.

@@ -136,6 +136,21 @@ def test_everything_that_is_written_comes_back(tmp_path: Path, run: fake_run.Fak
     assert tuple(folder.events()) == run.context.events
 
 
+def test_cycles_of_a_rig_with_other_cables_are_refused(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    folder.write_rig(run.context.rig.document)
+    folder.write_cycles(run.cycles)
+    path = folder.path / "cycles.csv"
+    path.write_text(path.read_text().replace("set_8_counts", "set_8_count", 1))
+    told = "cycles.csv has 7 cables, rig.json has 8"
+    with pytest.raises(BadInput, match=told):
+        folder.cycles()
+    with pytest.raises(BadInput, match=told):
+        folder.cycles_cut_short(8)
+
+
 def test_an_event_is_on_disk_as_soon_as_it_is_appended(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     first, second = RunEvent(0.5, "moving", "Los – 20 mm/s"), RunEvent(1.0, "stop", 'a "stop"\n')

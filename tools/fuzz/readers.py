@@ -91,7 +91,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     again = [
         Reader(f"again:{seed.name}", seed, _again, folder / seed.name)
         for seed in corpus["run"]
-        if seed.name in ("cycles.csv", "poses.csv", "summary.json")
+        if seed.name in ("cycles.csv", "poses.csv", "summary.json", "plan.json", "rig.json")
     ]
     unfinished = [Reader(f"cut:{seed.name}", seed, _cut, cut / seed.name) for seed in corpus["cut"]]
     return found + whole + again + unfinished

@@ -1,6 +1,11 @@
 """Feeds every reader mutated files and every verb odd command lines, and counts what goes wrong.
 
-    python tools/fuzz/run.py [--minutes 10] [--seed 1] [--workers 2] [--only READER] [--keep DIR]
+    python tools/fuzz/run.py [--minutes 10] [--calls N] [--seed 1] [--workers 2] [--only READER]
+                             [--keep DIR]
+
+With one seed and as many workers, the k-th call of a reader is the same on every machine. --calls
+ends after so many of each reader and a verb's call for each ten of them: what passed an hour here
+cannot fail in CI by luck.
 
 What goes wrong is a traceback, a call of more than 10 s of processor time or 30 s in all, more than
 2 GB of memory, a process that dies, or an unfinished output; the file or command line behind each
@@ -39,6 +44,8 @@ from verbs import VerbFuzzer  # noqa: E402
 CALL_S, SILENT_S = 10, 30
 MEMORY = 2 * 1024**3
 VERB_SHARE = 0.3
+READER_CALLS_A_VERB = 10
+VERBS = "verbs"
 
 
 class Hang(BaseException):
@@ -49,6 +56,7 @@ def main() -> int:
     """Runs the workers, restarts those that die, and prints the counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--calls", type=int, default=10**9, help="of each reader, at most")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--only", default="", help="readers whose name begins so; no verbs")
@@ -123,29 +131,31 @@ def _work(
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGPROF, _too_long)
-    chance = random.Random(f"{options.seed} {number} {start}")
     chosen = [r for r in readers(corpus, scratch) if r.name.startswith(options.only)]
     verbs = None if options.only else VerbFuzzer(corpus, scratch)
     counts: Counter[str] = Counter()
-    spent: Counter[str] = Counter({reader.name: 0 for reader in chosen})
+    spent = {reader.name: 0.0 for reader in chosen} | ({} if verbs is None else {VERBS: 0.0})
+    left = {name: _share(options, name == VERBS) for name in spent}
     by_name = {reader.name: reader for reader in chosen}
     seeds = {reader.name: reader.seed.read_bytes() for reader in chosen}
     beat, now = place / f"beat-{number}", place / f"now-{number}"
-    in_verbs = 0.0
-    while time.monotonic() < end:
+    while time.monotonic() < end and any(left.values()):
         os.utime(beat)
         (place / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
         began = time.monotonic()
-        if verbs is not None and in_verbs < VERB_SHARE * sum(spent.values()):
-            for found in verbs.one(chance, now):
-                counts[found] += 1
-                if found.startswith("verb "):
-                    shutil.copy(now, keep / f"verb-{options.seed}-{number}-{time.time_ns()}")
-            counts["verb calls"] += 1
-            in_verbs += time.monotonic() - began
-            continue
-        name = min(spent, key=spent.__getitem__)  # as much time for each reader
-        while time.monotonic() < began + 0.2:
+        # As much time for each reader, and for the verbs as for a third of them all.
+        name = min(
+            (name for name in left if left[name]),
+            key=lambda name: (
+                spent[name] * (1.0 / (VERB_SHARE * len(chosen)) if name == VERBS else 1.0)
+            ),
+        )
+        while left[name] and time.monotonic() < began + 0.2:
+            chance = random.Random(f"{options.seed} {name} {number} {start} {left[name]}")
+            left[name] -= 1
+            if name == VERBS:
+                counts.update(_verb(verbs, chance, now, keep))
+                continue
             data = mutated(seeds[name], chance)
             problem = _read(by_name[name], data, scratch, now)
             counts["reader calls"] += 1
@@ -155,6 +165,20 @@ def _work(
                 _keep(keep, name, data, problem)
         spent[name] += time.monotonic() - began
     (place / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
+
+
+def _share(options: argparse.Namespace, of_verbs: bool) -> int:
+    """The calls of one worker."""
+    calls = options.calls // READER_CALLS_A_VERB if of_verbs else options.calls
+    return max(1, calls // options.workers)
+
+
+def _verb(verbs: VerbFuzzer, chance: random.Random, now: Path, keep: Path) -> list[str]:
+    """One call of a verb: what to count."""
+    found = verbs.one(chance, now)
+    if any(one.startswith("verb ") for one in found):
+        shutil.copy(now, keep / f"verb-{time.time_ns()}")
+    return ["verb calls", *found]
 
 
 def _read(reader: Reader, data: bytes, scratch: Path, now: Path) -> tuple[str, str] | None:
