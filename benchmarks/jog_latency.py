@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from executor.hold_to_run.presses import PressBoard  # noqa: E402
-from executor.hold_to_run.session import jog_session  # noqa: E402
+from executor.hold_to_run.session import JogProver, jog_session  # noqa: E402
 from executor.state_machine import CycleRecord, State  # noqa: E402
 from model.rig import Rig, load_rig  # noqa: E402
 from model.scene import load_scene  # noqa: E402
@@ -49,7 +49,7 @@ class Operator:
     _last: tuple[int, ...] = ()
     _thread: threading.Thread | None = None
 
-    def on_cycle(self, record: CycleRecord, board: PressBoard) -> None:
+    def on_cycle(self, record: CycleRecord, board: PressBoard, _: JogProver) -> None:
         """Begins when the drives are ready; keeps the times of cycles with other targets."""
         if record.state is not State.MOVING:
             return

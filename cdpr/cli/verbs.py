@@ -149,7 +149,7 @@ OPERATE = (
     ),
     Verb(
         "monitor",
-        "Show a run live: state, drives, tensions, lateness, progress and events.",
+        "Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.",
         "operate.monitor:monitor",
     ),
     Verb(

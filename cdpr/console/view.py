@@ -149,7 +149,7 @@ class RobotView:
         rig, scene = self._file_rig, self._file_scene
         try:
             if folder is not None and (folder / "plan.json").exists():
-                run = RunFolder.open_cut_short(folder)
+                run = RunFolder(folder)  # which is under way
                 rig, scene = run.rig(), run.plan().scene
             else:
                 rig = MotionInterlock(rig).referenced_rig()

@@ -160,7 +160,7 @@ def jog_session(
     listener: Listener = SILENT,
     confirm: Callable[[JogProposal], bool] | None = None,
     supervisor: Supervisor | None = None,
-    on_cycle: Callable[[CycleRecord, PressBoard], None] | None = None,
+    on_cycle: Callable[[CycleRecord, PressBoard, JogProver], None] | None = None,
 ) -> None:
     """Enables the drives where the platform is, and moves it straight while a control is held.
 
@@ -180,8 +180,8 @@ def jog_session(
         listener: Receives what happens.
         confirm: Called once, before anything is enabled; False cancels it.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
-        on_cycle: Called after every cycle, with the board of presses, by a program that holds
-            controls itself.
+        on_cycle: Called after every cycle, with the board of presses and what is proved, by a
+            program that holds controls itself.
 
     Raises:
         CdprError: As for `executor.jogging.jog`; a fault is latched.
@@ -209,7 +209,7 @@ class _Session:
     realtime: bool
     need_real_time_rights: bool
     listener: Listener
-    on_cycle: Callable[[CycleRecord, PressBoard], None] | None
+    on_cycle: Callable[[CycleRecord, PressBoard, JogProver], None] | None
 
     def run(self, board: LocalRequests | SharedRequests) -> WinchesStand:
         """Moves until it ends; the command socket takes what is said of presses."""
@@ -294,7 +294,7 @@ class _Sink:
         if record.at - self.presses.last_heard > IDLE:
             self.presses.end()
         if self.session.on_cycle is not None:
-            self.session.on_cycle(record, self.presses)
+            self.session.on_cycle(record, self.presses, self.prover)
         if self.kept is not None:
             self.kept.take_cycle(record)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,8 @@ from model.errors import BadInput, Fault
 
 #: A run answers within this, [s]: its socket has a thread of its own.
 ANSWER_TIMEOUT = 2.0
+#: While there is no run, one is looked for this often, [s].
+LOOK = 0.2
 _CHUNK = 65536
 
 
@@ -202,20 +204,47 @@ def stop_runs() -> StopResult:
     )
 
 
-def follow_run(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
+def _pause(seconds: float) -> Sequence[bytes]:
+    time.sleep(seconds)
+    return ()
+
+
+def follow_run(
+    process: int | None,
+    rate: float,
+    *,
+    waits: bool = False,
+    between: Callable[[float], Sequence[bytes]] = _pause,
+) -> Iterator[dict[str, Any]]:
     """The status of a run, again and again, on one connection; until it ends.
 
     Args:
         process: Number of the run; None for the only one.
         rate: Reads a second, [Hz].
+        waits: Where there is no run, wait until one begins.
+        between: Passes the time given, [s], and says what the run is to be sent, lines of
+            `executor.remote.protocol.make_line`.
 
     Raises:
-        Fault: It is still there and does not answer.
+        Fault: There is no run, or it does not answer, or does not do what it was sent.
+        BadInput: It is not clear which run is meant.
     """
-    with find_runs() as runs:
-        run = select_run(runs, process, "monitor")
-        while True:
-            (answer,) = ask_all([run], "status")
+    while True:
+        with find_runs() as runs:
+            if runs or not waits:
+                yield from _followed(select_run(runs, process, "monitor"), rate, between)
+                return
+        between(LOOK)
+
+
+def _followed(
+    run: Reached, rate: float, between: Callable[[float], Sequence[bytes]]
+) -> Iterator[dict[str, Any]]:
+    status: dict[str, Any] = {}
+    lines: Sequence[bytes] = ()
+    while True:
+        for line in (*lines, make_line("status")):
+            answer = ask(run, line)
             if answer.ended:
                 last = last_word(run)
                 if last is not None:
@@ -223,5 +252,6 @@ def follow_run(process: int | None, rate: float) -> Iterator[dict[str, Any]]:
                 return
             if answer.status is None:
                 raise no_answer("monitor", [answer])
-            yield answer.status
-            time.sleep(1.0 / rate)
+            status = answer.status
+        yield status
+        lines = between(1.0 / rate)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from executor.hold_to_run import session as sessions
 from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, Piece, PieceRing
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
-from executor.hold_to_run.session import jog_session
+from executor.hold_to_run.session import JogProver, jog_session
 from executor.jogging import with_speed
 from executor.realtime.shared_memory import SharedMemory
 from executor.remote.protocol import STEPS_MM
@@ -51,7 +51,7 @@ class Script:
     end: float
     records: list[CycleRecord] = field(default_factory=list)
 
-    def __call__(self, record: CycleRecord, board: PressBoard) -> None:
+    def __call__(self, record: CycleRecord, board: PressBoard, _: JogProver) -> None:
         self.records.append(record)
         for begin, until, say in self.holds:
             if begin <= record.at < until:
@@ -195,8 +195,8 @@ def test_a_stop_ends_the_session_along_the_line() -> None:
 
     stops = Stops()
 
-    def on_cycle(record: CycleRecord, board: PressBoard) -> None:
-        script(record, board)
+    def on_cycle(record: CycleRecord, board: PressBoard, prover: JogProver) -> None:
+        script(record, board, prover)
         if record.at > 1.2:
             stops.board.ask_stop()
 

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import signal
+import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
+from rich.live import Live
+from rich.text import Text
 
 from cdpr.cli.facts import show_cable, show_jogging
+from cdpr.cli.operate.keys import Keys
 from cdpr.cli.operate.run import agreement, show, show_files
 from cdpr.cli.operate.supervision import RunSupervisor, SignalSupervisor, confirmation
 from cdpr.cli.options import (
@@ -24,11 +31,13 @@ from cdpr.cli.options import (
     rig_on_bus,
     with_option_groups,
 )
-from cdpr.cli.output import Terminal, out, show_json
+from cdpr.cli.output import Terminal, err, out, show_json
 from executor import jogging
 from executor.drives import is_simulated, require_own_time
-from executor.hold_to_run.session import jog_session
+from executor.hold_to_run.presses import PressBoard
+from executor.hold_to_run.session import JogProver, jog_session
 from executor.jogging import FASTEST, SPEED
+from executor.state_machine import CycleRecord, State
 from model.errors import BadInput
 from model.files.documents import millimetres
 from model.rig import Rig
@@ -72,7 +81,40 @@ class PathOptions:
         }
 
 
-DEFAULT_PATH = PathOptions()
+@dataclass(frozen=True, slots=True)
+class HeldOptions:
+    """Controls that are held; every field is an option of `cdpr jog`."""
+
+    hold_to_run: Annotated[
+        bool,
+        typer.Option(
+            "--hold-to-run",
+            help="enable the drives and follow held controls, as of `cdpr console`, until it ends",
+        ),
+    ] = False
+    keys: Annotated[
+        bool,
+        typer.Option(
+            "--keys", help="as --hold-to-run, by keys: arrows for x and y, page up and down for z"
+        ),
+    ] = False
+
+
+#: Keys that hold a jog, and where to.
+DIRECTIONS = {
+    "right": (1.0, 0.0, 0.0),
+    "left": (-1.0, 0.0, 0.0),
+    "up": (0.0, 1.0, 0.0),
+    "down": (0.0, -1.0, 0.0),
+    "page up": (0.0, 0.0, 1.0),
+    "page down": (0.0, 0.0, -1.0),
+}
+HELP = "arrows x and y · page up and down z · + and - speed · f frame · space stop · q end"
+#: The line with the position is renewed this often, [s].
+SHOWN_EVERY = 0.2
+#: Of + and -, in per cent.
+SPEED_STEP = 10
+DEFAULT_PATH, NOT_HELD = PathOptions(), HeldOptions()
 
 
 @with_option_groups
@@ -85,13 +127,7 @@ def jog(
     mm: Annotated[
         float | None, typer.Option("--mm", help="length to pay out, at most 50; negative winds in")
     ] = None,
-    hold_to_run: Annotated[
-        bool,
-        typer.Option(
-            "--hold-to-run",
-            help="enable the drives and follow held controls, as of `cdpr console`, until it ends",
-        ),
-    ] = False,
+    held: HeldOptions = NOT_HELD,
     limit_n: Annotated[
         float | None, typer.Option(help="with --cable: tension limit of any cable (default: 60 %)")
     ] = None,
@@ -112,7 +148,7 @@ def jog(
     and watched. With the interface 'virtual' the simulated platform hangs at home. With --cable one
     winch alone is moved: for commissioning, with cables that carry no load. With --hold-to-run the
     drives stay enabled, and the platform moves as long as a control is held, over the command
-    socket; `cdpr console` has such controls.
+    socket; `cdpr console` has such controls. With --keys it moves as long as a key is held here.
 
     [dim]Examples:[/dim]
 
@@ -134,8 +170,8 @@ def jog(
     require_unused(
         "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
-    if hold_to_run:
-        _held(the_rig, path, speed, fast, yes, without_real_time, as_json)
+    if held != NOT_HELD:
+        _held(the_rig, path, held, speed, fast, yes, without_real_time, as_json)
         return
     by = None if path.by_mm is None else millimetres(list(path.by_mm))
     jogging.require_distance(by, to_home=path.to_home)
@@ -161,6 +197,7 @@ def jog(
 def _held(
     rig: Rig,
     path: PathOptions,
+    held: HeldOptions,
     speed: float,
     fast: bool,
     yes: bool,
@@ -178,16 +215,105 @@ def _held(
         },
         "held controls say where to go, in real time",
     )
-    jog_session(
-        rig,
-        _scene(path.scene, path.no_scene, path.clearance_mm),
-        speed=speed,
-        need_real_time_rights=not without_real_time,
-        listener=Terminal(quiet=False),
-        confirm=confirmation(show_jogging, asks=not (is_simulated(rig) or yes), as_json=False),
-        supervisor=SignalSupervisor(),
-    )
+    keys = JogKeys(Keys(), 1000.0 * speed) if held.keys else None
+    with keys or ExitStack():
+        jog_session(
+            rig,
+            _scene(path.scene, path.no_scene, path.clearance_mm),
+            speed=speed,
+            need_real_time_rights=not without_real_time,
+            listener=Terminal(quiet=False),
+            confirm=confirmation(show_jogging, asks=not (is_simulated(rig) or yes), as_json=False),
+            supervisor=SignalSupervisor(),
+            on_cycle=None if keys is None else keys.take_cycle,
+        )
     out.print("the session is over; the drives hold")
+
+
+class JogKeys:
+    """Holds a jog by keys: a key that is held repeats, and counts for 150 ms.
+
+    A terminal says nothing when a key is let go, so that the platform moves until no repetition has
+    come for that time. Between the first press and its first repetition it comes to rest.
+    """
+
+    def __init__(self, keys: Keys, speed_mm_s: float) -> None:
+        """Nothing is held.
+
+        Args:
+            keys: Of the terminal; taken when the drives are ready.
+            speed_mm_s: At most.
+        """
+        self._keys, self._most = keys, speed_mm_s
+        self._percent, self._in_platform = 100, False
+        self._key, self._number = "", 0
+        self._shown_at = float("-inf")
+        self._live = Live(console=err, auto_refresh=False, transient=True)
+        self._stack = ExitStack()
+        self._is_ready = False
+
+    def __enter__(self) -> JogKeys:
+        """The terminal is as it was until the drives are ready."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """It is again."""
+        self._stack.close()
+
+    def take_cycle(self, record: CycleRecord, presses: PressBoard, prover: JogProver) -> None:
+        """A cycle is over: takes what was pressed meanwhile, and shows where the platform is."""
+        if record.state is not State.MOVING:
+            return
+        if not self._is_ready:
+            self._is_ready = True
+            self._stack.enter_context(self._keys)
+            if err.is_terminal:
+                self._stack.enter_context(self._live)
+        for key in self._keys.pressed():
+            self._take(key, presses)
+        if record.at - self._shown_at >= SHOWN_EVERY:
+            self._shown_at = record.at
+            self._show(prover)
+
+    def _take(self, key: str, presses: PressBoard) -> None:
+        if key in DIRECTIONS:
+            self._hold(key, presses)
+            return
+        presses.let_go(self._number)
+        if key == " ":
+            signal.raise_signal(signal.SIGINT)  # as Ctrl-C: a stop
+        elif key == "q":
+            presses.end()
+        elif key == "f":
+            self._in_platform = not self._in_platform
+        elif key in "+-":
+            change = SPEED_STEP if key == "+" else -SPEED_STEP
+            self._percent = min(max(self._percent + change, 1), 100)
+
+    def _hold(self, key: str, presses: PressBoard) -> None:
+        """The press goes on where it is the same key and has not ended; otherwise one begins."""
+        if key == self._key and self._said(presses):
+            return
+        self._key = key
+        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
+        self._said(presses)
+
+    def _said(self, presses: PressBoard) -> bool:
+        return presses.hold(
+            self._number,
+            np.array(DIRECTIONS[self._key]),
+            in_platform=self._in_platform,
+            step=None,
+            percent=self._percent,
+        )
+
+    def _show(self, prover: JogProver) -> None:
+        x, y, z = prover.pose.position * 1e3
+        frame = "platform" if self._in_platform else "world"
+        speed = self._most * self._percent / 100.0
+        limit = f"; stops in {prover.room * 1e3:.1f} mm: {prover.limit}" if prover.limit else ""
+        text = f"{x:.1f}, {y:.1f}, {z:.1f} mm  {speed:.1f} mm/s, {frame} frame{limit}\n{HELP}"
+        self._live.update(Text(text), refresh=self._live.is_started)
 
 
 def _one_cable(

@@ -1,9 +1,14 @@
-"""`cdpr monitor`: looks at a run that is under way, live in a terminal or once for a program."""
+"""`cdpr monitor`: shows a run that is under way, takes keys, or prints it for a program."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,11 +19,18 @@ from rich.table import Table
 from rich.text import Text
 
 from cdpr.cli.facts import camera_line
+from cdpr.cli.operate.keys import Keys
 from cdpr.cli.output import out, show_json
-from executor.remote.client import follow_run, request_run
+from cdpr.console.view import RobotNow, RobotView
+from executor.recording.run_folder import RIG, RunFolder
+from executor.remote.client import follow_run, request_run, stop_runs
+from executor.remote.protocol import make_line
+from model.errors import CdprError
 
 #: Of a run that ended so; what ends without a word was killed.
 _EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
+_KEYS = "space stop · h hold · r resume · + and - speed · q leave"
+_SPEED_STEP, _BAR = 10, 24
 _STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latched": "bold red"}
 
 
@@ -37,11 +49,15 @@ def monitor(
         int | None,
         typer.Option("--process", help="process number, if several runs are in progress"),
     ] = None,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="wait for a run to begin; in a terminal it always waits")
+    ] = False,
 ) -> None:
-    """Show a run live: state, drives, tensions, lateness, progress and events.
+    """Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.
 
-    It only looks; `cdpr stop`, `hold`, `resume` and `speed` act. Ctrl-C ends the monitor, not the
-    run. Exit code: 0 when the motion finished, 130 when it was stopped, 1 otherwise.
+    In a terminal it takes keys: space stops the run, h holds it, r resumes it, + and - change its
+    speed by ten per cent of the planned one. Ctrl-C or q ends the monitor, not the run. Exit code:
+    0 when the motion finished, 130 when it was stopped, 1 otherwise.
 
     [dim]Examples:[/dim]
 
@@ -50,17 +66,19 @@ def monitor(
       cdpr monitor --once --json
     """
     if once:
-        status = request_run("status", process, verb="monitor")
+        status = next(follow_run(process, rate, waits=True)) if wait else _now(process)
         if as_json:
             show_json(status)
         else:
             typer.echo(_plain(status))
-        return
-    looks = follow_run(process, rate)
-    if as_json or not out.is_terminal:
-        _lines(looks, as_json)
+    elif as_json or not out.is_terminal:
+        _lines(follow_run(process, rate, waits=wait), as_json)
     else:
-        _live(looks)
+        _live(process, rate)
+
+
+def _now(process: int | None) -> dict[str, Any]:
+    return request_run("status", process, verb="monitor")
 
 
 def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
@@ -82,16 +100,86 @@ def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
     _tell_end(status, as_json)
 
 
-def _live(looks: Iterator[dict[str, Any]]) -> None:
-
+def _live(process: int | None, rate: float) -> None:
     status: dict[str, Any] = {"state": "gone"}
+    robot = _Robot()
     try:
-        with Live(console=out, auto_refresh=False, transient=False) as live:
-            for status in looks:
-                live.update(_view(status), refresh=True)
+        with (
+            Keys() if sys.stdin.isatty() else nullcontext() as keys,
+            Live(console=out, auto_refresh=False, vertical_overflow="crop") as live,
+        ):
+            operator = _Operator(keys)
+            live.update(Text("waiting for a run to begin; Ctrl-C ends the monitor"), refresh=True)
+            for status in follow_run(process, rate, waits=True, between=operator.between):
+                operator.status = status
+                shown = _view(status, robot.seen(status), operator.line)
+                live.update(shown, refresh=True)
     except KeyboardInterrupt:
         return
     _tell_end(status, False)
+
+
+class _Operator:
+    """What the keys ask for."""
+
+    def __init__(self, keys: Keys | None) -> None:
+        """None where standard input is no terminal: then nothing is asked for."""
+        self._keys = keys
+        self.status: dict[str, Any] = {}
+        """Of the run, as it was seen last; empty before."""
+        self.line = _KEYS if keys else "no keys: standard input is not a terminal"
+        """Shown below the state."""
+
+    def between(self, seconds: float) -> Sequence[bytes]:
+        """See `executor.remote.client.follow_run`.
+
+        Raises:
+            KeyboardInterrupt: The monitor is to end.
+        """
+        if self._keys is None:
+            time.sleep(seconds)
+            return ()
+        return [line for key in self._keys.pressed(seconds) for line in self._asked(key)]
+
+    def _asked(self, key: str) -> Sequence[bytes]:
+        if key == "q":
+            raise KeyboardInterrupt
+        if key == " ":
+            self._stop()
+        elif key in "hr" and self.status:
+            return [make_line("hold" if key == "h" else "resume")]
+        elif key in "+-" and self.status:
+            step = _SPEED_STEP if key == "+" else -_SPEED_STEP
+            speed = min(max(self.status["wished"]["speed_percent"] + step, 1), 100)
+            self.status["wished"]["speed_percent"] = speed  # the next key counts from here
+            return [make_line("speed", percent=speed)]
+        return ()
+
+    def _stop(self) -> None:
+        """As `cdpr stop`: every run of this user."""
+        told = stop_runs()
+        self.line = "stop asked for" if told.stopped else "nothing moves"
+        if told.silent:
+            self.line = "A RUN DOES NOT ANSWER: PRESS THE EMERGENCY STOP"
+
+
+class _Robot:
+    """Pose and clearance of a run by its drives; its folder says which rig and plan it has."""
+
+    def __init__(self) -> None:
+        """Not seen yet."""
+        self._view: RobotView | None = None
+
+    def seen(self, status: dict[str, Any]) -> tuple[RobotView, RobotNow] | None:
+        """The robot now; None before the first cycle, and for motions without a plan."""
+        folder = Path(status["folder"] or "")
+        if self._view is None and (folder / RIG).is_file():
+            try:
+                self._view = RobotView(RunFolder(folder).rig(), None)
+            except CdprError:  # half written: the next look finds it whole
+                return None
+        now = None if self._view is None else self._view.take(status)
+        return None if self._view is None or now is None else (self._view, now)
 
 
 def _tell_end(status: dict[str, Any], as_json: bool) -> None:
@@ -151,27 +239,76 @@ def _plain(status: dict[str, Any]) -> str:
     return "\n".join([first, _head(status), *drives, *cameras, *events])
 
 
-def _view(status: dict[str, Any]) -> Group:
-    """The live image."""
+def _view(
+    status: dict[str, Any],
+    robot: tuple[RobotView, RobotNow] | None = None,
+    keys: str = "",
+) -> Group:
+    """The live image, the most important on top: a small window shows no more."""
     title = Text.assemble(
         (status["state"].upper(), _STATES.get(status["state"], "bold")),
         f"  {status['rig']} on {status['bus']}  process {status['process']}  {status['folder']}",
     )
-    drives = Table("drive", "state", box=None, padding=(0, 2), header_style="dim")
-    for name in ("position, counts", "off, counts", "tension, N"):
-        drives.add_column(name, justify="right")
-    for drive in status["drives"]:
-        drives.add_row(
-            str(drive["node"]),
-            drive["state"],
-            str(drive["position_counts"]),
-            f"{drive['position_counts'] - drive['set_counts']:+d}",
-            f"{drive['tension_n']:.2f}",
-        )
-    cameras = Text("\n".join(f"  camera {camera_line(one)}" for one in status["cameras"]))
     events = Table(box=None, show_header=False, padding=(0, 2))
     for event in status["events"]:
         events.add_row(f"{event['time_s']:.2f} s", event["code"], Text(event["text"]))
     bar = Table.grid()
     bar.add_row(ProgressBar(total=status["rows"], completed=status["row"] or 0.0, width=60))
-    return Group(title, Text(_head(status)), bar, drives, cameras, events)
+    lines = [] if status["next_stop"] is None else [Text(_ahead(status["next_stop"]))]
+    if robot is not None:
+        lines.append(Text(_where(*robot)))
+    if status["events"]:
+        lines.append(Text("last: {time_s:.2f} s  {text}".format(**status["events"][-1])))
+    lines.append(Text(keys, style="dim"))
+    cameras = Text("\n".join(f"  camera {camera_line(one)}" for one in status["cameras"]))
+    limits = None if robot is None else (robot[0].rig.min_tension, robot[0].rig.max_tension)
+    return Group(title, Text(_head(status)), bar, *lines, _drives(status, limits), cameras, events)
+
+
+def _ahead(stop: dict[str, Any]) -> str:
+    seconds = "" if stop["seconds"] is None else f", {stop['seconds']:.1f} s"
+    return f"next: {stop['name']} in {stop['distance_mm']:.1f} mm{seconds}"
+
+
+def _where(view: RobotView, now: RobotNow) -> str:
+    x, y, z = now.pose.position * 1e3
+    tilt = math.degrees(math.acos(min(max(now.pose.rotation[2, 2], -1.0), 1.0)))
+    text = f"platform {x:.1f}, {y:.1f}, {z:.1f} mm, tilt {tilt:.2f}° by the drives"
+    if now.clearance is None:
+        return text
+    distance, first, second = now.clearance
+    return (
+        f"{text}; clearance {distance * 1e3:.1f} of {view.required_clearance * 1e3:.1f} mm,"
+        f" {first} – {second}"
+    )
+
+
+def _drives(status: dict[str, Any], limits: tuple[float, float] | None) -> Table:
+    """A line a drive; tensions between their limits where these are known, [N]."""
+    drives = Table("drive", "state", box=None, padding=(0, 2), header_style="dim")
+    for name in ("position, counts", "off, counts", "tension, N"):
+        drives.add_column(name, justify="right")
+    if limits is not None:
+        drives.add_column(f"{limits[0]:.0f} to {limits[1]:.0f} N", no_wrap=True)
+    for drive in status["drives"]:
+        tension = drive["tension_n"]
+        beyond = limits is not None and not limits[0] <= tension <= limits[1]
+        drives.add_row(
+            str(drive["node"]),
+            drive["state"],
+            str(drive["position_counts"]),
+            f"{drive['position_counts'] - drive['set_counts']:+d}",
+            Text(f"{tension:.2f}", style="bold red" if beyond else ""),
+            *([] if limits is None else [_bar(tension, *limits)]),
+        )
+    return drives
+
+
+def _bar(tension: float, low: float, high: float) -> Text:
+    """A tension from zero to a little above its upper limit; the limits are marked."""
+    cells = [" "] * _BAR
+    place = [min(max(int(v / (1.1 * high) * _BAR), 0), _BAR - 1) for v in (tension, low, high)]
+    cells[: place[0]] = "━" * place[0]
+    for mark in place[1:]:
+        cells[mark] = "│"
+    return Text("".join(cells), style="" if low <= tension <= high else "bold red")

@@ -1,0 +1,229 @@
+"""Keys of the terminal: read as they are pressed, they watch and steer a run, and hold a jog."""
+
+from __future__ import annotations
+
+import os
+import pty
+import sys
+import termios
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdpr.cli.operate import monitor
+from cdpr.cli.operate.jog import JogKeys
+from cdpr.cli.operate.keys import NAMES, Keys, names_of
+from cdpr.cli.operate.supervision import SignalSupervisor
+from executor.hold_to_run.presses import TIMEOUT, PressBoard
+from executor.hold_to_run.session import JogProver, jog_session
+from executor.operator_requests import LocalRequests
+from executor.remote import client
+from executor.remote.client import StopResult, follow_run
+from executor.remote.protocol import make_line, parse_command
+from executor.remote.registry import Reached, advertised
+from executor.remote.server import serving
+from executor.remote.status import WinchStatus
+from executor.state_machine import CycleRecord
+from model.errors import BadInput, StoppedByOperator
+from model.rig import load_rig
+from tests.cli.plans import RIG
+from tests.cli.test_monitor import status
+from tests.executor import fake_run
+
+SENT = {name: b"\x1b[" + code for code, name in NAMES.items()} | {
+    sign: sign.encode() for sign in " hrq+-f"
+}
+
+
+@given(st.lists(st.sampled_from([*SENT, "unknown"])))
+def test_keys_are_told_apart_however_many_come_at_once(keys: list[str]) -> None:
+    data = b"".join(SENT.get(key, b"\x1b[1;5P") for key in keys)
+    assert names_of(data) == [key for key in keys if key != "unknown"]
+
+
+@given(st.binary(max_size=40))
+def test_no_bytes_are_too_odd(data: bytes) -> None:
+    assert all(name in NAMES.values() or len(name) == 1 for name in names_of(data))
+
+
+@contextmanager
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A terminal as standard input; its other end."""
+    operator, program = pty.openpty()
+    with os.fdopen(program) as stream, monkeypatch.context() as patched:
+        patched.setattr(sys, "stdin", stream)
+        yield operator
+    os.close(operator)
+
+
+def test_keys_come_without_enter_and_the_terminal_is_left_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with terminal(monkeypatch) as operator:
+        before = termios.tcgetattr(sys.stdin)
+        with Keys() as keys:
+            assert not termios.tcgetattr(sys.stdin)[3] & (termios.ICANON | termios.ECHO)
+            assert keys.pressed() == []
+            os.write(operator, b"h\x1b[A")
+            assert keys.pressed(wait=10.0) == ["h", "up"]
+            os.write(operator, b"rm -rf\n")  # not for the shell
+        assert termios.tcgetattr(sys.stdin) == before
+
+
+def test_a_pipe_has_no_keys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "input").touch()
+    with (tmp_path / "input").open() as stream:
+        monkeypatch.setattr(sys, "stdin", stream)
+        with pytest.raises(BadInput, match="not a terminal"):
+            Keys()
+
+
+class Typed:
+    """Keys by simulated time, in place of a terminal."""
+
+    def __init__(self, script: Sequence[tuple[float, float, str]]) -> None:
+        self._script, self.now = script, 0.0
+
+    def __enter__(self) -> Typed:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def pressed(self, wait: float = 0.0) -> list[str]:
+        return [key for begin, end, key in self._script if begin <= self.now < end]
+
+
+def jogged(script: Sequence[tuple[float, float, str]]) -> list[tuple[float, Any]]:
+    """Time and place of the platform, cycle by cycle, from when the drives are ready."""
+    typed, seen = Typed(script), []
+    keys = JogKeys(typed, 20.0)  # type: ignore[arg-type]
+    begun: list[float] = []
+
+    def on_cycle(record: CycleRecord, presses: PressBoard, prover: JogProver) -> None:
+        begun.append(record.at)
+        typed.now = record.at - begun[0]
+        keys.take_cycle(record, presses, prover)
+        seen.append((typed.now, prover.pose.position))
+
+    with keys:
+        jog_session(
+            load_rig(RIG), None, realtime=False, on_cycle=on_cycle, supervisor=SignalSupervisor()
+        )
+    return seen
+
+
+def test_the_platform_moves_while_a_key_repeats_and_rests_soon_after() -> None:
+    seen = jogged([(1.0, 2.0, "right"), (4.0, 9.0, "q")])
+    times, places = np.array([t for t, _ in seen]), np.array([p for _, p in seen])
+    moved = places[-1] - places[0]
+    assert moved[0] > 0.010
+    assert np.abs(moved[1:]).max() < 1e-9
+    rig = load_rig(RIG)
+    to_rest = 0.020 / rig.motion.acceleration + rig.motion.acceleration / rig.motion.jerk
+    rests = places[times > 2.0 + TIMEOUT + to_rest + 0.1]
+    assert len(rests) > 20
+    assert np.ptp(rests, axis=0).max() == 0.0
+    assert times[-1] < 5.0, "q ends the session"
+
+
+def test_a_second_key_ends_the_press_and_moves_from_rest() -> None:
+    seen = jogged([(1.0, 2.0, "up"), (2.0, 3.5, "page up"), (5.0, 9.0, "q")])
+    steps = np.diff([p for _, p in seen], axis=0)
+    assert np.ptp([p for _, p in seen], axis=0)[1:].min() > 0.002
+    assert not ((steps[:, 1] != 0.0) & (steps[:, 2] != 0.0)).any(), "along one axis at a time"
+
+
+@pytest.mark.parametrize("key", ["-", "f", "x"])
+def test_any_other_key_ends_the_press(key: str) -> None:
+    seen = jogged([(1.0, 1.3, "right"), (1.3, 1.4, key), (3.0, 9.0, "q")])
+    held = jogged([(1.0, 1.4, "right"), (3.0, 9.0, "q")])
+    assert seen[-1][1][0] < held[-1][1][0]
+
+
+def test_space_stops_the_session_while_it_moves() -> None:
+    with pytest.raises(StoppedByOperator):
+        jogged([(1.0, 9.0, "right"), (1.5, 1.51, " ")])
+
+
+class Script:
+    """Keys one call after the other."""
+
+    def __init__(self, *keys: str) -> None:
+        self._keys = list(keys)
+
+    def pressed(self, wait: float = 0.0) -> list[str]:
+        return [self._keys.pop(0)] if self._keys else []
+
+
+def test_the_monitors_keys_ask_what_the_verbs_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[int] = []
+    monkeypatch.setattr(monitor, "stop_runs", lambda: stopped.append(1) or StopResult((7,), ()))
+    operator = monitor._Operator(Script("h", "r", "+", "+", "-", " ", "x", "q"))  # type: ignore[arg-type]
+    operator.status = status()  # wished speed: 50 %
+    said = [parse_command(line) for _ in range(5) for line in operator.between(0.0)]
+    assert [one.command for one in said] == ["hold", "resume", "speed", "speed", "speed"]
+    assert [one.percent for one in said[2:]] == [60, 70, 60]  # type: ignore[union-attr]
+    assert list(operator.between(0.0)) == []
+    assert stopped == [1]
+    assert operator.line == "stop asked for"
+    assert list(operator.between(0.0)) == []
+    with pytest.raises(KeyboardInterrupt):
+        operator.between(0.0)
+
+
+def test_keys_before_a_run_ask_for_nothing() -> None:
+    operator = monitor._Operator(Script("h", "+"))  # type: ignore[arg-type]
+    assert [*operator.between(0.0), *operator.between(0.0)] == []
+
+
+def test_a_run_is_waited_for_and_takes_what_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    board, looks = LocalRequests(), iter([False, False, True])
+    find_runs, passed = client.find_runs, [0.0]
+
+    @contextmanager
+    def later() -> Iterator[list[Reached]]:
+        if not next(looks):
+            yield []
+            return
+        with find_runs() as runs:
+            yield [run for run in runs if run.process == os.getpid()]
+
+    def between(seconds: float) -> list[bytes]:
+        passed[0] += seconds
+        return [make_line("hold")]
+
+    monkeypatch.setattr(client, "find_runs", later)
+    told = WinchStatus(load_rig(RIG), board, simulated_time=False)
+    with advertised() as listeners, serving(listeners, board, told):
+        following = follow_run(None, 10.0, waits=True, between=between)
+        first = next(following)
+        assert passed[0] == pytest.approx(2 * client.LOOK)
+        assert not first["wished"]["hold"]
+        assert next(following)["wished"]["hold"]
+        following.close()
+
+
+def test_the_monitor_shows_where_the_platform_is_by_the_runs_own_rig(tmp_path: Path) -> None:
+    run = fake_run.make(rate_hz=2.0, every=20)
+    folder = fake_run.write(run, tmp_path / "run", pictures=False)
+    k = len(run.cycles) // 2
+    drives = [
+        {"node": i + 1, "state": "operation enabled", "position_counts": int(counts)}
+        | {"set_counts": int(counts), "tension_n": float(run.cycles.planned_tensions[k, i])}
+        for i, counts in enumerate(run.cycles.set_counts[k])
+    ]
+    told = status(folder=str(folder.path), drives=drives)
+    seen = monitor._Robot().seen(told)
+    assert seen is not None
+    view, robot = seen
+    np.testing.assert_allclose(robot.pose.position, run.cycles.planned[k], atol=2e-5)
+    assert robot.clearance is not None
+    assert view.scene.obstacles, "those of the plan that is run"
+    x, y, z = 1e3 * robot.pose.position
+    assert f"platform {x:.1f}, {y:.1f}, {z:.1f} mm" in monitor._where(view, robot)
