@@ -30,7 +30,7 @@ from model.errors import CdprError
 #: Of a run that ended so; what ends without a word was killed.
 _EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
 _KEYS = "space stop · h hold · r resume · + and - speed · q leave"
-_SPEED_STEP, _BAR = 10, 24
+_SPEED_STEP, _BAR = 10, 20
 _STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latched": "bold red"}
 
 
@@ -285,7 +285,8 @@ def _where(view: RobotView, now: RobotNow) -> str:
 
 def _drives(status: dict[str, Any], limits: tuple[float, float] | None) -> Table:
     """A line a drive; tensions between their limits where these are known, [N]."""
-    drives = Table("drive", "state", box=None, padding=(0, 2), header_style="dim")
+    drives = Table("drive", box=None, padding=(0, 1), header_style="dim")
+    drives.add_column("state", no_wrap=True)
     for name in ("position, counts", "off, counts", "tension, N"):
         drives.add_column(name, justify="right")
     if limits is not None:
