@@ -14,8 +14,7 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
 from executor.control.standstill import FaultReset, Release, StandstillMotion
-from executor.current_pose import current_pose
-from executor.drives import left_alone, require_other_process, resting_drives_of
+from executor.drives import current_pose, left_alone, require_other_process, resting_drives_of
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
@@ -24,9 +23,9 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.remote.registry import advertised
 from executor.remote.server import serving
 from executor.remote.status import WinchStatus
-from executor.standstill_runs import is_braked, release_drives, reset_drives
 from executor.state_machine import State
 from executor.supervision import Supervisor, require_confirmed
+from executor.winch_runs import is_braked, release_drives, reset_drives
 from model.errors import CdprError, Refused
 from model.pose import Pose
 from model.progress import SILENT, Listener
