@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from model.display import html_table
 from model.errors import BadInput, InvalidFile
 from model.files.documents import check_version, document_hash, problems_of, write_atomic
 from model.files.plan_file import PlanDocument, QualityDocument
 from model.files.reading import read_json
+from model.pages.page import html_table
 from model.pose import Pose
 from model.rig import NOT_IN_PLAN_HASH, Rig, rig_from_document
 from model.scene import Scene, scene_from_document

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from model.display import html_table
 from model.errors import BadInput
 from model.files.documents import (
     Document,
@@ -48,6 +47,7 @@ from model.geometry.shapes import (
     encloses_convex,
     read_only_indices,
 )
+from model.pages.page import html_table
 from model.pose import Array, Pose, read_only
 from model.rotation_limits import RotationLimits
 

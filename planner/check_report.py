@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from model.clearance import Nearest
-from model.display import html_table
 from model.errors import Refused
+from model.pages.page import html_table
 from model.plan import Plan
 from model.pose import Array, Pose
 

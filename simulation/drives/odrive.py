@@ -17,15 +17,18 @@ import can
 import numpy as np
 
 from drivers.can_bus import take
-from drivers.odrive.dbc import OWN_DBC, Layout, Layouts, read_layouts
 from drivers.odrive.endpoints import read_endpoints
 from drivers.odrive.messages import (
+    OWN_DBC,
     AxisError,
     AxisState,
     ControlMode,
     InputMode,
+    Layout,
+    Layouts,
     can_id,
     node_and_command,
+    read_layouts,
 )
 from drivers.plausibility import winding_signs
 from model.files.rig_file import OdriveDocument

@@ -48,7 +48,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
     },
     "an extra may not be installed": {
         "cdpr/cli/operate/console.py",
-        "drivers/odrive/dbc.py",
+        "drivers/odrive/messages.py",
         "planner/parallel.py",
         "tracking/detection/libraries.py",
     },
