@@ -17,10 +17,10 @@ from cdpr.cli.plan.examples import configs
 from model.files.output import make_folder
 from model.rig import load_rig
 from model.scene import load_scene
-from planner.campaign.cases import OWN
-from planner.campaign.claims import Finding, findings
 from planner.campaign.evaluation import about, run_campaign, write_campaign
 from planner.campaign.page import change_text
+from planner.campaign.results import Finding, findings
+from planner.campaign.trial import OWN
 
 ENVIRONMENTS = ("environment_1", "environment_2", "environment_3")
 DEFAULT_FOLDER = Path("bench-paper")

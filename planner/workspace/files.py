@@ -12,9 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from planner.workspace.compute import Maps
+from planner.workspace.figures import (
+    SETTINGS,
+    cost_figure,
+    level_figure,
+    slice_figure,
+    space_figure,
+    title_of,
+)
 from planner.workspace.report import Chapter, arrays_of, csv_of, page, shown_in, summary_of
-from planner.workspace.slices import SETTINGS, cost_figure, slice_figure, title_of
-from planner.workspace.volumes import level_figure, space_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
