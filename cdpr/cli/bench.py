@@ -12,8 +12,7 @@ from rich.table import Table
 
 from cdpr.cli.options import DaskOption, WorkersOption
 from cdpr.cli.output import Terminal, out, show_json
-from cdpr.cli.plan.demo import RIG
-from cdpr.cli.plan.examples import configs
+from model.files.examples import PAPER_RIG, ready_folder
 from model.files.output import make_folder
 from model.rig import load_rig
 from model.scene import load_scene
@@ -50,8 +49,8 @@ def paper(
 
       cdpr bench paper --seeds 100 -o bench-paper
     """
-    rig = load_rig(configs() / RIG)
-    scenes = [load_scene(configs() / f"{name}.yaml") for name in ENVIRONMENTS]
+    rig = load_rig(ready_folder() / PAPER_RIG)
+    scenes = [load_scene(ready_folder() / f"{name}.yaml") for name in ENVIRONMENTS]
     make_folder(output, force)
     listener = Terminal(quiet=as_json)
     results = run_campaign(

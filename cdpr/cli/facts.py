@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.markup import escape
 
 from cdpr.cli.output import err, out, show_facts, show_json
-from cdpr.cli.plan.facts import stop_facts
 from drivers.can_bus import IN_PROCESS
 from executor.cameras.sources import describe_cameras
 from executor.hold_to_run.session import JogProposal
@@ -63,7 +62,7 @@ def show_prepared(proposal: MotionProposal, on: Console) -> None:
             ("rig, scene", f"{rig.name}, {prepared.scene.name}"),
             ("from", f"{start[0]:z.1f}, {start[1]:z.1f}, {start[2]:z.1f} mm"),
             ("to", f"{goal[0]:z.1f}, {goal[1]:z.1f}, {goal[2]:z.1f} mm"),
-            *stop_facts(prepared.scene),
+            *prepared.scene.stop_facts(),
             (
                 "motion",
                 f"{prepared.length * 1000:.1f} mm in {prepared.duration:.1f} s,"

@@ -12,7 +12,7 @@ import pytest
 
 from calibration.results import write_result
 from cdpr.cli.facts import show_summary
-from cdpr.cli.operate.status import _next_step
+from cdpr.cli.operate.service import _next_step
 from cdpr.cli.output import progress_bar
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as told
