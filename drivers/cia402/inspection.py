@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import can
 import numpy as np
@@ -107,6 +107,26 @@ class Examined:
     def good(self) -> bool:
         """Every drive can be set up, as far as reading shows."""
         return not self.silent and all(row.verdict != "wrong" for row in self.rows)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {
+            "answered": list(self.nodes),
+            "silent": list(self.silent),
+            "objects": [
+                {
+                    "object": row.object,
+                    "verdict": row.verdict,
+                    "needed": row.needed,
+                    "found": [
+                        {"drives": nodes, "value": text} for text, nodes in row.found.items()
+                    ],
+                    "meaning": row.meaning,
+                    "change": row.change,
+                }
+                for row in self.rows
+            ],
+        }
 
 
 def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
-from typing import Any
 
-from cdpr.cli.facts import (
-    reference_dict,
-    reference_text,
-    show_release,
-    show_reset,
-    show_status,
-    status_dict,
-)
+from cdpr.cli.facts import show_release, show_reset, show_status
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CalibrationOption,
@@ -27,6 +20,7 @@ from cdpr.cli.options import (
 )
 from cdpr.cli.output import Terminal, out, show_json
 from executor import service
+from executor.service import StatusResult
 
 
 def status(
@@ -47,25 +41,24 @@ def status(
     """
     the_rig = rig_on_bus(rig, interface, channel, calibration)
     result = service.status(the_rig)
-    told = status_dict(result)
     if as_json:
-        show_json(told)
+        show_json(result.as_dict())
     else:
-        show_status(the_rig, result, _next_step(rig, told))
+        show_status(the_rig, result, _next_step(rig, result))
     if result.missing is not None:
         raise result.missing
 
 
-def _next_step(rig: Path, told: dict[str, Any]) -> str:
+def _next_step(rig: Path, seen: StatusResult) -> str:
     """What has to be done before anything can run; nothing where all is well or a run goes on."""
-    if told["run"] is not None or told["being_set_up"]:
+    if seen.run is not None or seen.being_set_up:
         return ""
     steps = []
-    if told["latched"] is not None:
+    if seen.latched is not None:
         steps.append(
             f"find the cause and check the platform, then run cdpr reset {quote(str(rig))}"
         )
-    if not told["reference"]["counts"]:
+    if not seen.reference.counts:
         ways = "--at-home, --pose-mm X Y Z or --camera SOURCE"
         steps.append(f"cdpr home {quote(str(rig))} with {ways}")
     return "; then ".join(steps)
@@ -98,21 +91,13 @@ def reset(
         listener=Terminal(quiet=as_json),
     )
     if as_json:
-        show_json(
-            {
-                "was_latched": result.was_latched,
-                "cause": result.cause,
-                "drives": list(result.drives),
-                "restarted": list(result.restarted),
-                "reference": reference_dict(result.reference),
-            }
-        )
+        show_json(asdict(result))
         return
     out.print(f"drives: {', '.join(sorted(set(result.drives)))}", soft_wrap=True)
     if result.restarted:
         names = ", ".join(the_rig.drive_names[node] for node in result.restarted)
         out.print(f"power-cycled since their last configuration: {names}", soft_wrap=True)
-    out.print(f"reference: {reference_text(result.reference)}", soft_wrap=True, markup=False)
+    out.print(f"reference: {result.reference}", soft_wrap=True, markup=False)
     latch_now = "the fault latch is released" if result.was_latched else "no fault was latched"
     out.print(f"{latch_now}; the next run must start from the platform's present pose")
 
@@ -146,8 +131,7 @@ def release(
         supervisor=SignalSupervisor(),
     )
     if as_json:
-        reference = reference_dict(result.reference)
-        show_json({"drives": list(result.drives), "reference": reference})
+        show_json(asdict(result))
         return
     out.print(f"all drives are without torque: {', '.join(sorted(set(result.drives)))}")
-    out.print(f"reference: {reference_text(result.reference)}", soft_wrap=True, markup=False)
+    out.print(f"reference: {result.reference}", soft_wrap=True, markup=False)
