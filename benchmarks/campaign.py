@@ -22,11 +22,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from cdpr.cli.plan.demo import RIG
-from cdpr.cli.plan.examples import configs
 from executor import runner
 from executor.recording.run_folder import RunFolder
 from model.errors import CdprError
+from model.files.examples import PAPER_RIG, ready_folder
 from model.plan import load_plan, save_plan
 from model.rig import Rig, load_rig
 from model.scene import load_scene
@@ -80,7 +79,7 @@ Result = PlanResult | RunResult
 def plan_one(rig: Rig, environment: int, clearance_mm: float, seed: int, path: Path) -> PlanResult:
     """Plans, writes, reads back and checks; leaves the plan in ``path``."""
     key = (environment, clearance_mm, seed)
-    scene = load_scene(configs() / f"environment_{environment}.yaml")
+    scene = load_scene(ready_folder() / f"environment_{environment}.yaml")
     scene = scene.changed(clearance=clearance_mm / 1000.0)
     begin = time.perf_counter()
     try:
@@ -137,7 +136,7 @@ def campaign(
     tell: Callable[[Result], None],
 ) -> list[Result]:
     """All of it, told one by one; see the head of this file."""
-    rig = load_rig(configs() / RIG)
+    rig = load_rig(ready_folder() / PAPER_RIG)
     results: list[Result] = []
 
     def take(result: Result) -> None:

@@ -29,8 +29,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from cdpr.cli.plan.demo import RIG
-from cdpr.cli.plan.examples import configs
 from drivers.can_load import SLOWEST_TENTHS_MS, TESTED_HZ, check_bus_load
 from executor.control.path_runs import run_in_real_time
 from executor.drives import drives_of
@@ -40,6 +38,7 @@ from executor.recording.run_folder import RunFolder
 from executor.remote.status import RunStatus
 from executor.trajectory.prepare import PreparedRun, prepare
 from model.errors import BadInput, CdprError
+from model.files.examples import PAPER_RIG, ready_folder
 from model.plan import load_plan, save_plan
 from model.pose import Array
 from model.rig import Rig, load_rig, rig_from_document
@@ -53,7 +52,7 @@ ENVIRONMENT = "environment_3.yaml"
 
 def prepared_at(rate: float, folder: Path) -> PreparedRun:
     """The third environment of the paper, a path of half a minute, with cycles at a rate [Hz]."""
-    rig, scene = load_rig(configs() / RIG), load_scene(configs() / ENVIRONMENT)
+    rig, scene = load_rig(ready_folder() / PAPER_RIG), load_scene(ready_folder() / ENVIRONMENT)
     plan = folder / f"plan-{rate:g}.json"
     save_plan(make_plan(rig, scene, OptimalSettings(seed=0)), plan)
     return prepare(verify(load_plan(plan)), with_cycle(rig, 1000.0 / rate))
@@ -199,7 +198,7 @@ def require_measurable(rates: Sequence[float], seconds: float) -> None:
                 why="arming refuses shorter cycles than were tested, the rig file longer ones",
                 next_step="name rates in that range",
             )
-        check_bus_load(with_cycle(load_rig(configs() / RIG), 1000.0 / rate))
+        check_bus_load(with_cycle(load_rig(ready_folder() / PAPER_RIG), 1000.0 / rate))
     if not (math.isfinite(seconds) and seconds > 0.0):
         what = f"{seconds:g} s leave no time to measure in"
         raise BadInput(what, where="--seconds", next_step="give a time above 0 s")

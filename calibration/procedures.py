@@ -41,12 +41,12 @@ from calibration.tag_map.result import TagsResult, judge_layout, tags_page, tags
 from calibration.targets.board import Board, read_corners
 from calibration.verdict import CalibrationVerdict
 from executor.kernels import ready_to_measure
-from model.display import html_table
 from model.errors import BadInput, Fault, Refused
 from model.files.documents import write_atomic
 from model.files.output import make_place, require_new_file
 from model.files.rig_file import RigDocument
 from model.kinematics import NoCable
+from model.pages.page import html_table
 from model.pose import Pose, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig

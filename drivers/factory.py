@@ -55,12 +55,12 @@ def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSna
     """
     document = rig.document.drives
     if document.type == "odrive":
-        from drivers.odrive import read_state as odrive
+        from drivers.odrive.group import read_axes
 
-        return odrive.look(rig, document, bus, pump)
-    from drivers.cia402 import read_state as cia402
+        return read_axes(rig, document, bus, pump)
+    from drivers.cia402.inspection import read_states
 
-    return cia402.look(rig, bus, pump)
+    return read_states(rig, bus, pump)
 
 
 def make_drive_group(

@@ -145,8 +145,8 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
     drives = rig.document.drives
     if not isinstance(drives, OdriveDocument):
         return []
-    from drivers.odrive.dbc import OWN_DBC, read_layouts
     from drivers.odrive.endpoints import read_endpoints
+    from drivers.odrive.messages import OWN_DBC, read_layouts
 
     try:
         read_layouts(Path(drives.dbc) if drives.dbc else OWN_DBC)

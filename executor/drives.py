@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
@@ -19,19 +20,22 @@ from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
 from executor.kernels import ready_to_simulate
 from executor.realtime.job import ReadyDrives
-from model.errors import BadInput, CdprError
+from model.errors import BadInput, CdprError, Fault, Refused
 from model.files.rig_file import RigDocument
-from model.pose import Pose
+from model.kinematics import forward_kinematics
+from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
 from model.scene import Load, nothing_in_the_way
+from model.statics.gravity import working_tensions
+from model.winches import WinchMap
+
+if TYPE_CHECKING:
+    from simulation.ground_truth import PowerLoss
+    from simulation.rig import SimulatedRig
 
 #: Within this time drives that lost their master have noticed it and come to rest, [s].
 ALONE = 1.0
-
-if TYPE_CHECKING:  # a real bus loads no simulator
-    from simulation.ground_truth import PowerLoss
-    from simulation.rig import SimulatedRig
 
 
 def is_simulated(rig: Rig) -> bool:
@@ -252,3 +256,56 @@ def resting_drives_of(
     load = nothing_in_the_way(rig).load
     set_up_as = partial(set_up_here, rig)
     return open_drives(rig, rig.home, load, to_reset=to_reset, set_up_as=set_up_as)
+
+
+# Where the platform stands, from where its drives stand.
+
+
+#: The stretch of the cables depends on the pose: rounds until the pose changes no more than this,
+#: [m]; soft cables on a large robot need some twenty.
+_SETTLED, _ROUNDS = 1e-8, 200
+
+
+def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
+    """The pose whose planned drive positions are these, ``world_from_platform``.
+
+    Args:
+        rig: The robot; its drives are referenced.
+        counts: Positions of the drives, shape (m,), [counts].
+        load: What the platform carries.
+
+    Raises:
+        Refused: No pose of the workspace fits them within the rig's start tolerance.
+        TensionInfeasible: The cables cannot hold the platform there.
+        Fault: The search for a pose ended without one.
+    """
+    winches = WinchMap(rig)
+    unstrained = winches.unstrained_from_counts(counts)
+    tensions = working_tensions(rig, rig.home, load).tensions
+    found = forward_kinematics(rig, winches.strained(unstrained, tensions))
+    for _ in range(_ROUNDS):
+        before = found.pose
+        tensions = working_tensions(rig, before, load).tensions
+        found = forward_kinematics(rig, winches.strained(unstrained, tensions), before)
+        if found.pose.distance_to(before) < _SETTLED:
+            break
+    else:
+        raise Fault(
+            "the platform pose could not be computed from the drive positions",
+            where="drive positions",
+            why="the solver did not converge",
+            next_step="report this with the rig file and the positions; nothing has moved",
+        )
+    place = found.pose.position
+    inside = np.all((rig.workspace_lower <= place) & (place <= rig.workspace_upper))
+    if not (inside and found.worst <= rig.motion.start_tolerance):
+        x, y, z = place * 1000.0
+        raise Refused(
+            f"the drive positions fit no pose in the workspace: the nearest is {x:.1f}, {y:.1f},"
+            f" {z:.1f} mm, with a cable {found.worst * 1000:.1f} mm off",
+            where="drive positions",
+            why="the homing reference is lost, a cable slipped, or the rig file is wrong",
+            next_step="home the drives at a known pose (home_counts in the rig file);"
+            " nothing was moved",
+        )
+    return found.pose

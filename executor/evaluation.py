@@ -11,7 +11,7 @@ import numpy as np
 
 from executor.cameras.client import CameraRecord
 from executor.cameras.multi_camera import CameraRecords
-from executor.cameras.worker import CameraSample
+from executor.cameras.process import CameraSample
 from executor.control.path_runs import Outcome
 from executor.recording.clearance import (
     ClearanceRow,
@@ -22,9 +22,8 @@ from executor.recording.clearance import (
     tension_noise,
 )
 from executor.recording.cycle_table import CycleTable
-from executor.recording.fused import fused_table
 from executor.recording.mcap import write_mcap
-from executor.recording.pose_table import OK, PoseTable, no_poses
+from executor.recording.pose_table import OK, PoseTable, fused_table, no_poses
 from executor.recording.run_course import RunCourse, versions
 from executor.recording.run_folder import (
     CLEARANCE,

@@ -14,8 +14,7 @@ import numpy as np
 
 from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
-from executor.current_pose import current_pose
-from executor.drives import is_simulated, look_at, require_own_time
+from executor.drives import current_pose, is_simulated, look_at, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_course import free_folder
 from executor.recording.run_folder import RunEvent, RunFolder

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from executor.recording.csv_columns import TableFile
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
-from model.display import html_table
+from model.pages.page import html_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

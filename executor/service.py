@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,8 +14,7 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
 from executor.control.standstill import FaultReset, Release, StandstillMotion
-from executor.current_pose import current_pose
-from executor.drives import left_alone, require_other_process, resting_drives_of
+from executor.drives import current_pose, left_alone, require_other_process, resting_drives_of
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
@@ -24,10 +23,11 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.remote.registry import advertised
 from executor.remote.server import serving
 from executor.remote.status import WinchStatus
-from executor.standstill_runs import is_braked, release_drives, reset_drives
 from executor.state_machine import State
 from executor.supervision import Supervisor, require_confirmed
+from executor.winch_runs import is_braked, release_drives, reset_drives
 from model.errors import CdprError, Refused
+from model.files.documents import PoseDocument
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -51,6 +51,14 @@ class ReferenceStatus:
     made: str | None
     how: str | None
     file: str | None
+
+    def __str__(self) -> str:
+        """Whether it is valid and how it was made, or why not."""
+        if not self.counts:
+            return f"not valid: {self.why_not}"
+        if not self.made:
+            return "none: absolute encoders match the rig file"
+        return f"valid, made {self.made} ({self.how})"
 
 
 def reference_status(
@@ -123,6 +131,34 @@ class StatusResult:
     pose: Pose | None = None
     why_no_pose: str | None = None
     missing: CdprError | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`: units in the keys, rounded."""
+        pose: dict[str, Any] | None = None
+        if self.pose is not None:
+            pose = PoseDocument.of(self.pose).model_dump(mode="json")
+        elif self.why_no_pose is not None:
+            pose = {"why_not": self.why_no_pose}
+        drives = [
+            {
+                "node": drive.node,
+                "state": drive.state,
+                "position_counts": drive.position,
+                "tension_n": round(drive.tension, 2),
+                "set_up": drive.set_up,
+            }
+            for drive in self.drives or ()
+        ]
+        return {
+            "rig": self.rig,
+            "bus": self.bus,
+            "run": self.run,
+            "latched": self.latched,
+            "being_set_up": self.being_set_up,
+            "reference": asdict(self.reference),
+            "drives": None if self.drives is None else drives,
+            "pose": pose,
+        }
 
 
 def status(rig: Rig) -> StatusResult:

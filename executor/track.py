@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from itertools import islice, takewhile
 from pathlib import Path
 
+import numpy as np
+
 from drivers.cameras.files import ImageFolder, PictureOutput
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import SYNTHETIC, require_camera_source
@@ -68,6 +70,39 @@ class TrackResult:
     def __repr__(self) -> str:
         """Numbers of images and poses."""
         return f"<TrackResult {len(self.poses)} poses in {len(self.pictures)} images>"
+
+    def summary(self) -> dict[str, int | float]:
+        """What was measured, in numbers with units in their names."""
+        poses, logged = self.poses, self.pictures
+        deviations = np.array([np.linalg.norm(p.position_deviation) for p in poses])
+        facts: dict[str, int | float] = {
+            "pictures": len(logged),
+            "poses": len(poses),
+            "position_deviation_mm": round(float(np.median(deviations)) * 1000, 4),
+            "reprojection_px": round(float(np.median([p.reprojection for p in poses])), 4),
+            "pictures_per_second": round(len(logged) / self.seconds, 1),
+            "measuring_ms": round(float(np.median(self.count.seconds)) * 1000, 2),
+        }
+        if self.together is not None:
+            facts["pictures_without_partner"] = self.together.without_partner
+            facts["moments_apart"] = self.together.apart
+            facts["moments_without_speed"] = self.together.without_speed
+        clearances = [p.clearance for p in logged if p.clearance is not None]
+        if clearances:
+            nearest = min(clearances, key=lambda c: c.distance)
+            facts["smallest_clearance_mm"] = round(nearest.distance * 1000, 3)
+            facts["clearance_uncertainty_mm"] = round(nearest.uncertainty * 1000, 3)
+            facts["clearance_at_most_mm"] = round(nearest.at_most * 1000, 3)
+        return facts
+
+    def unused_files(self) -> dict[str, str]:
+        """Why files are not used, by name; of several cameras by ``NAME/FILE``."""
+        several = len(self.unused) > 1
+        return {
+            f"{camera}/{name}" if several else name: why
+            for camera, files in self.unused.items()
+            for name, why in files.items()
+        }
 
     def save(self, path: Path | str, mcap: Path | str | None = None) -> None:
         """Writes the pose log, one for each of several cameras beside it, and MCAP.

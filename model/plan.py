@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import ValidationError
 
-from model.display import html_table
 from model.errors import BadInput, InvalidFile
 from model.files.documents import check_version, document_hash, problems_of, write_atomic
-from model.files.plan_file import PlanDocument, QualityDocument
+from model.files.plan_file import (
+    OptimalPlannerDocument,
+    PlanDocument,
+    PlannerDocument,
+    QualityDocument,
+)
 from model.files.reading import read_json
+from model.pages.page import html_table
 from model.pose import Pose
 from model.rig import NOT_IN_PLAN_HASH, Rig, rig_from_document
+from model.rotation_limits import largest_rotations
 from model.scene import Scene, scene_from_document
+from model.statics.dexterity import rms_anchor_radius
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,18 +90,7 @@ class Plan:
 
     def _repr_html_(self) -> str:
         """For notebooks."""
-        quality = self.quality
-        near = quality.obstacle_clearance
-        clearance = f"{near.distance_mm:.2f} mm, {near.first} to {near.second}" if near else "–"
-        rows = [
-            ("rig, scene", f"{self.rig.name}, {self.scene.name}"),
-            ("planner", self.document.planner.name),
-            ("length", f"{quality.length_mm:.1f} mm, {len(self.waypoints)} waypoints"),
-            ("clearance", clearance),
-            ("tension", f"{quality.min_tension_n:.1f} to {quality.max_tension_n:.1f} N"),
-            ("planning time", f"{self.document.statistics.planning_time_s:.2f} s"),
-        ]
-        return html_table("Plan", rows)
+        return html_table("Plan", plan_facts(self.document))
 
 
 def plan_from_document(document: PlanDocument) -> Plan:
@@ -202,3 +201,76 @@ def require_same_rig(plan: Plan, rig: Rig, plan_path: Path | str) -> None:
         next_step="plan again for this rig with `cdpr plan`; or, if the plan was made with"
         " --calibration, pass the same --calibration here",
     )
+
+
+# What a plan is, for programs and for people.
+
+
+def plan_as_dict(document: PlanDocument) -> dict[str, Any]:
+    """What a plan is, for programs: its file without waypoints, rig and scene."""
+    return {
+        "hash": document.hash,
+        "rig": document.rig.name,
+        "scene": document.scene.name,
+        "planner": document.planner.model_dump(mode="json"),
+        "waypoints": len(document.waypoints),
+        "stops": [mark.model_dump(mode="json") for mark in document.stops],
+        "quality": document.quality.model_dump(mode="json"),
+        "statistics": document.statistics.model_dump(mode="json"),
+    }
+
+
+def plan_facts(document: PlanDocument) -> list[tuple[str, str]]:
+    """What a plan is, for people: name and value."""
+    quality = document.quality
+    facts = [
+        ("rig, scene", f"{document.rig.name}, {document.scene.name}"),
+        *scene_from_document(document.scene).stop_facts(),
+        (
+            "length",
+            f"{quality.length_mm:.1f} mm ({len(document.waypoints)} waypoints;"
+            f" {quality.raw_length_mm:.1f} mm {_before(document)})",
+        ),
+    ]
+    facts += _rotation(document)
+    near = quality.obstacle_clearance
+    if near is not None:
+        facts.append(("clearance", f"{near.distance_mm:.2f} mm, {near.first} to {near.second}"))
+    own = quality.self_clearance
+    facts += [
+        ("self clearance", f"{own.distance_mm:.2f} mm, {own.first} to {own.second}"),
+        ("tension", f"{quality.min_tension_n:.1f} to {quality.max_tension_n:.1f} N"),
+        ("kinematic cost", f"{quality.mean_kinematic_cost:.3f} on average"),
+        ("search", _search_sentence(document)),
+    ]
+    return facts
+
+
+def _before(document: PlanDocument) -> str:
+    is_paper = isinstance(document.planner, PlannerDocument)
+    return "before post-processing" if is_paper else "first path found"
+
+
+def _rotation(document: PlanDocument) -> list[tuple[str, str]]:
+    """One line for a plan on which the platform turns; none for others."""
+    poses = [waypoint.pose() for waypoint in document.waypoints]
+    if all(pose.angle_to(poses[0]) == 0.0 for pose in poses):
+        return []
+    found = [largest_rotations(a.quaternion, b.quaternion) for a, b in pairwise(poses)]
+    tilt, turn = (math.degrees(max(values)) for values in zip(*found, strict=True))
+    radius = rms_anchor_radius(np.array(document.rig.anchors_mm))
+    way = sum(
+        math.hypot(a.distance_to(b) * 1e3, radius * a.angle_to(b)) for a, b in pairwise(poses)
+    )
+    text = f"tilted up to {tilt:.2f}°, rotated up to {turn:.2f}°; {way:.1f} mm with rotation"
+    return [("rotation", text)]
+
+
+def _search_sentence(document: PlanDocument) -> str:
+    statistics, planner = document.statistics, document.planner
+    rest = f"{statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s"
+    if isinstance(planner, OptimalPlannerDocument):
+        search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of search"
+        again = " ".join(f"--rounds {rounds}" for rounds in planner.rounds)
+        return f"{sum(planner.rounds)} rounds (to repeat: {again}), {rest}{search}"
+    return f"{statistics.nodes} nodes, {statistics.iterations} samples, {rest}"

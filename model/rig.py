@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.cameras import Camera, Tag, camera_from, tag_from
-from model.display import html_table
 from model.errors import BadInput
 from model.files.documents import document_hash, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
+from model.pages.page import html_table
 from model.pose import Array, Pose, read_only
 from model.posed_rig import PosedRig, posed_rig
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from model.display import html_table
 from model.errors import BadInput
 from model.files.documents import (
     Document,
@@ -48,6 +47,7 @@ from model.geometry.shapes import (
     encloses_convex,
     read_only_indices,
 )
+from model.pages.page import html_table
 from model.pose import Array, Pose, read_only
 from model.rotation_limits import RotationLimits
 
@@ -125,6 +125,16 @@ class Scene:
     def hash(self) -> str:
         """Hash of the scene's content."""
         return document_hash(self.document)
+
+    def stop_facts(self) -> list[tuple[str, str]]:
+        """Stops with what happens there and what is carried on, for people; none without stops."""
+        carried = [leg.scene.load.payload_mass for leg in legs_of(self)]
+        shown = []
+        for stop, before, after in zip(self.stops, carried[:-1], carried[1:], strict=True):
+            load = f", then {after:g} kg" if after != before else ""
+            dwell = f" {stop.dwell:g} s" if stop.dwell > 0.0 else ""
+            shown.append(f"{stop.name} ({stop.kind}{dwell}{load})")
+        return [("via", ", ".join(shown))] if shown else []
 
     def changed(
         self,

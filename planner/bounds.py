@@ -16,7 +16,7 @@ import numpy as np
 from model.clearance import ClearanceModel
 from model.errors import Fault
 from model.pose import Array, Pose
-from planner.pose_path import PosePath
+from planner.path import PosePath
 
 SHORTEST = 1e-6
 MOST_SAMPLES = 40000

@@ -41,7 +41,7 @@ from planner.check_report import (
     joined,
     verified,
 )
-from planner.pose_path import PosePath
+from planner.path import PosePath
 
 SPACING = 0.005
 CLEARANCE_TOLERANCE = 0.1e-3

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from model.clearance import Nearest
-from model.display import html_table
 from model.errors import Refused
+from model.pages.page import html_table
 from model.plan import Plan
 from model.pose import Array, Pose
 
@@ -32,6 +32,16 @@ class Closest:
     nearest: Nearest
     pose: Pose
     place: float
+
+    def sentence(self, proved: float, required: float) -> str:
+        """The distance with its place, and what is proved and required, [m]."""
+        near = self.nearest
+        x, y, z = self.pose.position * 1000
+        return (
+            f"{near.distance * 1000:.2f} mm, {near.first} to {near.second}, with the platform at"
+            f" {x:z.1f}, {y:z.1f}, {z:z.1f} mm; proved {proved * 1000:.2f} mm,"
+            f" required {required * 1000:g} mm"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """For `--json`, and with the keys of a plan's quality."""
@@ -124,28 +134,44 @@ class CheckReport:
         return self.obstacle_clearance.nearest.distance - self.proved_obstacle_clearance
 
     def __repr__(self) -> str:
-        """Whether the path passed, and its figures."""
-        return f"<CheckReport {'; '.join(f'{name} {value}' for name, value in self._rows())}>"
+        """Whether the path passed, and its length."""
+        return f"<CheckReport {self._verdict()}, {self.length * 1e3:.1f} mm>"
 
     def _repr_html_(self) -> str:
         """For notebooks."""
-        return html_table("Check of a path", self._rows())
+        violations = [("violation", violation.sentence()) for violation in self.violations]
+        rows = [("verdict", self._verdict()), *self.facts(), *violations]
+        return html_table("Check of a path", rows)
 
-    def _rows(self) -> list[tuple[str, str]]:
-        """What is shown of it: name and value."""
-        near, count = self.obstacle_clearance, len(self.violations)
-        rows = [
-            ("verdict", "passed" if self.passed else f"rejected: {count} violations"),
-            ("length", f"{self.length * 1e3:.1f} mm"),
-            ("self clearance", f"≥ {self.proved_self_clearance * 1e3:.2f} mm"),
-            ("capacity margin", f"≥ {self.proved_capacity_margin:.1f} N"),
-            ("tension", f"{self.min_tension:.1f} to {self.max_tension:.1f} N"),
+    def _verdict(self) -> str:
+        return "passed" if self.passed else f"rejected: {len(self.violations)} violations"
+
+    def facts(self) -> list[tuple[str, str]]:
+        """What the check found, for people: name and value."""
+        own = self.self_clearance
+        facts = [
+            ("length", f"{self.length * 1000:.1f} mm, {self.samples} poses checked"),
+            (
+                "self clearance",
+                own.sentence(self.proved_self_clearance, self.required_self_clearance),
+            ),
+            ("tension", self._tensions()),
+            (
+                "capacity margin",
+                f"{self.capacity_margin:.1f} N; proved {self.proved_capacity_margin:.1f} N",
+            ),
+            ("cable speed", f"up to {self.max_cable_speed * 1000:.1f} mm/s at these poses"),
         ]
+        near = self.obstacle_clearance
         if near is not None:
-            proved = self.proved_obstacle_clearance * 1e3
-            pair = f"{near.nearest.first} to {near.nearest.second}"
-            rows.insert(2, ("clearance", f"≥ {proved:.2f} mm, {pair}"))
-        return [*rows, *(("violation", v.sentence()) for v in self.violations)]
+            text = near.sentence(self.proved_obstacle_clearance, self.required_obstacle_clearance)
+            facts.insert(1, ("clearance", text))
+        return facts
+
+    def _tensions(self) -> str:
+        if math.isnan(self.min_tension):
+            return "no tensions within the limits hold the weight"
+        return f"{self.min_tension:.1f} to {self.max_tension:.1f} N at these poses"
 
     def as_dict(self) -> dict[str, Any]:
         """For `--json`: units in the keys, no NaN and no infinity."""

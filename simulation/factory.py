@@ -45,7 +45,7 @@ def make_rehearsal(
     check_drives(rig, behaviour, eds)
     # The protocol's library is loaded only for those who need it.
     if rig.document.drives.type == "odrive":
-        from simulation.drives.odrive_rig import SimulatedOdriveRig
+        from simulation.drives.odrive import SimulatedOdriveRig
 
         return SimulatedOdriveRig(rig, bus, start_pose, load)
     from simulation.drives.cia402_rig import SimulatedCia402Rig

@@ -27,7 +27,7 @@ from rich.progress import track
 from model.pose import Array, Pose
 from model.rig import Rig, load_rig
 from model.scene import load_scene
-from planner.campaign.cases import OWN, SHARES, WIDE, box_text, with_box
+from planner.campaign.trial import OWN, SHARES, WIDE, box_text, with_box
 from planner.check import check_path
 from planner.planning import make_plan
 from planner.settings import OBJECTIVES, OptimalSettings

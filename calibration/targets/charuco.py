@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.targets.board import LEAST_POINTS, Seen, require_board
+from model.files.camera_file import FAMILIES
 from model.pose import Array
-from model.tag_families import FAMILIES
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import diagnose_tags

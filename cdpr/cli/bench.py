@@ -12,15 +12,14 @@ from rich.table import Table
 
 from cdpr.cli.options import DaskOption, WorkersOption
 from cdpr.cli.output import Terminal, out, show_json
-from cdpr.cli.plan.demo import RIG
-from cdpr.cli.plan.examples import configs
+from model.files.examples import PAPER_RIG, ready_folder
 from model.files.output import make_folder
 from model.rig import load_rig
 from model.scene import load_scene
-from planner.campaign.cases import OWN
-from planner.campaign.claims import Finding, findings
 from planner.campaign.evaluation import about, run_campaign, write_campaign
 from planner.campaign.page import change_text
+from planner.campaign.results import Finding, findings
+from planner.campaign.trial import OWN
 
 ENVIRONMENTS = ("environment_1", "environment_2", "environment_3")
 DEFAULT_FOLDER = Path("bench-paper")
@@ -50,8 +49,8 @@ def paper(
 
       cdpr bench paper --seeds 100 -o bench-paper
     """
-    rig = load_rig(configs() / RIG)
-    scenes = [load_scene(configs() / f"{name}.yaml") for name in ENVIRONMENTS]
+    rig = load_rig(ready_folder() / PAPER_RIG)
+    scenes = [load_scene(ready_folder() / f"{name}.yaml") for name in ENVIRONMENTS]
     make_folder(output, force)
     listener = Terminal(quiet=as_json)
     results = run_campaign(

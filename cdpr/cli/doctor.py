@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -65,9 +66,8 @@ def doctor(
         _show_checks(checks)
     objects = examine(the_rig) if the_rig is not None and drives else None
     if as_json:
-        keys = ("name", "good", "text", "fix")
-        plain = [{key: getattr(check, key) for key in keys} for check in checks]
-        show_json(plain if objects is None else {"checks": plain, "drives": _plain(objects)})
+        plain = [asdict(check) for check in checks]
+        show_json(plain if objects is None else {"checks": plain, "drives": objects.as_dict()})
     elif objects is not None and the_rig is not None:
         _show_table(objects, the_rig)
     if not all(check.good for check in checks) or (objects is not None and not objects.good):
@@ -81,25 +81,6 @@ def _show_checks(checks: Iterable[MachineCheck]) -> None:
         out.print(f"{mark} {check.name}: {check.text}", soft_wrap=True)
         if not check.good and check.fix:
             out.print(f"     next: {check.fix}", soft_wrap=True)
-
-
-def _plain(found: Examined) -> dict[str, Any]:
-    """The table for `--json`."""
-    return {
-        "answered": list(found.nodes),
-        "silent": list(found.silent),
-        "objects": [
-            {
-                "object": row.object,
-                "verdict": row.verdict,
-                "needed": row.needed,
-                "found": [{"drives": nodes, "value": text} for text, nodes in row.found.items()],
-                "meaning": row.meaning,
-                "change": row.change,
-            }
-            for row in found.rows
-        ],
-    }
 
 
 def _show_table(found: Examined, rig: Rig) -> None:

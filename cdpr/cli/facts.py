@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.markup import escape
 
 from cdpr.cli.output import err, out, show_facts, show_json
-from cdpr.cli.plan.facts import stop_facts
 from drivers.can_bus import IN_PROCESS
 from executor.cameras.sources import describe_cameras
 from executor.hold_to_run.session import JogProposal
@@ -22,13 +21,11 @@ from executor.recording.resume import RunEnd
 from executor.recording.verdict import faults_among
 from executor.runner import MotionProposal, RunResult
 from executor.service import (
-    ReferenceStatus,
     ReleaseProposal,
     ResetProposal,
     StatusResult,
     reference_status,
 )
-from model.files.documents import PoseDocument
 from model.pose import Pose
 from model.rig import Camera, Rig
 from tracking.track import rates
@@ -63,7 +60,7 @@ def show_prepared(proposal: MotionProposal, on: Console) -> None:
             ("rig, scene", f"{rig.name}, {prepared.scene.name}"),
             ("from", f"{start[0]:z.1f}, {start[1]:z.1f}, {start[2]:z.1f} mm"),
             ("to", f"{goal[0]:z.1f}, {goal[1]:z.1f}, {goal[2]:z.1f} mm"),
-            *stop_facts(prepared.scene),
+            *prepared.scene.stop_facts(),
             (
                 "motion",
                 f"{prepared.length * 1000:.1f} mm in {prepared.duration:.1f} s,"
@@ -214,7 +211,7 @@ def _uncertainty(reference: HomingReference) -> str:
 
 def show_forgotten(proposal: ForgetProposal, on: Console) -> None:
     """The reference that is about to be given up."""
-    text = reference_text(reference_status(proposal.interlock))
+    text = reference_status(proposal.interlock)
     line = f"the present homing reference, which is discarded: {text}"
     on.print(line, soft_wrap=True, markup=False)
 
@@ -256,25 +253,6 @@ def show_jogging(proposal: JogProposal, on: Console) -> None:
 # Reference and status of a rig, its reset and its release.
 
 
-def reference_dict(reference: ReferenceStatus) -> dict[str, Any]:
-    """``counts``, ``why_not``, ``made``, ``how`` and ``file``; what there is none of is null."""
-    return {
-        "counts": reference.counts,
-        "why_not": reference.why_not,
-        "made": reference.made,
-        "how": reference.how,
-        "file": reference.file,
-    }
-
-
-def reference_text(reference: ReferenceStatus) -> str:
-    """The same in a sentence."""
-    made = f"made {reference.made} ({reference.how})" if reference.made else ""
-    if not reference.counts:
-        return f"not valid: {reference.why_not}"
-    return f"valid, {made}" if made else "none: absolute encoders match the rig file"
-
-
 def show_reset(proposal: ResetProposal, on: Console) -> None:
     """The fault that is about to be taken off."""
     latched = proposal.latched
@@ -284,7 +262,7 @@ def show_reset(proposal: ResetProposal, on: Console) -> None:
 
 def show_release(proposal: ReleaseProposal, on: Console) -> None:
     """The drives that are about to lose their torque."""
-    braked, kept = proposal.braked, reference_text(proposal.reference)
+    braked, kept = proposal.braked, str(proposal.reference)
     show_facts(
         "ready to release the drives",
         [
@@ -297,35 +275,6 @@ def show_release(proposal: ReleaseProposal, on: Console) -> None:
     )
 
 
-def status_dict(status: StatusResult) -> dict[str, Any]:
-    """The state of a rig, for programs."""
-    pose: dict[str, Any] | None = None
-    if status.pose is not None:
-        pose = PoseDocument.of(status.pose).model_dump(mode="json")
-    elif status.why_no_pose is not None:
-        pose = {"why_not": status.why_no_pose}
-    drives = [
-        {
-            "node": drive.node,
-            "state": drive.state,
-            "position_counts": drive.position,
-            "tension_n": round(drive.tension, 2),
-            "set_up": drive.set_up,
-        }
-        for drive in status.drives or ()
-    ]
-    return {
-        "rig": status.rig,
-        "bus": status.bus,
-        "run": status.run,
-        "latched": status.latched,
-        "being_set_up": status.being_set_up,
-        "reference": reference_dict(status.reference),
-        "drives": None if status.drives is None else drives,
-        "pose": pose,
-    }
-
-
 def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
     """The state of a rig, for people."""
     latched = status.latched or "none"
@@ -335,7 +284,7 @@ def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
         ("rig", rig.name),
         ("bus", status.bus),
         ("latched fault", latched),
-        ("reference", reference_text(status.reference)),
+        ("reference", str(status.reference)),
     ]
     if status.being_set_up:
         facts.append(("drives", "not read: another program is preparing a motion or reading them"))

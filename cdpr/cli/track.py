@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
 
 from cdpr.cli.arguments import refuse_overwriting
@@ -16,7 +15,7 @@ from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibra
 from cdpr.cli.output import Terminal, show_facts, show_json
 from executor.cameras.sources import parse_camera_sources
 from executor.operator_requests import LocalRequests
-from executor.track import TrackResult, own_drawing, own_file, require_plan_used, track_sources
+from executor.track import own_drawing, own_file, require_plan_used, track_sources
 from model.files.output import require_new_file
 from model.plan import load_plan, require_same_rig
 from model.rig import Camera, load_rig
@@ -102,9 +101,9 @@ def track(
             listener=Terminal(quiet=as_json),
         )
     result.save(output, mcap)
-    facts = _facts(result, output)
+    facts = {"poses_file": str(output), **result.summary()}
     if as_json:
-        show_json({**facts, "unused": _by_file(result.unused)})
+        show_json({**facts, "unused": result.unused_files()})
     else:
         show_facts(f"poses in {output}", [(k.replace("_", " "), str(v)) for k, v in facts.items()])
 
@@ -129,39 +128,3 @@ def _require_outputs(
         {name: path for name, path in written.items() if path is not None},
         [Path(place) for place in sources.values()],
     )
-
-
-def _by_file(unused: dict[str, dict[str, str]]) -> dict[str, str]:
-    """Why files are not used, by name; of several cameras by ``NAME/FILE``."""
-    several = len(unused) > 1
-    return {
-        f"{camera}/{name}" if several else name: why
-        for camera, files in unused.items()
-        for name, why in files.items()
-    }
-
-
-def _facts(result: TrackResult, output: Path) -> dict[str, Any]:
-    """What was measured, in numbers."""
-    poses, logged = result.poses, result.pictures
-    deviations = np.array([np.linalg.norm(p.position_deviation) for p in poses])
-    facts: dict[str, Any] = {
-        "poses_file": str(output),
-        "pictures": len(logged),
-        "poses": len(poses),
-        "position_deviation_mm": round(float(np.median(deviations)) * 1000, 4),
-        "reprojection_px": round(float(np.median([p.reprojection for p in poses])), 4),
-        "pictures_per_second": round(len(logged) / result.seconds, 1),
-        "measuring_ms": round(float(np.median(result.count.seconds)) * 1000, 2),
-    }
-    if result.together is not None:
-        facts["pictures_without_partner"] = result.together.without_partner
-        facts["moments_apart"] = result.together.apart
-        facts["moments_without_speed"] = result.together.without_speed
-    clearances = [p.clearance for p in logged if p.clearance is not None]
-    if clearances:
-        nearest = min(clearances, key=lambda c: c.distance)
-        facts["smallest_clearance_mm"] = round(nearest.distance * 1000, 3)
-        facts["clearance_uncertainty_mm"] = round(nearest.uncertainty * 1000, 3)
-        facts["clearance_at_most_mm"] = round(nearest.at_most * 1000, 3)
-    return facts

@@ -47,17 +47,17 @@ CALIBRATE = (
     Verb(
         "readout",
         "Measure a rolling shutter, from images of the platform while it moves.",
-        "calibrate.readout:readout",
+        "calibrate.camera:readout",
     ),
     Verb(
         "tags",
         "Find the tags' poses on the platform, from images that show two or more at once.",
-        "calibrate.tags:tags",
+        "calibrate.extrinsics:tags",
     ),
     Verb(
         "poses",
         "Choose the most informative poses for calibration, and plan a path with stops at them.",
-        "calibrate.poses:poses",
+        "calibrate.rig:poses",
     ),
     Verb(
         "rig",
@@ -67,27 +67,27 @@ CALIBRATE = (
     Verb(
         "print",
         "Make a calibration board, or the tags of a rig, as a PDF in exact size.",
-        "calibrate.targets:print_",
+        "calibrate.boards:print_",
     ),
     Verb(
         "diff",
         "Compare two calibration results: every number against its interval, and the effect in mm.",
-        "calibrate.compare:diff",
+        "calibrate.results:diff",
     ),
     Verb(
         "apply",
         "Write a new rig file with calibration results in place of its own values.",
-        "calibrate.apply:apply",
+        "calibrate.results:apply",
     ),
     Verb(
         "export",
         "Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.",
-        "calibrate.exchange:export",
+        "calibrate.results:export",
     ),
     Verb(
         "import",
         "Write a new rig file with a camera's matrix and lens from another program.",
-        "calibrate.exchange:import_",
+        "calibrate.results:import_",
     ),
 )
 BENCH = (
@@ -101,19 +101,19 @@ PLAN = (
     Verb(
         "demo",
         "Plan, check, run on simulated drives, track with a synthetic camera, and report.",
-        "plan.demo:demo",
+        "operate.run:demo",
     ),
     Verb(
         "examples",
         "List the ready rigs, scenes and recorded sessions, or copy some of them.",
-        "plan.examples:examples",
+        "start:examples",
     ),
-    Verb("new", "Ask for the essentials of a rig, and write a commented rig file.", "plan.new:new"),
-    Verb("plan", "Plan a collision-free path and write it to a file.", "plan.search:plan"),
+    Verb("new", "Ask for the essentials of a rig, and write a commented rig file.", "start:new"),
+    Verb("plan", "Plan a collision-free path and write it to a file.", "planning:plan"),
     Verb(
         "check",
         "Check a plan with an independent method: distances at dense poses, with bounds.",
-        "plan.check:check",
+        "planning:check",
     ),
 )
 OPERATE = (
@@ -125,22 +125,22 @@ OPERATE = (
     Verb(
         "stop",
         "Stop every run of this user: all drives slow down together along the path, then hold.",
-        "operate.stop:stop",
+        "operate.requests:stop",
     ),
     Verb(
         "hold",
         "Feed hold: the platform slows down along the path and waits there under tension.",
-        "operate.feed:hold",
+        "operate.requests:hold",
     ),
     Verb(
         "resume",
         "Continue after `cdpr hold`, at the last requested speed.",
-        "operate.feed:resume",
+        "operate.requests:resume",
     ),
     Verb(
         "speed",
         "Scale the speed along the path to a percentage of the planned one.",
-        "operate.feed:speed",
+        "operate.requests:speed",
     ),
     Verb(
         "console",
@@ -155,12 +155,12 @@ OPERATE = (
     Verb(
         "status",
         "Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.",
-        "operate.status:status",
+        "operate.service:status",
     ),
     Verb(
         "reset",
         "Release a latched fault once its cause is removed: resets drives in fault, moves nothing.",
-        "operate.reset:reset",
+        "operate.service:reset",
     ),
     Verb(
         "home",
@@ -175,7 +175,7 @@ OPERATE = (
     Verb(
         "release",
         "Release the drives with the platform on a support: close brakes, remove torque.",
-        "operate.release:release",
+        "operate.service:release",
     ),
 )
 SET_UP = (
@@ -196,6 +196,7 @@ ANALYSE = (
         "explain",
         "Explain a fault that a run reported: meaning, likely cause, state of the"
         " machine, next step.",
+        "report:explain",
     ),
     Verb(
         "workspace",

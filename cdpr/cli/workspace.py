@@ -92,9 +92,7 @@ def workspace(
     listener = Terminal(quiet=as_json)
     made = map_workspace(question, grids, workers=workers, dask=dask, listener=listener)
     with listener.waiting("drawing"):
-        where = f" in {the_scene.name}" if the_scene else ""
-        title = f"Workspace of {the_rig.name}{where}"
-        summary = write_maps(output, made, title, _lead(question))
+        summary = write_maps(output, made, question, the_scene)
     if as_json:
         show_json({"folder": str(output), "maps": summary})
     else:
@@ -108,15 +106,6 @@ def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array 
     if not 1e-6 < norm < np.inf:
         raise BadInput("the rotation is not a quaternion w x y z of non-zero length")
     return matrix_from_quaternion(np.array(rotation_wxyz) / norm)
-
-
-def _lead(question: Question) -> str:
-    rig = question.rig
-    turned = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform turned"
-    return (
-        f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
-        f" {question.length * 1e3:.1f} mm in the condition number{turned}."
-    )
 
 
 def _sentences(summary: dict[str, Any], folder: Path) -> list[tuple[str, str]]:

@@ -9,12 +9,11 @@ import numpy as np
 
 from drivers.can_bus import EchoFilter, SentFrame, echoes_own_frames
 from drivers.can_load import TESTED_HZ, check_bus_load, heartbeat_cycles, heartbeat_timeout
-from drivers.cia402.cob_ids import commanding_ids, foreign_master_message
 from drivers.cia402.configure import configure_drives
+from drivers.cia402.inspection import say_simulated
 from drivers.cia402.monitor import DriveMonitor
-from drivers.cia402.pdo import CyclicFrames
+from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message
 from drivers.cia402.profile import profile_of
-from drivers.cia402.read_state import say_simulated
 from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
     MODE_WAIT,

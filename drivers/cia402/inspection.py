@@ -5,10 +5,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import can
+import numpy as np
 
+from drivers.cia402.configure import is_still_set_up, require_answers
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.object_dictionary import (
     BEFORE,
@@ -26,8 +28,9 @@ from drivers.cia402.profile import load_profile, profile_names, profile_of
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
-from drivers.drive_group import Pump
-from model.errors import Refused
+from drivers.drive_group import DriveSnapshot, Pump
+from drivers.plausibility import winding_signs
+from model.errors import CdprError, Refused
 from model.files.drive_profile_file import ProfileDocument, object_name
 from model.rig import Rig
 from model.winches import WinchMap
@@ -104,6 +107,26 @@ class Examined:
     def good(self) -> bool:
         """Every drive can be set up, as far as reading shows."""
         return not self.silent and all(row.verdict != "wrong" for row in self.rows)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {
+            "answered": list(self.nodes),
+            "silent": list(self.silent),
+            "objects": [
+                {
+                    "object": row.object,
+                    "verdict": row.verdict,
+                    "needed": row.needed,
+                    "found": [
+                        {"drives": nodes, "value": text} for text, nodes in row.found.items()
+                    ],
+                    "meaning": row.meaning,
+                    "change": row.change,
+                }
+                for row in self.rows
+            ],
+        }
 
 
 def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
@@ -304,3 +327,62 @@ def _how_without(index: int, sub: int) -> str:
     if fitting:
         return f"name the drives in the rig file: drives.profile: {' or '.join(fitting)}"
     return "use another drive or firmware: see its manual"
+
+
+# Looks at CiA 402 drives without changing anything: questions by SDO, and nothing else.
+
+
+def read_states(rig: Rig, bus: can.BusABC, pump: Pump | None) -> DriveSnapshot:
+    """Status word, position and torque of every drive; see `drivers.factory.read_drives`."""
+    nodes = [winch.node_id for winch in rig.winches]
+    timeout = profile_of(rig).sdo_timeout_ms / 1000.0
+    network = SetupNetwork(bus, pump, nodes, timeout=timeout)
+    network.discard_waiting()
+    require_answers(network, nodes)
+    winch_map = WinchMap(rig)
+
+    def read(index: int, name: str, size: int) -> list[int]:
+        data = [network.client(node).read(index, 0, name, size) for node in nodes]
+        return [int.from_bytes(value, "little", signed=True) for value in data]
+
+    words = [word & 0xFFFF for word in read(0x6041, "status word", 2)]
+    return DriveSnapshot(
+        positions=np.array(read(0x6064, "position actual value", 4), dtype=np.int64),
+        torques=np.array(read(0x6077, "torque actual value", 2), dtype=np.int64)
+        * winding_signs(rig),
+        status_words=np.array(words, dtype=np.int64),
+        restarted=tuple(
+            node
+            for drive, node in enumerate(nodes)
+            if not is_still_set_up(network, node, settings_for(rig, drive, winch_map, None))
+        ),
+    )
+
+
+# Whether drives say by themselves that they are simulated.
+
+
+#: What simulated drives have as 1008h, the manufacturer device name. Source: CiA 301, 7.5.2.8.
+SIMULATED = b"cdpr simulated drive"
+
+
+def say_simulated(bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> bool:
+    """Whether every drive has the name of a simulated one; real ones need not have a name.
+
+    Asks the drives one after another, up to the first that is none. One that does not answer counts
+    as real here: the set-up that follows says what is wrong with it.
+
+    Args:
+        bus: An open bus.
+        pump: As for `drivers.factory.make_drive_group`.
+        nodes: All drives.
+    """
+    network = SetupNetwork(bus, pump, nodes)
+    network.discard_waiting()
+    try:
+        return all(
+            network.client(node).read_if_there(0x1008, 0, "manufacturer device name") == SIMULATED
+            for node in nodes
+        )
+    except CdprError:
+        return False

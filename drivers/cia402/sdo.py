@@ -19,9 +19,16 @@ import can
 
 from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, take, transmit
 from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
-from drivers.cia402.cob_ids import foreign_master_message, set_up_ids
 from drivers.cia402.error_codes import abort_text
-from drivers.cia402.pdo import NMT_ID, SDO_REPLY_BASE, SDO_REQUEST_BASE, NmtCommand, make_nmt
+from drivers.cia402.pdo import (
+    NMT_ID,
+    SDO_REPLY_BASE,
+    SDO_REQUEST_BASE,
+    NmtCommand,
+    foreign_master_message,
+    make_nmt,
+    set_up_ids,
+)
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import Pump
 from model.errors import CdprError, Fault, HardwareMissing, Refused

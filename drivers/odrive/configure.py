@@ -20,13 +20,14 @@ from drivers.can_errors import (
     moved_by_another,
 )
 from drivers.drive_group import Pump
-from drivers.odrive.dbc import Layout, Layouts
 from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
 from drivers.odrive.messages import (
     AxisError,
     AxisState,
     ControlMode,
     InputMode,
+    Layout,
+    Layouts,
     can_id,
     error_text,
     node_and_command,

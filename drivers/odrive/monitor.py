@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from drivers.odrive.configure import HEARTBEATS_WAITED
-from drivers.odrive.dbc import Layout, Layouts
-from drivers.odrive.messages import AxisState, can_id, error_text, status_word
+from drivers.odrive.messages import AxisState, Layout, Layouts, can_id, error_text, status_word
 from drivers.plausibility import ReplyCheck
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from executor.cameras.process import CameraProcess
-from executor.cameras.worker import CameraSample, FrameRequest, unseen
+from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, unseen
 from model.errors import CdprError, Fault
 from tracking.measurement import PoseMeasurement
 from tracking.track import FrameRate

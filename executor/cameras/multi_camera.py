@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from executor.cameras.client import BLIND_PICTURES, CameraClient, CameraRecord
-from executor.cameras.worker import CameraSample, FrameRequest, unseen
+from executor.cameras.process import CameraSample, FrameRequest, unseen
 from executor.operator_requests import RequestBoard, StopReason
 from executor.remote.status import RunStatus
 from model.clearance import ClearanceModel

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from drivers.cameras.live import LiveCamera
 from executor.cameras.client import CameraClient, wait_until_ready
 from executor.cameras.multi_camera import RunCameras
-from executor.cameras.process import CameraProcess
+from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, PictureSource
 from executor.cameras.sources import SYNTHETIC
 from executor.cameras.static_pose import looks_at_rest
-from executor.cameras.worker import CameraWorker, FrameRequest, PictureSource
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.operator_requests import RequestBoard
 from executor.recording.run_folder import RunFolder

@@ -7,13 +7,137 @@ time it is not asked again before it has answered, and an image that was due is 
 from __future__ import annotations
 
 import multiprocessing
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Protocol
 
-from executor.cameras.worker import CameraSample, FrameRequest, MakeObserver
+import numpy as np
+from numpy.typing import NDArray
+
 from executor.realtime.scheduling import interrupts_blocked
+from executor.recording.run_folder import RunFolder
 from model.errors import CdprError, Fault
+from model.pose import Pose
+from model.rig import Camera, Rig
+from tracking.clearance import MeasuredClearance
+from tracking.measurement import NoPose, Observation
+from tracking.tracker import DrivesAhead, Tracker
+
+# What a camera's process does with a trigger: an image, and the pose in it.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRequest:
+    """Asks for one image.
+
+    Attributes:
+        frame: Number of the moment, the same for all cameras.
+        time: Since the start of the run, [s].
+        asked: When, monotonic, [s].
+        true_pose: Where the simulated platform is; None with a real camera.
+        by_drives: Where the drives' positions put the platform; None when they are unknown.
+    """
+
+    frame: int
+    time: float
+    asked: float
+    true_pose: Pose | None
+    by_drives: Pose | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraSample:
+    """What came of one image, or of the images that several cameras took at one moment.
+
+    Attributes:
+        frame: Number of the moment.
+        found: The pose, or why there is none; its time is since the start of the run, [s].
+        picture: Name of the kept image in the run folder, or nothing.
+        seconds: How long measuring took, [s]; NaN where nothing was measured.
+        clearance: Distances at the measured pose, or None.
+    """
+
+    frame: int
+    found: Observation
+    picture: str = ""
+    seconds: float = float("nan")
+    clearance: MeasuredClearance | None = None
+
+
+def unseen(frame: int, time: float, reason: str) -> CameraSample:
+    """What is known of an image that was asked for and never measured."""
+    return CameraSample(frame, NoPose(time, reason))
+
+
+class PictureSource(Protocol):
+    """A camera, real or rendered, that gives an image when asked."""
+
+    def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
+        """A grey image, and how much later than asked for it was taken, [s]."""
+        ...
+
+    def close(self) -> None:
+        """Lets go of the camera."""
+        ...
+
+
+class CameraWorker:
+    """Takes images with one camera and measures them, as a context manager."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        camera: Camera,
+        source: PictureSource,
+        folder: RunFolder | None,
+        keep_every: int,
+        *,
+        named: bool,
+    ) -> None:
+        """Prepares to look.
+
+        Args:
+            rig: The robot with its tags.
+            camera: The camera that the source is.
+            source: Where images come from.
+            folder: Where some of them are kept; None to keep none.
+            keep_every: Every how many images one is kept.
+            named: Kept images are in a folder of the camera's name: there are others.
+        """
+        self._source, self._folder, self._keep_every = source, folder, keep_every
+        self._name = camera.name if named else ""
+        self._tracker, self._drives = Tracker(rig, camera), DrivesAhead()
+
+    def __enter__(self) -> CameraWorker:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._source.close()
+
+    def look(self, trigger: FrameRequest) -> CameraSample:
+        """Takes an image and measures the platform in it."""
+        image, delay = self._source.picture(trigger)
+        kept = ""
+        if self._folder is not None and trigger.frame % self._keep_every == 0:
+            kept = self._folder.write_picture(trigger.frame, image, self._name)
+        taken = trigger.time + delay
+        by_drives = self._drives.at(taken, trigger.time, trigger.by_drives)
+        began = time.monotonic()
+        found = self._tracker.observe(image, taken, by_drives)
+        return CameraSample(trigger.frame, found, kept, time.monotonic() - began)
+
+
+MakeObserver = Callable[[], CameraWorker]
+
 
 #: In simulated time an answer is waited for no longer than this, [s].
 PATIENCE = 20.0

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from executor.cameras.client import HEARING
-from executor.cameras.process import CameraProcess
-from executor.cameras.worker import FrameRequest
+from executor.cameras.process import CameraProcess, FrameRequest
 from model.errors import Fault, Refused
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix

@@ -15,7 +15,7 @@ from executor.operator_requests import OperatorRequests
 from executor.realtime.job import ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent
-from executor.trajectory.schedule import Schedule
+from executor.trajectory.dwell import Schedule
 from executor.trajectory.setpoints import CheckedSetpoints
 from model.files.rig_file import RigDocument
 from model.pose import Pose

@@ -18,8 +18,8 @@ from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder, RunLog
 from executor.state_machine import ON_PATH, CycleRecord, State
+from executor.trajectory.dwell import load_changes
 from executor.trajectory.prepare import PreparedRun
-from executor.trajectory.schedule import load_changes
 from executor.trajectory.setpoints import checked_setpoints_of
 from model.errors import CdprError
 from model.pose import Pose

@@ -2,7 +2,7 @@
 
 Whatever else is waited for (the operator's word, a file on disk, a camera), the cycle goes on, so
 that no drive loses its master. No drive is commanded to follow set-points when the SYNC before is
-too old (`executor.safety.sync_age`): that is decided when a cycle begins and once more between its
+too old (`executor.safety.monitor`): that is decided when a cycle begins and once more between its
 set-points and its SYNC, since this process may be suspended in between. Where it was suspended
 between that decision and the SYNC, a quick stop follows at once.
 """
@@ -19,8 +19,7 @@ import numpy as np
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
 from drivers.factory import drive_states
 from executor.realtime.clock import Clock
-from executor.safety.monitor import MISSING_CYCLES
-from executor.safety.sync_age import USUAL_TIMEOUT, SyncAge
+from executor.safety.monitor import MISSING_CYCLES, USUAL_TIMEOUT, SyncAge
 from model.errors import CdprError, Fault, HardwareMissing
 from model.rig import Rig
 

@@ -13,7 +13,6 @@ from mcap.writer import Writer
 
 from executor.recording.clearance import ClearanceTable, camera_of
 from executor.recording.cycle_table import CycleTable
-from executor.recording.fused import FusedTable
 from executor.recording.mcap_channels import (
     CHANNELS,
     WORLD,
@@ -23,12 +22,13 @@ from executor.recording.mcap_channels import (
     nanoseconds,
     pose_value,
     poses_of,
+    robot_messages,
     rows_of,
+    scene_messages,
     stamp_of,
     topic_of,
 )
-from executor.recording.mcap_scene import robot_messages, scene_messages
-from executor.recording.pose_table import OK, PoseTable
+from executor.recording.pose_table import OK, FusedTable, PoseTable
 from executor.recording.run_folder import RunFolder
 from executor.recording.summary import RunContext
 from model.errors import Fault

@@ -16,9 +16,8 @@ from executor.recording.cycle_table import CycleTable, quaternions_of
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.status import RunStatus
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
-from executor.trajectory.dwell import legs_at
+from executor.trajectory.dwell import legs_at, stop_events
 from executor.trajectory.prepare import PreparedRun
-from executor.trajectory.schedule import stop_events
 from executor.trajectory.setpoints import CheckedTrajectory
 from model.errors import CdprError, Fault
 from model.kinematics import forward_kinematics, poses_near

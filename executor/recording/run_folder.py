@@ -18,8 +18,7 @@ from pydantic import ValidationError
 
 from executor.recording.clearance import ClearanceTable
 from executor.recording.cycle_table import CycleTable, no_cycles
-from executor.recording.fused import FusedTable
-from executor.recording.pose_table import PoseTable
+from executor.recording.pose_table import FusedTable, PoseTable
 from executor.recording.record_files import (
     AGAIN,
     append_lines,

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from drivers.stopping_distance import require_stopping_room
-from executor.trajectory.blending import IsAllowed, rounded
+from executor.trajectory.path import IsAllowed, rounded
 from executor.trajectory.setpoints import CheckedTrajectory, build_table, check_table
 from executor.trajectory.time_scaling import time_law
 from model.clearance import ClearanceModel

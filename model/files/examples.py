@@ -15,6 +15,8 @@ from model.files.reading import read_bytes, read_text, shown, unreadable
 _KIND = re.compile(r"\$schema=.*/(rig|scene)\.schema\.json")
 _DESCRIPTION = re.compile(r"^description: *(.+)$", re.MULTILINE)
 _ABOUT = "README.md"
+PAPER_RIG = "gachon_8_6.yaml"
+"""The rig file of the paper's robot, in the folder of the ready files."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,17 @@ class Example:
     def file_name(self) -> str:
         """Of a copy."""
         return self.source.name
+
+
+def ready_folder(name: str = "configs") -> Path:
+    """The folder of the ready rigs and scenes: in the package `cdpr`, or in the repository.
+
+    Args:
+        name: ``examples`` for the recorded sessions instead.
+    """
+    root = Path(__file__).resolve().parents[2]
+    inside = root / "cdpr" / name
+    return inside if inside.is_dir() else root / name
 
 
 def find_examples(configs: Path, sessions: Path) -> list[Example]:

@@ -155,3 +155,16 @@ def known(value: float | None, digits: int, unit: str) -> str:
 def prose(text: str) -> str:
     """An escaped sentence whose numbers keep their units on the same line."""
     return _UNIT.sub("\u00a0", escape(text))
+
+
+# How objects show themselves in a notebook.
+
+
+def html_table(title: str, rows: Iterable[tuple[str, str]]) -> str:
+    """A title and rows of name and value as HTML; every text is escaped."""
+    cells = "".join(
+        f'<tr><th style="text-align:left">{escape(name)}</th>'
+        f'<td style="text-align:left">{escape(value)}</td></tr>'
+        for name, value in rows
+    )
+    return f"<table><caption><b>{escape(title)}</b></caption>{cells}</table>"

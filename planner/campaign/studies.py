@@ -9,8 +9,7 @@ from itertools import product
 
 from model.rig import Rig
 from model.scene import Scene
-from planner.campaign.cases import OWN, SHARES, WIDE
-from planner.campaign.trial import Arm, Batch, Case, Ends, Trial, run_batch
+from planner.campaign.trial import OWN, SHARES, WIDE, Arm, Batch, Case, Ends, Trial, run_batch
 from planner.rrt.variants import CONE_DRAWS, FAILURE_RATES, FOCUSES, STEERS, TEXT, AlgorithmVariant
 from planner.settings import CostName, SamplerName
 

@@ -11,10 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from model.scene import Scene
 from planner.workspace.compute import Maps
+from planner.workspace.figures import (
+    SETTINGS,
+    cost_figure,
+    level_figure,
+    slice_figure,
+    space_figure,
+    title_of,
+)
+from planner.workspace.maps import Question
 from planner.workspace.report import Chapter, arrays_of, csv_of, page, shown_in, summary_of
-from planner.workspace.slices import SETTINGS, cost_figure, slice_figure, title_of
-from planner.workspace.volumes import level_figure, space_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,21 +39,35 @@ _LEVELS_OF = (
 )
 
 
-def write_maps(folder: Path, made: list[Maps], title: str, lead: str) -> dict[str, Any]:
+def write_maps(
+    folder: Path, made: list[Maps], question: Question, scene: Scene | None = None
+) -> dict[str, Any]:
     """Writes everything and returns the summary, by name of grid.
 
     Args:
         folder: An existing folder.
         made: Of slices; of a volume named ``frame`` for the image of the whole space; of other
             volumes.
-        title: Of the page.
-        lead: First sentence of the page.
+        question: That they answer.
+        scene: With the obstacles among which they were made.
     """
+    where = f" in {scene.name}" if scene else ""
+    title = f"Workspace of {question.rig.name}{where}"
     chapters = [_chapter(folder, maps) for maps in made]
-    (folder / PAGE).write_text(page(title, lead, chapters), encoding="utf-8")
+    (folder / PAGE).write_text(page(title, _lead(question), chapters), encoding="utf-8")
     summary = {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
     (folder / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     return summary
+
+
+def _lead(question: Question) -> str:
+    """First sentence of the page."""
+    rig = question.rig
+    turned = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform turned"
+    return (
+        f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
+        f" {question.length * 1e3:.1f} mm in the condition number{turned}."
+    )
 
 
 def _chapter(folder: Path, maps: Maps) -> Chapter:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model.files.camera_file import drawn_upside_down, opencv_dictionary
 from model.geometry.shapes import (
     Box,
     Capsule,
@@ -29,7 +30,6 @@ from model.geometry.shapes import (
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
-from model.tag_families import drawn_upside_down, opencv_dictionary
 from tracking.camera_model import pixels_of, rays_of
 
 #: Samples a pixel along x and along y.

@@ -33,7 +33,12 @@ from simulation.drives.motion import (
     Motor,
     counts_in,
 )
-from simulation.drives.object_dictionary import NO_DUPLICATE_CONSUMER, OUT_OF_RANGE, DriveObjects
+from simulation.drives.object_dictionary import (
+    NO_DUPLICATE_CONSUMER,
+    OUT_OF_RANGE,
+    DriveObjects,
+    SdoServer,
+)
 from simulation.drives.pdo import (
     ACTING,
     CONTROL_WORD,
@@ -49,7 +54,6 @@ from simulation.drives.pdo import (
     ReceivePdo,
 )
 from simulation.drives.power import MODE_FOLLOWS, NO_WINDOW, WARNING_CHANGES, PowerStage
-from simulation.drives.sdo import SdoServer
 
 Frame = bytes | bytearray
 Send = Callable[[int, Frame], None]

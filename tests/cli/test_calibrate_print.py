@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.cli.calibrate.board_options import BoardOptions
+from cdpr.cli.calibrate.boards import BoardOptions, print_
 from cdpr.cli.calibrate.camera import camera
-from cdpr.cli.calibrate.targets import print_
 from tests.calibration.pages import pages_in
 from tests.cli.plans import RIG
 from tests.cli.program import call, nothing_written, one_message

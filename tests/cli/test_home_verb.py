@@ -12,8 +12,7 @@ import pytest
 
 from cdpr.cli.options import rig_on_bus
 from executor.cameras import process as camera_process
-from executor.cameras.process import CameraProcess
-from executor.cameras.worker import FrameRequest
+from executor.cameras.process import CameraProcess, FrameRequest
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import as_in_the_file
 from model.errors import Refused

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ import pytest
 
 from calibration.results import write_result
 from cdpr.cli.facts import show_summary
-from cdpr.cli.operate.status import _next_step
+from cdpr.cli.operate.service import _next_step
 from cdpr.cli.output import progress_bar
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as told
+from executor.service import ReferenceStatus, StatusResult
 from model.errors import Fault
 from model.rig import load_rig
 from model.scene import load_scene
@@ -99,22 +101,20 @@ def test_a_run_that_went_well_points_to_no_fault(
     assert "details" not in capsys.readouterr().out
 
 
-STANDING: dict[str, Any] = {
-    "run": None,
-    "latched": None,
-    "being_set_up": False,
-    "reference": {"counts": True},
-}
+REFERENCED = ReferenceStatus(counts=True, why_not=None, made=None, how=None, file=None)
+STANDING = StatusResult(
+    rig="rig", bus="bus", run=None, latched=None, being_set_up=False, reference=REFERENCED
+)
 
 
 def test_status_says_what_has_to_be_done_before_a_run() -> None:
     rig = Path("my rig.yaml")
     assert _next_step(rig, STANDING) == ""
-    lost = {**STANDING, "reference": {"counts": False}}
+    lost = replace(STANDING, reference=replace(REFERENCED, counts=False))
     assert _next_step(rig, lost).startswith("cdpr home 'my rig.yaml'")
-    both = _next_step(rig, {**lost, "latched": "cable 3 is slack"})
+    both = _next_step(rig, replace(lost, latched="cable 3 is slack"))
     assert both.index("cdpr reset 'my rig.yaml'") < both.index("cdpr home 'my rig.yaml'")
-    assert _next_step(rig, {**lost, "run": 17}) == ""
+    assert _next_step(rig, replace(lost, run=17)) == ""
 
 
 def test_monitor_calls_itself_by_its_name() -> None:

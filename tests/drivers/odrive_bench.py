@@ -17,8 +17,7 @@ from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.odrive.endpoints import wanted_settings
 from drivers.odrive.group import OdriveGroup
 from model.rig import Rig, load_rig, rig_from_document
-from simulation.drives.odrive import SimulatedOdrive
-from simulation.drives.odrive_rig import SimulatedOdriveRig
+from simulation.drives.odrive import SimulatedOdrive, SimulatedOdriveRig
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ODRIVE_RIG = CONFIGS / "gachon_8_6_odrive.yaml"

@@ -27,7 +27,7 @@ from drivers.can_errors import (
     bus_fault,
     error_frame_fault,
 )
-from drivers.cia402.cob_ids import commanding_ids
+from drivers.cia402.pdo import commanding_ids
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import WHOLE_BUS, GroupCommand, GroupState
 from drivers.plausibility import ReplyCheck

@@ -11,12 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.odrive.dbc import OWN_DBC, Layout, Layouts, read_layouts
 from drivers.odrive.messages import (
+    OWN_DBC,
     AxisError,
+    Layout,
+    Layouts,
     can_id,
     error_text,
     node_and_command,
+    read_layouts,
     state_text,
     status_word,
 )

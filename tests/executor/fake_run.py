@@ -12,9 +12,8 @@ import numpy as np
 
 from executor.recording.clearance import ClearanceTable
 from executor.recording.cycle_table import CycleTable
-from executor.recording.fused import fused_table
 from executor.recording.mcap import write_mcap
-from executor.recording.pose_table import PoseTable
+from executor.recording.pose_table import PoseTable, fused_table
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.recording.summary import RunContext, summarize
 from model.clearance import ClearanceModel

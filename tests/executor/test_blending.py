@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from executor.trajectory.blending import HALVINGS, LONGEST_SHARE, rounded
-from executor.trajectory.path import Path, poses_of
+from executor.trajectory.path import HALVINGS, LONGEST_SHARE, Path, poses_of, rounded
 from model.pose import Pose, interpolate
 from tests.executor.routes import WEIGHT, always, at_mm, random_route
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from executor.recording.fused import fused_table
 from executor.recording.mcap import write_mcap
 from executor.recording.mcap_channels import CHANNELS
+from executor.recording.pose_table import fused_table
 from executor.recording.run_folder import RunFolder
 from model.errors import Fault
 from tests.executor import fake_run

@@ -19,8 +19,7 @@ from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
 from executor.cameras.client import BLIND_PICTURES, CameraClient, wait_until_ready
 from executor.cameras.multi_camera import HURRY, PATIENCE, ROUND, RunCameras
-from executor.cameras.process import CameraProcess
-from executor.cameras.worker import CameraSample, FrameRequest
+from executor.cameras.process import CameraProcess, CameraSample, FrameRequest
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Fault
 from model.pose import Pose

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from executor.trajectory.blending import rounded
+from executor.trajectory.path import rounded
 from executor.trajectory.setpoints import CheckedTrajectory, Trajectory, build_table, check_table
 from executor.trajectory.time_scaling import time_law
 from model.errors import Refused

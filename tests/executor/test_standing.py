@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from executor.trajectory.blending import rounded
-from executor.trajectory.dwell import Dwell, legs_at
-from executor.trajectory.schedule import load_changes, stop_events
+from executor.trajectory.dwell import Dwell, legs_at, load_changes, stop_events
+from executor.trajectory.path import rounded
 from executor.trajectory.setpoints import Trajectory, build_table, check_table
 from executor.trajectory.time_scaling import time_law
 from model.errors import Refused

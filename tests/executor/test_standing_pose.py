@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.current_pose import current_pose
+from executor.drives import current_pose
 from model.errors import CdprError
 from model.files.scene_file import LoadDocument
 from model.kinematics import cables_at

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.trajectory.blending import rounded
-from executor.trajectory.path import Path, polyline
+from executor.trajectory.path import Path, polyline, rounded
 from executor.trajectory.time_scaling import TimeLaw, length_to_change, s_curve, time_law
 from model.errors import Fault
 from model.pose import Pose

@@ -17,8 +17,8 @@ from model.rig import rig_from_document
 from planner.check import _Check, check_path, verify
 from planner.check_report import VerifiedPlan
 from planner.costs import capacity_margins
+from planner.path import PosePath
 from planner.planning import make_plan
-from planner.pose_path import PosePath
 from planner.settings import PlannerSettings
 
 

@@ -13,7 +13,7 @@ from model.clearance import ClearanceModel, RobotBodies, ShiftedBodies
 from model.errors import Fault
 from model.pose import Pose, interpolate
 from planner.bounds import smallest_along, smallest_over_stretches
-from planner.pose_path import PosePath
+from planner.path import PosePath
 
 TOLERANCE = 0.1e-3
 SHAPES = (

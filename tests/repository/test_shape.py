@@ -31,11 +31,10 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "model/rig.py",
         "model/statics/tension_distribution.py",
         "model/statics/wrench_closure.py",
-        "planner/campaign/figures.py",
+        "planner/campaign/page.py",
         "planner/kernels/gjk.py",
         "planner/workspace/files.py",
-        "planner/workspace/slices.py",
-        "planner/workspace/volumes.py",
+        "planner/workspace/figures.py",
     },
     "of several protocols, back ends or planners one is loaded": {
         "drivers/factory.py",
@@ -48,7 +47,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
     },
     "an extra may not be installed": {
         "cdpr/cli/operate/console.py",
-        "drivers/odrive/dbc.py",
+        "drivers/odrive/messages.py",
         "planner/parallel.py",
         "tracking/detection/libraries.py",
     },

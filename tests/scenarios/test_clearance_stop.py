@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from executor.cameras.multi_camera import ClearanceMonitor
-from executor.cameras.worker import CameraWorker, FrameRequest
+from executor.cameras.process import CameraWorker, FrameRequest
 from executor.operator_requests import StopReason
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State

@@ -22,7 +22,7 @@ from executor.control.preconditions import counted_here, require_below, with_red
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
 from executor.control.winch_loop import LawMotion, WinchesHere
 from executor.control.winch_motion import WinchesStand, move_winches, require_held
-from executor.current_pose import current_pose
+from executor.drives import current_pose
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
 from executor.jogging import straight_way

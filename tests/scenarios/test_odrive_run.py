@@ -24,7 +24,7 @@ from model.errors import Refused
 from model.plan import load_plan, save_plan
 from model.rig import load_rig
 from planner.check import verify
-from simulation.drives.odrive_rig import SimulatedOdriveRig
+from simulation.drives.odrive import SimulatedOdriveRig
 from tests.cli.plans import CONFIGS, GOAL_MM, START_MM, free_scene, straight_plan
 from tests.cli.program import call, nothing_written
 from tests.scenarios.stage import Stage, at

@@ -38,8 +38,8 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     from drivers.cameras.files import read_picture
     from drivers.cameras.live import VideoFile
     from drivers.can_bus import BusSettings
-    from drivers.odrive.dbc import read_layouts
     from drivers.odrive.endpoints import read_endpoints
+    from drivers.odrive.messages import read_layouts
     from executor.interlock.fault_latch import FaultLatch
     from executor.interlock.reference import ReferenceFile
     from model.files.documents import load_yaml

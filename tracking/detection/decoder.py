@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from model.files.camera_file import tags_in
 from model.pose import Array
-from model.tag_families import tags_in
 from tracking.camera_model import Image
 from tracking.detection.tags import modules_across, official_modules
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from model.tag_families import APRILTAG_FAMILIES
+from model.files.camera_file import APRILTAG_FAMILIES
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
 

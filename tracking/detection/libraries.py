@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from model.errors import BadInput
+from model.files.camera_file import DETECTORS
 from model.pose import Array
-from model.tag_families import DETECTORS
 from tracking.camera_model import Image
 from tracking.detection.detector import Detection, TagDetector
 

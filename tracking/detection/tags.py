@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
+from model.files.camera_file import FAMILIES, drawn_upside_down, opencv_dictionary
 from model.pose import Array
 from model.rig import Tag
-from model.tag_families import FAMILIES, drawn_upside_down, opencv_dictionary
 
 #: Top left, top right, bottom right, bottom left of the upright image, in half sides.
 CORNER_SIGNS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])

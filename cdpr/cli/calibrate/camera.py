@@ -1,4 +1,4 @@
-"""`cdpr calibrate camera`: from images of a board."""
+"""`cdpr calibrate camera`, from images of a board, and `readout`, from images in motion."""
 
 from __future__ import annotations
 
@@ -16,18 +16,33 @@ from calibration.procedures import (
     Destination,
     calibrate_camera,
     calibrate_camera_from_corners,
+    measure_readout,
 )
 from calibration.results import require_file_name
 from calibration.targets.board import Board
-from cdpr.cli.calibrate.board_options import BoardOptions
-from cdpr.cli.calibrate.output import FolderOption, ForceOption, WantedOption, show_calibration
+from cdpr.cli.calibrate.boards import BoardOptions
+from cdpr.cli.calibrate.output import (
+    CameraOption,
+    FolderOption,
+    ForceOption,
+    WantedOption,
+    show_calibration,
+)
 from cdpr.cli.operate.supervision import stop_requests
-from cdpr.cli.options import JsonOption, with_option_groups
+from cdpr.cli.options import (
+    CalibrationOption,
+    JsonOption,
+    RigArgument,
+    calibrated_rig,
+    finite,
+    with_option_groups,
+)
 from cdpr.cli.output import Terminal, err
 from executor.cameras.sources import require_camera_source
 from executor.operator_requests import LocalRequests
 from model.errors import BadInput
 from model.files.output import make_folder
+from model.rig import load_rig
 
 
 class LensChoice(StrEnum):
@@ -171,3 +186,64 @@ def _facts(made: CameraOutcome) -> list[tuple[str, str]]:
             f" of the images differ by {quality.halves * 1e3:.2g} mm",
         ),
     ]
+
+
+# `cdpr calibrate readout`: how long a camera takes from its top row to its bottom row.
+
+
+def readout(
+    rig: RigArgument,
+    source: Annotated[
+        Path, typer.Argument(help="video file, or folder of images", metavar="SOURCE")
+    ],
+    camera: CameraOption = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1, callback=finite, help="images per second of a folder (default: the camera's)"
+        ),
+    ] = None,
+    speed_mm_s: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1, callback=finite, help="for which the error is stated (default: motion's)"
+        ),
+    ] = None,
+    calibration: CalibrationOption = None,
+    wanted_mm: WantedOption = 0.1,
+    output: FolderOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure a rolling shutter, from images of the platform while it moves.
+
+    The platform goes up and down and sideways before the camera, which stands still. Exit code 3
+    where the result is not good enough.
+
+    [dim]Examples:[/dim]
+
+      cdpr calibrate readout rig.yaml moving.mp4 -o calibration
+
+      cdpr calibrate readout rig.yaml runs/first/pictures --rate-hz 10
+    """
+    the_rig = calibrated_rig(load_rig(rig), calibration)
+    made = measure_readout(
+        the_rig,
+        the_rig.camera(camera),
+        source,
+        rate=rate_hz,
+        speed=None if speed_mm_s is None else speed_mm_s / 1e3,
+        wanted=wanted_mm / 1e3,
+        to=Destination(output, force),
+        listener=Terminal(quiet=as_json),
+    )
+    found = made.found
+    fastest = max(found.speeds.values())
+    facts = [
+        (
+            "pictures",
+            f"{len(found.speeds)} used, the platform's speed up to {fastest * 1e3:.0f} mm/s",
+        ),
+        ("edges", f"{found.before:.2f} standard deviations off before, {found.after:.2f} after"),
+    ]
+    show_calibration(made, facts, as_json)

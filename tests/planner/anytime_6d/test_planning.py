@@ -9,10 +9,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from cdpr.cli.plan.facts import sentences_of
 from model.errors import BadInput, InvalidFile, NoSolution
 from model.files.plan_file import PlanDocument
-from model.plan import load_plan, plan_from_document, save_plan
+from model.plan import load_plan, plan_facts, plan_from_document, save_plan
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, load_scene
@@ -60,7 +59,7 @@ def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> 
         assert judge.fault(start, end, 40) == ""
     assert document.quality.length_mm < 800.0
     assert document.planner.name == "turning"
-    told = dict(sentences_of(document))["rotation"]
+    told = dict(plan_facts(document))["rotation"]
     tilt = float(told.removeprefix("tilted up to ").split("°")[0])
     assert 6.0 <= tilt <= 8.0
     assert "rotated up to" in told
@@ -102,7 +101,7 @@ def test_where_nothing_is_in_the_way_the_single_move_is_the_path() -> None:
     route = routed(scene, ROUNDS)
     assert route.rounds == 1
     level = make_plan(GACHON, scene.changed(goal=Pose.level([0.06, 0.04, 0.43])), ROUNDS)
-    assert "rotation" not in dict(sentences_of(level))
+    assert "rotation" not in dict(plan_facts(level))
     assert len(route.route.path) == 2
 
 

@@ -16,14 +16,22 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from planner.campaign.cases import OWN, SHARES, WIDE, box_text, with_box
-from planner.campaign.claims import Finding, findings
-from planner.campaign.figures import save_figures
-from planner.campaign.page import page
-from planner.campaign.results import Change, Results, change_of_means, summary
+from planner.campaign.evaluation import findings_json, summary_csv, trials_csv
+from planner.campaign.page import page, save_figures
+from planner.campaign.results import Change, Finding, Results, change_of_means, findings, summary
 from planner.campaign.studies import FIGURE_9, all_readings, batches, figure_9_arm, run_all
-from planner.campaign.tables import findings_json, summary_csv, trials_csv
-from planner.campaign.trial import Batch, Case, PathFigures, Trial, run_batch
+from planner.campaign.trial import (
+    OWN,
+    SHARES,
+    WIDE,
+    Batch,
+    Case,
+    PathFigures,
+    Trial,
+    box_text,
+    run_batch,
+    with_box,
+)
 from planner.check import check_path
 from planner.costs import KinematicCost
 from planner.rrt.search import PaperPlanner
@@ -140,7 +148,7 @@ def test_a_trial_reports_what_its_search_and_the_independent_routes_find(
 def test_random_ends_are_as_far_apart_as_the_scenes_and_do_not_see_each_other(
     gachon, ready_scene
 ) -> None:
-    from planner.campaign.cases import random_ends
+    from planner.campaign.trial import random_ends
 
     scene = ready_scene("environment_2")
     planner = PaperPlanner(gachon, scene, PlannerSettings(cost="length"), CLEARANCE_RESERVE)

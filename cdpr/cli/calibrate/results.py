@@ -1,4 +1,4 @@
-"""`cdpr calibrate export` and `import`: camera files of OpenCV, ROS, Kalibr and mrcal."""
+"""`cdpr calibrate diff`, `apply`, `export`, `import`: what becomes of calibration results."""
 
 from __future__ import annotations
 
@@ -8,16 +8,89 @@ from typing import Annotated
 
 import typer
 
+from calibration.compare import compare
 from calibration.intrinsics.exchange import FORMATS, write_rig_with_camera
 from calibration.intrinsics.result import camera_named
+from calibration.load import load_result, write_calibrated_rig
 from cdpr.cli.calibrate.output import CameraOption
-from cdpr.cli.options import CalibrationOption, JsonOption, calibrated_rig
-from cdpr.cli.output import show_facts, show_json
+from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
+from cdpr.cli.output import err, show_facts, show_json
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
 
-RigArgument = Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")]
+
+def diff(
+    first: Annotated[Path, typer.Argument(help="result file (YAML)", metavar="A")],
+    second: Annotated[Path, typer.Argument(help="result file (YAML)", metavar="B")],
+    as_json: JsonOption = False,
+) -> None:
+    """Compare two calibration results: every number against its interval, and the effect in mm.
+
+    Exit code 3 where they are further apart than they state.
+
+    [dim]Example:[/dim]
+
+      cdpr calibrate diff calibration_camera_front_2026-03-01.yaml
+      calibration_camera_front_2026-06-01.yaml
+    """
+    one, other = load_result(first), load_result(second)
+    found = compare(one, other)
+    if as_json:
+        show_json(found.as_dict())
+    else:
+        title = f"{one.kind} {one.name}: from {one.date} to {other.date}"
+        facts = [("verdict", str(found)), ("next", found.next_step)]
+        facts += [
+            (
+                change.name,
+                f"{change.by:+.3g}, within {change.allowed:.2g} by chance"
+                f"{': CHANGED' if change.beyond else ''}",
+            )
+            for change in found.changes
+        ]
+        facts += [(name, "in one result only") for name in found.only_in_one]
+        show_facts(title, facts)
+    if not found.agree:
+        raise typer.Exit(3)
+
+
+# `cdpr calibrate apply`: a new rig file with calibration results in place.
+
+
+def apply(
+    rig: RigArgument,
+    results: Annotated[
+        list[Path], typer.Argument(help="result files of `cdpr calibrate`", metavar="RESULT...")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="rig file to write; must not exist yet")
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Write a new rig file with calibration results in place of its own values.
+
+    The rig file itself is never changed, and comments of it are not copied.
+
+    [dim]Example:[/dim]
+
+      cdpr calibrate apply rig.yaml calibration_rig_rig_2026-03-14.yaml -o rig_calibrated.yaml
+    """
+    loaded = [load_result(path) for path in results]
+    new = write_calibrated_rig(output, load_rig(rig), loaded)
+    for result in loaded:
+        if not result.good_enough:
+            what = f"calibration {result.kind} {result.name}, {result.date}"
+            err.print(f"remark {what}: {result.verdict}", markup=False, soft_wrap=True)
+    if as_json:
+        show_json({"rig": str(output), "results": [str(path) for path in results]})
+        return
+    facts = [(f"{one.kind} {one.name}", f"{one.date}: {one.verdict}") for one in loaded]
+    facts += [("rig file", str(output)), ("next", f"`cdpr home {output}`, then plan with it")]
+    show_facts(f"{new.name} with its calibration", facts)
+
+
+# `cdpr calibrate export` and `import`: camera files of OpenCV, ROS, Kalibr and mrcal.
 
 
 class FormatName(StrEnum):

@@ -1,4 +1,4 @@
-"""`cdpr new`: asks what a rig file needs to know, and writes it."""
+"""`cdpr examples` lists and copies ready files; `cdpr new` asks for a rig and writes its file."""
 
 from __future__ import annotations
 
@@ -9,11 +9,66 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.output import out
+from cdpr.cli.output import out, show_json
 from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_atomic
+from model.files.examples import copy_examples, find_examples, ready_folder, select_examples
 from model.files.new_rig import OPTIONS, RigQuestion, collect_answers, read_coordinates
 from model.files.rig_template import rig_text
+
+
+def examples(
+    names: Annotated[
+        list[str] | None, typer.Argument(help="examples to copy; without a name, all are listed")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="folder to copy to (default: the current one)", metavar="DIR"
+        ),
+    ] = None,
+    everything: Annotated[
+        bool,
+        typer.Option("--all", help="copy all, into configs/ and examples/ as in the repository"),
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="the list as JSON")] = False,
+) -> None:
+    """List the ready rigs, scenes and recorded sessions, or copy some of them.
+
+    [dim]Examples:[/dim]
+
+      cdpr examples
+
+      cdpr examples gachon_8_6 environment_1 -o my_robot
+
+      cdpr examples --all
+    """
+    if names and everything:
+        raise BadInput("--all copies every example already", next_step="leave out the names")
+    if output is not None and not (names or everything):
+        raise BadInput("-o needs something to copy", next_step="name an example, or pass --all")
+    known = find_examples(ready_folder(), ready_folder("examples"))
+    if not names and not everything:
+        if as_json:
+            show_json([{"name": e.name, "kind": e.kind, "about": e.about} for e in known])
+            return
+        for example in known:
+            line = f"  {example.kind:<8} {example.name:<22} {example.about}"
+            out.print(line, markup=False, soft_wrap=True)
+        out.print("next: copy one with `cdpr examples NAME`, or all with `cdpr examples --all`")
+        return
+    wanted = known if everything else select_examples(known, names or [])
+    copies = copy_examples(wanted, output or Path(), grouped=everything, replace=force)
+    if as_json:
+        show_json([str(path) for path in copies])
+        return
+    for path in copies:
+        out.print(f"copied {path}", markup=False, soft_wrap=True)
+
+
+# `cdpr new`: asks what a rig file needs to know, and writes it.
+
 
 _Point = tuple[float, float, float]
 

@@ -1,4 +1,4 @@
-"""`cdpr hold`, `cdpr resume`, `cdpr speed`: what an operator wants of a run that is under way."""
+"""`cdpr stop`, `hold`, `resume`, `speed`: what an operator asks of a run that is under way."""
 
 from __future__ import annotations
 
@@ -6,9 +6,39 @@ from typing import Annotated
 
 import typer
 
+from cdpr.cli.options import JsonOption
 from cdpr.cli.output import out, show_json
-from executor.remote.client import request_run
+from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.state_machine import State
+
+
+def stop(
+    as_json: JsonOption = False,
+) -> None:
+    """Stop every run of this user: all drives slow down together along the path, then hold.
+
+    This is a software stop. It does not replace the emergency-stop button.
+
+    [dim]Example:[/dim]
+
+      cdpr stop
+    """
+    result = stop_runs()
+    stopped, silent = result.stopped, result.silent
+    if as_json:
+        silent_processes = [answer.process for answer in silent]
+        show_json({"stopped_processes": list(stopped), "silent_processes": silent_processes})
+        raise typer.Exit(0 if stopped and not silent else 1)
+    if not (stopped or silent):
+        raise no_run("stop")
+    if stopped:
+        out.print(f"stop sent to process {', '.join(map(str, stopped))}")
+    if silent:
+        raise no_answer("stop", silent)
+
+
+# `cdpr hold`, `cdpr resume`, `cdpr speed`: what an operator wants of a run that is under way.
+
 
 #: The path is over, or the run is about to end.
 OVER = {State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED}

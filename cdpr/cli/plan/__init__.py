@@ -1,1 +1,0 @@
-"""The verbs of panel "Plan"; each is imported when it is called."""

@@ -1,0 +1,331 @@
+"""`cdpr plan` searches a path, `cdpr check` proves it by an independent route."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from pathlib import Path
+from shlex import quote
+from typing import Annotated, Any
+
+import typer
+
+from cdpr.cli.facts import resumed_facts
+from cdpr.cli.options import (
+    CalibrationOption,
+    JsonOption,
+    PlanFileOption,
+    ReplacePlanOption,
+    RigArgument,
+    SceneArgument,
+    Triple,
+    calibrated_rig,
+    with_option_groups,
+)
+from cdpr.cli.output import Terminal, out, show_facts, show_json
+from executor.recording.resume import require_room, scene_after
+from model.errors import BadInput
+from model.files.documents import millimetres
+from model.files.output import require_new_file
+from model.files.scene_file import StopDocument
+from model.plan import load_plan, plan_as_dict, plan_facts, require_same_rig, save_plan
+from model.pose import Pose
+from model.rig import load_rig
+from model.scene import Scene, load_scene
+from planner.check import check_path
+from planner.options import PlanningOptions, settings_from_options
+from planner.planning import plan_path
+
+_PANEL = "Open readings of the paper's text (docs/paper.md)"
+
+
+class PlannerName(StrEnum):
+    """Which planner searches."""
+
+    optimal = "optimal"
+    adaptive = "adaptive"
+    goal_bias = "goal-bias"
+
+
+class CostName(StrEnum):
+    """What makes a path good."""
+
+    length = "length"
+    kinematic = "kinematic"
+    clearance = "clearance"
+    capacity = "capacity"
+
+
+class ModeName(StrEnum):
+    """How far the paper's search goes."""
+
+    rewire = "rewire"
+    paper = "paper"
+
+
+class FailureRateName(StrEnum):
+    """The rate e_r at which samples are drawn backward."""
+
+    streak = "k/(k+1)"
+    streak_and_two = "k/(k+2)"
+    tree = "tree"
+    node = "node"
+
+
+class FocusName(StrEnum):
+    """The node x_c that the forward cone opens to."""
+
+    last_failed = "last-failed"
+    most_failed = "most-failed"
+    highest_rate = "highest-rate"
+
+
+class ConeDrawName(StrEnum):
+    """How points of the forward cone are drawn."""
+
+    radius = "radius"
+    volume = "volume"
+
+
+class SteerName(StrEnum):
+    """How far a new node is from the one it grows from."""
+
+    full_step = "full-step"
+    to_sample = "to-sample"
+
+
+@dataclass(frozen=True, slots=True)
+class SearchOptions:
+    """Which planner searches, and how; every field is an option of `cdpr plan`."""
+
+    planner: Annotated[
+        PlannerName,
+        typer.Option(help="optimal (recommended), the paper's, or half of all samples at the goal"),
+    ] = PlannerName.optimal
+    cost: Annotated[
+        CostName | None,
+        typer.Option(help="objective (default: length; the paper's planners: kinematic)"),
+    ] = None
+    weight: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--weight", help="NAME=NUMBER, repeatable for a weighted sum: length, kinematic, …"
+        ),
+    ] = None
+    longest_mm: Annotated[
+        float | None, typer.Option(min=0.001, help="optimal: upper limit of the path length")
+    ] = None
+    budget_ms: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001,
+            help="optimal: time for improvement (default: 50 ms; 500 with --free-rotation)",
+        ),
+    ] = None
+    rounds: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="optimal: fixed number of improvement rounds (reproducible)"),
+    ] = None
+    free_rotation: Annotated[
+        bool,
+        typer.Option(
+            "--free-rotation", help="optimal: also rotate the platform, within the scene's limits"
+        ),
+    ] = False
+    mode: Annotated[
+        ModeName | None,
+        typer.Option(help="the paper's planners: RRT* (rewire), or stop at the first path (paper)"),
+    ] = None
+    max_iterations: Annotated[
+        int | None,
+        typer.Option(min=1, max=1_000_000, help="the paper's planners: largest number of samples"),
+    ] = None
+    failure_rate: Annotated[
+        FailureRateName | None,
+        typer.Option(help="e_r, k: failures in a row", rich_help_panel=_PANEL),
+    ] = None
+    focus: Annotated[
+        FocusName | None, typer.Option(help="the node x_c", rich_help_panel=_PANEL)
+    ] = None
+    cone_draw: Annotated[
+        ConeDrawName | None,
+        typer.Option(help="r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL),
+    ] = None
+    steer: Annotated[
+        SteerName | None,
+        typer.Option(help="steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL),
+    ] = None
+    spacing_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="reject nodes closer than this to another", rich_help_panel=_PANEL
+        ),
+    ] = None
+    goal_sight: Annotated[
+        bool,
+        typer.Option("--goal-sight", help="every new node tries the goal", rich_help_panel=_PANEL),
+    ] = False
+
+    def with_seed(self, seed: int) -> PlanningOptions:
+        """As the planner's library takes them."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        plain: dict[str, Any] = {
+            name: value.value if isinstance(value, StrEnum) else value
+            for name, value in given.items()
+            if value is not None
+        }
+        return PlanningOptions(seed=seed, **plain)
+
+
+DEFAULT_SEARCH = SearchOptions()
+
+
+# `cdpr plan`: a path from start to goal.
+
+
+@with_option_groups
+def plan(
+    rig: RigArgument,
+    scene: SceneArgument,
+    output: PlanFileOption,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, help="random seed; with --rounds the plan is reproducible"),
+    ] = 0,
+    calibration: CalibrationOption = None,
+    clearance_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="obstacle clearance, overriding the scene's")
+    ] = None,
+    search: SearchOptions = DEFAULT_SEARCH,
+    start_mm: Annotated[
+        Triple | None, typer.Option(help="start position x y z, overriding the scene's")
+    ] = None,
+    goal_mm: Annotated[
+        Triple | None, typer.Option(help="goal position x y z, overriding the scene's")
+    ] = None,
+    via_mm: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
+        ),
+    ] = None,
+    from_run: Annotated[
+        Path | None,
+        typer.Option(help="start where this run ended, with the remaining stops", metavar="RUNDIR"),
+    ] = None,
+    force: ReplacePlanOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan a collision-free path and write it to a file.
+
+    [dim]Examples:[/dim]
+
+      cdpr plan configs/gachon_8_6.yaml configs/environment_1.yaml -o plan.json
+
+      cdpr plan configs/gachon_8_6.yaml configs/environment_3.yaml -o plan.json
+      --clearance-mm 20 --cost kinematic --longest-mm 1000
+
+      cdpr plan configs/gachon_8_6.yaml configs/environment_2.yaml -o plan.json
+      --planner adaptive --mode paper --seed 7
+
+      cdpr plan configs/gachon_8_6.yaml configs/pick_and_place.yaml -o rest.json
+      --from-run runs/stopped
+    """
+    the_rig = calibrated_rig(load_rig(rig), calibration)
+    if from_run is not None and start_mm is not None:
+        raise BadInput(
+            "--from-run and --start-mm contradict each other", next_step="leave out one of them"
+        )
+    the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
+    done: Sequence[StopDocument] = ()
+    begun: list[tuple[str, str]] = []
+    if from_run is not None:
+        the_scene, done, end = scene_after(the_scene, the_rig, from_run)
+        require_room(the_scene, the_rig)
+        begun = resumed_facts(end, from_run, len(done), len(the_scene.stops))
+    the_scene = _by_way_of(the_scene, via_mm or [])
+    require_new_file(output, force)
+    settings = settings_from_options(search.with_seed(seed))
+    of_legs = search.rounds if search.rounds and len(search.rounds) > 1 else []
+    listener = Terminal(quiet=as_json)
+    document = plan_path(the_rig, the_scene, settings, listener, rounds=of_legs, done=done)
+    save_plan(document, output)
+    if as_json:
+        show_json({"plan": str(output), **plan_as_dict(document)})
+        return
+    more = "".join(f" --calibration {quote(str(file))}" for file in calibration or [])
+    file = quote(str(output))
+    run_it = f"cdpr run {file} --rig {quote(str(rig))}{more} -o RUNDIR"
+    next_step = f"cdpr check {file}, then {run_it}"
+    show_facts(f"plan {output}", [*begun, *plan_facts(document), ("next", next_step)])
+
+
+def _changed(
+    scene: Scene, start_mm: Triple | None, goal_mm: Triple | None, clearance_mm: float | None
+) -> Scene:
+    start = None if start_mm is None else Pose.level(millimetres(list(start_mm)))
+    goal = None if goal_mm is None else Pose.level(millimetres(list(goal_mm)))
+    clearance = None if clearance_mm is None else clearance_mm / 1000.0
+    return scene.changed(start=start, goal=goal, clearance=clearance)
+
+
+def _by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
+    """The scene with level way-poses before its own stops, given as ``x y z`` (`joined_points`).
+
+    Raises:
+        BadInput: A way-pose cannot be read.
+    """
+    ways = []
+    for number, text in enumerate(via_mm, start=1):
+        try:
+            x, y, z = map(float, text.split())
+        except ValueError:
+            raise BadInput(
+                f"--via-mm {text}: three numbers are required", next_step="write --via-mm 0 40 430"
+            ) from None
+        if not all(map(math.isfinite, (x, y, z))):
+            raise BadInput(
+                f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
+            )
+        ways.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
+    return scene.changed(stops=[*ways, *scene.document.stops]) if ways else scene
+
+
+# `cdpr check`: proves a plan by an independent route.
+
+
+def check(
+    plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="check against this rig file as it is now"),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a plan with an independent method: distances at dense poses, with bounds.
+
+    Exits with 3 when anything is below what the scene asks.
+
+    [dim]Examples:[/dim]
+
+      cdpr check plan.json
+
+      cdpr check plan.json --rig configs/gachon_8_6.yaml --json
+    """
+    the_plan = load_plan(plan)
+    the_rig = the_plan.rig if rig is None else load_rig(rig)
+    require_same_rig(the_plan, the_rig, plan)
+    with Terminal(quiet=as_json).waiting("checking"):
+        report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
+    if as_json:
+        show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
+    else:
+        facts = [*the_plan.scene.stop_facts(), *report.facts()]
+        show_facts(f"check of {plan}", facts)
+        for violation in report.violations:
+            out.print(f"[red]violated[/red] {violation.sentence()}", soft_wrap=True)
+        out.print("[green]passed[/green]" if report.passed else "[red]not passed[/red]")
+    if not report.passed:
+        raise typer.Exit(3)
