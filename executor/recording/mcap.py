@@ -1,26 +1,27 @@
-"""``run.mcap``: all channels of a run in one file for Foxglove or PlotJuggler."""
+"""``run.mcap``: all channels of a run in one file for Foxglove, rerun or PlotJuggler."""
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from foxglove.messages import CompressedImage, Log, LogLevel
 from mcap.writer import Writer
 
 from executor.recording.clearance import ClearanceTable, camera_of
 from executor.recording.cycle_table import CycleTable
 from executor.recording.mcap_channels import (
-    CHANNELS,
-    WORLD,
+    OWN,
+    TYPED,
     Message,
     channel_of,
     column_of,
+    frame_of,
     nanoseconds,
-    pose_value,
+    pose_message,
     poses_of,
     robot_messages,
     rows_of,
@@ -29,7 +30,7 @@ from executor.recording.mcap_channels import (
     topic_of,
 )
 from executor.recording.pose_table import OK, FusedTable, PoseTable
-from executor.recording.run_folder import RunFolder
+from executor.recording.run_folder import PLAN, RIG, RunFolder
 from executor.recording.summary import RunContext
 from model.errors import Fault
 from tracking.clearance import COVERAGE, MeasuredClearance
@@ -87,16 +88,13 @@ def _pictures(
 ) -> Iterator[Message]:
     for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
         if name:
-            content = {
-                "timestamp": stamp_of(start, time),
-                "frame_id": camera or "camera",
-                "data": base64.b64encode(folder.picture(name)).decode(),
-                "format": "jpeg",
-            }
-            yield topic_of("/pictures", camera), time, content
-
-
-_INFO, _WARNING = 2, 3
+            picture = CompressedImage(
+                timestamp=stamp_of(start, time),
+                frame_id=frame_of(camera),
+                data=folder.picture(name),
+                format="jpeg",
+            )
+            yield topic_of("/pictures", camera), time, picture
 
 
 def write_mcap(
@@ -132,25 +130,29 @@ def write_mcap(
         *poses_of("/fused_pose", fused.time, fused.position, fused.rotation, start),
         *_events(context, start),
     ]
-    write_messages(folder.mcap, messages, start)
+    attached = [folder.path / name for name in (PLAN, RIG)]
+    write_messages(folder.mcap, messages, start, attached)
     return folder.mcap
 
 
-def write_messages(path: Path, messages: Sequence[Message], start: int) -> None:
+def write_messages(
+    path: Path, messages: Sequence[Message], start: int, attached: Sequence[Path] = ()
+) -> None:
     """Writes messages in the order of their times, or no file.
 
     Args:
         path: The file.
-        messages: Of the channels in `executor.recording.mcap_channels.CHANNELS`, or of one of them
-            for a camera alone (`executor.recording.mcap_channels.topic_of`).
+        messages: Of the channels in `executor.recording.mcap_channels`, or of one of them for a
+            camera alone (`executor.recording.mcap_channels.topic_of`).
         start: What their times count from, [ns since 1970].
+        attached: JSON files that go into the file as they are.
 
     Raises:
         Fault: The disk is full or gone; no part of the file is left.
     """
     unfinished = path.with_name(f".{path.name[:40]}.{os.getpid()}")
     try:
-        _write(unfinished, sorted(messages, key=lambda message: message[1]), start)
+        _write(unfinished, sorted(messages, key=lambda message: message[1]), start, attached)
         unfinished.replace(path)
     except OSError as error:
         unfinished.unlink(missing_ok=True)
@@ -162,25 +164,38 @@ def write_messages(path: Path, messages: Sequence[Message], start: int) -> None:
         ) from None
 
 
-def _write(path: Path, messages: Sequence[Message], start: int) -> None:
+def _write(path: Path, messages: Sequence[Message], start: int, attached: Sequence[Path]) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="", library="cdpr")
-        schemas, channels = {}, {}
-        for topic, (name, schema) in CHANNELS.items():
-            data = json.dumps(schema).encode()
-            schemas[topic] = writer.register_schema(name, "jsonschema", data)
-        of_cameras = {topic for topic, _, _ in messages} - CHANNELS.keys()
-        for topic in (*CHANNELS, *sorted(of_cameras)):
-            number = schemas[channel_of(topic)]
-            channels[topic] = writer.register_channel(topic, "json", number)
+        channels: dict[str, int] = {}
+        for topic in sorted({topic for topic, _, _ in messages} | TYPED.keys() | OWN.keys()):
+            channels[topic] = _registered(writer, topic)
         counts = dict.fromkeys(channels, 0)
         for topic, time, content in messages:
             at = start + nanoseconds(time)
-            data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+            data = _encoded(content) if isinstance(content, dict) else content.encode()
             writer.add_message(channels[topic], at, data, at, counts[topic])
             counts[topic] += 1
+        for file in attached:
+            data = file.read_bytes()
+            writer.add_attachment(start, start, file.name, "application/json", data)
         writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _registered(writer: Writer, topic: str) -> int:
+    kind = TYPED.get(channel_of(topic))
+    if kind is None:
+        name, described = OWN[channel_of(topic)]
+        schema = writer.register_schema(name, "jsonschema", json.dumps(described).encode())
+        return writer.register_channel(topic, "json", schema)
+    typed = kind.get_schema()
+    schema = writer.register_schema(typed.name, typed.encoding, typed.data)
+    return writer.register_channel(topic, typed.encoding, schema)
+
+
+def _encoded(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 
 
 def _cycles(cycles: CycleTable, start: int) -> Iterator[Message]:
@@ -253,15 +268,10 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
 
 def _events(context: RunContext, start: int) -> Iterator[Message]:
     for event in context.events:
-        content = {
-            "timestamp": stamp_of(start, event.time_s),
-            "level": _INFO if context.final_state == "finished" else _WARNING,
-            "message": event.text,
-            "name": event.code,
-            "file": "",
-            "line": 0,
-        }
-        yield "/events", event.time_s, content
+        level = LogLevel.Info if context.final_state == "finished" else LogLevel.Warning
+        stamp = stamp_of(start, event.time_s)
+        log = Log(timestamp=stamp, level=level, message=event.text, name=event.code)
+        yield "/events", event.time_s, log
 
 
 # Poses of `cdpr track` as an MCAP file, in the channels of a run's.
@@ -305,9 +315,9 @@ def _messages(pictures: Sequence[LoggedPicture], start: int, camera: str) -> Ite
                 {**status, "status": found.reason, "covariance": nothing},
             )
             continue
-        pose = pose_value(found.pose.position.tolist(), found.pose.quaternion.tolist())
         stamp = stamp_of(start, found.time)
-        yield pose_topic, found.time, {"timestamp": stamp, "frame_id": WORLD, "pose": pose}
+        pose = pose_message(stamp, found.pose.position.tolist(), found.pose.quaternion.tolist())
+        yield pose_topic, found.time, pose
         status |= {"tags": " ".join(map(str, found.tags)), "reprojection_px": found.reprojection}
         status["covariance"] = found.covariance.ravel().tolist()
         yield status_topic, found.time, status

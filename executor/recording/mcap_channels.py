@@ -1,4 +1,4 @@
-"""JSON schemas of the channels of ``run.mcap``: Foxglove's own where one fits, else ours.
+"""Channels of ``run.mcap``: Foxglove's Protobuf messages where one fits, else our own as JSON.
 
 Source: the Foxglove schemas, https://docs.foxglove.dev/docs/sdk/schemas (well-known names).
 """
@@ -9,18 +9,47 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from foxglove import messages as fox
 
 from executor.recording.cycle_table import CycleTable
 from executor.recording.summary import RunContext
+from model.cameras import Camera
+from model.files.camera_file import FISHEYE
 from model.geometry.solids import solid_of
 from model.kinematics import cables_to
 from model.pose import Array, Pose
 from model.rig import Rig
 
 Schema = dict[str, Any]
+#: A message of Foxglove's.
+Typed = (
+    fox.CameraCalibration
+    | fox.CompressedImage
+    | fox.FrameTransforms
+    | fox.Log
+    | fox.PoseInFrame
+    | fox.SceneUpdate
+)
+#: One message: topic, time since the start of the run [s], content; ours are dicts.
+Message = tuple[str, float, Typed | dict[str, Any]]
+
+#: Topic → its message, for those that are Foxglove's.
+TYPED: dict[str, type[Typed]] = {
+    "/planned_pose": fox.PoseInFrame,
+    "/encoder_pose": fox.PoseInFrame,
+    "/tag_pose": fox.PoseInFrame,
+    "/fused_pose": fox.PoseInFrame,
+    "/events": fox.Log,
+    "/pictures": fox.CompressedImage,
+    "/camera_calibration": fox.CameraCalibration,
+    "/scene": fox.SceneUpdate,
+    "/robot": fox.SceneUpdate,
+    "/tf": fox.FrameTransforms,
+}
 
 _NUMBER: Schema = {"type": ["number", "null"]}
 _TEXT: Schema = {"type": "string"}
+_INTEGER: Schema = {"type": "integer"}
 
 
 def _object(**properties: Schema) -> Schema:
@@ -31,48 +60,6 @@ def _list(items: Schema) -> Schema:
     return {"type": "array", "items": items}
 
 
-_INTEGER: Schema = {"type": "integer"}
-_TIME = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _object(position=_VECTOR, orientation=_QUATERNION)
-_COLOR = _object(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
-
-POSE_IN_FRAME = _object(timestamp=_TIME, frame_id=_TEXT, pose=_POSE)
-LOG = _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER)
-COMPRESSED_IMAGE = _object(
-    timestamp=_TIME,
-    frame_id=_TEXT,
-    data={"type": "string", "contentEncoding": "base64"},
-    format=_TEXT,
-)
-_PRIMITIVES = {
-    "cubes": _list(_object(pose=_POSE, size=_VECTOR, color=_COLOR)),
-    "lines": _list(
-        _object(
-            type=_INTEGER,
-            pose=_POSE,
-            thickness=_NUMBER,
-            scale_invariant={"type": "boolean"},
-            points=_list(_VECTOR),
-            color=_COLOR,
-        )
-    ),
-    "triangles": _list(_object(pose=_POSE, points=_list(_VECTOR), color=_COLOR)),
-}
-SCENE_UPDATE = _object(
-    deletions=_list(_object(timestamp=_TIME, type=_INTEGER, id=_TEXT)),
-    entities=_list(
-        _object(
-            timestamp=_TIME,
-            frame_id=_TEXT,
-            id=_TEXT,
-            lifetime=_TIME,
-            frame_locked={"type": "boolean"},
-            **_PRIMITIVES,
-        )
-    ),
-)
 DRIVES = _object(
     cycle=_INTEGER,
     state=_TEXT,
@@ -115,28 +102,15 @@ CLEARANCE = _object(
     obstacles=_list(_object(name=_TEXT, distance_mm=_NUMBER, planned_distance_mm=_NUMBER)),
 )
 
-#: Topic → (name of the schema, schema).
-CHANNELS: dict[str, tuple[str, Schema]] = {
-    "/planned_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
-    "/encoder_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
-    "/tag_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
-    "/fused_pose": ("foxglove.PoseInFrame", POSE_IN_FRAME),
+#: Topic → (name of the schema, JSON schema), for those that are ours.
+OWN: dict[str, tuple[str, Schema]] = {
     "/tag_status": ("cdpr.TagStatus", TAG_STATUS),
     "/drives": ("cdpr.Drives", DRIVES),
     "/clearance": ("cdpr.Clearance", CLEARANCE),
-    "/events": ("foxglove.Log", LOG),
-    "/pictures": ("foxglove.CompressedImage", COMPRESSED_IMAGE),
-    "/scene": ("foxglove.SceneUpdate", SCENE_UPDATE),
-    "/robot": ("foxglove.SceneUpdate", SCENE_UPDATE),
 }
 
-
-# Times, vectors and poses as the messages of ``run.mcap`` write them.
-
-
-#: One message: topic, time since the start of the run [s], content.
-Message = tuple[str, float, dict[str, Any]]
-WORLD = "world"
+WORLD, PLATFORM = "world", "platform"
+STILL = fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
 
 
 def topic_of(channel: str, camera: str) -> str:
@@ -154,26 +128,28 @@ def nanoseconds(time: float) -> int:
     return round(time * 1e9)
 
 
-def stamp_of(start: int, time: float) -> dict[str, int]:
+def stamp_of(start: int, time: float) -> fox.Timestamp:
     """The moment ``time`` [s] after ``start`` [ns since 1970]."""
     seconds, rest = divmod(start + nanoseconds(time), 1_000_000_000)
-    return {"sec": seconds, "nsec": rest}
+    return fox.Timestamp(sec=seconds, nsec=rest)
 
 
-def vector(values: Sequence[float | None]) -> dict[str, float | None]:
-    """Three numbers by axis."""
-    return {"x": values[0], "y": values[1], "z": values[2]}
+def vector(values: Sequence[float] | Array) -> fox.Vector3:
+    """Three numbers."""
+    return fox.Vector3(x=values[0], y=values[1], z=values[2])
 
 
-def pose_value(
-    position: Sequence[float | None], quaternion: Sequence[float | None]
-) -> dict[str, dict[str, float | None]]:
-    """A position [m] and a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return {"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+def _quaternion(values: Sequence[float] | Array) -> fox.Quaternion:
+    w, x, y, z = values
+    return fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
-STILL = pose_value((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+def pose_message(
+    stamp: fox.Timestamp, position: Sequence[float], quaternion: Sequence[float]
+) -> fox.PoseInFrame:
+    """A position [m] and a unit quaternion (w, x, y, z) in the world frame."""
+    pose = fox.Pose(position=vector(position), orientation=_quaternion(quaternion))
+    return fox.PoseInFrame(timestamp=stamp, frame_id=WORLD, pose=pose)
 
 
 def rows_of(values: Array) -> list[list[float | None]]:
@@ -206,37 +182,44 @@ def poses_of(
         times[known].tolist(), positions[known].tolist(), quaternions[known].tolist(), strict=True
     )
     for time, position, quaternion in rows:
-        stamp = stamp_of(start, time)
-        yield (
-            topic,
-            time,
-            {"timestamp": stamp, "frame_id": WORLD, "pose": pose_value(position, quaternion)},
-        )
+        yield topic, time, pose_message(stamp_of(start, time), position, quaternion)
 
 
-# The drawn scene of ``run.mcap``: obstacles and path once, the robot often enough to watch.
-
+# The drawn scene: obstacles, path and cameras once, the robot often enough to watch.
 
 ROBOT_RATE = 20.0
 """How often the drawn robot is logged, [Hz]; the numbers are logged every cycle."""
-_LINE_STRIP, _LINE_LIST = 0, 2
-_OBSTACLE = {"r": 0.35, "g": 0.39, "b": 0.45, "a": 0.75}
-_PLATFORM = {"r": 0.0, "g": 0.45, "b": 0.70, "a": 0.9}
-_CABLE = {"r": 0.1, "g": 0.1, "b": 0.1, "a": 1.0}
-_PATH = {"r": 0.84, "g": 0.37, "b": 0.0, "a": 1.0}
+_OBSTACLE = fox.Color(r=0.35, g=0.39, b=0.45, a=0.75)
+_PLATFORM = fox.Color(r=0.0, g=0.45, b=0.70, a=0.9)
+_CABLE = fox.Color(r=0.1, g=0.1, b=0.1, a=1.0)
+_PATH = fox.Color(r=0.84, g=0.37, b=0.0, a=1.0)
+_STRIP, _LIST = fox.LinePrimitiveLineType.LineStrip, fox.LinePrimitiveLineType.LineList
 
 
 def scene_messages(context: RunContext, start: int) -> Iterator[Message]:
-    """Obstacles and planned path, once."""
+    """Obstacles, planned path and cameras, once."""
+    stamp = stamp_of(start, 0.0)
     entities = []
     for obstacle in context.plan.scene.obstacles:
-        corners = [vector(p) for p in solid_of(obstacle).triangles().reshape(-1, 3).tolist()]
-        surface = {"pose": STILL, "points": corners, "color": _OBSTACLE}
-        entities.append(_entity(f"obstacle {obstacle.name}", start, 0.0, triangles=[surface]))
-    corners = [vector(pose.position.tolist()) for pose in context.plan.waypoints]
-    path = _line(_LINE_STRIP, corners, 3.0, _PATH)
-    entities.append(_entity("planned path", start, 0.0, lines=[path]))
-    yield "/scene", 0.0, {"deletions": [], "entities": entities}
+        corners = _points(solid_of(obstacle).triangles().reshape(-1, 3))
+        surface = fox.TriangleListPrimitive(pose=STILL, points=corners, color=_OBSTACLE)
+        entities.append(_entity(f"obstacle {obstacle.name}", stamp, triangles=[surface]))
+    path = _line(_STRIP, np.array([p.position for p in context.plan.waypoints]), 3.0, _PATH)
+    entities.append(_entity("planned path", stamp, lines=[path]))
+    yield "/scene", 0.0, fox.SceneUpdate(entities=entities)
+    cameras = context.rig.cameras
+    for camera in cameras:
+        alone = camera.name if len(cameras) > 1 else ""
+        place = camera.world_from_camera
+        yield "/tf", 0.0, _transform(stamp, frame_of(alone), place.position, place.quaternion)
+        calibration = _calibration(camera, stamp, frame_of(alone))
+        if calibration is not None:
+            yield topic_of("/camera_calibration", alone), 0.0, calibration
+
+
+def frame_of(camera: str) -> str:
+    """The frame of one of several cameras, or of the only one."""
+    return camera or "camera"
 
 
 def robot_messages(rig: Rig, cycles: CycleTable, start: int) -> Iterator[Message]:
@@ -250,40 +233,82 @@ def robot_messages(rig: Rig, cycles: CycleTable, start: int) -> Iterator[Message
         if time - last < 1.0 / ROBOT_RATE - 1e-6:
             continue
         last = time
-        position, quaternion = cycles.encoder[i], cycles.encoder_rotation[i]
-        pose = Pose.from_quaternion(position, quaternion)
-        cables = cables_to(rig, pose.apply(rig.anchors))
-        ends = np.stack([cables.exits, cables.anchors], axis=1).reshape(-1, 3)
-        points = [vector(point) for point in ends.tolist()]
-        cube = {
-            "pose": pose_value(position.tolist(), quaternion.tolist()),
-            "size": vector((2.0 * rig.half_size).tolist()),
-            "color": _PLATFORM,
-        }
-        lines = [_line(_LINE_LIST, points, 1.5, _CABLE)]
-        entity = _entity("robot", start, time, cubes=[cube], lines=lines)
-        yield "/robot", time, {"deletions": [], "entities": [entity]}
+        pose = Pose.from_quaternion(cycles.encoder[i], cycles.encoder_rotation[i])
+        for topic, message in robot_at(rig, pose, stamp_of(start, time)):
+            yield topic, time, message
+
+
+def robot_at(rig: Rig, pose: Pose, stamp: fox.Timestamp) -> Iterator[tuple[str, Typed]]:
+    """Platform and cables at a pose, and the platform's frame, each with its topic."""
+    cables = cables_to(rig, pose.apply(rig.anchors))
+    ends = np.stack([cables.exits, cables.anchors], axis=1).reshape(-1, 3)
+    drawn = fox.Pose(position=vector(pose.position), orientation=_quaternion(pose.quaternion))
+    cube = fox.CubePrimitive(pose=drawn, size=vector(2.0 * rig.half_size), color=_PLATFORM)
+    lines = [_line(_LIST, ends, 1.5, _CABLE)]
+    yield "/robot", fox.SceneUpdate(entities=[_entity("robot", stamp, cubes=[cube], lines=lines)])
+    yield "/tf", _transform(stamp, PLATFORM, pose.position, pose.quaternion)
+
+
+def _transform(
+    stamp: fox.Timestamp, frame: str, position: Array, quaternion: Array
+) -> fox.FrameTransforms:
+    place = fox.FrameTransform(
+        timestamp=stamp,
+        parent_frame_id=WORLD,
+        child_frame_id=frame,
+        translation=vector(position),
+        rotation=_quaternion(quaternion),
+    )
+    return fox.FrameTransforms(transforms=[place])
+
+
+def _calibration(camera: Camera, stamp: fox.Timestamp, frame: str) -> fox.CameraCalibration | None:
+    """None for lenses that Foxglove cannot describe: those with a thin prism or a tilt."""
+    count = len(camera.distortion)
+    if camera.lens == FISHEYE:
+        model = "kannala_brandt"
+    elif count <= 8:
+        model = "plumb_bob" if count <= 5 else "rational_polynomial"
+    else:
+        return None
+    lens = np.zeros({"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial": 8}[model])
+    lens[:count] = camera.distortion
+    return fox.CameraCalibration(
+        timestamp=stamp,
+        frame_id=frame,
+        width=camera.width,
+        height=camera.height,
+        distortion_model=model,
+        D=lens.tolist(),
+        K=camera.matrix.reshape(-1).tolist(),
+        R=np.eye(3).reshape(-1).tolist(),
+        P=np.column_stack([camera.matrix, np.zeros(3)]).reshape(-1).tolist(),
+    )
+
+
+def _points(points: Array) -> list[fox.Point3]:
+    return [fox.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()]
 
 
 def _line(
-    kind: int, points: list[dict[str, float | None]], thickness: float, color: dict[str, float]
-) -> dict[str, Any]:
-    return {
-        "type": kind,
-        "pose": STILL,
-        "thickness": thickness,
-        "scale_invariant": True,
-        "points": points,
-        "color": color,
-    }
+    kind: fox.LinePrimitiveLineType, points: Array, thickness: float, color: fox.Color
+) -> fox.LinePrimitive:
+    return fox.LinePrimitive(
+        type=kind,
+        pose=STILL,
+        thickness=thickness,
+        scale_invariant=True,
+        points=_points(points),
+        color=color,
+    )
 
 
-def _entity(name: str, start: int, time: float, **primitives: list[Any]) -> dict[str, Any]:
-    return {
-        "timestamp": stamp_of(start, time),
-        "frame_id": WORLD,
-        "id": name,
-        "lifetime": {"sec": 0, "nsec": 0},
-        "frame_locked": True,
+def _entity(name: str, stamp: fox.Timestamp, **primitives: Any) -> fox.SceneEntity:
+    return fox.SceneEntity(
+        timestamp=stamp,
+        frame_id=WORLD,
+        id=name,
+        lifetime=fox.Duration(sec=0),
+        frame_locked=True,
         **primitives,
-    }
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections import defaultdict
 from pathlib import Path
@@ -10,16 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.json_format import MessageToDict
 from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 
 from executor.recording.mcap import write_mcap
-from executor.recording.mcap_channels import CHANNELS
+from executor.recording.mcap_channels import OWN, TYPED
 from executor.recording.pose_table import fused_table
 from executor.recording.run_folder import RunFolder
 from model.errors import Fault
 from tests.executor import fake_run
 
-Messages = dict[str, list[tuple[int, dict[str, Any]]]]
+#: Of each channel: time, and the message as its own schema in the file decodes it.
+Messages = dict[str, list[tuple[int, Any]]]
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +37,11 @@ def folder(run: fake_run.FakeRun, tmp_path_factory: pytest.TempPathFactory) -> R
 @pytest.fixture(scope="module")
 def messages(folder: RunFolder) -> Messages:
     found: Messages = defaultdict(list)
+    decoders = DecoderFactory()
     with folder.mcap.open("rb") as stream:
-        for _schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
-            found[channel.topic].append((message.log_time, json.loads(message.data)))
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            decode = decoders.decoder_for(channel.message_encoding, schema) or json.loads
+            found[channel.topic].append((message.log_time, decode(message.data)))
     return found
 
 
@@ -46,6 +50,7 @@ def test_no_row_is_lost(run: fake_run.FakeRun, folder: RunFolder, messages: Mess
     seen = sum(status == "ok" for status in poses.status)
     counts = {topic: len(rows) for topic, rows in messages.items()}
     assert counts.pop("/robot") > 100
+    assert counts.pop("/tf") > 100
     assert counts == {
         "/planned_pose": cycles,
         "/encoder_pose": cycles,
@@ -57,6 +62,7 @@ def test_no_row_is_lost(run: fake_run.FakeRun, folder: RunFolder, messages: Mess
         "/events": len(run.context.events),
         "/pictures": sum(bool(name) for name in folder.poses().picture),
         "/scene": 1,
+        "/camera_calibration": 1,
     }
 
 
@@ -64,8 +70,8 @@ def test_times_are_the_start_plus_run_time(run: fake_run.FakeRun, messages: Mess
     start = int(run.context.started.timestamp()) * 1_000_000_000
     times = np.array([time - start for time, _ in messages["/drives"]]) / 1e9
     np.testing.assert_allclose(times, run.cycles.time, atol=1e-9)
-    stamps = [m["timestamp"] for _, m in messages["/tag_pose"]]
-    told = [s["sec"] * 1_000_000_000 + s["nsec"] for s in stamps]
+    stamps = [m.timestamp for _, m in messages["/tag_pose"]]
+    told = [s.seconds * 1_000_000_000 + s.nanos for s in stamps]
     assert told == [time for time, _ in messages["/tag_pose"]]
 
 
@@ -75,8 +81,10 @@ def test_numbers_are_those_of_the_tables(run: fake_run.FakeRun, messages: Messag
     assert drive["drives"][4]["set_counts"] == run.cycles.set_counts[33, 4]
     assert drive["drives"][7]["tension_n"] == run.cycles.tensions[33, 7]
     _, pose = messages["/encoder_pose"][33]
-    assert pose["pose"]["position"]["y"] == run.cycles.encoder[33, 1]
-    assert pose["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    assert pose.frame_id == "world"
+    assert pose.pose.position.y == run.cycles.encoder[33, 1]
+    turn = pose.pose.orientation
+    assert (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0)
     highs = [m["at_most_mm"] for _, m in messages["/clearance"]]
     order = np.argsort(run.clearance.time, kind="stable")
     np.testing.assert_allclose(highs, run.clearance.at_most[order] * 1e3)
@@ -99,24 +107,64 @@ def test_a_picture_without_a_pose_says_why_and_has_nulls(
 def test_pictures_are_the_jpegs_of_the_folder(folder: RunFolder, messages: Messages) -> None:
     name = next(name for name in folder.poses().picture if name)
     _, picture = messages["/pictures"][0]
-    assert base64.b64decode(picture["data"]) == folder.picture(name)
-    assert picture["format"] == "jpeg"
+    assert picture.data == folder.picture(name)
+    assert (picture.format, picture.frame_id) == ("jpeg", "camera")
 
 
-def test_every_channel_has_a_json_schema_and_messages_fit_it(
+def test_the_camera_stands_in_the_tree_of_frames_with_its_lens(
+    run: fake_run.FakeRun, messages: Messages
+) -> None:
+    (camera,) = run.context.rig.cameras
+    _, calibration = messages["/camera_calibration"][0]
+    assert list(calibration.K) == camera.matrix.reshape(-1).tolist()
+    assert list(calibration.D)[: len(camera.distortion)] == camera.distortion.tolist()
+    assert (calibration.width, calibration.height) == (camera.width, camera.height)
+    frames = {m.transforms[0].child_frame_id: m.transforms[0] for _, m in messages["/tf"]}
+    assert frames.keys() == {"camera", "platform"}
+    assert {frame.parent_frame_id for frame in frames.values()} == {"world"}
+    place = frames["camera"].translation
+    assert [place.x, place.y, place.z] == camera.world_from_camera.position.tolist()
+
+
+def test_cables_are_drawn_from_their_outlets_to_the_platform(
+    run: fake_run.FakeRun, messages: Messages
+) -> None:
+    rig, (at, robot) = run.context.rig, messages["/robot"][40]
+    (entity,) = robot.entities
+    points = np.array([[p.x, p.y, p.z] for p in entity.lines[0].points]).reshape(-1, 2, 3)
+    transform = next(m.transforms[0] for time, m in messages["/tf"] if time == at)
+    centre = transform.translation
+    np.testing.assert_allclose(points[:, 1] - [centre.x, centre.y, centre.z], rig.anchors)
+    lengths = np.linalg.norm(points[:, 0] - points[:, 1], axis=1)
+    assert lengths.min() > 0.1
+    assert lengths.max() < 3.0
+
+
+def test_plan_and_rig_are_attached_as_they_were(folder: RunFolder) -> None:
+    with folder.mcap.open("rb") as stream:
+        attached = {a.name: a.data for a in make_reader(stream).iter_attachments()}
+    assert attached == {
+        name: (folder.path / name).read_bytes() for name in ("plan.json", "rig.json")
+    }
+
+
+def test_every_channel_has_its_schema_and_messages_fit_it(
     folder: RunFolder, messages: Messages
 ) -> None:
     with folder.mcap.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
-    names = {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
-    assert {topic: schema.name for topic, schema in names.items()} == {
-        topic: name for topic, (name, _) in CHANNELS.items()
-    }
-    for topic, schema in names.items():
-        assert schema.encoding == "jsonschema"
-        for _, message in messages[topic][:3]:
-            assert_fits(message, json.loads(schema.data), topic)
+    schemas = {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
+    assert schemas.keys() == TYPED.keys() | OWN.keys()
+    for topic, schema in schemas.items():
+        if topic in OWN:
+            assert (schema.name, schema.encoding) == (OWN[topic][0], "jsonschema")
+            for _, message in messages[topic][:3]:
+                assert_fits(message, json.loads(schema.data), topic)
+        else:
+            assert schema.encoding == "protobuf"
+            assert schema.name.startswith("foxglove.")
+            assert all(MessageToDict(message) for _, message in messages[topic][:3])
 
 
 def assert_fits(value: Any, schema: dict[str, Any], place: str) -> None:
