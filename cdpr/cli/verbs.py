@@ -256,12 +256,12 @@ def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
     module, _, function = (verb.target or f"{verb.name}:{verb.name}").partition(":")
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
     called = getattr(import_module(f"cdpr.cli.{module}"), function)
-    app.command(verb.name, cls=_Command)(_guarded(called))
+    app.command(verb.name, cls=_VerbCommand)(_guarded(called))
     command: Any = typer.main.get_command(app)
     return command  # type: ignore[no-any-return]
 
 
-class _Command(TyperCommand):
+class _VerbCommand(TyperCommand):
     """A verb whose points are typed as X Y Z everywhere."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
