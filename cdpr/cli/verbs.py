@@ -23,7 +23,7 @@ class Verb:
     Attributes:
         name: As it is typed.
         help: The first line of the verb's own help, or all of a group's.
-        target: ``module:function`` below `cdpr.cli`; ``name:name`` when left out.
+        target: ``module:function`` below `cdpr.cli`; nothing for a group.
         verbs: Of a group.
     """
 
@@ -33,174 +33,143 @@ class Verb:
     verbs: tuple[Verb, ...] = ()
 
 
+def _in(module: str, **helps: str) -> tuple[Verb, ...]:
+    """Verbs of a module below `cdpr.cli`: their functions, with an underscore after a Python word.
+
+    Args:
+        module: That has them.
+        helps: The first line of each one's help, by the name of its function.
+    """
+    return tuple(Verb(name.rstrip("_"), text, f"{module}:{name}") for name, text in helps.items())
+
+
 CALIBRATE = (
-    Verb(
-        "camera",
-        "Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.",
-        "calibrate.camera:camera",
+    *_in(
+        "calibrate.camera",
+        camera="Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.",
     ),
-    Verb(
-        "extrinsics",
-        "Find a camera's pose, from surveyed tags on the frame or from the rig's motion.",
-        "calibrate.extrinsics:extrinsics",
+    *_in(
+        "calibrate.extrinsics",
+        extrinsics="Find a camera's pose, from surveyed tags on the frame or from the rig's"
+        " motion.",
     ),
-    Verb(
-        "readout",
-        "Measure a rolling shutter, from images of the platform while it moves.",
-        "calibrate.camera:readout",
+    *_in(
+        "calibrate.camera",
+        readout="Measure a rolling shutter, from images of the platform while it moves.",
     ),
-    Verb(
-        "tags",
-        "Find the tags' poses on the platform, from images that show two or more at once.",
-        "calibrate.extrinsics:tags",
+    *_in(
+        "calibrate.extrinsics",
+        tags="Find the tags' poses on the platform, from images that show two or more at once.",
     ),
-    Verb(
-        "poses",
-        "Choose the most informative poses for calibration, and plan a path with stops at them.",
-        "calibrate.rig:poses",
+    *_in(
+        "calibrate.rig",
+        poses="Choose the most informative poses for calibration, and plan a path with stops at"
+        " them.",
+        rig="Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.",
     ),
-    Verb(
-        "rig",
-        "Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.",
-        "calibrate.rig:rig",
+    *_in(
+        "calibrate.boards",
+        print_="Make a calibration board, or the tags of a rig, as a PDF in exact size.",
     ),
-    Verb(
-        "print",
-        "Make a calibration board, or the tags of a rig, as a PDF in exact size.",
-        "calibrate.boards:print_",
-    ),
-    Verb(
-        "diff",
-        "Compare two calibration results: every number against its interval, and the effect in mm.",
-        "calibrate.results:diff",
-    ),
-    Verb(
-        "apply",
-        "Write a new rig file with calibration results in place of its own values.",
-        "calibrate.results:apply",
-    ),
-    Verb(
-        "export",
-        "Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.",
-        "calibrate.results:export",
-    ),
-    Verb(
-        "import",
-        "Write a new rig file with a camera's matrix and lens from another program.",
-        "calibrate.results:import_",
+    *_in(
+        "calibrate.results",
+        diff="Compare two calibration results: every number against its interval, and the effect"
+        " in mm.",
+        apply="Write a new rig file with calibration results in place of its own values.",
+        export="Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.",
+        import_="Write a new rig file with a camera's matrix and lens from another program.",
     ),
 )
 BENCH = (
-    Verb(
-        "paper",
-        "Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.",
-        "bench:paper",
+    *_in(
+        "bench",
+        paper="Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.",
     ),
 )
 PLAN = (
-    Verb(
-        "demo",
-        "Plan, check, run on simulated drives, track with a synthetic camera, and report.",
-        "operate.run:demo",
+    *_in(
+        "operate.run",
+        demo="Plan, check, run on simulated drives, track with a synthetic camera, and report.",
     ),
-    Verb(
-        "examples",
-        "List the ready rigs, scenes and recorded sessions, or copy some of them.",
-        "start:examples",
+    *_in(
+        "start",
+        examples="List the ready rigs, scenes and recorded sessions, or copy some of them.",
+        new="Ask for the essentials of a rig, and write a commented rig file.",
     ),
-    Verb("new", "Ask for the essentials of a rig, and write a commented rig file.", "start:new"),
-    Verb("plan", "Plan a collision-free path and write it to a file.", "planning:plan"),
-    Verb(
-        "check",
-        "Check a plan with an independent method: distances at dense poses, with bounds.",
-        "planning:check",
+    *_in(
+        "planning",
+        plan="Plan a collision-free path and write it to a file.",
+        check="Check a plan with an independent method: distances at dense poses, with bounds.",
     ),
 )
 OPERATE = (
-    Verb(
-        "run",
-        "Run a plan: check it, compute set-points, arm the drives, move, measure, report.",
-        "operate.run:run",
+    *_in(
+        "operate.run",
+        run="Run a plan: check it, compute set-points, arm the drives, move, measure, report.",
     ),
-    Verb(
-        "stop",
-        "Stop every run of this user: all drives slow down together along the path, then hold.",
-        "operate.requests:stop",
+    *_in(
+        "operate.requests",
+        stop="Stop every run of this user: all drives slow down together along the path, then"
+        " hold.",
+        hold="Feed hold: the platform slows down along the path and waits there under tension.",
+        resume="Continue after `cdpr hold`, at the last requested speed.",
+        speed="Scale the speed along the path to a percentage of the planned one.",
     ),
-    Verb(
-        "hold",
-        "Feed hold: the platform slows down along the path and waits there under tension.",
-        "operate.requests:hold",
+    *_in(
+        "operate.console",
+        console="Open the operator's page: see the robot live, jog, teach, preview, run, hold,"
+        " stop.",
     ),
-    Verb(
-        "resume",
-        "Continue after `cdpr hold`, at the last requested speed.",
-        "operate.requests:resume",
+    *_in(
+        "operate.monitor",
+        monitor="Show a run live: state, drives, tensions, lateness, progress and events.",
     ),
-    Verb(
-        "speed",
-        "Scale the speed along the path to a percentage of the planned one.",
-        "operate.requests:speed",
+    *_in(
+        "operate.service",
+        status="Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.",
+        reset="Release a latched fault once its cause is removed: resets drives in fault, moves"
+        " nothing.",
     ),
-    Verb(
-        "console",
-        "Open the operator's page: see the robot live, jog, teach, preview, run, hold, stop.",
-        "operate.console:console",
+    *_in(
+        "operate.home",
+        home="Pretension all cables, then set the encoder reference at a known pose.",
     ),
-    Verb(
-        "monitor",
-        "Show a run live: state, drives, tensions, lateness, progress and events.",
-        "operate.monitor:monitor",
+    *_in(
+        "operate.jog",
+        jog="Move the platform straight slowly by a few millimetres from its present pose.",
     ),
-    Verb(
-        "status",
-        "Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.",
-        "operate.service:status",
-    ),
-    Verb(
-        "reset",
-        "Release a latched fault once its cause is removed: resets drives in fault, moves nothing.",
-        "operate.service:reset",
-    ),
-    Verb(
-        "home",
-        "Pretension all cables, then set the encoder reference at a known pose.",
-        "operate.home:home",
-    ),
-    Verb(
-        "jog",
-        "Move the platform straight slowly by a few millimetres from its present pose.",
-        "operate.jog:jog",
-    ),
-    Verb(
-        "release",
-        "Release the drives with the platform on a support: close brakes, remove torque.",
-        "operate.service:release",
+    *_in(
+        "operate.service",
+        release="Release the drives with the platform on a support: close brakes, remove torque.",
     ),
 )
 SET_UP = (
-    Verb(
+    *_in(
         "doctor",
-        "Check that this machine can run a rig; with a rig file, also its bus and cameras.",
+        doctor="Check that this machine can run a rig; with a rig file, also its bus and cameras.",
     ),
-    Verb(
+    *_in(
         "sim",
-        "Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.",
+        sim="Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.",
     ),
     Verb("calibrate", "Calibrate and compare.", verbs=CALIBRATE),
 )
-MEASURE = (Verb("track", "Measure the platform's pose from its tags, image by image."),)
-ANALYSE = (
-    Verb("report", "Write the report of a run folder again from its files."),
-    Verb(
-        "explain",
-        "Explain a fault that a run reported: meaning, likely cause, state of the"
-        " machine, next step.",
-        "report:explain",
+MEASURE = (
+    *_in(
+        "track",
+        track="Measure the platform's pose from its tags, image by image.",
     ),
-    Verb(
+)
+ANALYSE = (
+    *_in(
+        "report",
+        report="Write the report of a run folder again from its files.",
+        explain="Explain a fault that a run reported: meaning, likely cause, state of the machine,"
+        " next step.",
+    ),
+    *_in(
         "workspace",
-        "Map the workspace: feasibility, wrench closure, capacity margin and dexterity.",
+        workspace="Map the workspace: feasibility, wrench closure, capacity margin and dexterity.",
     ),
     Verb("bench", "Measure the planner.", verbs=BENCH),
 )
@@ -253,7 +222,7 @@ def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
         return _GROUPS[verb.name](
             name=verb.name, help=verb.help, no_args_is_help=True, rich_markup_mode="rich"
         )
-    module, _, function = (verb.target or f"{verb.name}:{verb.name}").partition(":")
+    module, _, function = verb.target.partition(":")
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
     called = getattr(import_module(f"cdpr.cli.{module}"), function)
     app.command(verb.name, cls=_VerbCommand)(_guarded(called))
