@@ -135,7 +135,7 @@ wheel: install  ## Build the wheel into dist/ and try it in a clean environment 
 	"$(BIN)/python" tools/wheel.py
 
 schema: install  ## Write the JSON schemas of the rig, scene and plan files into docs/schema/
-	"$(BIN)/python" -m model.files.schema
+	"$(BIN)/python" tools/schemas.py
 
 clean:  ## Remove build output and caches (never .venv or your runs)
 	rm -rf build dist site htmlcov .coverage .coverage.* .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

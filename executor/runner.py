@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from executor.cameras.multi_camera import CameraRecords, RunWatch
+from executor.cameras.multi_camera import CameraRecords, CameraWatch
 from executor.cameras.open import asked_rate, open_cameras, require_no_stop
 from executor.cameras.sources import CameraChoice, require_simulated_pictures, resolve_cameras
 from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
@@ -310,7 +310,7 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
         cameras = stack.enter_context(opening(simulated_time=fast, listener=listener))
         with listener.progress("preparing, row", rows) as advance:
             watch = (
-                RunWatch(
+                CameraWatch(
                     cameras, status, board, moved.take_event,
                     clearance_stop=options.clearance_stop, listener=listener,
                 )

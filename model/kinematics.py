@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput, Fault
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+from model.statics.dexterity import rms_anchor_radius
 
 if TYPE_CHECKING:
     from model.rig import Rig
@@ -267,7 +268,7 @@ def _levenberg_marquardt(
 
 def _step_scale(rig: Rig) -> Array:
     """Makes a unit of rotation move the anchors as far as a unit of translation."""
-    radius = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
+    radius = rms_anchor_radius(rig.anchors)
     return np.array([1.0, 1.0, 1.0, 1.0 / radius, 1.0 / radius, 1.0 / radius])
 
 

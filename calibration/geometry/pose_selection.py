@@ -22,6 +22,7 @@ from model.progress import SILENT, Listener
 from model.rig import Rig
 from model.rotation_limits import largest_rotations
 from model.scene import Scene, scene_from_document
+from model.statics.dexterity import rms_anchor_radius
 from model.statics.gravity import working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 from model.winches import WinchMap
@@ -84,7 +85,7 @@ def chosen_poses(
             " --candidates",
         )
     best = _most_telling(_rows(rig, found, wish, parameters), wish.count)
-    reach = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
+    reach = rms_anchor_radius(rig.anchors)
     return _in_order([found[k] for k in best], scene.start, reach)
 
 

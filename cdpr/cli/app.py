@@ -1,7 +1,8 @@
-"""The `cdpr` command: its verbs, and what happens to errors."""
+"""The `cdpr` command: its verbs, imported only when they are called, and what becomes of errors."""
 
 from __future__ import annotations
 
+import functools
 import gc
 import io
 import json
@@ -9,14 +10,273 @@ import os
 import sys
 import tempfile
 import traceback
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Annotated, NoReturn
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import islice
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from cdpr.cli.verbs import LazyGroup
-from model.errors import AlreadyExists, BadInput, CdprError, Fault
+from cdpr.cli.arguments import check_arguments
+from model.errors import AlreadyExists, BadInput, CdprError, Fault, StoppedByOperator
 from model.files.reading import shown
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """A line of the help text, and where the verb is.
+
+    Attributes:
+        name: As it is typed.
+        help: The first line of the verb's own help, or all of a group's.
+        target: ``module:function`` below `cdpr.cli`; nothing for a group.
+        verbs: Of a group.
+    """
+
+    name: str
+    help: str
+    target: str = ""
+    verbs: tuple[Verb, ...] = ()
+
+
+def _in(module: str, **helps: str) -> tuple[Verb, ...]:
+    """Verbs of a module below `cdpr.cli`: their functions, with an underscore after a Python word.
+
+    Args:
+        module: That has them.
+        helps: The first line of each one's help, by the name of its function.
+    """
+    return tuple(Verb(name.rstrip("_"), text, f"{module}:{name}") for name, text in helps.items())
+
+
+CALIBRATE = (
+    *_in(
+        "calibrate.camera",
+        camera="Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.",
+    ),
+    *_in(
+        "calibrate.extrinsics",
+        extrinsics="Find a camera's pose, from surveyed tags on the frame or from the rig's"
+        " motion.",
+    ),
+    *_in(
+        "calibrate.camera",
+        readout="Measure a rolling shutter, from images of the platform while it moves.",
+    ),
+    *_in(
+        "calibrate.extrinsics",
+        tags="Find the tags' poses on the platform, from images that show two or more at once.",
+    ),
+    *_in(
+        "calibrate.rig",
+        poses="Choose the most informative poses for calibration, and plan a path with stops at"
+        " them.",
+        rig="Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.",
+    ),
+    *_in(
+        "calibrate.boards",
+        print_="Make a calibration board, or the tags of a rig, as a PDF in exact size.",
+    ),
+    *_in(
+        "calibrate.results",
+        diff="Compare two calibration results: every number against its interval, and the effect"
+        " in mm.",
+        apply="Write a new rig file with calibration results in place of its own values.",
+        export="Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.",
+        import_="Write a new rig file with a camera's matrix and lens from another program.",
+    ),
+)
+BENCH = (
+    *_in(
+        "bench",
+        paper="Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.",
+    ),
+)
+PLAN = (
+    *_in(
+        "operate.run",
+        demo="Plan, check, run on simulated drives, track with a synthetic camera, and report.",
+    ),
+    *_in(
+        "start",
+        examples="List the ready rigs, scenes and recorded sessions, or copy some of them.",
+        new="Ask for the essentials of a rig, and write a commented rig file.",
+    ),
+    *_in(
+        "planning",
+        plan="Plan a collision-free path and write it to a file.",
+        check="Check a plan with an independent method: distances at dense poses, with bounds.",
+    ),
+)
+OPERATE = (
+    *_in(
+        "operate.run",
+        run="Run a plan: check it, compute set-points, arm the drives, move, measure, report.",
+    ),
+    *_in(
+        "operate.requests",
+        stop="Stop every run of this user: all drives slow down together along the path, then"
+        " hold.",
+        hold="Feed hold: the platform slows down along the path and waits there under tension.",
+        resume="Continue after `cdpr hold`, at the last requested speed.",
+        speed="Scale the speed along the path to a percentage of the planned one.",
+    ),
+    *_in(
+        "operate.console",
+        console="Open the operator's page: see the robot live, jog, teach, preview, run, hold,"
+        " stop.",
+    ),
+    *_in(
+        "operate.monitor",
+        monitor="Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.",
+    ),
+    *_in(
+        "operate.service",
+        status="Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.",
+        reset="Release a latched fault once its cause is removed: resets drives in fault, moves"
+        " nothing.",
+    ),
+    *_in(
+        "operate.home",
+        home="Pretension all cables, then set the encoder reference at a known pose.",
+    ),
+    *_in(
+        "operate.jog",
+        jog="Move the platform straight slowly by a few millimetres from its present pose.",
+    ),
+    *_in(
+        "operate.service",
+        release="Release the drives with the platform on a support: close brakes, remove torque.",
+    ),
+)
+SET_UP = (
+    *_in(
+        "doctor",
+        doctor="Check that this machine can run a rig; with a rig file, also its bus and cameras.",
+    ),
+    *_in(
+        "sim",
+        sim="Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.",
+    ),
+    Verb("calibrate", "Calibrate and compare.", verbs=CALIBRATE),
+)
+MEASURE = (
+    *_in(
+        "track",
+        track="Measure the platform's pose from its tags, image by image.",
+    ),
+)
+ANALYSE = (
+    *_in(
+        "report",
+        report="Write the report of a run folder again from its files.",
+        explain="Explain a fault that a run reported: meaning, likely cause, state of the machine,"
+        " next step.",
+    ),
+    *_in(
+        "workspace",
+        workspace="Map the workspace: feasibility, wrench closure, capacity margin and dexterity.",
+    ),
+    Verb("bench", "Measure the planner.", verbs=BENCH),
+)
+PANELS: dict[str, tuple[Verb, ...]] = {
+    "Plan": PLAN,
+    "Operate": OPERATE,
+    "Set up": SET_UP,
+    "Measure": MEASURE,
+    "Analyse": ANALYSE,
+}
+VERBS = tuple(verb for verbs in PANELS.values() for verb in verbs)
+
+
+class LazyGroup(TyperGroup):
+    """Verbs of a table; the help text and completion of names need no module of theirs."""
+
+    verbs: tuple[Verb, ...] = VERBS
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        panels = {verb: panel for panel, verbs in PANELS.items() for verb in verbs}
+        self.commands = {
+            verb.name: TyperCommand(verb.name, help=verb.help, rich_help_panel=panels.get(verb))
+            for verb in self.verbs
+        }
+
+    def loaded(self, name: str) -> TyperCommand | TyperGroup:
+        """The verb itself, with its options, from its module."""
+        return _loaded(next(verb for verb in self.verbs if verb.name == name))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """As Typer does; the verb that is called is imported."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, self.loaded(name) if command is not None and name else command, rest
+
+
+class _CalibrateGroup(LazyGroup):
+    verbs = CALIBRATE
+
+
+class _BenchGroup(LazyGroup):
+    verbs = BENCH
+
+
+_GROUPS = {"calibrate": _CalibrateGroup, "bench": _BenchGroup}
+
+
+def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
+    if verb.verbs:
+        return _GROUPS[verb.name](
+            name=verb.name, help=verb.help, no_args_is_help=True, rich_markup_mode="rich"
+        )
+    module, _, function = verb.target.partition(":")
+    app = typer.Typer(rich_markup_mode="rich", add_completion=False)
+    called = getattr(import_module(f"cdpr.cli.{module}"), function)
+    app.command(verb.name, cls=_VerbCommand)(_guarded(called))
+    command: Any = typer.main.get_command(app)
+    return command  # type: ignore[no-any-return]
+
+
+class _VerbCommand(TyperCommand):
+    """A verb whose points are typed as X Y Z everywhere."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As Typer does, once points are one word each."""
+        return super().parse_args(ctx, joined_points(args))
+
+
+def joined_points(arguments: Sequence[str]) -> list[str]:
+    """The arguments with the three words after each ``--via-mm`` as one.
+
+    Typer knows options of three values and options that may be repeated, not both at once.
+    """
+    words = iter(arguments)
+    joined: list[str] = []
+    for word in words:
+        joined.append(word)
+        if word == "--via-mm":
+            joined.append(" ".join(islice(words, 3)))
+    return joined
+
+
+def _guarded(verb: Callable[..., None]) -> Callable[..., None]:
+    """With arguments that can be used; Ctrl-C where no run is going on is the operator's stop."""
+
+    @functools.wraps(verb)
+    def guarded(*args: object, **options: object) -> None:
+        try:
+            check_arguments(options)
+            verb(*args, **options)
+        except KeyboardInterrupt:
+            raise StoppedByOperator("interrupted") from None
+
+    return guarded
+
+
+# The `cdpr` command: its verbs, and what happens to errors.
+
 
 EPILOG = (
     "Exit codes: 0 ok, 1 fault, 2 bad input, 3 refused by a safety check,"

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from cdpr.console.view import scene_figure
+from executor.report.scene import plan_labels
 from executor.runner import prepare_plan
 from executor.trajectory.prepare import PreparedRun
 from model.clearance import ClearanceModel
 from model.errors import CdprError
 from model.kinematics import cables_at
-from model.pages.scene import Label, Moment, Stroke, scene_data
+from model.pages.scene import Moment, Stroke, scene_data
 from model.plan import Plan, load_plan, require_same_rig
 from model.pose import Pose
 from model.rig import Rig
@@ -100,13 +101,8 @@ def _clearances(rig: Rig, plan: Plan, poses: list[Pose]) -> list[float | None] |
 def _drawn(rig: Rig, plan: Plan, moments: list[tuple[float, Pose]]) -> dict[str, Any]:
     points = np.array([pose.position for pose in plan.waypoints])
     figure = scene_figure(rig, plan.scene, Stroke.along("path", "ink", points, 4.5))
-    labels = (
-        Label("path", "start", points[0], "ring"),
-        *(Label("path", stop.name, stop.pose.position, "dot") for stop in plan.scene.stops),
-        Label("path", "goal", points[-1], "dot"),
-    )
     drawn = tuple(
         Moment(time, pose.position, pose.rotation, cables_at(rig, pose).exits)
         for time, pose in moments
     )
-    return scene_data(replace(figure, labels=labels, moments=drawn))
+    return scene_data(replace(figure, labels=plan_labels(plan), moments=drawn))

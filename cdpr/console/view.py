@@ -11,13 +11,12 @@ import numpy as np
 
 from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_folder import RunFolder
-from executor.report.scene import frame_surface, platform_surface
+from executor.report.scene import frame_surface, obstacle_surfaces, platform_surface
 from executor.service import StatusResult
 from model.clearance import ClearanceModel
 from model.errors import CdprError
-from model.geometry.solids import solid_of
 from model.kinematics import cables_at, forward_kinematics
-from model.pages.scene import SceneFigure, SceneSurface, Stroke, grid_floor, scene_data
+from model.pages.scene import SceneFigure, Stroke, grid_floor, scene_data
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, nothing_in_the_way
@@ -29,15 +28,7 @@ CLEARANCE_EVERY = 0.2
 
 def scene_figure(rig: Rig, scene: Scene | None, *strokes: Stroke) -> SceneFigure:
     """The rig among its obstacles, without the platform at any moment."""
-    obstacles = () if scene is None else scene.obstacles
-    surfaces = [frame_surface(rig)]
-    for one in obstacles:
-        solid = solid_of(one)
-        surfaces.append(
-            SceneSurface(
-                "obstacles", "obstacle", solid.vertices, solid.faces, solid.edges, 0.62, one.name
-            )
-        )
+    surfaces = [frame_surface(rig), *(() if scene is None else obstacle_surfaces(scene))]
     points = [surface.vertices for surface in surfaces]
     points += [stroke.segments.reshape(-1, 3) for stroke in strokes]
     floor, _ = grid_floor(np.concatenate(points))

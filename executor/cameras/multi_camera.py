@@ -327,7 +327,7 @@ class RunCameras:
 Tell = Callable[[str, str, float], None]
 
 
-class RunWatch:
+class CameraWatch:
     """Asks the cameras for images, and stops the run when they see too little clearance."""
 
     def __init__(

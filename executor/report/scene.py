@@ -12,8 +12,10 @@ from model.geometry.shapes import Obstacle, convex_hull
 from model.geometry.solids import Solid, box_solid, solid_of
 from model.kinematics import cables_to
 from model.pages.scene import Label, Moment, SceneFigure, SceneSurface, Stroke, grid_floor, viewer
+from model.plan import Plan
 from model.pose import Array, Pose, matrix_from_quaternion
 from model.rig import Rig
+from model.scene import Scene
 
 MOST_MOMENTS = 400
 MOST_BRANCHES = 4000
@@ -53,10 +55,7 @@ class RunScene:
 def run_scene(run: RunData) -> RunScene:
     """The scene of a run, with the platform at its start."""
     tree, branches = _tree(run)
-    obstacles = tuple(
-        _surface("obstacles", "obstacle", solid_of(one), 0.62, one.name)
-        for one in run.plan.scene.obstacles
-    )
+    obstacles = obstacle_surfaces(run.plan.scene)
     frame = frame_surface(run.rig)
     strokes = (_workspace(run.rig), Stroke("tree", "tree", tree, 1.0, 0.75), *_paths(run))
     fixed = [frame.vertices, *(one.vertices for one in obstacles)]
@@ -65,7 +64,7 @@ def run_scene(run: RunData) -> RunScene:
     scene = SceneFigure(
         surfaces=(frame, *obstacles),
         strokes=(floor, *strokes),
-        labels=_labels(run),
+        labels=plan_labels(run.plan),
         anchors=run.rig.anchors,
         platform=platform_surface(run.rig),
         moments=_motion(run),
@@ -84,6 +83,13 @@ def scene_viewer(run: RunData, view: RunScene) -> str:
 
 def _surface(layer: str, role: str, solid: Solid, opacity: float, name: str = "") -> SceneSurface:
     return SceneSurface(layer, role, solid.vertices, solid.faces, solid.edges, opacity, name)
+
+
+def obstacle_surfaces(scene: Scene) -> tuple[SceneSurface, ...]:
+    """The obstacles, by their names."""
+    return tuple(
+        _surface("obstacles", "obstacle", solid_of(one), 0.62, one.name) for one in scene.obstacles
+    )
 
 
 def platform_surface(rig: Rig) -> SceneSurface:
@@ -132,10 +138,10 @@ def _paths(run: RunData) -> tuple[Stroke, ...]:
     )
 
 
-def _labels(run: RunData) -> tuple[Label, ...]:
+def plan_labels(plan: Plan) -> tuple[Label, ...]:
     """Start, stops and goal."""
-    points = run.plan.waypoints
-    stops = tuple(Label("path", s.name, s.pose.position, "dot") for s in run.plan.scene.stops)
+    points = plan.waypoints
+    stops = tuple(Label("path", s.name, s.pose.position, "dot") for s in plan.scene.stops)
     start = Label("path", "start", points[0].position, "ring")
     return (start, *stops, Label("path", "goal", points[-1].position, "dot"))
 

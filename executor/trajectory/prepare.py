@@ -19,6 +19,7 @@ from model.clearance import ClearanceModel
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene
+from model.statics.dexterity import rms_anchor_radius
 from planner.check import parted
 from planner.check_report import VerifiedPlan
 
@@ -62,7 +63,7 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
         TensionInfeasible: A pose on it cannot be held.
     """
     plan = verified.plan
-    weight = float(np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1))))
+    weight = rms_anchor_radius(rig.anchors)
     is_allowed = _keeps_clearance(rig, plan.scene)
     legs = []
     for waypoints in parted(plan.waypoints, plan.stops, len(plan.scene.stops)):

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from executor.cameras.client import CameraClient
-from executor.cameras.multi_camera import RunCameras, RunWatch
+from executor.cameras.multi_camera import CameraWatch, RunCameras
 from executor.operator_requests import LocalRequests, StopReason
 from tests.executor.test_run_cameras import MODEL, RATE, Scripted
 
@@ -19,7 +19,7 @@ def watched(
     """The board after so many moments, and what was told."""
     board, told = LocalRequests(), list[tuple[str, str]]()
     status: Any = SimpleNamespace(take_cameras=lambda _cameras: None)
-    watch = RunWatch(
+    watch = CameraWatch(
         RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE),
         status,
         board,

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import pytest
 
-from cdpr.cli.verbs import VERBS, LazyGroup
+from cdpr.cli.app import VERBS, LazyGroup
 from model import jit as machine_code
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import Answer, call

@@ -36,7 +36,6 @@ def loaded_by(code: str) -> set[str]:
         "model.scene",
         "model.plan",
         "model.kinematics",
-        "model.files.schema",
         "cdpr.cli.app",
         "cdpr",
         "calibration",
@@ -84,11 +83,10 @@ def test_completion_of_a_verb_imports_no_verb(words: str) -> None:
         },
     )
     loaded = {line.rsplit("|", 1)[-1].strip() for line in result.stderr.splitlines()}
-    assert "cdpr.cli.verbs" in loaded
+    assert "cdpr.cli.app" in loaded
     assert {name for name in loaded if name.startswith("cdpr.cli.")} <= {
         "cdpr.cli.app",
         "cdpr.cli.arguments",
-        "cdpr.cli.verbs",
     }
     assert loaded.isdisjoint({"numpy", *HEAVY})
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from model.files.schema import DOCUMENTS, schema_text, write_schemas
+from tools.schemas import DOCUMENTS, schema_text, write_schemas
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "schema"
 CONFIGS = Path(__file__).parents[2] / "configs"

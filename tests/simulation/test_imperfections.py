@@ -23,11 +23,11 @@ from model.pose import Pose
 from model.rig import Rig, load_rig, rig_from_document
 from model.scene import Scene, load_scene
 from model.statics.gravity import working_tensions
-from simulation.drive_train import Transmission
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.factory import make_synthetic_camera
 from simulation.ground_truth import camera_as_built, rig_as_built
 from simulation.plant import Plant
+from simulation.rig import Transmission
 
 ROOT = Path(__file__).resolve().parents[2]
 _CHANNELS = itertools.count()

@@ -13,7 +13,6 @@ from calibration.intrinsics.quality import FULL_COVERAGE
 from calibration.pictures import take_pictures
 from calibration.procedures import (
     CameraOutcome,
-    Destination,
     calibrate_camera,
     calibrate_camera_from_corners,
     measure_readout,
@@ -22,22 +21,20 @@ from calibration.results import require_file_name
 from calibration.targets.board import Board
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
+    NOWHERE,
     CameraOption,
-    FolderOption,
-    ForceOption,
+    ResultOptions,
     WantedOption,
-    show_calibration,
 )
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import (
     CalibrationOption,
-    JsonOption,
     RigArgument,
     calibrated_rig,
     finite,
     with_option_groups,
 )
-from cdpr.cli.output import Terminal, err
+from cdpr.cli.output import err
 from executor.cameras.sources import require_camera_source
 from executor.operator_requests import LocalRequests
 from model.errors import BadInput
@@ -85,9 +82,7 @@ def camera(
     lens: Annotated[
         LensChoice, typer.Option(help="its model; auto: what fits held-out pictures best")
     ] = LensChoice.auto,
-    output: FolderOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    result: ResultOptions = NOWHERE,
 ) -> None:
     """Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.
 
@@ -105,7 +100,7 @@ def camera(
       cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
     """
     require_file_name(name, "--name")
-    to = Destination(output, force)
+    to = result.to
     if live is None and folder.suffix.lower() == ".csv":
         if size_px is None:
             raise BadInput(
@@ -122,7 +117,7 @@ def camera(
             lens=lens.value,
             to=to,
         )
-        show_calibration(made, _facts(made), as_json)
+        result.show(made, _facts(made))
         return
     board = printed.made()
     if live is None and (pictures is not None or size_px is not None):
@@ -135,7 +130,7 @@ def camera(
         to.require_free("camera", name)
         if not Path(live).is_file():
             require_camera_source(live)
-        make_folder(folder, force)
+        make_folder(folder, result.force)
         _take_pictures(live, folder, board, pictures or 40, size_px or (1280, 720))
     made = calibrate_camera(
         folder,
@@ -145,9 +140,9 @@ def camera(
         distance=distance_m,
         lens=lens.value,
         to=to,
-        listener=Terminal(quiet=as_json),
+        listener=result.listener,
     )
-    show_calibration(made, _facts(made), as_json)
+    result.show(made, _facts(made))
 
 
 def _take_pictures(
@@ -191,6 +186,7 @@ def _facts(made: CameraOutcome) -> list[tuple[str, str]]:
 # `cdpr calibrate readout`: how long a camera takes from its top row to its bottom row.
 
 
+@with_option_groups
 def readout(
     rig: RigArgument,
     source: Annotated[
@@ -211,9 +207,7 @@ def readout(
     ] = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.1,
-    output: FolderOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    result: ResultOptions = NOWHERE,
 ) -> None:
     """Measure a rolling shutter, from images of the platform while it moves.
 
@@ -234,8 +228,8 @@ def readout(
         rate=rate_hz,
         speed=None if speed_mm_s is None else speed_mm_s / 1e3,
         wanted=wanted_mm / 1e3,
-        to=Destination(output, force),
-        listener=Terminal(quiet=as_json),
+        to=result.to,
+        listener=result.listener,
     )
     found = made.found
     fastest = max(found.speeds.values())
@@ -246,4 +240,4 @@ def readout(
         ),
         ("edges", f"{found.before:.2f} standard deviations off before, {found.after:.2f} after"),
     ]
-    show_calibration(made, facts, as_json)
+    result.show(made, facts)

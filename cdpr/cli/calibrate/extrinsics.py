@@ -16,7 +16,6 @@ from calibration.pictures import Pictures, pictures_of
 from calibration.procedures import (
     USUAL_PICTURES,
     USUAL_TAG_PICTURES,
-    Destination,
     ExtrinsicsOutcome,
     locate_camera,
     locate_tags,
@@ -24,23 +23,20 @@ from calibration.procedures import (
 from calibration.tag_map.result import change_rows
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
+    NOWHERE,
     CameraOption,
-    FolderOption,
-    ForceOption,
     PicturesOption,
+    ResultOptions,
     SourceArgument,
     WantedOption,
-    show_calibration,
 )
 from cdpr.cli.options import (
     CalibrationOption,
-    JsonOption,
     RigArgument,
     calibrated_rig,
     finite,
     with_option_groups,
 )
-from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.rig import Camera, load_rig
 
@@ -87,9 +83,7 @@ def extrinsics(
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 1.0,
-    output: FolderOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    result: ResultOptions = NOWHERE,
 ) -> None:
     """Find a camera's pose, from surveyed tags on the frame or from the rig's motion.
 
@@ -123,10 +117,10 @@ def extrinsics(
             (_opener(source, the_camera, pictures), _opener(other, the_rig.camera(name), pictures)),
             board=printed.made() if printed != NO_BOARD else None,
             wanted=wanted_mm / 1e3,
-            to=Destination(output, force),
-            listener=Terminal(quiet=as_json),
+            to=result.to,
+            listener=result.listener,
         )
-        show_calibration(made, _facts(made, the_camera), as_json)
+        result.show(made, _facts(made, the_camera))
         return
     made = locate_camera(
         the_rig,
@@ -135,10 +129,10 @@ def extrinsics(
         poses=poses,
         survey=Survey(survey_mm / 1e3, None if survey_deg is None else radians(survey_deg)),
         wanted=wanted_mm / 1e3,
-        to=Destination(output, force),
-        listener=Terminal(quiet=as_json),
+        to=result.to,
+        listener=result.listener,
     )
-    show_calibration(made, _facts(made, the_camera), as_json)
+    result.show(made, _facts(made, the_camera))
 
 
 def _opener(source: str, camera: Camera, pictures: int | None) -> Callable[[], Pictures]:
@@ -157,6 +151,7 @@ def _facts(made: ExtrinsicsOutcome, camera: Camera) -> list[tuple[str, str]]:
 # `cdpr calibrate tags`: where the tags are on the platform.
 
 
+@with_option_groups
 def tags(
     rig: RigArgument,
     source: SourceArgument,
@@ -170,9 +165,7 @@ def tags(
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.2,
-    output: FolderOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    result: ResultOptions = NOWHERE,
 ) -> None:
     """Find the tags' poses on the platform, from images that show two or more at once.
 
@@ -193,8 +186,8 @@ def tags(
         lambda: pictures_of(source, the_camera, pictures, USUAL_TAG_PICTURES),
         fixed_tag=fixed_tag,
         wanted=wanted_mm / 1e3,
-        to=Destination(output, force),
-        listener=Terminal(quiet=as_json),
+        to=result.to,
+        listener=result.listener,
     )
     found = made.found
     facts = [
@@ -207,4 +200,4 @@ def tags(
             for name, shift, turn, _, count in change_rows(found)
         ),
     ]
-    show_calibration(made, facts, as_json)
+    result.show(made, facts)

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from calibration.procedures import Calibration
-from cdpr.cli.options import finite
-from cdpr.cli.output import show_facts, show_json
+from calibration.procedures import Calibration, Destination
+from cdpr.cli.options import JsonOption, finite
+from cdpr.cli.output import Terminal, show_facts, show_json
 
-FolderOption = Annotated[
-    Path | None, typer.Option("-o", "--output", help="folder for the result and its report")
-]
-ForceOption = Annotated[
-    bool, typer.Option("--force", help="replace a result of the same name and date")
-]
 WantedOption = Annotated[
     float, typer.Option(min=0.001, callback=finite, help="required accuracy, 95 %")
 ]
@@ -34,27 +29,49 @@ CameraOption = Annotated[
 ]
 
 
-def show_calibration(
-    made: Calibration[Any, Any, Any], facts: Sequence[tuple[str, str]], as_json: bool
-) -> None:
-    """Shows a calibration, and exits with 3 if it is not good enough.
+@dataclass(frozen=True, slots=True)
+class ResultOptions:
+    """Where a calibration's result goes, and who reads it; every field is an option."""
 
-    Args:
-        made: Written already.
-        facts: More that people want to know.
-        as_json: Whether a program reads it.
-    """
-    result = made.result
-    if as_json:
-        show_json(result.sealed().model_dump(mode="json"))
-    else:
-        lines = [("verdict", result.verdict), *(("next", step) for step in result.next_steps)]
-        lines += [
-            *result.in_words(),
-            *facts,
-            *(("not used", f"{k} {why}") for k, why in result.unused.items()),
-            *zip(("result", "report"), map(str, made.files), strict=False),
-        ]
-        show_facts(f"{result.kind} {result.name}", lines)
-    if not result.good_enough:
-        raise typer.Exit(3)
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="folder for the result and its report")
+    ] = None
+    force: Annotated[
+        bool, typer.Option("--force", help="replace a result of the same name and date")
+    ] = False
+    as_json: JsonOption = False
+
+    @property
+    def to(self) -> Destination:
+        """Where the result is written."""
+        return Destination(self.output, self.force)
+
+    @property
+    def listener(self) -> Terminal:
+        """What shows the progress."""
+        return Terminal(quiet=self.as_json)
+
+    def show(self, made: Calibration[Any, Any, Any], facts: Sequence[tuple[str, str]]) -> None:
+        """Shows a calibration that was written, and exits with 3 if it is not good enough.
+
+        Args:
+            made: Written already.
+            facts: More that people want to know.
+        """
+        result = made.result
+        if self.as_json:
+            show_json(result.sealed().model_dump(mode="json"))
+        else:
+            lines = [("verdict", result.verdict), *(("next", step) for step in result.next_steps)]
+            lines += [
+                *result.in_words(),
+                *facts,
+                *(("not used", f"{k} {why}") for k, why in result.unused.items()),
+                *zip(("result", "report"), map(str, made.files), strict=False),
+            ]
+            show_facts(f"{result.kind} {result.name}", lines)
+        if not result.good_enough:
+            raise typer.Exit(3)
+
+
+NOWHERE = ResultOptions()

@@ -12,8 +12,8 @@ from typing import Annotated
 import typer
 
 from calibration.geometry.pose_selection import measurement_poses
-from calibration.procedures import Destination, RigOutcome, calibrate_rig
-from cdpr.cli.calibrate.output import FolderOption, ForceOption, WantedOption, show_calibration
+from calibration.procedures import RigOutcome, calibrate_rig
+from cdpr.cli.calibrate.output import NOWHERE, ResultOptions, WantedOption
 from cdpr.cli.options import (
     CalibrationOption,
     JsonOption,
@@ -218,9 +218,7 @@ def rig(
     ] = 5.0,
     wanted_mm: WantedOption = 1.0,
     name: Annotated[str, typer.Option(help="name of the result")] = "rig",
-    output: FolderOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    result: ResultOptions = NOWHERE,
 ) -> None:
     """Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.
 
@@ -247,10 +245,10 @@ def rig(
         wanted=wanted_mm / 1e3,
         name=name,
         rig_file=rig,
-        to=Destination(output, force),
-        listener=Terminal(quiet=as_json),
+        to=result.to,
+        listener=result.listener,
     )
-    show_calibration(made, _facts(made), as_json)
+    result.show(made, _facts(made))
 
 
 def _facts(made: RigOutcome) -> list[tuple[str, str]]:

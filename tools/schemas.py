@@ -1,7 +1,6 @@
 """The JSON schemas of rig, scene, plan and drive profile files, for editors and other programs.
 
-``python -m model.files.schema`` writes them into ``docs/schema/`` of the repository (``make
-schema``).
+``python tools/schemas.py`` writes them into ``docs/schema/`` of the repository (``make schema``).
 """
 
 from __future__ import annotations
@@ -38,4 +37,4 @@ def write_schemas(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    write_schemas(Path(__file__).resolve().parents[2] / "docs" / "schema")
+    write_schemas(Path(__file__).resolve().parents[1] / "docs" / "schema")
