@@ -150,6 +150,7 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
                 _say(link, _Ready())
                 while True:
                     _say(link, observer.look(_next_trigger(link)))
+                    observer.show()
         except CdprError as error:
             _say(link, _Failure(error))
         except Exception as error:

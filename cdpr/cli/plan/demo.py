@@ -7,15 +7,17 @@ from typing import Annotated
 
 import typer
 
+from cdpr.cli.operate.console import serve
 from cdpr.cli.operate.run import agreement, show, show_files
 from cdpr.cli.operate.supervision import RunSupervisor
 from cdpr.cli.output import Terminal, out, show_facts
 from cdpr.cli.plan.examples import configs
 from cdpr.cli.plan.facts import sentences_of
+from cdpr.console.session import ConsoleFiles
 from executor import runner
 from executor.recording.run_course import free_folder
 from executor.recording.run_folder import RunFolder
-from model.plan import plan_from_document
+from model.plan import plan_from_document, save_plan
 from model.rig import load_rig
 from model.scene import load_scene
 from planner.planning import plan_path
@@ -32,19 +34,36 @@ def demo(
         int, typer.Option(min=1, max=3, help="number of the paper's environment")
     ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
+    console: Annotated[
+        bool,
+        typer.Option("--console", help="run it from the operator's page, in real time"),
+    ] = False,
 ) -> None:
     """Plan, check, run on simulated drives, track with a synthetic camera, and report.
 
-    [dim]Example:[/dim]
+    With --console the plan is loaded into the operator's page, at the address that is printed:
+    drives and cameras are simulated, in real time; take control there, and run it, jog and teach.
+
+    [dim]Examples:[/dim]
 
       cdpr demo --environment 3
+
+      cdpr demo --console
     """
     folder = output or free_folder("demo")
     RunFolder.require_free(folder)
     rig = load_rig(configs() / RIG)
-    scene = load_scene(configs() / f"environment_{environment}.yaml")
+    scene_file = configs() / f"environment_{environment}.yaml"
+    scene = load_scene(scene_file)
     document = plan_path(rig, scene, OptimalSettings(seed=seed), Terminal())
     show_facts("plan", sentences_of(document))
+    if console:
+        folder.mkdir(parents=True)
+        plan = folder / "plan.json"
+        save_plan(document, plan)
+        files = ConsoleFiles(configs() / RIG, rig, (), (), (), scene_file, False, False)
+        serve(files, plan, "127.0.0.1", 0)
+        return
     with RunSupervisor(lambda result: show(result, False)) as supervisor:
         result = runner.run(
             plan_from_document(document),
