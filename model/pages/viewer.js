@@ -174,7 +174,7 @@ function sceneViewer(canvas, data, shown = () => true) {
     for (const stroke of (now?.strokes ?? []).filter((one) => shown(one.layer)))
       for (const b of stroke.segments) {
         segment(project(b.slice(0, 3)), project(b.slice(3)), colours[stroke.role], stroke.width, 1, stroke.dash);
-        items[items.length - 1].depth = -Infinity;
+        items[items.length - 1].depth = -1e9; // in front of everything
       }
     return items;
   }

@@ -255,7 +255,10 @@ class Fake:
                 "now": round(near, 1),
                 "required": 10.0,
                 "pair": ["cable 5", "obstacle_1"],
-                "points_mm": [[-120.0, 10.0, 420.0], [-145.0, 5.0, 420.0]],
+                "points_mm": [
+                    np.round(self.position * 1e3, 1).tolist(),
+                    [-110.0, 0.0, 430.0],
+                ],
             },
             "measured": self._measured(near),
             "next_stop": self._next_stop(),

@@ -40,7 +40,7 @@ function measuredClearance(measured) {
   if (measured === null) return "";
   if (!isFresh(measured)) return `no measured pose for ${known(measured.age_s, 0, "s")}`;
   const { clearance, within_mm: within, stated } = measured;
-  if (clearance) return `measured ${known(clearance.distance_mm, 1)} (95 %: ${known(clearance.low_mm, 1)} to ${known(clearance.high_mm, 1, "mm")})`;
+  if (clearance) return `measured ${known(clearance.distance_mm, 1)} (${known(clearance.low_mm, 1)}–${known(clearance.high_mm, 1)})`;
   return `pose measured to ±${known(within, 2, "mm")}${stated ? "" : " by scatter alone"}`;
 }
 

@@ -10,7 +10,7 @@ export class Pick {
   #point = null;
   #down = null;
 
-  /** `page` has `command(name, fields)`, `situation()`, `scene`, and `view(name)`. */
+  /** `page` has `command(name, fields)`, `situation()`, `say(text)`, `scene`, and `view(name)`. */
   constructor(page) {
     this.#page = page;
     at("pick").addEventListener("click", () => this.#begin());
@@ -58,6 +58,7 @@ export class Pick {
   }
 
   async #keep() {
+    if (!this.#point) return this.#page.say("Click in the scene first.");
     const taken = this.#page.situation().state.poses.map(({ name }) => name);
     const name = taken.concat("").map((_, k) => `goal ${k + 1}`).find((one) => !taken.includes(one));
     const { ok } = await this.#page.command("teach_at", { name, position_mm: this.#point });
@@ -70,7 +71,6 @@ export class Pick {
     const point = this.#point;
     write(at("pick-height-shown"), known(this.#height, 0, "mm"));
     write(at("pick-text"), point ? `${point.map((v) => known(v, 0)).join(", ")} mm` : "Click where the platform is to go.");
-    at("pick-keep").hidden = !point;
     this.#page.scene.showPick({ height: this.#height, point });
   }
 

@@ -25,24 +25,26 @@ function closestPair(clearance) {
   };
 }
 
-const POINTS = 24, LEAST_SHARE = 0.02;
+const POINTS = 24, LEAST_SHARE = 0.04;
+/** The first of 1, 2, 5, 10, 20 … that is no less. */
+const roundUp = (wanted) => {
+  const power = 10 ** Math.floor(Math.log10(wanted));
+  return [1, 2, 5, 10].find((one) => one * power >= wanted * (1 - 1e-9)) * power;
+};
 
 /** Three principal ellipses about the measured position, drawn large enough to be seen, and by how much larger they are. */
 function ellipsoid(measured, size) {
   if (!measured) return null;
   const { position_mm: middle, half_axes_mm: axes, within_mm: within } = measured;
-  const larger = 10 ** Math.max(0, Math.ceil(Math.log10((LEAST_SHARE * size) / Math.max(within, 1e-6))));
+  const larger = roundUp(Math.max(1, (LEAST_SHARE * size) / Math.max(within, 1e-3)));
   const on = ([u, v], k) => {
     const angle = (2 * Math.PI * k) / POINTS;
     return middle.map((value, c) => value + larger * (Math.cos(angle) * u[c] + Math.sin(angle) * v[c]));
   };
   const rings = [[0, 1], [0, 2], [1, 2]].map((pair) => pair.map((k) => axes[k]));
   const segments = rings.flatMap((pair) => Array.from({ length: POINTS }, (_, k) => [...on(pair, k), ...on(pair, k + 1)]));
-  const top = Math.max(...segments.map((segment) => segment[2]));
-  return {
-    strokes: [{ layer: "measured", role: "tag", segments, width: 1.6, dash: null }],
-    labels: [{ layer: "measured", text: `measured ±${known(within, within < 1 ? 2 : 1, "mm")}${larger > 1 ? `, drawn ${larger}×` : ""}`, at: [middle[0], middle[1], top], mark: "" }],
-  };
+  const legend = `Measured to ±${known(within, within < 1 ? 2 : 1, "mm")} (95 %)${larger > 1 ? `, ellipsoid drawn ${larger}×` : ""}`;
+  return { strokes: [{ layer: "measured", role: "tag", segments, width: 1.6, dash: null }], labels: [], legend };
 }
 
 export class Scene {
@@ -77,7 +79,8 @@ export class Scene {
     const fresh = isFresh(measured) ? { ...measured, age_s: 0 } : null;
     const shown = JSON.stringify([platform, tensions?.map((tension) => Math.round(2 * tension)), clearance, fresh, this.#pick]);
     if (shown !== this.#shown) {
-      const more = drawn([closestPair(clearance), ellipsoid(fresh, this.#view.size()), this.#goal()]);
+      const measure = ellipsoid(fresh, this.#view.size()), more = drawn([closestPair(clearance), measure, this.#goal()]);
+      write(at("scene-legend"), measure && !this.#hidden.has("measured") ? measure.legend : "");
       this.#view.show(platform && { p: platform.position_mm, r: platform.rotation, exits: platform.exits_mm, tensions, ...more });
     }
     this.#shown = shown; // at rest nothing is drawn again
