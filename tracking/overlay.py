@@ -42,6 +42,13 @@ def drawn_over(
     Returns:
         Shape (height, width, 3), blue green red.
     """
+    canvas = outlined(image, rig, camera, found)
+    _draw_text(canvas, _lines(found, clearance))
+    return canvas
+
+
+def outlined(image: Image, rig: Rig, camera: Camera, found: Observation) -> NDArray[np.uint8]:
+    """The image in colour with the platform's box and axes and its tags; as for `drawn_over`."""
     canvas = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     if isinstance(found, PoseMeasurement):
         camera_from_platform = camera.world_from_camera.inverse().compose(found.pose)
@@ -49,7 +56,6 @@ def drawn_over(
         for tag in rig.platform_tags:
             if tag.id in found.tags:
                 _draw_line(canvas, camera, camera_from_platform.apply(tag_corners(tag)), USED, True)
-    _draw_text(canvas, _lines(found, clearance))
     return canvas
 
 

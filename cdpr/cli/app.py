@@ -97,7 +97,7 @@ BENCH = (
 )
 PLAN = (
     *_in(
-        "operate.run",
+        "operate.demo",
         demo="Plan, check, run on simulated drives, track with a synthetic camera, and report.",
     ),
     *_in(
@@ -131,7 +131,8 @@ OPERATE = (
     ),
     *_in(
         "operate.monitor",
-        monitor="Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.",
+        monitor="Show a run live: state, pose, clearance, tensions, drives, lateness, progress and"
+        " events.",
     ),
     *_in(
         "operate.service",

@@ -14,6 +14,7 @@ from executor.remote.protocol import STEPS_MM, Number, Share
 LONGEST = 4096
 
 Text = Annotated[str, Field(max_length=400)]
+Millimetres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Index = Annotated[int, Field(ge=0, le=10_000)]
 
 
@@ -64,6 +65,13 @@ class FileCommand(_Command):
     file: Text
 
 
+class CompareCommand(_Command):
+    """A plan to look at beside the one that is loaded; none to look at that alone."""
+
+    command: Literal["compare"]
+    file: Text | None
+
+
 class PlanCommand(_Command):
     """A path to plan: of a scene, or through the taught poses."""
 
@@ -77,6 +85,14 @@ class NameCommand(_Command):
 
     command: Literal["teach"]
     name: Text
+
+
+class PickCommand(_Command):
+    """A position of the scene is to be kept, with the orientation of now."""
+
+    command: Literal["teach_at"]
+    name: Text
+    position_mm: Annotated[list[Millimetres], Field(min_length=3, max_length=3)]
 
 
 class RenameCommand(_Command):
@@ -134,8 +150,10 @@ Message = (
     | TakeCommand
     | SpeedCommand
     | FileCommand
+    | CompareCommand
     | PlanCommand
     | NameCommand
+    | PickCommand
     | RenameCommand
     | MoveCommand
     | IndexCommand

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 class _Page:
     name: str
     hold: int = 0
+    motion: int = 0
     press: int = 0
     over: int = 0
 
@@ -73,19 +74,24 @@ class PageControl:
         """Who has control."""
         return None if self.holder is None else self._pages[self.holder].name
 
-    def hold(self, page: int, hold: int) -> int | None:
+    def hold(self, page: int, hold: int, motion: int) -> int | None:
         """The press that a page's control is held with; None where it may not, or no longer.
 
         Args:
             page: Which.
             hold: The page's own number of the press, rising from 1.
+            motion: Number of the session that it is to move; a press is over with the session in
+                which it began, and at once where there is none (0).
         """
         mine = self._pages[page]
         if self.holder != page or hold <= mine.over or hold < mine.hold:
             return None
+        if motion == 0 or (hold == mine.hold and motion != mine.motion):
+            mine.over = hold
+            return None
         if hold > mine.hold:
             self._last_press = max(self._last_press + 1, self._now_ms())
-            mine.hold, mine.press = hold, self._last_press
+            mine.hold, mine.press, mine.motion = hold, self._last_press, motion
         return mine.press
 
     def let_go(self, page: int, hold: int | None = None) -> int | None:

@@ -42,6 +42,8 @@ def preview(path: Path, rig: Rig) -> dict[str, Any]:
             "checks": [],
             "duration_s": None,
             "length_mm": None,
+            "least_clearance_mm": None,
+            "largest_tension_n": None,
             **_drawn(rig, plan, []),
             "curves": None,
         }
@@ -57,6 +59,8 @@ def preview(path: Path, rig: Rig) -> dict[str, Any]:
         "checks": _checks(prepared),
         "duration_s": round(prepared.duration, 1),
         "length_mm": round(prepared.length * 1e3, 1),
+        "least_clearance_mm": _in_mm(report.proved_obstacle_clearance),
+        "largest_tension_n": round(report.max_tension, 1),
         **_drawn(rig, plan, list(zip(times, poses, strict=True))),
         "curves": {
             "time_s": times,
@@ -65,6 +69,11 @@ def preview(path: Path, rig: Rig) -> dict[str, Any]:
             "tensions_n": np.round(table.tensions[rows].T, 2).tolist(),
         },
     }
+
+
+def _in_mm(distance: float) -> float | None:
+    """A distance [m] as the page takes it; None where nothing is near."""
+    return round(distance * 1e3, 1) if np.isfinite(distance) else None
 
 
 def _rows(prepared: PreparedRun) -> list[int]:

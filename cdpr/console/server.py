@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -30,6 +33,8 @@ from executor.recording.verdict import fault_codes, page_text
 RATE = 20.0
 #: A page that does not take its states for so long is let go, [s].
 PATIENCE = 2.0
+#: Pages that may be open at a time; STOP by `POST /stop` needs none.
+MOST_PAGES = 64
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:;"
     " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -50,9 +55,17 @@ class ConsoleServer:
         token: Who knows it may look, and take control.
     """
 
-    def __init__(self, console: Console, token: str | None = None) -> None:
-        """No page is open; without a token one is drawn."""
+    def __init__(self, console: Console, token: str | None = None, host: str = "") -> None:
+        """No page is open.
+
+        Args:
+            console: What is shown and done.
+            token: Of the address; without one it is drawn.
+            host: A name of this machine by which pages ask, beside its own.
+        """
         self.token = token or secrets.token_urlsafe(18)
+        self._names = {"localhost", socket.gethostname().lower(), host.lower()}
+        self._pages = 0
         self._console = console
         self._state: dict[str, Any] = {}
         self._news = asyncio.Condition()
@@ -67,6 +80,8 @@ class ConsoleServer:
                 Route("/scene", self._scene),
                 Route("/api/files", self._files),
                 Route("/api/preview", self._preview),
+                Route("/api/compared", self._compared),
+                Route("/camera/{name}", self._picture),
                 Route("/runs/{name:path}", _run_file),
                 Route("/help/{code}", _help),
                 Route("/stop", self._stop, methods=["POST"]),
@@ -104,8 +119,8 @@ class ConsoleServer:
         """No page of another origin gets or does anything; files that say nothing need no token."""
         path = request.url.path
         is_open = path.startswith("/static/") or path == "/stop"
-        if not _same_origin(request.headers):
-            return Response("another origin", 403)
+        if not self._asks_us(request.headers):
+            return Response("another origin, or another name than this machine's", 403)
         if not is_open and not self._knows(request.query_params.get("token")):
             text = "open the address that `cdpr console` printed: it has the token"
             return Response(text, 403)
@@ -117,6 +132,23 @@ class ConsoleServer:
         response.headers["Referrer-Policy"] = "no-referrer"
         response.headers["Cache-Control"] = "no-store"
         return response
+
+    def _asks_us(self, headers: Any) -> bool:
+        """The page that asks, if a browser names one, is ours, and asks by our name or address.
+
+        Other names may be another site's, which lets them point here to be of one origin with us.
+        """
+        host, origin = headers.get("host", ""), headers.get("origin")
+        if origin is not None and origin.partition("://")[2] != host:
+            return False
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        with suppress(ValueError):
+            ip_address(name)
+            return True
+        return name in self._names
 
     def _knows(self, token: str | None) -> bool:
         return token is not None and secrets.compare_digest(token.encode(), self.token.encode())
@@ -138,6 +170,19 @@ class ConsoleServer:
             raise HTTPException(404, "no plan is loaded")
         return JSONResponse(self._console.preview)
 
+    async def _compared(self, _request: Request) -> Response:
+        if self._console.compared is None:
+            raise HTTPException(404, "no plan is compared")
+        return JSONResponse(self._console.compared)
+
+    async def _picture(self, request: Request) -> Response:
+        """The newest image of a camera that measures."""
+        name = request.path_params["name"]
+        made = await run_in_threadpool(self._console.pictures.jpeg, name)
+        if made is None:
+            raise HTTPException(404, "no image")
+        return Response(made, media_type="image/jpeg")
+
     async def _stop(self, _request: Request) -> Response:
         """For a page whose socket is lost; anybody may stop."""
         why_not = await run_in_threadpool(self._console.stop)
@@ -145,25 +190,34 @@ class ConsoleServer:
 
     # The socket.
 
-    async def _socket(self, socket: WebSocket) -> None:
-        known = self._knows(socket.query_params.get("token"))
-        if not (known and "origin" in socket.headers and _same_origin(socket.headers)):
-            await socket.close(4403)
+    async def _socket(self, page: WebSocket) -> None:
+        known = self._knows(page.query_params.get("token"))
+        if not (known and "origin" in page.headers and self._asks_us(page.headers)):
+            await page.close(4403)
             return
-        await socket.accept()
-        client = socket.client
-        page = self._console.control.join("?" if client is None else f"{client.host}")
-        telling = asyncio.create_task(self._tell(socket, page))
+        if self._pages >= MOST_PAGES:
+            await page.close(1013)
+            return
+        self._pages += 1
+        try:
+            await self._speak(page)
+        finally:
+            self._pages -= 1
+
+    async def _speak(self, page: WebSocket) -> None:
+        await page.accept()
+        number = self._console.control.join("?" if page.client is None else page.client.host)
+        telling = asyncio.create_task(self._tell(page, number))
         try:
             while True:
-                await self._hear(socket, page, await socket.receive_text())
-        except (WebSocketDisconnect, RuntimeError, KeyError):
+                await self._hear(page, number, await page.receive_text())
+        except (WebSocketDisconnect, RuntimeError, KeyError):  # the last for what is no text
             pass
         finally:
             telling.cancel()
-            await run_in_threadpool(self._console.leave, page)
+            await run_in_threadpool(self._console.leave, number)
 
-    async def _tell(self, socket: WebSocket, page: int) -> None:
+    async def _tell(self, page: WebSocket, number: int) -> None:
         seen = 0  # before the first look there is nothing to tell
         while True:
             async with self._news:
@@ -171,35 +225,29 @@ class ConsoleServer:
                     await self._news.wait()
                 seen = self._seq
             control = self._console.control
-            own = {"yours": control.holder == page, "held_by": control.holder_name()}
+            own = {"yours": control.holder == number, "held_by": control.holder_name()}
             state = {**self._state, "seq": seen, "control": own}
             try:
-                await asyncio.wait_for(socket.send_json(state), PATIENCE)
+                await asyncio.wait_for(page.send_json(state), PATIENCE)
             except (TimeoutError, RuntimeError, WebSocketDisconnect):
                 with suppress(RuntimeError):
-                    await socket.close(1013)
+                    await page.close(1013)
                 return
 
-    async def _hear(self, socket: WebSocket, page: int, text: str) -> None:
+    async def _hear(self, page: WebSocket, number: int, text: str) -> None:
         try:
             message = parse_message(text)
         except NotAMessage as error:
-            await socket.send_json({"kind": "answer", "to": 0, "ok": False, "what": str(error)})
+            await page.send_json({"kind": "answer", "to": 0, "ok": False, "what": str(error)})
             return
         if isinstance(message, Held):
-            await run_in_threadpool(self._console.held, page, message)
+            await run_in_threadpool(self._console.held, number, message)
         elif isinstance(message, LetGo):
-            await run_in_threadpool(self._console.let_go, page, message)
+            await run_in_threadpool(self._console.let_go, number, message)
         else:
-            why_not = await run_in_threadpool(self._console.command, page, message)
+            why_not = await run_in_threadpool(self._console.command, number, message)
             answer = {"kind": "answer", "to": message.id, "ok": not why_not, "what": why_not}
-            await socket.send_json(answer)
-
-
-def _same_origin(headers: Any) -> bool:
-    """A browser names the page that asks; programs name none."""
-    origin = headers.get("origin")
-    return origin is None or origin.partition("://")[2] == headers.get("host")
+            await page.send_json(answer)
 
 
 def _resource(name: str) -> str:

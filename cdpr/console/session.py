@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cdpr.console.commands import (
+    CompareCommand,
     FileCommand,
     Held,
     IndexCommand,
@@ -21,23 +22,25 @@ from cdpr.console.commands import (
     Message,
     MoveCommand,
     NameCommand,
+    PickCommand,
     PlanCommand,
     RenameCommand,
     SpeedCommand,
     TakeCommand,
 )
 from cdpr.console.control import PageControl
+from cdpr.console.pictures import CameraPictures
 from cdpr.console.preview import preview
 from cdpr.console.started import StartedVerb, file_here
+from cdpr.console.state import Kept, jog_state, kept_state, measured_state, outcome_state
 from cdpr.console.teach import TaughtPoses, scene_text
-from cdpr.console.view import RobotNow, RobotView, pose_data
+from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
 from cdpr.console.watch import RunWatch
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
 from executor.jogging import FASTEST
-from executor.recording.run_course import RUNS
 from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
 from executor.service import StatusResult, reference_status
@@ -97,15 +100,17 @@ class Console:
             f"{files.rig.document.bus.interface} {files.rig.document.bus.channel}".strip()
         )
         self.view = RobotView(files.rig, self.scene)
+        self.pictures = CameraPictures()
         self.poses = TaughtPoses(MADE / "poses.json")
         self.preview: dict[str, Any] | None = None
+        self.compared: dict[str, Any] | None = None
         self._control_lock, self._one_at_a_time = threading.Lock(), threading.Lock()
         self._line = ""
-        self._robot: RobotNow | None = None
+        self._robot: RobotNow | None = self.view.at_home() if is_simulated(self.rig) else None
         self._at_rest: Future[StatusResult] | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
         self._was_busy = True  # so that the drives are asked at first
-        self._kept_at, self._kept = float("-inf"), _Kept(None, False, None)
+        self._kept_at, self._kept = float("-inf"), Kept(None, False, None)
 
     # What it shows.
 
@@ -116,6 +121,7 @@ class Console:
         if look.status is not None:
             seen = self.view.take(look.status)
             self._robot = seen or self._robot
+        self.pictures.watch(look.status, self.view.rig)
         self._ask_at_rest(look.status is not None or self.verbs.verb is not None)
         self._read_kept()
         return self._state(look.status, time.monotonic() - look.at)
@@ -123,6 +129,7 @@ class Console:
     def close(self) -> None:
         """Lets go of what it watches; what moves goes on."""
         self._asks.shutdown()
+        self.pictures.close()
         self.watch.close()
 
     def _ask_at_rest(self, busy: bool) -> None:
@@ -143,75 +150,28 @@ class Console:
             return read_status(self.rig)
 
     def _state(self, status: dict[str, Any] | None, age: float) -> dict[str, Any]:
-        robot, rig = self._robot, self.view.rig
-        jog = None if status is None else status.get("jog")
+        robot, rig, verb = self._robot, self.view.rig, self.verbs.verb
+        near = None if robot is None else robot.nearest
         return {
             "kind": "state",
             "read_only": self.files.read_only,
             "rig": rig.name,
             "bus": bus_name(rig),
             "simulated": is_simulated(rig),
-            "latched": self._kept.latched,
-            "reference": {"counts": self._kept.referenced, "why_not": self._kept.why_not},
-            "busy": None
-            if self.verbs.verb is None
-            else {"verb": self.verbs.verb, "text": self._line},
-            "outcome": self._outcome(),
+            **kept_state(self._kept),
+            "busy": None if verb is None else {"verb": verb, "text": self._line},
+            "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
             "platform": None if robot is None else pose_data(rig, robot.pose, "drives"),
             "tensions_n": None if robot is None else [round(t, 2) for t in robot.tensions],
             "tension_limits_n": [rig.min_tension, rig.max_tension],
-            "clearance_mm": self._clearance(),
+            "clearance_mm": near and nearest_data(near, self.view.required_clearance),
+            "measured": measured_state(status, age),
             "next_stop": None if status is None else status["next_stop"],
             "preview": None if self.preview is None else self.preview["name"],
-            "jog": self._jog(status, jog),
+            "compared": None if self.compared is None else self.compared["name"],
+            "jog": jog_state(status),
             "poses": self.poses.told(),
-        }
-
-    def _busy(self) -> dict[str, Any] | None:
-        verb = self.verbs.verb
-        return None if verb is None else {"verb": verb, "text": self._line}
-
-    def _outcome(self) -> dict[str, Any] | None:
-        ended = self.verbs.outcome
-        if ended is None:
-            return None
-        return {
-            "verb": ended.verb,
-            "ok": ended.exit_code == 0,
-            "text": ended.text,
-            "report": None if ended.report is None else _address_of(ended.report),
-            "fault_page": None if ended.fault is None else f"/help/{ended.fault}",
-        }
-
-    def _clearance(self) -> dict[str, Any] | None:
-        if self._robot is None or self._robot.clearance is None:
-            return None
-        distance, first, second = self._robot.clearance
-        required = self.view.required_clearance
-        return {
-            "now": round(distance * 1e3, 1),
-            "required": round(required * 1e3, 1),
-            "pair": [first, second],
-        }
-
-    def _jog(self, status: dict[str, Any] | None, jog: dict[str, Any] | None) -> dict[str, Any]:
-        if status is None or jog is None:
-            return {
-                "ready": False,
-                "why_not": "the drives are not enabled for jogging",
-                "moving": False,
-                "limit": None,
-                "speed_mm_s": 1e3 * FASTEST,
-            }
-        ready = status["state"] == "moving"
-        limit = jog["limit"] and f"stops in {jog['room_mm']:.1f} mm: {jog['limit']}"
-        return {
-            "ready": ready,
-            "why_not": None if ready else f"the drives are {status['state']}",
-            "moving": bool(status["feed_percent"]),
-            "limit": limit,
-            "speed_mm_s": jog["speed_mm_s"],
         }
 
     def _read_kept(self) -> None:
@@ -221,7 +181,7 @@ class Console:
             return
         self._kept_at = now
         if is_simulated(self.rig):
-            self._kept = _Kept(None, True, None)
+            self._kept = Kept(None, True, None)
             return
         fault, under_way = None, self.watch.last.status is not None
         try:
@@ -230,7 +190,7 @@ class Console:
             why = reference.why_not
         except CdprError as error:
             why = error.what
-        self._kept = _Kept(None if fault is None or under_way else fault.cause, not why, why)
+        self._kept = Kept(None if fault is None or under_way else fault.cause, not why, why)
 
     # What it does.
 
@@ -261,6 +221,14 @@ class Console:
         self.preview = None
         self.preview = preview(path, self.rig)
 
+    def compare_plan(self, path: Path | None) -> None:
+        """Shows another plan beside the one that is loaded; None no longer does.
+
+        Raises:
+            BadInput: It cannot be read, or is for another rig.
+        """
+        self.compared = None if path is None else preview(path, self.rig)
+
     def _command(self, page: int, message: Message) -> str:
         if isinstance(message, TakeCommand):
             moving = self.watch.last.status is not None
@@ -282,10 +250,14 @@ class Console:
                 return self.watch.say("speed", percent=message.percent)
             case FileCommand():
                 self.load_plan(file_here(message.file))
+            case CompareCommand():
+                self.compare_plan(None if message.file is None else file_here(message.file))
             case PlanCommand():
                 self._plan(message)
             case NameCommand():
                 self.poses.teach(message.name, self._pose_now())
+            case PickCommand():
+                self.poses.teach(message.name, self._picked(message))
             case RenameCommand():
                 self.poses.rename(message.index, message.name)
             case MoveCommand():
@@ -361,6 +333,19 @@ class Console:
         write_atomic(path, scene_text(document))
         return path
 
+    def _picked(self, message: PickCommand) -> Pose:
+        """A position of the scene, oriented as the platform is."""
+        position = millimetres(message.position_mm)
+        rig = self.view.rig
+        if np.any(position < rig.workspace_lower) or np.any(position > rig.workspace_upper):
+            raise Refused(
+                "this position is outside the workspace",
+                where="console",
+                why="the rig file limits x, y and z of the platform",
+                next_step="pick another one, or another height",
+            )
+        return Pose(position, self._pose_now().rotation)
+
     def _pose_now(self) -> Pose:
         jog = (self.watch.last.status or {}).get("jog")
         if jog is not None:  # where it was sent, to the last digit: jogs do not turn it
@@ -378,8 +363,9 @@ class Console:
 
     def held(self, page: int, message: Held) -> None:
         """A page's jog control is held; what may not move does not."""
+        motion = 0 if self.files.read_only else self.watch.number
         with self._control_lock:
-            press = None if self.files.read_only else self.control.hold(page, message.hold)
+            press = self.control.hold(page, message.hold, motion)
         if press is None:
             return
         most = 1e3 * self.view.rig.motion.speed
@@ -414,18 +400,5 @@ class Console:
             self.watch.say("let_go", press=press)
 
 
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    latched: str | None
-    referenced: bool
-    why_not: str | None
-
-
 def _milliseconds() -> int:
     return time.time_ns() // 1_000_000
-
-
-def _address_of(report: Path) -> str | None:
-    """Where the console serves a report; only those below the folder of runs."""
-    path, root = report.resolve(), RUNS.resolve()
-    return f"/runs/{path.relative_to(root)}" if path.is_relative_to(root) else None

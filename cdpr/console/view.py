@@ -13,17 +13,20 @@ from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_folder import RunFolder
 from executor.report.scene import frame_surface, obstacle_surfaces, platform_surface
 from executor.service import StatusResult
-from model.clearance import ClearanceModel
+from model.clearance import ClearanceModel, Nearest
 from model.errors import CdprError
 from model.kinematics import cables_at, forward_kinematics
 from model.pages.scene import SceneFigure, Stroke, grid_floor, scene_data
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, nothing_in_the_way
+from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
 #: Clearance is computed this often at most, [s].
 CLEARANCE_EVERY = 0.2
+#: Half axes of the ellipsoid that holds 95 % of a normal error in space: in standard deviations.
+SURE_IN_SPACE = 2.7955
 
 
 def scene_figure(rig: Rig, scene: Scene | None, *strokes: Stroke) -> SceneFigure:
@@ -61,6 +64,42 @@ def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
     }
 
 
+def nearest_data(nearest: Nearest, required: float) -> dict[str, Any]:
+    """The closest pair as the page takes it: mm, and where on both bodies it is closest.
+
+    Args:
+        nearest: A body of the robot and an obstacle.
+        required: Clearance that the scene asks for, [m].
+    """
+    points = np.stack([nearest.first_point, nearest.second_point])
+    return {
+        "now": round(nearest.distance * 1e3, 1),
+        "required": round(required * 1e3, 1),
+        "pair": [nearest.first, nearest.second],
+        "points_mm": (np.round(points * 1e3, 1) + 0.0).tolist(),
+    }
+
+
+def measured_data(measured: dict[str, Any], age: float) -> dict[str, Any]:
+    """The measured pose of a run's status as the page takes it: mm, and its 95 % ellipsoid.
+
+    Args:
+        measured: See `executor.remote.status`.
+        age: Of its images, [s].
+    """
+    covariance = np.array(measured["covariance_mm2"]).reshape(3, 3)
+    variances, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
+    half = SURE_IN_SPACE * np.sqrt(np.maximum(variances, 0.0))
+    return {
+        "position_mm": [round(v, 2) for v in measured["position_mm"]],
+        "half_axes_mm": np.round(axes.T * half[:, None], 4).tolist(),
+        "within_mm": round(float(half[-1]), 3),
+        "stated": measured["stated"],
+        "age_s": round(age, 3),
+        "clearance": measured["clearance"],
+    }
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotNow:
     """The robot as its drives have it.
@@ -68,12 +107,12 @@ class RobotNow:
     Attributes:
         pose: ``world_from_platform``; None where their positions fit none.
         tensions: By their torques, [N].
-        clearance: Smallest distance [m], and between what; None without obstacles.
+        nearest: The closest pair of a body of the robot and an obstacle; None without obstacles.
     """
 
     pose: Pose
     tensions: list[float]
-    clearance: tuple[float, str, str] | None
+    nearest: Nearest | None
 
 
 class RobotView:
@@ -89,7 +128,7 @@ class RobotView:
         self._file_rig, self._file_scene = rig, scene
         self._folder: str | None = None
         self._looked = float("-inf")
-        self._clearance: tuple[float, str, str] | None = None
+        self._nearest: Nearest | None = None
         self._pose = rig.home
         self._set(rig, scene)
 
@@ -122,18 +161,22 @@ class RobotView:
         tensions = [drive.tension for drive in status.drives]
         return RobotNow(status.pose, tensions, self._near(status.pose))
 
+    def at_home(self) -> RobotNow:
+        """The robot at its home pose: where drives that a verb simulates begin."""
+        tensions = working_tensions(self.rig, self.rig.home, self.scene.load).tensions
+        return RobotNow(self.rig.home, tensions.tolist(), self._near(self.rig.home))
+
     @property
     def required_clearance(self) -> float:
         """Of the scene, [m]."""
         return self.scene.obstacle_clearance
 
-    def _near(self, pose: Pose) -> tuple[float, str, str] | None:
+    def _near(self, pose: Pose) -> Nearest | None:
         now = time.monotonic()
         if now - self._looked >= CLEARANCE_EVERY:
             self._looked = now
-            near = self._model.smallest(pose)
-            self._clearance = None if near is None else (near.distance, near.first, near.second)
-        return self._clearance
+            self._nearest = self._model.smallest(pose)
+        return self._nearest
 
     def _set_by(self, folder: Path | None) -> None:
         """A run's folder says for which rig and scene it is; other motions go by the files."""

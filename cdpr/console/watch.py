@@ -8,12 +8,19 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
-from executor.remote.client import Answer, ask
+from executor.remote.client import Answer, RunLink
 from executor.remote.protocol import make_line
-from executor.remote.registry import Reached, find_runs
+from executor.remote.registry import find_runs
 
 #: While nothing moves, a new run is looked for this often, [s].
 LOOK = 0.2
+#: A run that answers later is silent: its last status stays, and grows old, [s].
+PATIENCE = 0.1
+#: What an operator asks for is answered within this, [s].
+ANSWERED_WITHIN = 0.5
+#: Sent to a silent run as well: obeyed late, they make nothing move.
+_ALWAYS = frozenset({"let_go", "hold", "end"})
+_SILENT = "the run does not answer"
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,33 +44,54 @@ class RunWatch:
         self._bus = bus
         self._lock = threading.Lock()
         self._links = ExitStack()
-        self._run: Reached | None = None
+        self._run: RunLink | None = None
         self._looked = float("-inf")
+        self._count = 0
         self.last = Look(None, time.monotonic())
+
+    @property
+    def number(self) -> int:
+        """Of the motion that is followed, rising with each; 0 while nothing moves."""
+        return 0 if self._run is None else self._count
 
     def look(self) -> Look:
         """Asks the run that moves; finds one where none did."""
-        with self._lock:
+        if not self._lock.acquire(timeout=PATIENCE):
+            return self.last  # somebody waits for an answer
+        try:
             now = time.monotonic()
             if self._run is None and now - self._looked >= LOOK:
                 self._looked = now
                 self._connect()
             if self._run is None:
                 self.last = Look(None, now)
+            elif self._run.owed:
+                self._take(self._run.hear(PATIENCE))
             else:
-                self._take(ask(self._run, make_line("status")))
+                self._take(self._run.ask(make_line("status"), PATIENCE))
             return self.last
+        finally:
+            self._lock.release()
 
     def say(self, command: str, **values: Any) -> str:
-        """Sends the run a command; why it was not taken, or nothing."""
+        """Sends the run a command; why it was not taken, or nothing.
+
+        A run that is silent is sent nothing that it could obey when it wakes up, long after.
+        """
         with self._lock:
             if self._run is None:
                 return "nothing moves"
-            answer = ask(self._run, make_line(command, **values))
+            if self._run.owed:
+                self._take(self._run.hear(PATIENCE))
+                if self._run is None:
+                    return "nothing moves"
+                if self._run.owed and command not in _ALWAYS:
+                    return _SILENT
+            answer = self._run.ask(make_line(command, **values), ANSWERED_WITHIN)
             if answer.what:
                 return answer.what
             self._take(answer)
-            return "" if answer.status is not None else "the run does not answer"
+            return "" if answer.status is not None else _SILENT
 
     def close(self) -> None:
         """Lets go of the connection."""
@@ -81,9 +109,11 @@ class RunWatch:
     def _connect(self) -> None:
         links = self._links.enter_context(ExitStack())
         for run in links.enter_context(find_runs()):
-            answer = ask(run, make_line("status"))
+            link = RunLink(run)
+            answer = link.ask(make_line("status"), PATIENCE)
             if answer.status is not None and answer.status["bus"] == self._bus:
-                self._run = run
+                self._run = link
+                self._count += 1
                 return
         self._let_go()
 

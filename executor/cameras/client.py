@@ -86,13 +86,15 @@ class CameraRecord:
 class CameraClient:
     """Asks one camera for images and keeps its answers."""
 
-    def __init__(self, process: CameraProcess, source: str) -> None:
+    def __init__(self, process: CameraProcess, source: str, live_image: int | None = None) -> None:
         """Nothing was asked for yet.
 
         Args:
             process: Takes and measures the images.
             source: Where they come from, for messages.
+            live_image: Descriptor of the memory of `executor.cameras.live_image`; None for none.
         """
+        self._live_image = live_image
         self.name, self.source = process.name, source
         self.looks: list[CameraSample] = []
         """Its answers, in order."""
@@ -172,6 +174,7 @@ class CameraClient:
             "measuring_ms": self._pace.measuring_ms,
             "tags": list(found.tags) if isinstance(found, PoseMeasurement) else [],
             "trouble": self.trouble(now),
+            "live_image": self._live_image,
         }
 
     def _taken(self, answer: Callable[[], CameraSample | None]) -> CameraSample | None:

@@ -202,6 +202,8 @@ class RunCameras:
         self._frame, self._now = 0, 0.0
         self._open: list[_FrameSet] = []
         self._together: list[CameraSample] = []
+        self.newest: tuple[PoseMeasurement, MeasuredClearance | None] | None = None
+        """The newest pose of all cameras together, and the clearance at it; None before one."""
         self._told: dict[str, str] = {}
         self._news: list[CameraNews] = []
 
@@ -294,7 +296,12 @@ class RunCameras:
             late = bool(moment.looks) and moment.trigger.frame < self._frame - 1
             if not (answered or late or last):
                 return
-            self._together.append(self._joined(self._open.pop(0)))
+            self._keep(self._joined(self._open.pop(0)))
+
+    def _keep(self, sample: CameraSample) -> None:
+        self._together.append(sample)
+        if isinstance(sample.found, PoseMeasurement):
+            self.newest = sample.found, sample.clearance
 
     def _joined(self, moment: _FrameSet) -> CameraSample:
         """What all cameras say of a moment together."""
@@ -363,6 +370,8 @@ class CameraWatch:
         self._tell_news(asked)
         each = self._cameras.as_dict()
         self._status.take_cameras(each)
+        if self._cameras.newest is not None:
+            self._status.take_measured(*self._cameras.newest)
         self.rates = "; ".join(
             f"{c['name']} {rates(c['pictures_per_second'], c['measuring_ms'], len(c['tags']))}"
             for c in each

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from drivers.cameras.live import LiveCamera
 from executor.cameras.client import CameraClient, wait_until_ready
+from executor.cameras.live_image import ImageBoard, memory_for
 from executor.cameras.multi_camera import RunCameras
 from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, PictureSource
 from executor.cameras.sources import SYNTHETIC
 from executor.cameras.static_pose import looks_at_rest
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.operator_requests import RequestBoard
+from executor.realtime.shared_memory import SharedMemory
 from executor.recording.run_folder import RunFolder
 from model.clearance import ClearanceModel
 from model.errors import Fault, StoppedByOperator
@@ -71,11 +73,18 @@ def open_cameras(
     keep_every = max(1, pictures // KEPT_PICTURES)
     ready_for_camera_processes(listener)
     with ExitStack() as stack:
-        processes = {}
+        processes, lives = {}, {}
         for camera, source in sources.items():
+            live = lives[camera] = memory_for(camera)
+            stack.callback(live.close)
             place = (camera.name, source, folder, keep_every)
             make = partial(
-                make_observer, rig.document, scene.document, *place, named=len(sources) > 1
+                make_observer,
+                rig.document,
+                scene.document,
+                *place,
+                named=len(sources) > 1,
+                live=live,
             )
             process = CameraProcess(camera.name, make, may_wait=simulated_time)
             stack.callback(process.close)
@@ -84,7 +93,10 @@ def open_cameras(
         with listener.waiting(f"opening camera {names}"):
             wait_until_ready(list(processes.values()), partial(require_no_stop, board))
         yield RunCameras(
-            [CameraClient(process, sources[camera]) for camera, process in processes.items()],
+            [
+                CameraClient(process, sources[camera], lives[camera].descriptor)
+                for camera, process in processes.items()
+            ],
             ClearanceModel(rig, scene),
             scene.obstacle_clearance,
             asked_rate(sources),
@@ -117,6 +129,7 @@ def make_observer(
     keep_every: int,
     *,
     named: bool,
+    live: SharedMemory | None = None,
 ) -> CameraWorker:
     """Builds the observer inside its camera's process."""
     rig, scene = rig_from_document(rig_document), scene_from_document(scene_document)
@@ -124,7 +137,8 @@ def make_observer(
     ready_to_measure()
     pictures = _source(rig, scene, camera, source)
     kept = None if folder is None else RunFolder(folder)
-    return CameraWorker(rig, camera, pictures, kept, keep_every, named=named)
+    board = None if live is None else ImageBoard(live)
+    return CameraWorker(rig, camera, pictures, kept, keep_every, named=named, live=board)
 
 
 def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:

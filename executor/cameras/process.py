@@ -18,6 +18,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from executor.cameras.live_image import ImageBoard
 from executor.realtime.scheduling import interrupts_blocked
 from executor.recording.run_folder import RunFolder
 from model.errors import CdprError, Fault
@@ -85,6 +86,11 @@ class PictureSource(Protocol):
         ...
 
 
+_NOTHING: tuple[int, NDArray[np.uint8], Observation] = (
+    0, np.zeros((0, 0), np.uint8), NoPose(0.0, "")
+)  # fmt: skip
+
+
 class CameraWorker:
     """Takes images with one camera and measures them, as a context manager."""
 
@@ -97,6 +103,7 @@ class CameraWorker:
         keep_every: int,
         *,
         named: bool,
+        live: ImageBoard | None = None,
     ) -> None:
         """Prepares to look.
 
@@ -107,10 +114,12 @@ class CameraWorker:
             folder: Where some of them are kept; None to keep none.
             keep_every: Every how many images one is kept.
             named: Kept images are in a folder of the camera's name: there are others.
+            live: Where images are shown to who looks on; None for nobody.
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._name = camera.name if named else ""
         self._tracker, self._drives = Tracker(rig, camera), DrivesAhead()
+        self._live, self._newest = live, _NOTHING
 
     def __enter__(self) -> CameraWorker:
         return self
@@ -133,7 +142,13 @@ class CameraWorker:
         by_drives = self._drives.at(taken, trigger.time, trigger.by_drives)
         began = time.monotonic()
         found = self._tracker.observe(image, taken, by_drives)
+        self._newest = trigger.frame, image, found
         return CameraSample(trigger.frame, found, kept, time.monotonic() - began)
+
+    def show(self) -> None:
+        """Shows the newest image to who looks on; called when its answer is on its way."""
+        if self._live is not None:
+            self._live.show(*self._newest)
 
 
 MakeObserver = Callable[[], CameraWorker]
@@ -274,6 +289,7 @@ def _serve(make_observer: MakeObserver, link: Connection) -> None:
                 _say(link, _Ready())
                 while True:
                     _say(link, observer.look(_next_trigger(link)))
+                    observer.show()
         except CdprError as error:
             _say(link, _Failure(error))
         except Exception as error:

@@ -34,11 +34,12 @@ class SharedMemory:
     Attributes:
         view: Its content.
         size: [bytes].
+        descriptor: Of the memory file in this process.
     """
 
     def __init__(self, descriptor: int, size: int, *, writable: bool) -> None:
         """Takes over an open memory file; `create` and `sealed` make one."""
-        self._descriptor, self._writable = descriptor, writable
+        self.descriptor, self._writable = descriptor, writable
         self.size = size
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
         self.view = mmap.mmap(descriptor, size, prot=protection)
@@ -63,11 +64,11 @@ class SharedMemory:
 
     def close(self) -> None:
         """Lets go of it; what NumPy still looks at stays until that is gone."""
-        os.close(self._descriptor)
+        os.close(self.descriptor)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Only while a process is being started: the descriptor goes along."""
-        return _received, (DupFd(self._descriptor), self.size, self._writable)
+        return _received, (DupFd(self.descriptor), self.size, self._writable)
 
 
 def _received(descriptor: _Sent, size: int, writable: bool) -> SharedMemory:

@@ -55,6 +55,44 @@ def _ask_all(runs: Sequence[Reached], line: bytes) -> list[Answer]:
     ]
 
 
+class RunLink:
+    """A run that is asked again and again; a late answer never passes for that to a later question.
+
+    Attributes:
+        owed: Answers that were asked for and have not come.
+    """
+
+    def __init__(self, run: Reached) -> None:
+        """Nothing was asked yet."""
+        self._run, self._begun = run, b""
+        self.owed = 0
+
+    def ask(self, line: bytes, patience: float) -> Answer:
+        """Sends a line of `make_line`; what is said to it within so long, [s]."""
+        if not _told(self._run, line):
+            return Answer(self._run.process, None, ended=True)
+        self.owed += 1
+        return self.hear(patience)
+
+    def hear(self, patience: float) -> Answer:
+        """The answer to the last question, once no earlier one is owed; waited for so long, [s]."""
+        newest, latest = b"", time.monotonic() + patience
+        while self.owed:
+            try:
+                self._run.link.settimeout(max(1e-3, latest - time.monotonic()))
+                chunk = self._run.link.recv(_CHUNK)
+            except TimeoutError:
+                return Answer(self._run.process, None)
+            except OSError:
+                chunk = b""
+            if not chunk:
+                return Answer(self._run.process, None, ended=True)
+            *lines, self._begun = (self._begun + chunk).split(b"\n")
+            self.owed = max(0, self.owed - len(lines))
+            newest = lines[-1] if lines else newest
+        return _parsed(self._run.process, newest)
+
+
 def _told(run: Reached, line: bytes) -> bool:
     run.link.settimeout(ANSWER_TIMEOUT)
     try:
@@ -67,18 +105,24 @@ def _told(run: Reached, line: bytes) -> bool:
 def _heard(run: Reached) -> Answer:
     """What it answers; a run that hangs is distinguished from one that ended."""
     try:
-        answer = json.loads(_line(run.link))
+        line = _line(run.link)
     except TimeoutError:
         return Answer(run.process, None)
     except OSError:
         return Answer(run.process, None, ended=True)
+    return _parsed(run.process, line)
+
+
+def _parsed(process: int, line: bytes) -> Answer:
+    try:
+        answer = json.loads(line)
     except ValueError as error:
-        return Answer(run.process, None, f"its answer cannot be read: {error}")
+        return Answer(process, None, f"its answer cannot be read: {error}")
     status = answer.get("status") if isinstance(answer, dict) else None
     if isinstance(status, dict):
-        return Answer(run.process, status)
+        return Answer(process, status)
     what = answer.get("what") if isinstance(answer, dict) else None
-    return Answer(run.process, None, str(what or "its answer is empty"))
+    return Answer(process, None, str(what or "its answer is empty"))
 
 
 def last_word(run: Reached) -> dict[str, Any] | None:

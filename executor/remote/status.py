@@ -7,8 +7,13 @@ Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, 
 ``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``rejected_frames``,
 ``error_frames``, ``cameras`` [{``name``, ``source``, ``pictures``, ``poses``, ``dropped``,
 ``pictures_per_second`` (of the run's time), ``measuring_ms``, ``tags`` (seen last), ``trouble``
-(what keeps it from measuring, or nothing)}], ``drives`` [{``node``, ``state``, ``position_counts``,
-``set_counts``, ``tension_n``}], ``events`` [{``time_s``, ``code``, ``text``}], the newest last. A
+(what keeps it from measuring, or nothing), ``live_image`` (descriptor of its newest image in this
+process, see `executor.cameras.live_image`)}], ``measured`` (the newest pose of all cameras
+together, or nothing) {``time_s`` (of its images), ``position_mm``, ``quaternion``,
+``covariance_mm2`` (of the position, row by row), ``stated`` (whether it holds the errors that all
+images share), ``clearance`` {``distance_mm``, ``low_mm``, ``high_mm`` (its 95 % interval),
+``pair``}, or nothing}, ``drives`` [{``node``, ``state``, ``position_counts``, ``set_counts``,
+``tension_n``}], ``events`` [{``time_s``, ``code``, ``text``}], the newest last. A
 number that is not known is null; before the first cycle ``state`` is ``preparing`` (while `cdpr
 release` takes the torque off ``releasing``) and ``drives`` is empty; at the end ``cause`` says why
 it did not end well. Winches that move without a path (`cdpr home`, `cdpr jog --cable`) have no
@@ -36,6 +41,8 @@ from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.trajectory.prepare import PreparedRun
 from model.pose import Pose
 from model.rig import Rig
+from tracking.clearance import MeasuredClearance
+from tracking.measurement import PoseMeasurement
 
 #: Number of newest events reported.
 EVENTS_TOLD = 12
@@ -137,6 +144,29 @@ def whose(rig: Rig, folder: Path | None) -> dict[str, Any]:
     }
 
 
+def measured_data(measured: PoseMeasurement, clearance: MeasuredClearance | None) -> dict[str, Any]:
+    """A measured pose and the clearance at it; see the head of this file."""
+    covariance = (measured.covariance + measured.shared)[:3, :3] * 1e6
+    return {
+        "time_s": round(measured.time, 3),
+        "position_mm": [round(float(v) * 1e3, 4) for v in measured.pose.position],
+        "quaternion": [round(float(v), 7) for v in measured.pose.quaternion],
+        "covariance_mm2": [float(f"{v:.6g}") for v in covariance.reshape(-1)],
+        "stated": not measured.unstated,
+        "clearance": None if clearance is None else _clearance_data(clearance),
+    }
+
+
+def _clearance_data(clearance: MeasuredClearance) -> dict[str, Any]:
+    nearest = min(clearance.nearest, key=lambda one: one.distance)
+    return {
+        "distance_mm": round(clearance.distance * 1e3, 3),
+        "low_mm": round((clearance.distance - clearance.uncertainty) * 1e3, 3),
+        "high_mm": round(clearance.at_most * 1e3, 3),
+        "pair": [nearest.first, nearest.second],
+    }
+
+
 def wished(board: RequestBoard) -> dict[str, Any]:
     """What the operator wants."""
     wishes = board.read()
@@ -152,6 +182,7 @@ class MotionStatus(ABC):
         self._rig, self._board = rig, board
         self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
         self._cameras: list[dict[str, Any]] = []
+        self._measured: tuple[PoseMeasurement, MeasuredClearance | None] | None = None
         self.folder: Path | None = None
         """Where it is on record, if anywhere."""
 
@@ -170,6 +201,7 @@ class MotionStatus(ABC):
             **self._cycles.as_dict(),
             **self._place(),
             "cameras": self._cameras,
+            "measured": None if self._measured is None else measured_data(*self._measured),
             **wished(self._board),
             "events": self._told(),
         }
@@ -201,6 +233,10 @@ class RunStatus(MotionStatus):
     def take_cameras(self, cameras: list[dict[str, Any]]) -> None:
         """How each camera does now."""
         self._cameras = cameras
+
+    def take_measured(self, measured: PoseMeasurement, clearance: MeasuredClearance | None) -> None:
+        """The newest pose of the cameras, and the clearance at it; read by who asks."""
+        self._measured = measured, clearance
 
     def take_event(self, event: RunEvent) -> None:
         """Something happened."""

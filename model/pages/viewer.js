@@ -2,9 +2,11 @@
 /* A scene of scene.py on a canvas: drag to turn, two fingers or Ctrl and wheel to zoom.
 
 sceneViewer(canvas, data, shown) draws `data` (scene_data); `shown(layer)` says what is drawn. It returns
-  show(moment)     the platform at a moment, or none (null); with `tensions` cables take their colours;
+  show(moment)     the platform at a moment, or none (null); with `tensions` cables take their colours; `strokes`
+                   and `labels` of its own are drawn in front of everything, and never change the view;
   update(parts)    other surfaces, strokes, labels or moments, kept in view;
-  zoom(factor), reset(), redraw().
+  zoom(factor), reset(), redraw(), size() in mm;
+  pick(x, y, height)  the point at that height [mm] that is drawn at a pixel of the canvas; null where none is.
 tensionColour(share) is a cable's colour, from 0 at the lower limit of its tension to 1 at the upper. */
 
 // Blue, grey and orange differ for every kind of colour vision; a cable beyond a limit is dashed as well.
@@ -21,7 +23,7 @@ function sceneViewer(canvas, data, shown = () => true) {
   const context = canvas.getContext("2d");
   const CABLE_PIECES = 10; // so that a cable can pass behind one obstacle and in front of another
   const MARGIN = 24; // px, for texts beside points
-  const UNFITTED = ["tree", "trail"]; // layers that may lie outside the picture
+  const UNFITTED = ["tree", "trail", "pick"]; // layers that may lie outside the picture
   const first = { azimuth: data.view.azimuth, elevation: data.view.elevation, zoom: 1 };
   const eye = { ...first };
   const reach = [0, 1, 2].map((k) => Math.max(...data.platform.vertices.map((v) => Math.abs(v[k]))));
@@ -80,15 +82,36 @@ function sceneViewer(canvas, data, shown = () => true) {
   }
 
   // Everything fits at every angle and size of the window; zooming in goes beyond that.
-  function projector() {
+  function fitted() {
     const width = canvas.clientWidth, height = canvas.clientHeight;
     const see = seer(eye), seen = seenPoints.map(see);
     const [[left, right], [low, high]] = [0, 1].map((k) => [Math.min(...seen.map((p) => p[k])), Math.max(...seen.map((p) => p[k]))]);
     const scale = eye.zoom * Math.min((width - 2 * MARGIN) / (right - left), (height - 2 * MARGIN) / (high - low));
+    return { see, scale, middle: [(left + right) / 2, (low + high) / 2], width, height };
+  }
+
+  function projector() {
+    const { see, scale, middle, width, height } = fitted();
     return (p) => {
       const [x, y, depth] = see(p);
-      return [width / 2 + scale * (x - (left + right) / 2), height / 2 - scale * (y - (low + high) / 2), depth];
+      return [width / 2 + scale * (x - middle[0]), height / 2 - scale * (y - middle[1]), depth];
     };
+  }
+
+  // Along the ray from the eye through a pixel, to a horizontal plane before it.
+  function pick(x, y, level) {
+    const { scale, middle, width, height } = fitted();
+    const a = (eye.azimuth * Math.PI) / 180, e = (eye.elevation * Math.PI) / 180;
+    const ca = Math.cos(a), sa = Math.sin(a), ce = Math.cos(e), se = Math.sin(e);
+    const right = (x - width / 2) / scale + middle[0], up = (height / 2 - y) / scale + middle[1];
+    const share = (level - centre[2] - se * distance) / (ce * up - se * distance); // of the depth of the centre
+    if (!(share > 0.05 && share < 20)) return null;
+    const toward = distance * (1 - share);
+    return [
+      centre[0] + share * (-sa * right - se * ca * up) + ce * ca * toward,
+      centre[1] + share * (ca * right - se * sa * up) + ce * sa * toward,
+      level,
+    ];
   }
 
   function draw() {
@@ -148,6 +171,11 @@ function sceneViewer(canvas, data, shown = () => true) {
         if (stroke.layer === "floor") items[items.length - 1].depth += size;
       }
     if (shown("robot") && now) robot(project, segment, surface);
+    for (const stroke of (now?.strokes ?? []).filter((one) => shown(one.layer)))
+      for (const b of stroke.segments) {
+        segment(project(b.slice(0, 3)), project(b.slice(3)), colours[stroke.role], stroke.width, 1, stroke.dash);
+        items[items.length - 1].depth = -1e9; // in front of everything
+      }
     return items;
   }
 
@@ -183,7 +211,7 @@ function sceneViewer(canvas, data, shown = () => true) {
   }
 
   function texts(project) {
-    for (const { layer, text, at, mark } of data.labels) if (shown(layer)) write(text, project(at), mark);
+    for (const { layer, text, at, mark } of [...data.labels, ...(now?.labels ?? [])]) if (shown(layer)) write(text, project(at), mark);
     for (const solid of data.surfaces.filter((one) => one.name && shown(one.layer))) {
       const top = Math.max(...solid.vertices.map((v) => v[2]));
       const upper = solid.vertices.filter((v) => v[2] > top - 0.01);
@@ -265,7 +293,8 @@ function sceneViewer(canvas, data, shown = () => true) {
   readColours();
   update({});
   return {
-    update, zoom, redraw,
+    update, zoom, redraw, pick,
+    size: () => size, // diagonal of all that is fitted into the picture, [mm]
     show: (moment) => {
       now = moment;
       redraw();

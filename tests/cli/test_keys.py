@@ -223,7 +223,7 @@ def test_the_monitor_shows_where_the_platform_is_by_the_runs_own_rig(tmp_path: P
     assert seen is not None
     view, robot = seen
     np.testing.assert_allclose(robot.pose.position, run.cycles.planned[k], atol=2e-5)
-    assert robot.clearance is not None
+    assert robot.nearest is not None
     assert view.scene.obstacles, "those of the plan that is run"
     x, y, z = 1e3 * robot.pose.position
     assert f"platform {x:.1f}, {y:.1f}, {z:.1f} mm" in monitor._where(view, robot)

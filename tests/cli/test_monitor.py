@@ -52,6 +52,7 @@ def status(**changes: Any) -> dict[str, Any]:
                 "tension_n": 20.5,
             }
         ],
+        "measured": None,
         "cameras": [
             {
                 "name": "side",
@@ -113,7 +114,7 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     now = told.as_dict()
     assert now.keys() == status().keys()
     assert {key for key, value in now.items() if value is None} == {
-        *("path_mm", "path_length_mm", "next_stop", "cause")
+        *("path_mm", "path_length_mm", "next_stop", "cause", "measured")
     }
     assert now["elapsed_s"] == pytest.approx(0.02)
     assert now["events"] == [{"time_s": 0.01, "code": "moving", "text": "winding in"}]

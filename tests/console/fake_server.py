@@ -23,6 +23,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import uvicorn
 from starlette.applications import Starlette
@@ -111,7 +112,9 @@ def preview(name: str) -> dict[str, Any]:
             "speed, acceleration, jerk",
         ],
         "duration_s": ROUND_S,
-        "length_mm": 921.4,
+        "length_mm": 921.4 if passed else None,
+        "least_clearance_mm": 12.4 if passed else None,
+        "largest_tension_n": 61.5 if passed else None,
         **{key: data[key] for key in ("moments", "strokes", "surfaces", "labels")},
         "curves": {
             "time_s": [ROUND_S * s for s in shares],
@@ -136,6 +139,7 @@ class Fake:
         self.latched: str | None = None
         self.homed = True
         self.plan: str | None = None
+        self.compared: str | None = None
         self.poses: list[dict[str, Any]] = []
         self.outcome: dict[str, Any] | None = None
         self.share = self.rate = 0.0
@@ -147,6 +151,8 @@ class Fake:
         self.held: dict[str, Any] | None = None
         self.held_at, self.spent = 0.0, -1
         self.events: list[dict[str, Any]] = []
+        self.pictures: list[float] = []
+        self.slow_ms = 0
         self._seq = itertools.count(1)
 
     def tick(self) -> None:
@@ -249,9 +255,15 @@ class Fake:
                 "now": round(near, 1),
                 "required": 10.0,
                 "pair": ["cable 5", "obstacle_1"],
+                "points_mm": [
+                    np.round(self.position * 1e3, 1).tolist(),
+                    [-110.0, 0.0, 430.0],
+                ],
             },
+            "measured": self._measured(near),
             "next_stop": self._next_stop(),
             "preview": self.plan,
+            "compared": self.compared,
             "jog": {**jog, "speed_mm_s": 20.0},
             "poses": self.poses,
             **self.over,
@@ -265,6 +277,23 @@ class Fake:
             "name": "goal",
             "distance_mm": round(921.4 * left, 1),
             "seconds": round(ROUND_S * left, 1),
+        }
+
+    def _measured(self, near: float) -> dict[str, Any] | None:
+        if self.moving is None:
+            return None
+        return {
+            "position_mm": np.round(self.position * 1e3 + [0.21, -0.13, 0.3], 2).tolist(),
+            "half_axes_mm": [[0.12, 0.0, 0.0], [0.0, 0.15, 0.05], [0.0, -0.14, 0.42]],
+            "within_mm": 0.443,
+            "stated": True,
+            "age_s": 0.08,
+            "clearance": {
+                "distance_mm": round(near + 0.2, 3),
+                "low_mm": round(near - 0.4, 3),
+                "high_mm": round(near + 0.8, 3),
+                "pair": ["cable 5", "obstacle_1"],
+            },
         }
 
     def _motion(self, tensions: Array) -> dict[str, Any] | None:
@@ -291,6 +320,7 @@ class Fake:
             "measuring_ms": 31.2,
             "tags": [301, 305],
             "trouble": None,
+            "live_image": 7,
         }
         return {
             "process": 4711,
@@ -362,6 +392,11 @@ class Fake:
             self.homed = command == "home"
         elif command in ("load_plan", "plan"):
             self.plan = message.get("file") or message.get("scene") or "taught poses"
+        elif command == "compare":
+            self.compared = message["file"]
+        elif command == "teach_at":
+            pose = {k: message[k] for k in ("name", "position_mm")}
+            self.poses = [*self.poses, {**pose, "quaternion": [1, 0, 0, 0]}]
         elif command == "teach":
             position = np.round(self.position * 1e3, 1).tolist()
             self.poses = [
@@ -414,6 +449,17 @@ def application(fake: Fake) -> Starlette:
     async def preview_of(request: Request) -> Response:
         return JSONResponse(preview(fake.plan)) if fake.plan else PlainTextResponse("no plan", 404)
 
+    async def picture(request: Request) -> Response:
+        fake.pictures.append(time.monotonic())
+        await asyncio.sleep(0.001 * fake.slow_ms)
+        _, file = cv2.imencode(".jpg", np.full((480, 640), 90, np.uint8))
+        return Response(file.tobytes(), media_type="image/jpeg")
+
+    async def compared_of(request: Request) -> Response:
+        if fake.compared is None:
+            return PlainTextResponse("no plan", 404)
+        return JSONResponse(preview(fake.compared))
+
     async def stop(request: Request) -> Response:
         ok, what = fake.stop()
         return JSONResponse({"ok": ok, "what": what})
@@ -434,7 +480,7 @@ def application(fake: Fake) -> Starlette:
                 for left in list(fake.sockets):
                     await left.close()
         position = np.round(fake.position * 1e3, 3).tolist()
-        names = ("received", "stops", "ticks", "plan", "poses", "latched")
+        names = ("received", "stops", "ticks", "plan", "poses", "latched", "pictures")
         return JSONResponse(
             {name: getattr(fake, name) for name in names} | {"position_mm": position}
         )
@@ -445,6 +491,8 @@ def application(fake: Fake) -> Starlette:
         Route("/scene", scene),
         Route("/api/files", files),
         Route("/api/preview", preview_of),
+        Route("/api/compared", compared_of),
+        Route("/camera/{name}", picture),
         Route("/stop", stop, methods=["POST"]),
         Route("/fake", hooks, methods=["GET", "POST"]),
         WebSocketRoute("/ws", lambda page: speak(fake, page)),

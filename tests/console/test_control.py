@@ -18,6 +18,8 @@ class ControlMachine(RuleBasedStateMachine):
         self.now = 1
         self.control = PageControl(lambda: self.now)
         self.pages: set[int] = set()
+        self.motion = 1
+        self.begun_in: dict[int, int] = {}
         self.begun: dict[int, tuple[int, int]] = {}
         self.ended: set[int] = set()
         self.newest = 0
@@ -57,12 +59,20 @@ class ControlMachine(RuleBasedStateMachine):
             self._end(self.control.give(page))
             assert self.control.holder != page
 
+    @rule(motion=st.integers(0, 2))
+    def another_motion(self, motion: int) -> None:
+        """The session ended, and another one may have begun."""
+        self.motion = motion and self.motion + motion
+
     @rule(number=st.integers(0, 5), hold=st.integers(1, 5))
     def hold(self, number: int, hold: int) -> None:
         if page := self._page(number):
-            press = self.control.hold(page, hold)
+            press = self.control.hold(page, hold, self.motion)
             if press is None:
                 return
+            assert self.motion, "there is something to move"
+            begun_in = self.begun_in.setdefault(press, self.motion)
+            assert begun_in == self.motion, "a press is over with its session"
             assert self.control.holder == page, "only who has control"
             assert press not in self.ended, "what ended is over"
             assert self.begun.setdefault(press, (page, hold)) == (page, hold)
@@ -73,7 +83,7 @@ class ControlMachine(RuleBasedStateMachine):
     def let_go(self, number: int, hold: int) -> None:
         if page := self._page(number):
             self._end(self.control.let_go(page, hold))
-            assert self.control.hold(page, hold) is None
+            assert self.control.hold(page, hold, 1) is None
 
     @invariant()
     def one_holder(self) -> None:
@@ -99,8 +109,8 @@ def test_a_press_that_was_let_go_before_it_arrived_is_over(hold: int) -> None:
     page = control.join("a")
     control.take(page, moving=False)
     control.let_go(page, hold)
-    assert control.hold(page, hold) is None
-    assert control.hold(page, hold + 1) is not None
+    assert control.hold(page, hold, 1) is None
+    assert control.hold(page, hold + 1, 1) is not None
 
 
 @pytest.mark.parametrize("moving", [False, True])
@@ -121,6 +131,6 @@ def test_two_consoles_at_once_never_number_a_press_alike() -> None:
         control.take(page, moving=False)
     seen: list[int | None] = []
     for hold in range(1, 20):
-        seen += [c.hold(p, hold) for c, p in zip(consoles, pages, strict=True)]
+        seen += [c.hold(p, hold, 1) for c, p in zip(consoles, pages, strict=True)]
     assert len(set(seen)) == len(seen)
     assert None not in seen

@@ -310,6 +310,7 @@ def test_cables_beyond_a_limit_are_named_in_newtons(desk: Visit) -> None:
 
 def test_nothing_known_is_shown_as_not_known(desk: Visit) -> None:
     keys = ("platform", "tensions_n", "clearance_mm", "next_stop", "preview", "motion", "busy")
+    keys += ("measured",)
     desk.fake.ask(state={**dict.fromkeys(keys), "reference": {"counts": False, "why_not": None}})
     for name in ("x", "tilt", "clearance", "stop", "following", "lost"):
         expect(desk.page.locator(f"#value-{name}")).to_have_text("–")

@@ -39,9 +39,9 @@ def moving(state: str, **wished: Any) -> dict[str, Any]:
 
 
 RUN = {"verb": "run", "text": ""}
-REST = {"home", "release", "load_plan", "plan", "plan_poses", "run", "jog_begin"}
+REST = {"home", "release", "load_plan", "compare", "plan", "plan_poses", "run", "jog_begin"}
 ALWAYS = {"stop", "jog_setting"}
-TAUGHT = {"teach", "edit_pose", "give_control"}
+TAUGHT = {"teach", "teach_at", "edit_pose", "give_control"}
 #: Name, situation, and the buttons that are possible in it; all others are not.
 TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
     ("at rest", {}, ALWAYS | TAUGHT | REST),
@@ -69,7 +69,7 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
         {"reference": {"counts": False, "why_not": "x"}},
         (ALWAYS | TAUGHT | REST) - {"run", "jog_begin"},
     ),
-    ("no plan", {"preview": None}, (ALWAYS | TAUGHT | REST) - {"run"}),
+    ("no plan", {"preview": None}, (ALWAYS | TAUGHT | REST) - {"run", "compare"}),
     ("plan failed", {"plan": {"passed": False}}, (ALWAYS | TAUGHT | REST) - {"run"}),
     ("plan not read yet", {"plan": None}, (ALWAYS | TAUGHT | REST) - {"run"}),
     ("planning", {"busy": {"verb": "plan", "text": ""}}, ALWAYS | TAUGHT),
@@ -103,7 +103,7 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
         ALWAYS | TAUGHT | {"jog", "jog_end"},
     ),
     ("jogging begins", {"busy": {"verb": "jog", "text": ""}}, ALWAYS | TAUGHT | {"jog_end"}),
-    ("position not known", {"platform": None}, (ALWAYS | TAUGHT | REST) - {"teach"}),
+    ("position not known", {"platform": None}, (ALWAYS | TAUGHT | REST) - {"teach", "teach_at"}),
     ("one pose", {"poses": [{}]}, (ALWAYS | TAUGHT | REST) - {"plan_poses"}),
     ("no pose", {"poses": []}, (ALWAYS | TAUGHT | REST) - {"plan_poses", "edit_pose"}),
 ]
@@ -231,6 +231,8 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     page = desk.page
     desk.take_control()
     desk.load()
+    page.locator("#compare-plan").click()
+    page.locator("#compare-end").click()
     desk.run()
     page.locator("#speed").fill("50")
     page.locator("#hold").click()
@@ -250,6 +252,10 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     for _ in range(2):
         page.locator("#teach").click()
         expect(page.locator("#notice")).to_have_text("teach: done")
+    page.locator("#pick").click()
+    page.locator("#scene-canvas").click()
+    page.locator("#pick-keep").click()
+    expect(page.locator("#poses li")).to_have_count(3)
     page.get_by_role("button", name="Move pose 2 up").click()
     page.get_by_role("textbox", name="Name of pose 1").fill("grip")
     page.get_by_role("textbox", name="Name of pose 1").press("Enter")
@@ -270,7 +276,18 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     names = {m.get("command", m["kind"]) for m in said}
     assert names == {
         *("take_control", "give_control", "load_plan", "plan", "run", "speed", "hold", "resume"),
-        *("stop", "home", "release", "reset", "teach", "move", "rename", "forget"),
+        *(
+            "stop",
+            "home",
+            "release",
+            "reset",
+            "teach",
+            "teach_at",
+            "compare",
+            "move",
+            "rename",
+            "forget",
+        ),
         *("jog_begin", "held", "let_go", "jog_end"),
     }
     for message in said:

@@ -9,7 +9,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from cdpr.console.server import ConsoleServer
 from cdpr.console.session import Console, ConsoleFiles
+from cdpr.console.watch import RunWatch
 from model.rig import load_rig
 from tests.cli.plans import RIG, write_short_plan
 from tests.console import fake_server
@@ -41,6 +42,13 @@ class Served:
         self.console.watch.say = self._say  # type: ignore[method-assign]
         self.console.verbs.start = self._start  # type: ignore[method-assign]
         self.server = ConsoleServer(self.console)
+
+    @contextmanager
+    def something_moves(self) -> Iterator[None]:
+        """A session of jogs is followed."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(RunWatch, "number", property(lambda _: 1))
+            yield
 
     def _say(self, command: str, **values: Any) -> str:
         self.said.append((command, values))
@@ -263,7 +271,7 @@ def test_everybody_may_stop(served: Served) -> None:
 
 
 def test_a_held_control_is_passed_on_for_who_has_control_only(served: Served) -> None:
-    with served.page() as first, served.page() as second:
+    with served.something_moves(), served.page() as first, served.page() as second:
         command(first, "take_control")
         second.send(held(1))
         first.send(held(3))
@@ -281,7 +289,7 @@ def test_a_held_control_is_passed_on_for_who_has_control_only(served: Served) ->
 
 
 def test_what_a_page_held_ends_when_the_page_is_gone(served: Served) -> None:
-    with served.page() as first:
+    with served.something_moves(), served.page() as first:
         command(first, "take_control")
         first.send(held(1))
         command(first, "stop")
@@ -289,6 +297,50 @@ def test_what_a_page_held_ends_when_the_page_is_gone(served: Served) -> None:
         while state(second)["control"]["held_by"] is not None:
             pass
     assert [name for name, _ in served.said] == ["held", "let_go"]
+
+
+def test_a_press_without_a_session_is_over_before_there_is_one(served: Served) -> None:
+    with served.page() as first:
+        command(first, "take_control")
+        first.send(held(1))
+        assert command(first, "stop")
+        with served.something_moves():
+            first.send(held(1))
+            assert command(first, "stop")
+            assert served.said == []
+            first.send(held(2))
+            assert command(first, "stop")
+            assert [name for name, _ in served.said] == ["held"]
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:8402", "[::1", "127.0.0.1.evil.example", "a b"]
+)
+def test_another_name_gets_nothing(served: Served, host: str) -> None:
+    """Of a site that lets its own name point here: its pages would be of one origin with us."""
+    for origin in ({}, {"Origin": f"http://{host}"}):
+        assert served.get("/scene", Host=host, **origin)[0] in (400, 403)
+        assert served.get("/static/main.js", Host=host, **origin)[0] in (400, 403)
+
+
+@pytest.mark.parametrize("host", ["localhost:9", "127.0.0.1", "[::1]:8402", "192.168.7.2:1"])
+def test_this_machine_s_names_and_addresses_are_ours(served: Served, host: str) -> None:
+    """As a tunnel, or another computer where that is allowed, has them."""
+    assert served.get("/scene", Host=host)[0] == 200
+
+
+def test_no_more_pages_than_can_be_served_are_open(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdpr.console.server.MOST_PAGES", 2)
+    with served.page() as first, served.page() as second:
+        state(first), state(second)
+        with pytest.raises((InvalidStatus, ConnectionClosed)):
+            served.page().recv(timeout=10)
+    while True:  # until the server has noticed that they are gone
+        with suppress(InvalidStatus, ConnectionClosed), served.page() as again:
+            state(again)
+            return
 
 
 def test_nothing_runs_that_was_not_seen_to_pass(served: Served) -> None:

@@ -252,6 +252,9 @@ class Quick:
             signal.pause()
         return seen_at(trigger)
 
+    def show(self) -> None:
+        pass
+
 
 def quick() -> Quick:
     return Quick(silent=False)

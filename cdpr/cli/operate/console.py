@@ -79,16 +79,6 @@ def console(
             why="the connection is not encrypted, and who knows the address can move the robot",
             next_step="use an SSH tunnel, or pass --allow-others in a network that you trust",
         )
-    try:
-        import uvicorn
-
-        from cdpr.console.server import ConsoleServer
-    except ImportError as error:
-        raise HardwareMissing(
-            f"the console needs {error.name}",
-            where="cdpr console",
-            next_step='install it: pip install "cdpr[console]"',
-        ) from None
     options = [("--interface", interface), ("--channel", channel)]
     files = ConsoleFiles(
         rig_file=rig,
@@ -102,13 +92,41 @@ def console(
         without_real_time=without_real_time,
         read_only=read_only,
     )
+    serve(files, plan, host, port)
+
+
+def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
+    """Serves the page until it is interrupted, and prints its address.
+
+    Args:
+        files: What the console is started with.
+        plan: Shown at first; None for none.
+        host: Address to listen on.
+        port: 0 for a free one.
+
+    Raises:
+        HardwareMissing: A library of the server is not installed.
+        BadInput: The plan cannot be shown, or the address cannot be used.
+    """
+    try:
+        import uvicorn
+
+        from cdpr.console.server import ConsoleServer
+    except ImportError as error:
+        raise HardwareMissing(
+            f"the console needs {error.name}",
+            where="cdpr console",
+            next_step='install it: pip install "cdpr[console]"',
+        ) from None
     shown = Console(files)
     if plan is not None:
         shown.load_plan(plan)
     with _listening(host, port) as listener:
-        server = ConsoleServer(shown)
+        server = ConsoleServer(shown, host=host)
         at = listener.getsockname()[1]
-        out.print(f"console of {files.rig.name}: http://{host}:{at}/?token={server.token}")
+        out.print(
+            f"console of {files.rig.name}: http://{host}:{at}/?token={server.token}", soft_wrap=True
+        )
         out.print("Ctrl-C ends the console, not what moves", soft_wrap=True)
         config = uvicorn.Config(server.app(), log_level="warning", ws_max_size=4096)
         uvicorn.Server(config).run(sockets=[listener])

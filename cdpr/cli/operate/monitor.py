@@ -274,12 +274,11 @@ def _where(view: RobotView, now: RobotNow) -> str:
     x, y, z = now.pose.position * 1e3
     tilt = math.degrees(math.acos(min(max(now.pose.rotation[2, 2], -1.0), 1.0)))
     text = f"platform {x:.1f}, {y:.1f}, {z:.1f} mm, tilt {tilt:.2f}° by the drives"
-    if now.clearance is None:
+    if now.nearest is None:
         return text
-    distance, first, second = now.clearance
     return (
-        f"{text}; clearance {distance * 1e3:.1f} of {view.required_clearance * 1e3:.1f} mm,"
-        f" {first} – {second}"
+        f"{text}; clearance {now.nearest.distance * 1e3:.1f} of"
+        f" {view.required_clearance * 1e3:.1f} mm, {now.nearest.first} – {now.nearest.second}"
     )
 
 

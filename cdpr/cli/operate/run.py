@@ -1,4 +1,4 @@
-"""`cdpr run` runs a plan on the drives and measures it; `cdpr demo` does so in simulation."""
+"""`cdpr run`: runs a plan on the drives and measures it."""
 
 from __future__ import annotations
 
@@ -22,22 +22,16 @@ from cdpr.cli.options import (
     require_unused,
     rig_on_bus,
 )
-from cdpr.cli.output import Terminal, out, show_facts
+from cdpr.cli.output import Terminal, out
 from drivers.can_bus import IN_PROCESS
 from executor import runner
 from executor.drives import is_simulated
-from executor.recording.run_course import free_folder
-from executor.recording.run_folder import RunFolder
 from executor.runner import MotionProposal, RunResult
 from model.errors import BadInput
 from model.files.documents import millimetres
-from model.files.examples import PAPER_RIG, ready_folder
-from model.plan import load_plan, plan_facts, plan_from_document
+from model.plan import load_plan
 from model.pose import Pose
-from model.rig import Rig, load_rig
-from model.scene import load_scene
-from planner.planning import plan_path
-from planner.settings import OptimalSettings
+from model.rig import Rig
 
 
 def run(
@@ -179,42 +173,3 @@ def _refuse_camera_options(camera: list[str] | None, no_clearance_stop: bool) ->
 
 def _level(position_mm: tuple[float, float, float] | None) -> Pose | None:
     return None if position_mm is None else Pose.level(millimetres(list(position_mm)))
-
-
-# `cdpr demo`: the whole way on the paper's rig, simulated.
-
-
-def demo(
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder to create", metavar="DIR")
-    ] = None,
-    environment: Annotated[
-        int, typer.Option(min=1, max=3, help="number of the paper's environment")
-    ] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
-) -> None:
-    """Plan, check, run on simulated drives, track with a synthetic camera, and report.
-
-    [dim]Example:[/dim]
-
-      cdpr demo --environment 3
-    """
-    folder = output or free_folder("demo")
-    RunFolder.require_free(folder)
-    rig = load_rig(ready_folder() / PAPER_RIG)
-    scene = load_scene(ready_folder() / f"environment_{environment}.yaml")
-    document = plan_path(rig, scene, OptimalSettings(seed=seed), Terminal())
-    show_facts("plan", plan_facts(document))
-    with RunSupervisor(lambda result: show(result, False)) as supervisor:
-        result = runner.run(
-            plan_from_document(document),
-            rig,
-            folder=folder,
-            realtime=False,
-            listener=Terminal(),
-            confirm=agreement(supervisor, rig, False, False),
-            supervisor=supervisor,
-        )
-        show_files(result, False)
-    out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
-    raise typer.Exit(result.exit_code)

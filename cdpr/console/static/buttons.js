@@ -54,6 +54,7 @@ export const BUTTONS = {
   reset: [...OPERATOR, "idle", "latched"],
   release: [...OPERATOR, "idle"],
   load_plan: [...OPERATOR, "idle"],
+  compare: [...OPERATOR, "idle", "planned"],
   plan: [...OPERATOR, "idle"],
   plan_poses: [...OPERATOR, "two_poses", "idle"],
   run: [...OPERATOR, "idle", "unlatched", "homed", "planned", "proved"],
@@ -62,6 +63,7 @@ export const BUTTONS = {
   jog: [...OPERATOR, "unlatched", "jog_ready"],
   jog_setting: ["fresh", "writable"],
   teach: [...OPERATOR, "located"],
+  teach_at: [...OPERATOR, "located"],
   edit_pose: [...OPERATOR, "poses"],
 };
 

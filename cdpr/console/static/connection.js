@@ -27,6 +27,7 @@ export class Connection extends EventTarget {
   #id = 0;
   #tries = 0;
   #wasFresh = false;
+  #due = 0; // timer of the moment at which the last state becomes too old
 
   start() {
     this.#connect();
@@ -107,6 +108,8 @@ export class Connection extends EventTarget {
     if (message.kind !== "state") return;
     this.state = message;
     this.#received = performance.now();
+    clearTimeout(this.#due);
+    this.#due = setTimeout(() => this.#tick(), 1 + 1000 * Math.max(0, STALE_S - this.freshness().age));
     this.dispatchEvent(new Event("state"));
   }
 

@@ -32,6 +32,18 @@ export function motionText({ motion, busy, jog, latched }) {
   return latched === null ? "At rest" : "Fault latched";
 }
 
+/** A pose by the cameras that is older says nothing of now, [s]. */
+const FRESH_S = 1;
+export const isFresh = (measured) => measured !== null && measured.age_s <= FRESH_S;
+
+function measuredClearance(measured) {
+  if (measured === null) return "";
+  if (!isFresh(measured)) return `no measured pose for ${known(measured.age_s, 0, "s")}`;
+  const { clearance, within_mm: within, stated } = measured;
+  if (clearance) return `measured ${known(clearance.distance_mm, 1)} (${known(clearance.low_mm, 1)}–${known(clearance.high_mm, 1)})`;
+  return `pose measured to ±${known(within, 2, "mm")}${stated ? "" : " by scatter alone"}`;
+}
+
 export class Live {
   #bars = []; // per cable {bar, value, row}
 
@@ -50,18 +62,22 @@ export class Live {
     this.#tensions(state);
   }
 
-  #pose({ platform }) {
-    ["x", "y", "z"].forEach((axis, k) => tile(axis, known(platform?.position_mm[k], 1)));
+  #pose({ platform, measured }) {
+    ["x", "y", "z"].forEach((axis, k) => {
+      tile(axis, known(platform?.position_mm[k], 1));
+      write(at(`measured-${axis}`), measured ? `measured ${isFresh(measured) ? known(measured.position_mm[k], 2) : "–"}` : "");
+    });
     tile("tilt", known(platform?.tilt_deg, 2));
     const note = platform === null ? "not known" : platform.source === "plan" ? "by the plan" : `turn ${known(platform.turn_deg, 2)}°`;
     write(at("note-tilt"), note);
   }
 
-  #motion({ clearance_mm: clearance, next_stop: stop, motion }) {
+  #motion({ clearance_mm: clearance, measured, next_stop: stop, motion }) {
     tile("clearance", known(clearance?.now, 1));
     const low = Boolean(clearance) && clearance.now < clearance.required;
     at("tile-clearance").classList.toggle("bad", low);
     write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${known(clearance.required, 0, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or not known");
+    write(at("note-measured"), measuredClearance(measured));
     tile("stop", stop ? known(stop.distance_mm, 0) : "–");
     write(at("note-stop"), stop ? `${stop.name} in ${duration(stop.seconds)}` : "none ahead");
     tile("following", known(motion?.following_error_mm, 2));

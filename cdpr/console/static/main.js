@@ -9,6 +9,8 @@ import { Events } from "./events.js";
 import { bindJog } from "./jog.js";
 import { Live } from "./live.js";
 import { Operate } from "./operate.js";
+import { Pick } from "./pick.js";
+import { Pictures } from "./pictures.js";
 import { Scene } from "./scene.js";
 import { bindStop } from "./stop.js";
 import { Teach } from "./teach.js";
@@ -34,7 +36,7 @@ async function command(name, fields) {
   return answer;
 }
 
-const page = { command, situation, say, scene };
+const page = { command, situation, say, scene, view };
 const stopBar = bindStop(connection, () => {
   cancelDialog();
   jog.end("STOP");
@@ -42,7 +44,7 @@ const stopBar = bindStop(connection, () => {
   const { state, stale } = situation();
   return !stale && !state.jog.ready && !isActive(state.motion);
 });
-const live = new Live(), curves = new Curves(), events = new Events(), teach = new Teach(page), operate = new Operate(page);
+const live = new Live(), curves = new Curves(), events = new Events(), pictures = new Pictures(), teach = new Teach(page), pick = new Pick(page), operate = new Operate(page);
 const jog = bindJog(connection, situation, command);
 
 // Views: beside the live view on a wide screen, one of five on a narrow one.
@@ -108,8 +110,10 @@ connection.addEventListener("state", () => {
     scene.show(state);
     curves.show(state, performance.now());
     events.show(state);
+    pictures.show(state);
     operate.show(state);
     teach.show(state);
+    pick.show();
     jog.show(state);
     stopBar.show(state.motion);
     checkDialog();

@@ -23,6 +23,8 @@ function headline(text) {
 export class Operate {
   plan = null; // that is loaded: what /api/preview gave
   #page;
+  #compared = null; // id of the plan that is compared with it
+  #other = null; // that plan: what /api/compared gave
   #preview = null; // id of the plan that is being read or was
   #curves = new PlanCurves();
   #outcome = "";
@@ -48,6 +50,8 @@ export class Operate {
     at("release").addEventListener("click", () => this.#release());
     at("run").addEventListener("click", () => this.#run());
     at("load-plan").addEventListener("click", () => this.#withFile("plan-file", (file) => page.command("load_plan", { file })));
+    at("compare-plan").addEventListener("click", () => this.#withFile("plan-file", (file) => page.command("compare", { file })));
+    at("compare-end").addEventListener("click", () => page.command("compare", { file: null }));
     at("make-plan").addEventListener("click", () => this.#withFile("scene-file", (scene) => page.command("plan", { scene, objective: chosen("objective") })));
     at("plan-time").addEventListener("input", () => this.#look());
     at("outcome-seen").addEventListener("click", () => (at("outcome").hidden = true));
@@ -75,7 +79,7 @@ export class Operate {
   }
 
   show(state) {
-    const { control, latched, motion, outcome, busy, preview } = state;
+    const { control, latched, motion, outcome, busy, preview, compared } = state;
     write(at("control-text"), state.read_only ? "This console is read-only: you see everything, and STOP works." : control.yours ? "You have control." : control.held_by ? `${control.held_by} has control. You see everything, and STOP works.` : "Control is free. Take it to command the robot.");
     at("take-control").hidden = control.yours;
     at("give-control").hidden = !control.yours;
@@ -83,6 +87,7 @@ export class Operate {
     write(at("latched-cause"), latched ?? "");
     this.#motion(state);
     if (preview !== this.#preview) this.#read(preview);
+    if (compared !== this.#compared) this.#readCompared(compared);
     if (isActive(motion)) this.#leave();
     at("plan-look").hidden = !(this.plan?.moments.length > 1) || isActive(motion);
     write(at("busy"), busy ? `${VERBS[busy.verb] ?? busy.verb}: ${busy.text || "…"}` : "");
@@ -138,6 +143,37 @@ export class Operate {
       else this.#page.say("The plan cannot be read from the server.", true);
     }
     this.#showPlan();
+    this.#showComparison();
+  }
+
+  async #readCompared(id) {
+    this.#compared = id;
+    this.#other = null;
+    if (id !== null) {
+      const response = await fetch(address("/api/compared")).catch(() => null);
+      if (id !== this.#compared) return; // another one came meanwhile
+      if (response?.ok) this.#other = await response.json();
+      else this.#page.say("The plan to compare cannot be read from the server.", true);
+    }
+    this.#page.scene.compare(this.#other);
+    this.#showComparison();
+  }
+
+  #showComparison() {
+    const { plan } = this, other = this.#other;
+    at("comparison").hidden = !plan || !other;
+    if (!plan || !other) return;
+    write(at("comparison-this"), plan.name);
+    write(at("comparison-other"), other.name);
+    const rows = [
+      ["Check", (one) => (one.passed ? "passed" : "failed")],
+      ["Length", (one) => known(one.length_mm, 0, "mm")],
+      ["Duration", (one) => duration(one.duration_s)],
+      ["Least clearance", (one) => known(one.least_clearance_mm, 1, "mm")],
+      ["Largest tension", (one) => known(one.largest_tension_n, 1, "N")],
+    ];
+    at("comparison-rows").replaceChildren(...rows.map(([title, text]) =>
+      make("tr", {}, make("th", { scope: "row" }, title), make("td", {}, text(plan)), make("td", {}, text(other)))));
   }
 
   #showPlan() {

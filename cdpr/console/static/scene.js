@@ -2,19 +2,57 @@
 
 import { address } from "./connection.js";
 import { at, duration, known, make, write } from "./elements.js";
+import { isFresh } from "./live.js";
 
 const LAYERS = {
   obstacles: "Obstacles", robot: "Platform", numbers: "Cable numbers", frame: "Frame", floor: "Floor", workspace: "Workspace",
-  path: "Planned path", raw: "Raw path", tree: "Search tree", trail: "Driven path",
+  path: "Planned path", raw: "Raw path", tree: "Search tree", trail: "Driven path", other: "Compared path", nearest: "Closest pair", measured: "Measured position",
 };
-const COLOURS = { obstacles: "obstacle", robot: "platform", numbers: "ink", frame: "frame", floor: "line", workspace: "muted", path: "ink", raw: "raw", tree: "tree", trail: "encoder" };
+const COLOURS = { obstacles: "obstacle", robot: "platform", numbers: "ink", frame: "frame", floor: "line", workspace: "muted", path: "ink", raw: "raw", tree: "tree", trail: "encoder", other: "raw", nearest: "limit", measured: "tag" };
 const HIDDEN_AT_FIRST = ["tree", "raw"];
 const TRAIL_STEP_MM = 2, TRAIL_MOST = 600;
+
+/** Strokes and labels of several parts, each `{strokes, labels}` or null. */
+const drawn = (parts) => ({ strokes: parts.flatMap((part) => part?.strokes ?? []), labels: parts.flatMap((part) => part?.labels ?? []) });
+
+/** A line between the two nearest points, with the distance at its middle. */
+function closestPair(clearance) {
+  if (!clearance) return null;
+  const [from, to] = clearance.points_mm, middle = from.map((v, k) => (v + to[k]) / 2);
+  return {
+    strokes: [{ layer: "nearest", role: "limit", segments: [[...from, ...to]], width: 3, dash: null }],
+    labels: [{ layer: "nearest", text: known(clearance.now, 1, "mm"), at: middle, mark: "" }],
+  };
+}
+
+const POINTS = 24, LEAST_SHARE = 0.04;
+/** The first of 1, 2, 5, 10, 20 … that is no less. */
+const roundUp = (wanted) => {
+  const power = 10 ** Math.floor(Math.log10(wanted));
+  return [1, 2, 5, 10].find((one) => one * power >= wanted * (1 - 1e-9)) * power;
+};
+
+/** Three principal ellipses about the measured position, drawn large enough to be seen, and by how much larger they are. */
+function ellipsoid(measured, size) {
+  if (!measured) return null;
+  const { position_mm: middle, half_axes_mm: axes, within_mm: within } = measured;
+  const larger = roundUp(Math.max(1, (LEAST_SHARE * size) / Math.max(within, 1e-3)));
+  const on = ([u, v], k) => {
+    const angle = (2 * Math.PI * k) / POINTS;
+    return middle.map((value, c) => value + larger * (Math.cos(angle) * u[c] + Math.sin(angle) * v[c]));
+  };
+  const rings = [[0, 1], [0, 2], [1, 2]].map((pair) => pair.map((k) => axes[k]));
+  const segments = rings.flatMap((pair) => Array.from({ length: POINTS }, (_, k) => [...on(pair, k), ...on(pair, k + 1)]));
+  const legend = `Measured to ±${known(within, within < 1 ? 2 : 1, "mm")} (95 %)${larger > 1 ? `, ellipsoid drawn ${larger}×` : ""}`;
+  return { strokes: [{ layer: "measured", role: "tag", segments, width: 1.6, dash: null }], labels: [], legend };
+}
 
 export class Scene {
   #view = null;
   #base = null;
   #plan = null;
+  #other = null; // the plan that is compared
+  #pick = null; // {height, point}: where a goal is being picked
   #trail = [];
   #shown = "";
   #moment = null; // of the plan, while it is looked through
@@ -30,15 +68,21 @@ export class Scene {
     at("scene-reset").addEventListener("click", () => this.#view.reset());
     this.#layers();
     if (this.#plan) this.load(this.#plan);
+    if (this.#other) this.compare(this.#other);
   }
 
   /** The platform where it is now; a plan that is looked through is left for it as soon as something moves. */
-  show({ platform, tensions_n: tensions, tension_limits_n: limits, motion, jog }) {
+  show({ platform, tensions_n: tensions, tension_limits_n: limits, clearance_mm: clearance, measured, motion, jog }) {
     if (!this.#view) return;
     if ((motion || jog.moving) && platform?.source === "drives") this.#drive(platform.position_mm);
     if (this.#moment) return;
-    const shown = JSON.stringify([platform, tensions?.map((tension) => Math.round(2 * tension))]);
-    if (shown !== this.#shown) this.#view.show(platform && { p: platform.position_mm, r: platform.rotation, exits: platform.exits_mm, tensions });
+    const fresh = isFresh(measured) ? { ...measured, age_s: 0 } : null;
+    const shown = JSON.stringify([platform, tensions?.map((tension) => Math.round(2 * tension)), clearance, fresh, this.#pick]);
+    if (shown !== this.#shown) {
+      const measure = ellipsoid(fresh, this.#view.size()), more = drawn([closestPair(clearance), measure, this.#goal()]);
+      write(at("scene-legend"), measure && !this.#hidden.has("measured") ? measure.legend : "");
+      this.#view.show(platform && { p: platform.position_mm, r: platform.rotation, exits: platform.exits_mm, tensions, ...more });
+    }
     this.#shown = shown; // at rest nothing is drawn again
     if (limits.join() !== this.#base.tension_limits?.join()) {
       this.#base.tension_limits = limits;
@@ -53,6 +97,42 @@ export class Scene {
     if (!this.#view) return;
     this.#draw();
     this.#layers();
+  }
+
+  /** Another plan's path beside the loaded one's, or null. */
+  compare(plan) {
+    this.#other = plan;
+    if (!this.#view) return;
+    this.#draw();
+    this.#layers();
+  }
+
+  /** The point [mm] at a height that is drawn where a pointer is, or null. */
+  pointAt({ clientX, clientY }, height) {
+    const box = at("scene-canvas").getBoundingClientRect();
+    return this.#view?.pick(clientX - box.left, clientY - box.top, height) ?? null;
+  }
+
+  /** The highest that a goal may be picked, [mm]: the top of all that is drawn. */
+  highest() {
+    const heights = (this.#base?.surfaces ?? []).flatMap(({ vertices }) => vertices.map(([, , z]) => z));
+    return Math.ceil(Math.max(100, ...heights));
+  }
+
+  /** Shows a plane at a height, and a goal on it: `{height, point}`; null ends it. */
+  showPick(pick) {
+    const moved = pick?.height !== this.#pick?.height;
+    this.#pick = pick;
+    if (this.#view && moved) this.#draw();
+  }
+
+  #goal() {
+    if (!this.#pick?.point) return null;
+    const { point } = this.#pick, below = [point[0], point[1], 0];
+    return {
+      strokes: [{ layer: "pick", role: "encoder", segments: [[...point, ...below]], width: 2, dash: [4, 4] }],
+      labels: [{ layer: "pick", text: "goal", at: point, mark: "ring" }],
+    };
   }
 
   /** A moment of the plan, shown instead of the platform; null goes back to it. */
@@ -80,6 +160,15 @@ export class Scene {
       const more = this.#plan?.[kind] ?? [], replaced = new Set(more.map((one) => one.layer));
       parts[kind] = [...this.#base[kind].filter((one) => !replaced.has(one.layer)), ...more];
     }
+    if (this.#other) {
+      const path = this.#other.strokes.filter((one) => one.layer === "path");
+      parts.strokes.push(...path.map((one) => ({ ...one, layer: "other", role: "raw", width: 3, ahead: true })));
+    }
+    if (this.#pick) {
+      const floor = this.#base.strokes.filter((one) => one.layer === "floor"), { height } = this.#pick;
+      const raised = ([x, y, , u, v]) => [x, y, height, u, v, height];
+      parts.strokes.push(...floor.map((one) => ({ ...one, layer: "pick", role: "encoder", opacity: 0.45, segments: one.segments.map(raised) })));
+    }
     const segments = this.#trail.slice(1).map((point, k) => [...this.#trail[k], ...point]);
     parts.strokes.push({ layer: "trail", role: "encoder", segments, width: 2.5, opacity: 1, dash: [], ahead: true });
     return parts;
@@ -91,7 +180,7 @@ export class Scene {
 
   #layers() {
     const { surfaces, strokes } = this.#parts();
-    const drawn = new Set([...surfaces, ...strokes].map((one) => one.layer)).add("robot").add("numbers");
+    const drawn = new Set([...surfaces, ...strokes].map((one) => one.layer)).add("robot").add("numbers").add("nearest").add("measured");
     const boxes = Object.keys(LAYERS).filter((layer) => drawn.has(layer)).map((layer) => {
       const box = make("input", { type: "checkbox", checked: !this.#hidden.has(layer) });
       box.addEventListener("change", () => {

@@ -1,0 +1,322 @@
+"""A million hostile requests and messages to the console's server, while a robot could be jogged.
+
+    python benchmarks/console_abuse.py [--messages 1000000]
+
+The server is `cdpr console` in a process of its own, with simulated drives over UDP in real time;
+an operator's page has control and has enabled the drives for jogging. One in ten is an HTTP
+request: no token, a wrong one, another origin, another host, paths that leave the folder, garbage,
+heads that are too long. The others come over sockets of pages without control: broken JSON, wrong
+types, values out of range, what is too long, binary, deep, commands, and what the operator's page
+said before. Nothing may move, nothing may be started, and the server's memory, threads and
+descriptors must stay where they were. Prints the figures; exit code 1 if anything was wrong. It
+takes a quarter of an hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tests.cli.plans import RIG  # noqa: E402
+from tests.scenarios.test_console import Operator, console, drives, operator  # noqa: E402
+
+#: Messages that are sent before their answers are read; sockets and connections at a time.
+BATCH, SOCKETS, CONNECTIONS = 40, 6, 4
+COMMANDS = (
+    *("hold", "resume", "home", "reset", "release", "run", "jog_begin", "jog_end"),
+    *("take_control", "load_plan", "compare", "plan", "speed", "teach", "teach_at", "rename"),
+)
+
+
+class Attack:
+    """What is sent, and what came of it."""
+
+    def __init__(self, address: str, heard: list[str], seed: int) -> None:
+        """Against an address with its token; ``heard`` was said by the page that has control."""
+        self.host, _, self.token = address.removeprefix("http://").partition("/?token=")
+        self._heard, self._random = heard, random.Random(seed)
+        self.sent: Counter[str] = Counter()
+        self.answers: Counter[str] = Counter()
+
+    def message(self) -> tuple[str, str | bytes]:
+        """Its kind, and what is sent."""
+        pick = self._random.random()
+        if pick < 0.0005:
+            return "too long", "x" * 5000
+        if pick < 0.001:
+            return "binary", self._random.randbytes(200)
+        if pick < 0.2:
+            return "replayed", self._random.choice(self._heard)
+        if pick < 0.4:
+            return "not in control", json.dumps(self._command())
+        if pick < 0.6:
+            return "out of range", json.dumps(self._held(1e9 * (self._random.random() - 0.5)))
+        if pick < 0.8:
+            text = json.dumps(self._held(1.0))
+            at = self._random.randrange(len(text))
+            return "broken", text[:at] + self._random.choice('{}[]",:\\\0é9') + text[at + 1 :]
+        if pick < 0.9:
+            return "deep", "[" * self._random.randrange(1, 1500)
+        return "other JSON", json.dumps(self._random.choice([None, 1, "x", [], {}, {"kind": 1}]))
+
+    def _command(self) -> dict[str, Any]:
+        more = {"file": "../../etc/passwd", "percent": 10**6, "index": -1, "to": 2**70, "name": ""}
+        extra = {k: v for k, v in more.items() if self._random.random() < 0.3}
+        return {"kind": "command", "id": 1, "command": self._random.choice(COMMANDS), **extra}
+
+    def _held(self, value: float) -> dict[str, Any]:
+        said: dict[str, Any] = {
+            "kind": "held", "hold": 1, "direction": [0.0, 0.0, 1.0], "frame": "world",
+            "step_mm": None, "speed_mm_s": 5.0, "seq": 1,
+        }  # fmt: skip
+        key = self._random.choice(["hold", "direction", "frame", "step_mm", "speed_mm_s"])
+        said[key] = [value] * 3 if key == "direction" else value
+        return said
+
+    async def sockets(self, count: int) -> None:
+        """Sends so many messages by a page without control."""
+        left = count
+        while left > 0:
+            with suppress(ConnectionClosed, InvalidHandshake, OSError):
+                async with self._page() as page:
+                    while left > 0:
+                        left -= await self._batch(page, min(BATCH, left))
+
+    def _page(self) -> connect:
+        address = f"ws://{self.host}/ws?token={self.token}"
+        origin: Any = f"http://{self.host}"
+        return connect(address, origin=origin, max_queue=256)
+
+    async def _batch(self, page: ClientConnection, size: int) -> int:
+        """Sends a few, reads their answers; how many went out."""
+        owed = 0
+        for k in range(size):
+            kind, text = self.message()
+            self.sent[kind] += 1
+            await page.send(text)
+            if kind in ("too long", "binary"):  # this ends the socket
+                await page.wait_closed()
+                return k + 1
+            # A page without control gets no answer to what is held by a press.
+            owed += not (kind == "replayed" or self._is_whole(text))
+        while owed:
+            said = json.loads(await page.recv())
+            if said["kind"] == "answer":
+                owed -= 1
+                self.answers["done" if said["ok"] else "refused"] += 1
+        return size
+
+    def _is_whole(self, text: str | bytes) -> bool:
+        """A held message that broke into another whole one is taken without a word."""
+        from cdpr.console.commands import Held, LetGo, NotAMessage, parse_message
+
+        with suppress(NotAMessage):
+            return isinstance(parse_message(str(text)), Held | LetGo)
+        return False
+
+    async def requests(self, count: int) -> None:
+        """Sends so many HTTP requests."""
+        left = count
+        while left > 0:
+            with suppress(OSError, asyncio.IncompleteReadError, ValueError):
+                host, _, port = self.host.rpartition(":")
+                reader, writer = await asyncio.open_connection(host, int(port))
+                try:
+                    while left > 0:
+                        left -= 1
+                        await self._request(reader, writer)
+                finally:
+                    writer.close()
+
+    async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        kind, request = self.request()
+        self.sent[f"HTTP {kind}"] += 1
+        writer.write(request)
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), 30)
+        status = head.split(b" ", 2)[1].decode()
+        self.answers[f"HTTP {status}"] += 1
+        length = [
+            line for line in head.split(b"\r\n") if line.lower().startswith(b"content-length")
+        ]
+        if length:
+            await reader.readexactly(int(length[0].split(b":")[1]))
+        if b"connection: close" in head.lower() or not length:
+            raise ConnectionError
+
+    def request(self) -> tuple[str, bytes]:
+        """Its kind, and what is sent."""
+        path = self._random.choice(["/", "/scene", "/api/files", "/runs/x", "/camera/x", "/ws"])
+        token = f"?token={self.token}"
+        kinds = {
+            "no token": (path, self.host, ""),
+            "wrong token": (f"{path}?token={self._random.random()}", self.host, ""),
+            "other origin": (path + token, self.host, "Origin: http://evil.example\r\n"),
+            "other host": (path + token, "evil.example:80", "Origin: http://evil.example:80\r\n"),
+            "outside": (f"/runs/../../{path}%2e%2e/passwd{token}", self.host, ""),
+            "long head": (path, self.host, f"X: {'y' * 70_000}\r\n"),
+        }
+        kind = self._random.choice([*kinds, "garbage"])
+        if kind == "garbage":
+            return kind, self._random.randbytes(60) + b"\r\n\r\n"
+        if kind == "long head" and self._random.random() < 0.98:
+            kind = "no token"
+        where, host, more = kinds[kind]
+        verb = self._random.choice(["GET", "POST", "PUT", "DELETE", "OPTIONS"])
+        return kind, f"{verb} {where} HTTP/1.1\r\nHost: {host}\r\n{more}\r\n".encode()
+
+
+class Watched:
+    """The server's process, from outside."""
+
+    def __init__(self, process: int) -> None:
+        """Looked at now."""
+        self._process = Path(f"/proc/{process}")
+        self.looks = [self._look()]
+
+    def _look(self) -> tuple[float, int, int]:
+        """Memory [MB], threads, descriptors."""
+        lines = (self._process / "status").read_text().splitlines()
+        values = dict(line.split(":", 1) for line in lines)
+        memory = int(values["VmRSS"].split()[0]) / 1024.0
+        return memory, int(values["Threads"]), len(os.listdir(self._process / "fd"))
+
+    async def look(self, every: float) -> None:
+        """Again and again."""
+        while True:
+            await asyncio.sleep(every)
+            self.looks.append(self._look())
+
+
+class Holder:
+    """The page that has control and holds nothing; nothing may move meanwhile."""
+
+    def __init__(self, address: str) -> None:
+        """Not connected yet."""
+        self.host, _, self.token = address.removeprefix("http://").partition("/?token=")
+        self.wrong: list[str] = []
+        self.states = self.moments = 0
+        self._stood: dict[int, list[int]] = {}
+
+    async def watch(self) -> None:
+        """Takes control and looks; a session that ends for want of a press is begun again."""
+        origin: Any = f"http://{self.host}"
+        address = f"ws://{self.host}/ws?token={self.token}"
+        async with connect(address, origin=origin, max_queue=256) as page:
+            await self._say(page, "take_control")
+            while True:
+                said = json.loads(await page.recv())
+                if said["kind"] == "state":
+                    await self._look(page, said)
+
+    async def _look(self, page: ClientConnection, state: dict[str, Any]) -> None:
+        self.states += 1
+        if (state["busy"] or {"verb": "jog"})["verb"] != "jog":
+            self.wrong.append(f"`cdpr {state['busy']['verb']}` was started")
+        motion = state["motion"]
+        if motion is None:
+            if state["busy"] is None and self.states % 40 == 0:
+                await self._say(page, "jog_begin")
+            return
+        if motion["state"] != "moving":
+            return
+        self.moments += 1
+        stands = [drive["set_counts"] for drive in motion["drives"]]
+        before = self._stood.setdefault(motion["process"], stands)
+        if stands != before and len(self.wrong) < 9:
+            self.wrong.append(f"set-points moved: {before} to {stands}")
+
+    async def _say(self, page: ClientConnection, command: str) -> None:
+        await page.send(json.dumps({"kind": "command", "id": 1, "command": command}))
+
+
+async def attacked(attack: Attack, count: int, watched: Watched, holder: Holder) -> None:
+    """All of it; an eighth first, after which memory must stay."""
+    looking = asyncio.create_task(watched.look(5.0))
+    holding = asyncio.create_task(holder.watch())
+    while not holder.moments:
+        await asyncio.sleep(0.1)
+    for part in (count // 8, count - count // 8):
+        web = part // 10
+        each, pages = web // CONNECTIONS, (part - web) // SOCKETS
+        rest = [attack.requests(each) for _ in range(CONNECTIONS)]
+        await asyncio.gather(*rest, *(attack.sockets(pages) for _ in range(SOCKETS)))
+        watched.looks.append(watched._look())
+        if part == count // 8:
+            watched.looks = watched.looks[-1:]
+    if holding.done():
+        holder.wrong.append(f"the page in control was lost: {holding.exception()}")
+    looking.cancel()
+    holding.cancel()
+
+
+def enabled(me: Operator) -> list[str]:
+    """Enables the drives and jogs a little; what the page said of it."""
+    heard: list[str] = []
+    send = me._page.send
+    me._page.send = lambda text: (heard.append(text), send(text))[1]  # type: ignore[method-assign]
+    assert me.command("jog_begin")["ok"]
+    me.until(lambda state: state["jog"]["ready"])
+    me.jog(2, 2.0)
+    me._page.send = send  # type: ignore[method-assign]
+    # STOP is for everybody: it is no attack.
+    return [text for text in heard if "held" in text or "let_go" in text]
+
+
+def main() -> int:
+    """Prints the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--messages", type=int, default=1_000_000)
+    options = parser.parse_args()
+    wrong = []
+    with ExitStack() as stack:
+        place = stack.enter_context(tempfile.TemporaryDirectory())
+        for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+            os.environ[name] = place  # no run of another program is seen, and none is stopped
+        tempfile.tempdir = None
+        os.chdir(place)
+        bus = stack.enter_context(drives(RIG, 7))
+        process, address = stack.enter_context(console(RIG, bus))
+        with operator(address) as me:
+            attack = Attack(address, enabled(me), 1)
+        watched, holder, began = Watched(process.pid), Holder(address), time.monotonic()
+        asyncio.run(attacked(attack, options.messages, watched, holder))
+        seconds = time.monotonic() - began
+        wrong += holder.wrong
+        wrong += [] if process.poll() is None else ["the server ended"]
+        with operator(address) as me:
+            me.command("stop")
+            me.until(lambda state: state["busy"] is None)
+        os.chdir("/")
+    total = sum(attack.sent.values())
+    print(f"{total} in {seconds:.0f} s: {dict(sorted(attack.sent.items()))}")
+    print(f"the drives stood in all of {holder.moments} states with a session enabled")
+    print(f"answered: {dict(sorted(attack.answers.items()))}")
+    first, last = watched.looks[0], watched.looks[-1]
+    for name, a, b in zip(("memory [MB]", "threads", "descriptors"), first, last, strict=True):
+        print(f"{name:12} {a:.0f} after an eighth, {b:.0f} at the end")
+    print(f"memory between {min(watched.looks)[0]:.1f} and {max(watched.looks)[0]:.1f} MB")
+    wrong += [] if last[0] < 1.1 * first[0] + 5.0 else ["memory grew"]
+    wrong += [] if last[2] <= first[2] + 8 else ["descriptors are left"]
+    wrong += [] if not attack.answers["done"] else [f"{attack.answers['done']} were obeyed"]
+    print("\n".join(["wrong: nothing"] if not wrong else ["wrong:", *wrong]))
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,47 @@
+"""Random sequences of what happens at consoles, against a session of jogs in simulated time.
+
+    python benchmarks/console_sequences.py [--count 100000] [--seed 1]
+
+What happens, and how each cycle is judged, is in `tests/console/sequences.py`. Prints what was done
+and what was wrong; exit code 1 if anything was. 100 000 sequences take an hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tests.console.sequences import sequences  # noqa: E402
+
+
+def main() -> int:
+    """Prints the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+            os.environ[name] = place
+        tempfile.tempdir = None
+        os.chdir(place)
+        began = time.monotonic()
+        figures = sequences(options.count, options.seed)
+        seconds = time.monotonic() - began
+        os.chdir("/")
+    print(figures.report())
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    print(f"{seconds:.0f} s, {most:.0f} MB at most")
+    return 1 if figures.wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""How soon the console's page says that what it shows is old, in a real browser.
+
+    python benchmarks/console_stale.py [--times 10]
+
+The server is stopped (SIGSTOP), a session of jogs is, and the connection falls silent, by turns;
+drives are simulated over UDP in real time. Measured in the page, from the last state that came (for
+the session: from its last word) to the frame that shows the banner. Not a test: it takes minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from playwright.sync_api import Page, expect  # noqa: E402
+
+from executor.remote.registry import find_runs  # noqa: E402
+from tests.cli.plans import RIG  # noqa: E402
+from tests.console.browsing import browser_at, chromium  # noqa: E402
+from tests.console.cut import CutConnection  # noqa: E402
+from tests.scenarios.test_console import console, drives  # noqa: E402
+
+#: Keeps when the last state came, how old its run's word was then, and when the banner was shown.
+WATCH = """() => {
+  const Plain = WebSocket;
+  globalThis.seen = { state: 0, run: 0, shown: null };
+  globalThis.WebSocket = class extends Plain {
+    constructor(...how) {
+      super(...how);
+      this.addEventListener("message", ({ data }) => {
+        const message = JSON.parse(data), now = performance.now();
+        if (message.kind !== "state") return;
+        seen.state = now;
+        seen.run = now - 1000 * (message.motion?.age_s ?? 0);
+      });
+    }
+  };
+  addEventListener("DOMContentLoaded", () => {
+    const banner = document.getElementById("stale");
+    new MutationObserver(() => {
+      if (banner.hidden) seen.shown = null;
+      else if (seen.shown === null) requestAnimationFrame(() => (seen.shown = performance.now()));
+    }).observe(banner, { attributes: true, attributeFilter: ["hidden"] });
+  });
+}"""
+
+
+def once(page: Page, of: str, silence: Callable[[], None], end: Callable[[], None]) -> float:
+    """From the last word to the banner, [ms]."""
+    expect(page.locator("#stale")).to_be_hidden(timeout=60_000)
+    page.wait_for_timeout(1000)
+    silence()
+    try:
+        page.wait_for_function("() => seen.shown !== null", timeout=20_000, polling=20)
+        return float(page.evaluate(f"() => seen.shown - seen.{of}"))
+    finally:
+        end()
+
+
+def main() -> int:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--times", type=int, default=10)
+    options = parser.parse_args()
+    found: dict[str, list[float]] = {"server": [], "connection": [], "session": []}
+    with ExitStack() as stack:
+        place = stack.enter_context(tempfile.TemporaryDirectory())
+        for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+            os.environ[name] = place  # no run of another program is seen, and none is stopped
+        tempfile.tempdir = None
+        os.chdir(place)
+        bus = stack.enter_context(drives(RIG, 8))
+        server, address = stack.enter_context(console(RIG, bus))
+        host, _, rest = address.removeprefix("http://").partition("/")
+        cut = stack.enter_context(CutConnection(int(host.rpartition(":")[2])))
+        page = stack.enter_context(browser_at(chromium())).new_page()
+        page.add_init_script(f"({WATCH})()")
+        page.goto(f"http://127.0.0.1:{cut.port}/{rest}")
+        for _ in range(options.times):
+            found["server"].append(once(page, "state", *stopped(server.pid)))
+            found["connection"].append(once(page, "state", cut.pause, cut.resume))
+        page.locator("#take-control").click()
+        page.locator("#tab-jog").click()
+        page.locator("#jog-begin").click()
+        expect(page.locator("#jog-state")).to_contain_text("Ready", timeout=90_000)
+        with find_runs() as runs:
+            (session,) = [run.process for run in runs]
+        # A supervisor that is silent for 2 s ends the session, so it is stopped once.
+        found["session"].append(once(page, "run", *stopped(session)))
+        time.sleep(1.0)
+        os.chdir("/")
+    for name, values in found.items():
+        ordered = sorted(values)
+        middle, most = ordered[len(ordered) // 2], ordered[-1]
+        print(
+            f"{name:11} silent: banner after {middle:.0f} ms, at most {most:.0f} ({len(values)}×)"
+        )
+    return 0
+
+
+def stopped(process: int) -> tuple[Callable[[], None], Callable[[], None]]:
+    """Stops a process, and continues it."""
+    return (
+        lambda: os.kill(process, signal.SIGSTOP),
+        lambda: os.kill(process, signal.SIGCONT),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+/* Picking a goal in the scene: a click on a plane at a chosen height gives a position, kept among the taught poses. */
+
+import { whyNot } from "./buttons.js";
+import { at, known, write } from "./elements.js";
+
+const MOVED_PX = 6; // a pointer that went farther turned the view
+
+export class Pick {
+  #page;
+  #point = null;
+  #down = null;
+
+  /** `page` has `command(name, fields)`, `situation()`, `say(text)`, `scene`, and `view(name)`. */
+  constructor(page) {
+    this.#page = page;
+    at("pick").addEventListener("click", () => this.#begin());
+    at("pick-cancel").addEventListener("click", () => this.end());
+    at("pick-height").addEventListener("input", () => {
+      if (this.#point) this.#point[2] = this.#height;
+      this.#show();
+    });
+    at("pick-keep").addEventListener("click", () => this.#keep());
+    const canvas = at("scene-canvas");
+    canvas.addEventListener("pointerdown", (event) => (this.#down = event.isPrimary ? [event.clientX, event.clientY] : null));
+    canvas.addEventListener("pointerup", (event) => {
+      const down = this.#down;
+      if (!this.on || !down || Math.hypot(event.clientX - down[0], event.clientY - down[1]) > MOVED_PX) return;
+      const point = this.#page.scene.pointAt(event, this.#height);
+      if (point) this.#point = point.map((v) => Math.round(10 * v) / 10);
+      this.#show();
+    });
+  }
+
+  get on() {
+    return !at("pick-bar").hidden;
+  }
+
+  get #height() {
+    return Number(at("pick-height").value);
+  }
+
+  #begin() {
+    const { state } = this.#page.situation();
+    const slider = at("pick-height");
+    slider.max = String(this.#page.scene.highest());
+    slider.value = String(Math.round(state.platform.position_mm[2]));
+    at("pick-bar").hidden = false;
+    this.#point = null;
+    this.#page.view("live");
+    this.#show();
+    at("pick-height").focus();
+  }
+
+  /** Ends picking; nothing is kept. */
+  end() {
+    at("pick-bar").hidden = true;
+    this.#page.scene.showPick(null);
+  }
+
+  async #keep() {
+    if (!this.#point) return this.#page.say("Click in the scene first.");
+    const taken = this.#page.situation().state.poses.map(({ name }) => name);
+    const name = taken.concat("").map((_, k) => `goal ${k + 1}`).find((one) => !taken.includes(one));
+    const { ok } = await this.#page.command("teach_at", { name, position_mm: this.#point });
+    if (!ok) return;
+    this.end();
+    this.#page.view("teach");
+  }
+
+  #show() {
+    const point = this.#point;
+    write(at("pick-height-shown"), known(this.#height, 0, "mm"));
+    write(at("pick-text"), point ? `${point.map((v) => known(v, 0)).join(", ")} mm` : "Click where the platform is to go.");
+    this.#page.scene.showPick({ height: this.#height, point });
+  }
+
+  /** Where control is lost, picking ends. */
+  show() {
+    if (this.on && whyNot("teach_at", this.#page.situation())) this.end();
+  }
+}

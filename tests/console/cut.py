@@ -1,0 +1,125 @@
+"""A TCP connection to a server that can fall silent or be cut, as a network does it."""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import TracebackType
+
+_CHUNK = 65536
+
+
+class CutConnection:
+    """Passes on what both sides say, until it is told not to; a context manager.
+
+    Attributes:
+        port: Of this side of it, on the loopback.
+    """
+
+    def __init__(self, to: int) -> None:
+        """In front of a port of this machine."""
+        self._to = to
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._waker, self._woken = socket.socketpair()
+        self._passing = threading.Event()
+        self._passing.set()
+        self._hang_up = threading.Event()
+        self._other: dict[socket.socket, socket.socket] = {}
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> CutConnection:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._waker.close()
+        self._thread.join()
+        self._woken.close()
+        self._listener.close()
+
+    @contextmanager
+    def silent(self) -> Iterator[None]:
+        """Nothing is passed on, and nobody is told: a cable that is pulled."""
+        self.pause()
+        try:
+            yield
+        finally:
+            self.resume()
+
+    def pause(self) -> None:
+        """From now on nothing is passed on."""
+        self._passing.clear()
+
+    def resume(self) -> None:
+        """What waited is passed on."""
+        self._passing.set()
+
+    def hang_up(self) -> None:
+        """Both sides see an end."""
+        self._hang_up.set()
+        self._waker.send(b".")
+
+    def _run(self) -> None:
+        with selectors.DefaultSelector() as ready:
+            self._ready = ready
+            for one in (self._listener, self._woken):
+                ready.register(one, selectors.EVENT_READ)
+            while self._serve([key.fileobj for key, _ in ready.select(0.02)]):
+                pass
+            for one in list(self._other):
+                self._close(one)
+
+    def _serve(self, places: list[object]) -> bool:
+        for place in places:
+            assert isinstance(place, socket.socket)
+            if place is self._woken:
+                if not place.recv(_CHUNK):
+                    return False
+                if self._hang_up.is_set():
+                    self._hang_up.clear()
+                    for one in list(self._other):
+                        self._close(one)
+            elif place is self._listener:
+                self._join(place)
+            elif self._passing.is_set() and place in self._other:
+                self._pass_on(place)
+        if not self._passing.is_set():
+            self._passing.wait(0.02)
+        return True
+
+    def _join(self, listener: socket.socket) -> None:
+        here, _ = listener.accept()
+        try:
+            there = socket.create_connection(("127.0.0.1", self._to))
+        except OSError:
+            here.close()
+            return
+        for one, other in ((here, there), (there, here)):
+            self._other[one] = other
+            self._ready.register(one, selectors.EVENT_READ)
+
+    def _pass_on(self, place: socket.socket) -> None:
+        try:
+            got = place.recv(_CHUNK)
+            self._other[place].sendall(got)
+        except OSError:
+            got = b""
+        if not got:
+            self._close(place)
+
+    def _close(self, place: socket.socket) -> None:
+        for one in (place, self._other.get(place)):
+            if one is not None and one in self._other:
+                del self._other[one]
+                with suppress(KeyError):
+                    self._ready.unregister(one)
+                one.close()

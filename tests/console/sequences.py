@@ -1,0 +1,367 @@
+"""Random sequences of what happens at consoles, in simulated time, against a session that moves.
+
+The console is the real one, with its command socket; so is the session of jogs, with drives that
+are simulated in this process. Pages hold and let go, two at once, take control and lose it, are cut
+off, reloaded with a clock that jumped, send again what is over, change what they do, and STOP. What
+the pages truly held is kept apart; every cycle is judged by it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cdpr.console.commands import Held, LetGo, parse_message
+from cdpr.console.session import Console, ConsoleFiles
+from executor.hold_to_run.presses import TIMEOUT, PressBoard
+from executor.hold_to_run.session import jog_session
+from executor.state_machine import CycleRecord, State
+from model.clearance import ClearanceModel
+from model.errors import StoppedByOperator
+from model.pose import Pose
+from model.rig import load_rig
+from model.scene import load_scene
+from tests.cli.plans import RIG
+
+SCENE = RIG.parent / "environment_1.yaml"
+#: From the jog speed to rest, [s]; and what two processes may be apart, [cycles].
+RAMP, CYCLES_LATE = 0.35, 3
+#: A page says that it holds every so many cycles of 10 ms.
+SAID_EVERY = 5
+DIRECTIONS = [[*row] for sign in (1.0, -1.0) for row in (sign * np.eye(3)).tolist()]
+
+
+@dataclass
+class PageAtHand:
+    """One page as the operator at it sees it."""
+
+    number: int
+    hold: int
+    direction: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0])
+    step: float | None = None
+    speed: float = 20.0
+    pressed: bool = False
+    silent: int = 0
+    had_control: bool = False
+    is_over: bool = False
+    over: list[str] = field(default_factory=list)
+
+    def word(self, hold: int | None = None) -> str:
+        """What it says as long as it holds."""
+        said = {"kind": "held", "hold": self.hold if hold is None else hold, "seq": 1}
+        how = {"direction": self.direction, "frame": "world", "step_mm": self.step}
+        return json.dumps(said | how | {"speed_mm_s": self.speed})
+
+
+@dataclass
+class Figures:
+    """What was done, and what was wrong."""
+
+    sequences: int = 0
+    cycles: int = 0
+    sessions: int = 0
+    presses: int = 0
+    moving_cycles: int = 0
+    did: Counter[str] = field(default_factory=Counter)
+    wrong: list[str] = field(default_factory=list)
+
+    def report(self) -> str:
+        """In a few lines."""
+        did = ", ".join(f"{name} {count}" for name, count in sorted(self.did.items()))
+        return (
+            f"{self.sequences} sequences in {self.sessions} sessions: {self.presses} presses,"
+            f" {self.cycles} cycles, {self.moving_cycles} of them in motion\n{did}\n"
+            f"wrong: {len(self.wrong)}" + "".join(f"\n  {text}" for text in self.wrong[:20])
+        )
+
+
+class Judge:
+    """Holds every cycle against what was truly held."""
+
+    def __init__(self, figures: Figures) -> None:
+        self._figures = figures
+        self._last: CycleRecord | None = None
+        self._ahead = 0.0
+        self._rig = load_rig(RIG)
+        self._model = ClearanceModel(self._rig, load_scene(SCENE))
+        self._required = load_scene(SCENE).obstacle_clearance
+        self.heard = float("-inf")
+        """When a press was truly held last, [s]."""
+        cycle = self._rig.document.bus.cycle_ms / 1000.0
+        # The anchor of a cable moves with the platform; nothing is wound in faster than it moves.
+        self._step = [
+            1.5 * 0.020 * cycle * winch.counts_per_metre + 2 for winch in self._rig.winches
+        ]
+
+    def begin(self) -> None:
+        """A new session; the drives stand."""
+        self._last, self.heard = None, float("-inf")
+
+    def release(self, now: float) -> None:
+        """What was held is not any more: as if it had been silent for long enough."""
+        self.heard = min(self.heard, now - TIMEOUT)
+
+    def judge(self, record: CycleRecord) -> None:
+        """One cycle."""
+        self._figures.cycles += 1
+        before, self._last = self._last, record
+        if before is None:
+            return
+        ahead = np.subtract(record.targets, before.targets)
+        late = CYCLES_LATE * self._rig.document.bus.cycle_ms / 1000.0
+        since = record.at - self.heard
+        if ahead.any():
+            self._figures.moving_cycles += 1
+            if since > TIMEOUT + RAMP + late:
+                self._say(record, f"moves though nothing was held for {since:.3f} s")
+            if np.any(np.abs(ahead) > self._step):
+                self._say(record, f"a set-point is {np.abs(ahead).max()} counts ahead")
+        # With limited jerk it still speeds up for a moment, and less and less.
+        ahead_before, self._ahead = self._ahead, record.rate - before.rate
+        if self._ahead > max(ahead_before, 0.0) + 1e-9 and since > TIMEOUT + late:
+            self._say(record, f"speeds up though nothing was held for {since:.3f} s")
+        if record.state is State.LATCHED:
+            self._say(record, "latched")
+
+    def look_around(self, console: Console) -> None:
+        """Where the platform is keeps what the scene asks for."""
+        jog = (console.watch.last.status or {}).get("jog")
+        if jog is None:
+            return
+        position = np.array(jog["position_mm"]) / 1000.0
+        pose = Pose(position, self._rig.home.rotation)
+        near = self._model.smallest(pose)
+        if near is not None and near.distance < self._required - 1e-4:
+            self._figures.wrong.append(f"only {1e3 * near.distance:.2f} mm at {position}")
+        for event in (console.watch.last.status or {}).get("events", []):
+            if event["code"] in ("gate_denied", "traceback", "broken"):
+                self._figures.wrong.append(f"{event['code']}: {event['text']}")
+
+    def _say(self, record: CycleRecord, text: str) -> None:
+        self._figures.wrong.append(
+            f"at {record.at:.2f} s of session {self._figures.sessions}: {text}"
+        )
+
+
+class Sequences:
+    """Pages at one console, and the sessions that it jogs."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+        rig = load_rig(RIG)
+        files = ConsoleFiles(RIG, rig, (), (), (), SCENE, True, False)
+        self.console = Console(files)
+        self._started: list[str] = []
+        self.console.verbs.start = self._start  # type: ignore[method-assign]
+        self.figures = Figures()
+        self._judge = Judge(self.figures)
+        self._pages: list[PageAtHand] = []
+        self._goal = self._left = self._cycle = 0
+        self._now = 0.0
+
+    def run(self, count: int) -> Figures:
+        """So many sequences, in as many sessions as STOP and mode changes make of them."""
+        self._goal = count
+        while self.figures.sequences < count and not self.figures.wrong:
+            self.figures.sessions += 1
+            self._judge.begin()
+            try:
+                jog_session(
+                    self.console.rig, load_scene(SCENE), speed=0.020, realtime=False,
+                    on_cycle=self._on_cycle,
+                )  # fmt: skip
+            except StoppedByOperator:
+                self.figures.did["session stopped"] += 1
+            for page in self._pages:
+                page.pressed = False
+        for page in self._pages:
+            self.console.leave(page.number)
+        self.console.close()
+        return self.figures
+
+    def _start(self, verb: str, _arguments: object) -> None:
+        self._started.append(verb)
+
+    def _on_cycle(self, record: CycleRecord, board: PressBoard) -> None:
+        self._judge.judge(record)
+        self._cycle, self._now = self._cycle + 1, record.at
+        if record.state is not State.MOVING:
+            return
+        if self._cycle % SAID_EVERY == 0:
+            self.console.look()
+            self._words()
+        if self._cycle % 50 == 0:
+            self._judge.look_around(self.console)
+        self._left -= 1
+        if self._left <= 0:
+            self._act(board)
+
+    def _words(self) -> None:
+        """What pages say that hold a control, unless they are held up."""
+        for page in self._pages:
+            page.silent = max(0, page.silent - SAID_EVERY)
+            if page.pressed and not page.silent:
+                self._hold(page)
+
+    def _hold(self, page: PageAtHand) -> None:
+        if self.console.control.holder != page.number:
+            page.is_over |= page.had_control  # who lost control has to press again
+        elif not page.is_over:
+            page.had_control, self._judge.heard = True, self._now
+        self._held(page, page.word())
+
+    def _held(self, page: PageAtHand, text: str) -> None:
+        message = parse_message(text)
+        assert isinstance(message, Held)
+        self.console.held(page.number, message)
+
+    def _command(self, page: PageAtHand, command: str, **values: object) -> str:
+        text = json.dumps({"kind": "command", "id": 1, "command": command, **values})
+        message = parse_message(text)
+        assert not isinstance(message, Held | LetGo)
+        return self.console.command(page.number, message)
+
+    def _act(self, board: PressBoard) -> None:
+        """The next thing that happens; a sequence is about a handful of them."""
+        if self._random.random() < 0.25:
+            self.figures.sequences += 1
+            if self.figures.sequences >= self._goal:
+                board.end()
+        while len(self._pages) < 2:
+            self._join()
+        act = self._random.choices(ACTS, WEIGHTS)[0]
+        self.figures.did[act.__name__.strip("_")] += 1
+        act(self, self._random.choice(self._pages))
+        self._left = self._random.choice((0, 0, 0, 1, 1, 3, 8, 20))
+
+    def _join(self) -> None:
+        base = self._random.choice((1, 1_000, 1_700_000_000_000))  # its clock jumped
+        self._pages.append(PageAtHand(self.console.control.join("test"), base))
+
+    # What happens.
+
+    def _press(self, page: PageAtHand) -> None:
+        if page.pressed:
+            return
+        self.figures.presses += 1
+        page.hold += 1
+        page.direction = self._random.choice(DIRECTIONS)
+        page.step = self._random.choice((None, None, None, 0.1, 1.0, 10.0))
+        page.speed = self._random.choice((1.0, 5.0, 20.0, 900.0))
+        page.pressed, page.silent = True, 0
+        page.had_control = page.is_over = False
+        self._hold(page)
+
+    def _let_go(self, page: PageAtHand) -> None:
+        if page.pressed:
+            page.over.append(page.word())
+            self._release(page)
+        page.pressed = False
+        message = parse_message(json.dumps({"kind": "let_go", "hold": page.hold}))
+        assert isinstance(message, LetGo)
+        self.console.let_go(page.number, message)
+
+    def _release(self, page: PageAtHand) -> None:
+        if self.console.control.holder == page.number:
+            self._judge.release(self._now)
+
+    def _take(self, page: PageAtHand) -> None:
+        self._command(page, "take_control", force=self._random.random() < 0.5)
+
+    def _give(self, page: PageAtHand) -> None:
+        self._release(page)
+        self._command(page, "give_control")
+
+    def _cut(self, page: PageAtHand) -> None:
+        """The socket is lost, and the page may come back as another one."""
+        self._release(page)
+        self.console.leave(page.number)
+        self._pages.remove(page)
+
+    def _held_up(self, page: PageAtHand) -> None:
+        page.silent = self._random.choice((10, 20, 60))
+        if page.silent > 100.0 * TIMEOUT:
+            page.pressed = False  # as hold.js does
+            page.over.append(page.word())
+
+    def _replay(self, page: PageAtHand) -> None:
+        """Words of presses that are over, from any page's memory."""
+        over = [text for other in self._pages for text in other.over[-5:]]
+        for text in self._random.sample(over, min(3, len(over))):
+            message = json.loads(text)
+            # A higher number would be a new press: of this page such words are over by now.
+            message["hold"] = min(message["hold"], page.hold - page.pressed)
+            if message["hold"] > 0:
+                self._held(page, json.dumps(message))
+
+    def _mode(self, page: PageAtHand) -> None:
+        """What else a page may want; nothing of it is done while the session is there."""
+        command = self._random.choice(("home", "reset", "release", "run", "jog_begin", "resume"))
+        self._command(page, command)
+        if self._started:
+            self.figures.wrong.append(f"{self._started.pop()} was started during a session")
+
+    def _feed(self, page: PageAtHand) -> None:
+        self._command(page, "speed", percent=self._random.choice((1, 50, 100)))
+        self._command(page, self._random.choice(("hold", "resume")))
+
+    def _stop(self, page: PageAtHand) -> None:
+        self._command(page, "stop")
+
+    def _end(self, page: PageAtHand) -> None:
+        self._command(page, "jog_end")
+
+
+Act = Callable[[Sequences, PageAtHand], None]
+_WEIGHTED: list[tuple[Act, float]] = [
+    (Sequences._press, 8.0),
+    (Sequences._let_go, 3.0),
+    (Sequences._take, 2.0),
+    (Sequences._give, 0.7),
+    (Sequences._cut, 0.7),
+    (Sequences._held_up, 1.5),
+    (Sequences._replay, 2.0),
+    (Sequences._mode, 1.0),
+    (Sequences._feed, 0.5),
+    (Sequences._stop, 0.01),
+    (Sequences._end, 0.01),
+]
+ACTS = [act for act, _ in _WEIGHTED]
+WEIGHTS = [weight for _, weight in _WEIGHTED]
+
+
+def open_files() -> int:
+    """Descriptors of this process, without the one that keeps the cache of machine code."""
+    found = 0
+    for name in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # the one by which the folder was read
+            found += "/kernels/" not in os.readlink(f"/proc/self/fd/{name}")
+    return found
+
+
+def children() -> list[str]:
+    """Processes that this one started and that are there still."""
+    tasks = Path("/proc/self/task")
+    found = " ".join((task / "children").read_text() for task in tasks.iterdir())
+    return found.split()
+
+
+def sequences(count: int, seed: int) -> Figures:
+    """So many sequences; threads, sockets and processes that are left count as wrong."""
+    sys.setswitchinterval(1e-4)  # the session and its socket's thread take turns all the time
+    before = threading.active_count(), open_files(), children()
+    figures = Sequences(seed).run(count)
+    after = threading.active_count(), open_files(), children()
+    if after != before:
+        figures.wrong.append(f"threads, descriptors, processes: {before} before, {after} after")
+    return figures

@@ -1,0 +1,192 @@
+"""The console's scene and camera images in a real browser: what is drawn, picked and compared."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.console.browsing import Visit
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+COUNT = """([role, x, y, width, height]) => {
+  const style = getComputedStyle(document.documentElement);
+  const value = parseInt(style.getPropertyValue(`--${role}`).trim().slice(1), 16);
+  const colour = [value >> 16, (value >> 8) & 255, value & 255];
+  const canvas = document.getElementById("scene-canvas"), context = canvas.getContext("2d");
+  const { data } = context.getImageData(x, y, width || canvas.width, height || canvas.height);
+  let count = 0;
+  for (let k = 0; k < data.length; k += 4)
+    count += data[k + 3] > 200 && colour.every((v, c) => Math.abs(data[k + c] - v) < 30);
+  return count;
+}"""
+
+
+def painted(desk: Visit, role: str) -> int:
+    """Pixels of the scene in about the colour of a role."""
+    return int(desk.page.evaluate(COUNT, [role, 0, 0, 0, 0]))
+
+
+def until_painted(desk: Visit, role: str, least: int) -> None:
+    """Waits until so many pixels of the scene have the colour; 0 for none at all."""
+
+    def holds(_: dict[str, Any]) -> bool:
+        found = painted(desk, role)
+        return found >= least if least else found == 0
+
+    desk.fake.wait(desk.page, holds)
+
+
+def without_layer(desk: Visit, title: str) -> None:
+    desk.page.locator("#live summary", has_text="Layers").click()
+    desk.page.get_by_role("checkbox", name=title).uncheck()
+    desk.page.evaluate("() => new Promise((done) => requestAnimationFrame(done))")
+
+
+def test_the_closest_pair_is_drawn_and_can_be_hidden(desk: Visit) -> None:
+    desk.fake.ask(state={"tensions_n": [20.0] * 8})
+    until_painted(desk, "limit", 10)
+    without_layer(desk, "Closest pair")
+    until_painted(desk, "limit", 0)
+
+
+def test_the_measured_position_is_shown_beside_the_one_by_the_drives(desk: Visit) -> None:
+    desk.take_control()
+    expect(desk.page.locator("#measured-x")).to_have_text("")
+    desk.load()
+    desk.run()
+    expect(desk.page.locator("#measured-x")).to_contain_text("measured")
+    expect(desk.page.locator("#note-measured")).to_contain_text(re.compile(r"measured [\d.]+ \("))
+    expect(desk.page.locator("#scene-legend")).to_contain_text("ellipsoid drawn 200×")
+    until_painted(desk, "tag", 20)
+    without_layer(desk, "Measured position")
+    until_painted(desk, "tag", 0)
+
+
+def test_an_old_measurement_is_not_shown_as_one_of_now(desk: Visit) -> None:
+    old = desk.fake.ask(state={"measured": None})
+    assert old
+    measured = {"position_mm": [1.0, 2.0, 3.0], "half_axes_mm": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+    more = {"within_mm": 1.0, "stated": True, "clearance": None}
+    desk.fake.ask(state={"measured": {**measured, **more, "age_s": 3.2}})
+    expect(desk.page.locator("#note-measured")).to_have_text(re.compile("no measured pose for 3"))
+    expect(desk.page.locator("#measured-x")).to_have_text("measured –")
+    until_painted(desk, "tag", 0)
+    desk.fake.ask(state={"measured": {**measured, **more, "age_s": 0.1, "stated": False}})
+    expect(desk.page.locator("#note-measured")).to_contain_text("by scatter alone")
+
+
+def test_pictures_of_cameras_come_at_most_five_times_a_second(desk: Visit) -> None:
+    """And only where they are looked at; a server that is slow is not asked again meanwhile."""
+    desk.take_control()
+    desk.load()
+    desk.run()
+    assert desk.fake.let_pass(desk.page)["pictures"] == []
+    desk.view("events")
+    found = desk.fake.wait(desk.page, lambda f: len(f["pictures"]) >= 6)
+    expect(desk.page.locator("#pictures img")).to_be_visible()
+    expect(desk.page.locator("#pictures figcaption")).to_have_text("top: tags 301, 305")
+    gaps = [b - a for a, b in zip(found["pictures"], found["pictures"][1:], strict=False)]
+    assert sum(gaps) / len(gaps) >= 0.19
+    desk.fake.ask(set={"slow_ms": 600})
+    count = len(desk.fake.let_pass(desk.page, 20)["pictures"])
+    assert len(desk.fake.let_pass(desk.page, 20)["pictures"]) - count <= 3
+    desk.view("operate")
+    desk.fake.let_pass(desk.page, 20)
+    count = len(desk.fake.ask()["pictures"])
+    assert len(desk.fake.let_pass(desk.page, 10)["pictures"]) == count
+
+
+# Picking a goal, comparing plans.
+
+
+def near(desk: Visit, x: float, y: float, role: str) -> int:
+    """Pixels in about the colour of a role within 8 px of a point of the page."""
+    box = desk.page.locator("#scene-canvas").bounding_box()
+    assert box
+    return int(desk.page.evaluate(COUNT, [role, x - box["x"] - 8, y - box["y"] - 8, 17, 17]))
+
+
+def begin_to_pick(found: Visit) -> dict[str, Any]:
+    found.take_control()
+    found.view("teach")
+    found.page.locator("#pick").click()
+    expect(found.page.locator("#pick-bar")).to_be_visible()
+    box = found.page.locator("#scene-canvas").bounding_box()
+    assert box
+    return dict(box)
+
+
+@pytest.mark.parametrize("turned", [0, 4])
+def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None:
+    """The goal is drawn, by the projection of the scene, under the pointer that picked it."""
+    box = begin_to_pick(desk)
+    desk.page.locator("#scene-canvas").focus()
+    for _ in range(turned):
+        desk.page.keyboard.press("ArrowLeft")
+        desk.page.keyboard.press("ArrowUp")
+    for height in (300, 700):
+        desk.page.locator("#pick-height").fill(str(height))
+        x, y = box["x"] + 0.55 * box["width"], box["y"] + 0.5 * box["height"]
+        desk.page.mouse.click(x, y)
+        expect(desk.page.locator("#pick-text")).to_contain_text(f", {height} mm")
+        # The ring about the goal.
+        desk.fake.wait(desk.page, lambda _, x=x, y=y: near(desk, x, y, "ink") > 20)
+    desk.page.locator("#pick-keep").click()
+    expect(desk.page.locator("#pick-bar")).to_be_hidden()
+    (pose,) = desk.fake.wait(desk.page, lambda f: bool(f["poses"]))["poses"]
+    assert pose["name"] == "goal 1"
+    assert pose["position_mm"][2] == 700.0
+    expect(desk.page.locator("#poses li")).to_have_count(1)
+
+
+def test_turning_the_view_picks_nothing_and_cancel_keeps_nothing(desk: Visit) -> None:
+    box = begin_to_pick(desk)
+    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+    desk.page.mouse.move(x, y)
+    desk.page.mouse.down()
+    desk.page.mouse.move(x + 60, y, steps=4)
+    desk.page.mouse.up()
+    expect(desk.page.locator("#pick-text")).to_have_text("Click where the platform is to go.")
+    desk.page.locator("#pick-keep").click()
+    expect(desk.page.locator("#notice")).to_have_text("Click in the scene first.")
+    desk.page.locator("#pick-cancel").click()
+    expect(desk.page.locator("#pick-bar")).to_be_hidden()
+    assert desk.fake.ask()["poses"] == []
+
+
+def test_on_a_phone_the_scene_comes_up_to_pick_and_the_list_afterwards(phone: Visit) -> None:
+    box = begin_to_pick(phone)
+    expect(phone.page.locator("#scene")).to_be_in_viewport()
+    phone.page.touchscreen.tap(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    phone.page.locator("#pick-keep").click()
+    expect(phone.page.locator("#poses li")).to_have_count(1)
+
+
+def test_picking_ends_with_control(desk: Visit) -> None:
+    begin_to_pick(desk)
+    desk.fake.ask(state={"control": {"yours": False, "held_by": "page 7"}})
+    expect(desk.page.locator("#pick-bar")).to_be_hidden()
+
+
+def test_two_plans_stand_side_by_side_and_both_paths_are_drawn(desk: Visit) -> None:
+    desk.take_control()
+    desk.load()
+    hide = {"clearance_mm": None, "tensions_n": None}
+    desk.fake.ask(state=hide)
+    until_painted(desk, "raw", 0)
+    name = "plans/colliding.json"
+    desk.page.locator(f"input[name=plan-file][value='{name}']").check(force=True)
+    desk.page.locator("#compare-plan").click()
+    table = desk.page.locator("#comparison")
+    expect(table).to_contain_text("Least clearance12.4\u00a0mm–")
+    expect(table).to_contain_text("Checkpassedfailed")
+    expect(desk.page.locator("#plan-name")).to_have_text("plans/circle.json")
+    until_painted(desk, "raw", 20)
+    desk.page.locator("#compare-end").click()
+    expect(table).to_be_hidden()
+    until_painted(desk, "raw", 0)
