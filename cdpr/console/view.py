@@ -130,6 +130,8 @@ class RobotView:
         self._looked = float("-inf")
         self._nearest: Nearest | None = None
         self._pose = rig.home
+        self.waypoints: tuple[Pose, ...] = ()
+        """Of the plan that is run; none otherwise."""
         self._set(rig, scene)
 
     def take(self, status: dict[str, Any]) -> RobotNow | None:
@@ -181,10 +183,12 @@ class RobotView:
     def _set_by(self, folder: Path | None) -> None:
         """A run's folder says for which rig and scene it is; other motions go by the files."""
         rig, scene = self._file_rig, self._file_scene
+        self.waypoints = ()
         try:
             if folder is not None and (folder / "plan.json").exists():
                 run = RunFolder(folder)  # which is under way
-                rig, scene = run.rig(), run.plan().scene
+                plan = run.plan()
+                rig, scene, self.waypoints = run.rig(), plan.scene, plan.waypoints
             else:
                 rig = MotionInterlock(rig).referenced_rig()
         except CdprError:  # not homed yet, or the folder is not whole

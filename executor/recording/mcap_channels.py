@@ -15,6 +15,7 @@ from executor.recording.cycle_table import CycleTable
 from executor.recording.summary import RunContext
 from model.cameras import Camera
 from model.files.camera_file import FISHEYE
+from model.geometry.shapes import Obstacle
 from model.geometry.solids import solid_of
 from model.kinematics import cables_to
 from model.pose import Array, Pose
@@ -145,7 +146,7 @@ def _quaternion(values: Sequence[float] | Array) -> fox.Quaternion:
 
 
 def pose_message(
-    stamp: fox.Timestamp, position: Sequence[float], quaternion: Sequence[float]
+    stamp: fox.Timestamp, position: Sequence[float] | Array, quaternion: Sequence[float] | Array
 ) -> fox.PoseInFrame:
     """A position [m] and a unit quaternion (w, x, y, z) in the world frame."""
     pose = fox.Pose(position=vector(position), orientation=_quaternion(quaternion))
@@ -199,14 +200,7 @@ _STRIP, _LIST = fox.LinePrimitiveLineType.LineStrip, fox.LinePrimitiveLineType.L
 def scene_messages(context: RunContext, start: int) -> Iterator[Message]:
     """Obstacles, planned path and cameras, once."""
     stamp = stamp_of(start, 0.0)
-    entities = []
-    for obstacle in context.plan.scene.obstacles:
-        corners = _points(solid_of(obstacle).triangles().reshape(-1, 3))
-        surface = fox.TriangleListPrimitive(pose=STILL, points=corners, color=_OBSTACLE)
-        entities.append(_entity(f"obstacle {obstacle.name}", stamp, triangles=[surface]))
-    path = _line(_STRIP, np.array([p.position for p in context.plan.waypoints]), 3.0, _PATH)
-    entities.append(_entity("planned path", stamp, lines=[path]))
-    yield "/scene", 0.0, fox.SceneUpdate(entities=entities)
+    yield "/scene", 0.0, scene_at(context.plan.scene.obstacles, context.plan.waypoints, stamp)
     cameras = context.rig.cameras
     for camera in cameras:
         alone = camera.name if len(cameras) > 1 else ""
@@ -215,6 +209,21 @@ def scene_messages(context: RunContext, start: int) -> Iterator[Message]:
         calibration = _calibration(camera, stamp, frame_of(alone))
         if calibration is not None:
             yield topic_of("/camera_calibration", alone), 0.0, calibration
+
+
+def scene_at(
+    obstacles: Sequence[Obstacle], waypoints: Sequence[Pose], stamp: fox.Timestamp
+) -> fox.SceneUpdate:
+    """Obstacles, and the path through waypoints, if there is one."""
+    entities = []
+    for obstacle in obstacles:
+        corners = _points(solid_of(obstacle).triangles().reshape(-1, 3))
+        surface = fox.TriangleListPrimitive(pose=STILL, points=corners, color=_OBSTACLE)
+        entities.append(_entity(f"obstacle {obstacle.name}", stamp, triangles=[surface]))
+    if waypoints:
+        path = _line(_STRIP, np.array([p.position for p in waypoints]), 3.0, _PATH)
+        entities.append(_entity("planned path", stamp, lines=[path]))
+    return fox.SceneUpdate(entities=entities)
 
 
 def frame_of(camera: str) -> str:

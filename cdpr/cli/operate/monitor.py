@@ -20,12 +20,14 @@ from rich.text import Text
 
 from cdpr.cli.facts import camera_line
 from cdpr.cli.operate.keys import Keys
-from cdpr.cli.output import out, show_json
+from cdpr.cli.output import err, out, show_json
 from cdpr.console.view import RobotNow, RobotView
 from executor.recording.run_folder import RIG, RunFolder
 from executor.remote.client import follow_run, request_run, stop_runs
 from executor.remote.protocol import make_line
 from model.errors import CdprError
+from model.files.documents import write_atomic
+from model.files.output import require_new_file
 
 #: Of a run that ended so; what ends without a word was killed.
 _EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
@@ -52,6 +54,20 @@ def monitor(
     wait: Annotated[
         bool, typer.Option("--wait", help="wait for a run to begin; in a terminal it always waits")
     ] = False,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(
+            "--foxglove",
+            min=0,
+            max=65535,
+            help="also serve Foxglove at this port of this computer, such as 8765",
+            metavar="PORT",
+        ),
+    ] = None,
+    foxglove_layout: Annotated[
+        Path | None,
+        typer.Option("--foxglove-layout", help="write a layout for Foxglove and exit"),
+    ] = None,
 ) -> None:
     """Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.
 
@@ -64,7 +80,15 @@ def monitor(
       cdpr monitor
 
       cdpr monitor --once --json
+
+      cdpr monitor --foxglove 8765 --rate-hz 20
     """
+    if foxglove_layout is not None:
+        from cdpr.console.foxglove import layout_text
+
+        require_new_file(foxglove_layout)
+        write_atomic(foxglove_layout, layout_text() + "\n")
+        return
     if once:
         status = next(follow_run(process, rate, waits=True)) if wait else _now(process)
         if as_json:
@@ -72,9 +96,24 @@ def monitor(
         else:
             typer.echo(_plain(status))
     elif as_json or not out.is_terminal:
-        _lines(follow_run(process, rate, waits=wait), as_json)
+        _lines(_served(follow_run(process, rate, waits=wait), foxglove), as_json)
     else:
-        _live(process, rate)
+        _live(process, rate, foxglove)
+
+
+def _served(looks: Iterator[dict[str, Any]], port: int | None) -> Iterator[dict[str, Any]]:
+    """The same looks, which are also sent to Foxglove; no port for no Foxglove."""
+    if port is None:
+        yield from looks
+        return
+    from cdpr.console.foxglove import foxglove_stream
+
+    robot = _Robot()
+    with foxglove_stream(port) as stream:
+        err.print(f"Foxglove: open the connection {stream.address}", soft_wrap=True)
+        for status in looks:
+            stream.take(status, robot.seen(status))
+            yield status
 
 
 def _now(process: int | None) -> dict[str, Any]:
@@ -100,7 +139,7 @@ def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
     _tell_end(status, as_json)
 
 
-def _live(process: int | None, rate: float) -> None:
+def _live(process: int | None, rate: float, foxglove: int | None) -> None:
     status: dict[str, Any] = {"state": "gone"}
     robot = _Robot()
     try:
@@ -110,7 +149,8 @@ def _live(process: int | None, rate: float) -> None:
         ):
             operator = _Operator(keys)
             live.update(Text("waiting for a run to begin; Ctrl-C ends the monitor"), refresh=True)
-            for status in follow_run(process, rate, waits=True, between=operator.between):
+            looks = follow_run(process, rate, waits=True, between=operator.between)
+            for status in _served(looks, foxglove):
                 operator.status = status
                 shown = _view(status, robot.seen(status), operator.line)
                 live.update(shown, refresh=True)
