@@ -21,16 +21,15 @@ from cdpr.cli.options import (
     SceneArgument,
     Triple,
     calibrated_rig,
+    level_pose,
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
 from executor.recording.resume import require_room, scene_after
 from model.errors import BadInput
-from model.files.documents import millimetres
 from model.files.output import require_new_file
 from model.files.scene_file import StopDocument
 from model.plan import plan_as_dict, plan_facts, save_plan
-from model.pose import Pose
 from model.rig import load_rig
 from model.scene import Scene, load_scene
 from planner.options import PlanningOptions, settings_from_options
@@ -236,7 +235,11 @@ def plan(
         raise BadInput(
             "--from-run and --start-mm contradict each other", next_step="leave out one of them"
         )
-    the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
+    the_scene = load_scene(scene).changed(
+        start=level_pose(start_mm),
+        goal=level_pose(goal_mm),
+        clearance=None if clearance_mm is None else clearance_mm / 1000.0,
+    )
     done: Sequence[StopDocument] = ()
     begun: list[tuple[str, str]] = []
     if from_run is not None:
@@ -258,15 +261,6 @@ def plan(
     run_it = f"cdpr run {file} --rig {quote(str(rig))}{more} -o RUNDIR"
     next_step = f"cdpr check {file}, then {run_it}"
     show_facts(f"plan {output}", [*begun, *plan_facts(document), ("next", next_step)])
-
-
-def _changed(
-    scene: Scene, start_mm: Triple | None, goal_mm: Triple | None, clearance_mm: float | None
-) -> Scene:
-    start = None if start_mm is None else Pose.level(millimetres(list(start_mm)))
-    goal = None if goal_mm is None else Pose.level(millimetres(list(goal_mm)))
-    clearance = None if clearance_mm is None else clearance_mm / 1000.0
-    return scene.changed(start=start, goal=goal, clearance=clearance)
 
 
 def _by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:

@@ -19,6 +19,7 @@ from cdpr.cli.options import (
     WithoutRealTimeOption,
     YesOption,
     calibrated_rig,
+    level_pose,
     require_unused,
     rig_on_bus,
 )
@@ -30,10 +31,8 @@ from executor.recording.run_course import free_folder
 from executor.recording.run_folder import RunFolder
 from executor.runner import MotionProposal, RunResult
 from model.errors import BadInput
-from model.files.documents import millimetres
 from model.files.examples import PAPER_RIG, ready_folder
 from model.plan import load_plan, plan_facts, plan_from_document
-from model.pose import Pose
 from model.rig import Rig, load_rig
 from model.scene import load_scene
 from planner.planning import plan_path
@@ -112,7 +111,7 @@ def run(
             folder=output,
             cameras=[] if no_camera else camera or None,
             realtime=not fast,
-            start=_level(simulated_start_mm),
+            start=level_pose(simulated_start_mm),
             clearance_stop=not no_clearance_stop,
             need_real_time_rights=not without_real_time,
             listener=Terminal(quiet=as_json),
@@ -175,10 +174,6 @@ def _refuse_camera_options(camera: list[str] | None, no_clearance_stop: bool) ->
         )
     why = "without a camera no clearance is measured, so it cannot stop the run"
     require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
-
-
-def _level(position_mm: tuple[float, float, float] | None) -> Pose | None:
-    return None if position_mm is None else Pose.level(millimetres(list(position_mm)))
 
 
 # `cdpr demo`: the whole way on the paper's rig, simulated.
