@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from executor.cameras.client import CameraRecord
 from executor.cameras.multi_camera import CameraRecords
 from executor.cameras.process import CameraSample
 from executor.control.path_runs import Outcome
@@ -24,7 +23,7 @@ from executor.recording.clearance import (
 from executor.recording.cycle_table import CycleTable
 from executor.recording.mcap import write_mcap
 from executor.recording.pose_table import OK, PoseTable, fused_table, no_poses
-from executor.recording.run_course import RunCourse, versions
+from executor.recording.run_course import CameraRecord, RunCourse, versions
 from executor.recording.run_folder import (
     CLEARANCE,
     COURSE,

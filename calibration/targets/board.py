@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from model.errors import BadInput
-from model.files.reading import CsvTable
+from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, read_only
 from model.rig import Camera
 from tracking.camera_model import Image

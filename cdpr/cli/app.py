@@ -106,8 +106,11 @@ PLAN = (
         new="Ask for the essentials of a rig, and write a commented rig file.",
     ),
     *_in(
-        "planning",
+        "plan",
         plan="Plan a collision-free path and write it to a file.",
+    ),
+    *_in(
+        "check",
         check="Check a plan with an independent method: distances at dense poses, with bounds.",
     ),
 )
@@ -174,6 +177,9 @@ ANALYSE = (
     *_in(
         "report",
         report="Write the report of a run folder again from its files.",
+    ),
+    *_in(
+        "explain",
         explain="Explain a fault that a run reported: meaning, likely cause, state of the machine,"
         " next step.",
     ),

@@ -17,7 +17,6 @@ from executor.homing import ForgetProposal, HomeResult, HomingProposal
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.jogging import CableProposal
-from executor.recording.resume import RunEnd
 from executor.recording.verdict import faults_among
 from executor.runner import MotionProposal, RunResult
 from executor.service import (
@@ -26,7 +25,6 @@ from executor.service import (
     StatusResult,
     reference_status,
 )
-from model.pose import Pose
 from model.rig import Camera, Rig
 from tracking.track import rates
 
@@ -134,29 +132,6 @@ def show_missing(result: RunResult) -> None:
     lines.append(f"  next: the verdict and the exit code are valid; {then}")
     for line in lines:
         err.print(line, markup=False, soft_wrap=True)
-
-
-def resumed_facts(end: RunEnd, folder: Path, done: int, left: int) -> list[tuple[str, str]]:
-    """Where a plan begins that continues a run.
-
-    Args:
-        end: Of that run.
-        folder: Of that run.
-        done: How many stops are behind it.
-        left: How many are left.
-    """
-    how = "finished" if end.finished else "stopped"
-    text = (
-        f"pose where {folder} {how}: {_millimetres(end.pose, 3)}, with {end.payload.mass_kg:g} kg"
-    )
-    text += f"; {done} stops done, {left} left"
-    if end.waiting_at:
-        text += f"; the dwell at {end.waiting_at!r} was interrupted and is repeated"
-    return [("from", text)]
-
-
-def _millimetres(pose: Pose, decimals: int) -> str:
-    return ", ".join(f"{c * 1e3:z.{decimals}f}" for c in pose.position.tolist()) + " mm"
 
 
 # Before and after homing and jogging.
@@ -289,7 +264,8 @@ def show_status(rig: Rig, status: StatusResult, next_step: str) -> None:
     if status.being_set_up:
         facts.append(("drives", "not read: another program is preparing a motion or reading them"))
     if status.pose is not None:
-        place = f"{_millimetres(status.pose, 2)} from the encoders, without a load"
+        x, y, z = status.pose.position * 1000.0
+        place = f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm from the encoders, without a load"
         facts.append(("platform", place))
     elif status.why_no_pose is not None:
         facts.append(("platform", status.why_no_pose))

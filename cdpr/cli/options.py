@@ -14,6 +14,8 @@ import typer
 
 from cdpr.cli.output import Terminal
 from model.errors import BadInput
+from model.files.documents import millimetres
+from model.pose import Pose
 from model.rig import Rig, load_rig
 
 RigArgument = Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")]
@@ -28,6 +30,11 @@ DaskOption = Annotated[
     str | None, typer.Option(help="compute on this Dask cluster", metavar="ADDRESS")
 ]
 Triple = tuple[float, float, float]
+
+
+def level_pose(position_mm: Triple | None) -> Pose | None:
+    """The level pose at a position x y z of an option, ``world_from_platform``."""
+    return None if position_mm is None else Pose.level(millimetres(list(position_mm)))
 
 
 def finite(value: float | None) -> float | None:

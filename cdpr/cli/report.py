@@ -1,8 +1,7 @@
-"""`cdpr report` makes the page of a run again; `cdpr explain` says what its faults mean."""
+"""`cdpr report`: makes the report of a run from its folder."""
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +10,6 @@ import typer
 from cdpr.cli.output import Terminal, out, show_json
 from executor.evaluation import rewrite_report
 from executor.recording.run_folder import RunFolder
-from executor.recording.verdict import fault_codes, page_text
-from model.errors import BadInput
 
 
 def report(
@@ -35,37 +32,3 @@ def report(
         show_json(folder.summary())
         return
     out.print(f"report: {folder.report}", markup=False, soft_wrap=True)
-
-
-# `cdpr explain`: what a fault means, its likely cause, and the next step.
-
-
-def explain(
-    code: Annotated[
-        str | None, typer.Argument(help="code of the fault, such as drive_silent", metavar="CODE")
-    ] = None,
-) -> None:
-    """Explain a fault that a run reported: meaning, likely cause, state of the machine, next step.
-
-    Without a code, list all of them.
-
-    [dim]Example:[/dim]
-
-      cdpr explain drive_silent
-    """
-    codes = fault_codes()
-    if code is None:
-        for known in codes:
-            title = page_text(known).split("\n", 1)[0].removeprefix("# ")
-            out.print(f"  {known:<22} {title}", markup=False, soft_wrap=True)
-        return
-    if code not in codes:
-        near = difflib.get_close_matches(code, codes, n=1)
-        raise BadInput(
-            f"there is no fault code {code!r}",
-            where="cdpr explain",
-            next_step=f"run `cdpr explain {near[0]}`"
-            if near
-            else f"use one of: {', '.join(codes)}",
-        )
-    out.print(page_text(code).rstrip(), markup=False, soft_wrap=True)

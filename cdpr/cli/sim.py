@@ -15,6 +15,7 @@ from cdpr.cli.options import (
     RigArgument,
     Triple,
     calibrated_rig,
+    level_pose,
     rig_on_bus,
 )
 from cdpr.cli.output import Terminal, out
@@ -23,7 +24,6 @@ from executor.kernels import ready_to_simulate
 from executor.operator_requests import LocalRequests
 from executor.realtime.scheduling import real_time
 from model.errors import BadInput
-from model.files.documents import millimetres
 from model.plan import load_plan, require_same_rig
 from model.pose import Pose
 from model.rig import Rig
@@ -147,4 +147,4 @@ def _start(rig: Rig, start_mm: Triple | None, plan: Path | None) -> tuple[Pose, 
         require_same_rig(the_plan, rig, plan)
         scene = the_plan.scene
         return scene.start, scene.load
-    return (rig.home if start_mm is None else Pose.level(millimetres(list(start_mm)))), None
+    return level_pose(start_mm) or rig.home, None

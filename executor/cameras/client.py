@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, unseen
+from executor.recording.run_course import CameraRecord
 from model.errors import CdprError, Fault
 from tracking.measurement import PoseMeasurement
 from tracking.track import FrameRate
@@ -58,29 +58,6 @@ class CameraHealth:
                 " says, are tags in view and lit?)"
             )
         return ""
-
-
-@dataclass(frozen=True, slots=True)
-class CameraRecord:
-    """What became of one camera's images in a run.
-
-    Attributes:
-        name: Of the camera in the rig file.
-        source: Where its images came from.
-        pictures: How many it was asked for.
-        poses: How many of them gave a pose.
-        dropped: How many were due while it was busy, and not asked for.
-        measuring_ms: Median time that measuring one took; None where none was measured.
-        failed: Why it gave no images any more, or nothing.
-    """
-
-    name: str
-    source: str
-    pictures: int
-    poses: int
-    dropped: int
-    measuring_ms: float | None
-    failed: str
 
 
 class CameraClient:

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from executor.cameras.client import BLIND_PICTURES, CameraClient, CameraRecord
+from executor.cameras.client import BLIND_PICTURES, CameraClient
 from executor.cameras.process import CameraSample, FrameRequest, unseen
 from executor.operator_requests import RequestBoard, StopReason
+from executor.recording.run_course import CameraRecord
 from executor.remote.status import RunStatus
 from model.clearance import ClearanceModel
 from model.pose import Pose

@@ -44,6 +44,24 @@ class RunEnd:
     waiting_at: str
     finished: bool
 
+    def facts(self, folder: Path, done: int, left: int) -> list[tuple[str, str]]:
+        """Where a plan begins that continues the run, for people.
+
+        Args:
+            folder: Of the run.
+            done: How many of the scene's stops are behind it.
+            left: How many stops are left.
+        """
+        x, y, z = self.pose.position * 1000.0
+        text = (
+            f"pose where {folder} {'finished' if self.finished else 'stopped'}:"
+            f" {x:z.3f}, {y:z.3f}, {z:z.3f} mm, with {self.payload.mass_kg:g} kg;"
+            f" {done} stops done, {left} left"
+        )
+        if self.waiting_at:
+            text += f"; the dwell at {self.waiting_at!r} was interrupted and is repeated"
+        return [("from", text)]
+
 
 def run_end(folder: RunFolder) -> RunEnd:
     """The end of the run in a folder.

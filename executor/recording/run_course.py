@@ -115,6 +115,29 @@ LIBRARIES = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class CameraRecord:
+    """What became of one camera's images in a run.
+
+    Attributes:
+        name: Of the camera in the rig file.
+        source: Where its images came from.
+        pictures: How many it was asked for.
+        poses: How many of them gave a pose.
+        dropped: How many were due while it was busy, and not asked for.
+        measuring_ms: Median time that measuring one took; None where none was measured.
+        failed: Why it gave no images any more, or nothing.
+    """
+
+    name: str
+    source: str
+    pictures: int
+    poses: int
+    dropped: int
+    measuring_ms: float | None
+    failed: str
+
+
 def versions() -> dict[str, str]:
     """Name and version of Python and of the libraries that matter."""
     found = {"python": platform.python_version()}

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.can_bus import IN_PROCESS
-from executor.cameras.client import CameraRecord
 from executor.recording.clearance import ClearanceTable
 from executor.recording.cycle_table import CycleTable
 from executor.recording.pose_table import PoseTable
+from executor.recording.run_course import CameraRecord
 from executor.recording.run_folder import RunEvent
 from executor.recording.verdict import judge
 from model.plan import Plan

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 import executor
-from executor.cameras.client import CameraRecord
 from executor.recording.clearance import ClearanceTable
 from executor.recording.cycle_table import CycleTable
 from executor.recording.pose_table import PoseTable
+from executor.recording.run_course import CameraRecord
 from executor.safety.limits import tension_limits
 from executor.state_machine import ON_PATH
 from model.rig import Rig

@@ -17,6 +17,7 @@ from cdpr.cli.options import (
     RigArgument,
     WithoutRealTimeOption,
     YesOption,
+    level_pose,
     require_unused,
     rig_on_bus,
     with_option_groups,
@@ -34,8 +35,6 @@ from executor.homing import (
     SLACK,
     SPEED,
 )
-from model.files.documents import millimetres
-from model.pose import Pose
 from model.rig import Rig
 
 FURTHEST_MM, FASTEST_MM_S = 1000.0 * FURTHEST, 1000.0 * FASTEST
@@ -141,7 +140,7 @@ def home(
     result = homing.home(
         the_rig,
         at_home=at_home,
-        pose=None if pose_mm is None else Pose.level(millimetres(list(pose_mm))),
+        pose=level_pose(pose_mm),
         camera=camera,
         tension=winding.tension_n,
         limit=winding.limit_n,

@@ -19,6 +19,7 @@ from cdpr.cli.options import (
     WithoutRealTimeOption,
     YesOption,
     calibrated_rig,
+    level_pose,
     require_unused,
     rig_on_bus,
 )
@@ -28,9 +29,7 @@ from executor import runner
 from executor.drives import is_simulated
 from executor.runner import MotionProposal, RunResult
 from model.errors import BadInput
-from model.files.documents import millimetres
 from model.plan import load_plan
-from model.pose import Pose
 from model.rig import Rig
 
 
@@ -106,7 +105,7 @@ def run(
             folder=output,
             cameras=[] if no_camera else camera or None,
             realtime=not fast,
-            start=_level(simulated_start_mm),
+            start=level_pose(simulated_start_mm),
             clearance_stop=not no_clearance_stop,
             need_real_time_rights=not without_real_time,
             listener=Terminal(quiet=as_json),
@@ -169,7 +168,3 @@ def _refuse_camera_options(camera: list[str] | None, no_clearance_stop: bool) ->
         )
     why = "without a camera no clearance is measured, so it cannot stop the run"
     require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
-
-
-def _level(position_mm: tuple[float, float, float] | None) -> Pose | None:
-    return None if position_mm is None else Pose.level(millimetres(list(position_mm)))

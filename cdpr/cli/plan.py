@@ -1,4 +1,4 @@
-"""`cdpr plan` searches a path, `cdpr check` proves it by an independent route."""
+"""`cdpr plan`: a path from start to goal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import typer
 
-from cdpr.cli.facts import resumed_facts
 from cdpr.cli.options import (
     CalibrationOption,
     JsonOption,
@@ -22,19 +21,17 @@ from cdpr.cli.options import (
     SceneArgument,
     Triple,
     calibrated_rig,
+    level_pose,
     with_option_groups,
 )
-from cdpr.cli.output import Terminal, out, show_facts, show_json
+from cdpr.cli.output import Terminal, show_facts, show_json
 from executor.recording.resume import require_room, scene_after
 from model.errors import BadInput
-from model.files.documents import millimetres
 from model.files.output import require_new_file
 from model.files.scene_file import StopDocument
-from model.plan import load_plan, plan_as_dict, plan_facts, require_same_rig, save_plan
-from model.pose import Pose
+from model.plan import plan_as_dict, plan_facts, save_plan
 from model.rig import load_rig
 from model.scene import Scene, load_scene
-from planner.check import check_path
 from planner.options import PlanningOptions, settings_from_options
 from planner.planning import plan_path
 
@@ -238,13 +235,17 @@ def plan(
         raise BadInput(
             "--from-run and --start-mm contradict each other", next_step="leave out one of them"
         )
-    the_scene = _changed(load_scene(scene), start_mm, goal_mm, clearance_mm)
+    the_scene = load_scene(scene).changed(
+        start=level_pose(start_mm),
+        goal=level_pose(goal_mm),
+        clearance=None if clearance_mm is None else clearance_mm / 1000.0,
+    )
     done: Sequence[StopDocument] = ()
     begun: list[tuple[str, str]] = []
     if from_run is not None:
         the_scene, done, end = scene_after(the_scene, the_rig, from_run)
         require_room(the_scene, the_rig)
-        begun = resumed_facts(end, from_run, len(done), len(the_scene.stops))
+        begun = end.facts(from_run, len(done), len(the_scene.stops))
     the_scene = _by_way_of(the_scene, via_mm or [])
     require_new_file(output, force)
     settings = settings_from_options(search.with_seed(seed))
@@ -260,15 +261,6 @@ def plan(
     run_it = f"cdpr run {file} --rig {quote(str(rig))}{more} -o RUNDIR"
     next_step = f"cdpr check {file}, then {run_it}"
     show_facts(f"plan {output}", [*begun, *plan_facts(document), ("next", next_step)])
-
-
-def _changed(
-    scene: Scene, start_mm: Triple | None, goal_mm: Triple | None, clearance_mm: float | None
-) -> Scene:
-    start = None if start_mm is None else Pose.level(millimetres(list(start_mm)))
-    goal = None if goal_mm is None else Pose.level(millimetres(list(goal_mm)))
-    clearance = None if clearance_mm is None else clearance_mm / 1000.0
-    return scene.changed(start=start, goal=goal, clearance=clearance)
 
 
 def _by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
@@ -291,41 +283,3 @@ def _by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
             )
         ways.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
     return scene.changed(stops=[*ways, *scene.document.stops]) if ways else scene
-
-
-# `cdpr check`: proves a plan by an independent route.
-
-
-def check(
-    plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
-    rig: Annotated[
-        Path | None,
-        typer.Option(help="check against this rig file as it is now"),
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Check a plan with an independent method: distances at dense poses, with bounds.
-
-    Exits with 3 when anything is below what the scene asks.
-
-    [dim]Examples:[/dim]
-
-      cdpr check plan.json
-
-      cdpr check plan.json --rig configs/gachon_8_6.yaml --json
-    """
-    the_plan = load_plan(plan)
-    the_rig = the_plan.rig if rig is None else load_rig(rig)
-    require_same_rig(the_plan, the_rig, plan)
-    with Terminal(quiet=as_json).waiting("checking"):
-        report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
-    if as_json:
-        show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
-    else:
-        facts = [*the_plan.scene.stop_facts(), *report.facts()]
-        show_facts(f"check of {plan}", facts)
-        for violation in report.violations:
-            out.print(f"[red]violated[/red] {violation.sentence()}", soft_wrap=True)
-        out.print("[green]passed[/green]" if report.passed else "[red]not passed[/red]")
-    if not report.passed:
-        raise typer.Exit(3)

@@ -1,0 +1,49 @@
+"""`cdpr check`: proves a plan by an independent route."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cdpr.cli.options import JsonOption
+from cdpr.cli.output import Terminal, out, show_facts, show_json
+from model.plan import load_plan, require_same_rig
+from model.rig import load_rig
+from planner.check import check_path
+
+
+def check(
+    plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="check against this rig file as it is now"),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a plan with an independent method: distances at dense poses, with bounds.
+
+    Exits with 3 when anything is below what the scene asks.
+
+    [dim]Examples:[/dim]
+
+      cdpr check plan.json
+
+      cdpr check plan.json --rig configs/gachon_8_6.yaml --json
+    """
+    the_plan = load_plan(plan)
+    the_rig = the_plan.rig if rig is None else load_rig(rig)
+    require_same_rig(the_plan, the_rig, plan)
+    with Terminal(quiet=as_json).waiting("checking"):
+        report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
+    if as_json:
+        show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
+    else:
+        facts = [*the_plan.scene.stop_facts(), *report.facts()]
+        show_facts(f"check of {plan}", facts)
+        for violation in report.violations:
+            out.print(f"[red]violated[/red] {violation.sentence()}", soft_wrap=True)
+        out.print("[green]passed[/green]" if report.passed else "[red]not passed[/red]")
+    if not report.passed:
+        raise typer.Exit(3)
