@@ -192,7 +192,7 @@ class RobotView:
         rig, scene = self._file_rig, self._file_scene
         try:
             if folder is not None and (folder / "plan.json").exists():
-                run = RunFolder.open_cut_short(folder)
+                run = RunFolder(folder)  # it is under way: only what was written first is read
                 rig, scene = run.rig(), run.plan().scene
             else:
                 rig = MotionInterlock(rig).referenced_rig()

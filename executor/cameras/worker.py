@@ -103,7 +103,7 @@ class CameraWorker:
             folder: Where some of them are kept; None to keep none.
             keep_every: Every how many images one is kept.
             named: Kept images are in a folder of the camera's name: there are others.
-            live: Where images are shown to who looks on; None for nobody.
+            live: Where images are shown to who looks on; None to show none.
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._name = camera.name if named else ""

@@ -22,6 +22,7 @@ CIRCLES: list[list[str]] = []
 INNER_IMPORTS: dict[str, set[str]] = {
     "a heavy library is loaded by the few calls that need it": {
         "cdpr/cli/app.py",
+        "cdpr/console/pictures.py",
         "executor/recording/run_folder.py",
         "executor/report/figures.py",
         "executor/report/tiles.py",
