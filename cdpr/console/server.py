@@ -180,7 +180,7 @@ class ConsoleServer:
         name = request.path_params["name"]
         made = await run_in_threadpool(self._console.pictures.jpeg, name)
         if made is None:
-            raise HTTPException(404, "no image")
+            return Response(status_code=204)  # the page asks again
         return Response(made, media_type="image/jpeg")
 
     async def _stop(self, _request: Request) -> Response:

@@ -186,7 +186,7 @@ class RobotView:
         self.waypoints = ()
         try:
             if folder is not None and (folder / "plan.json").exists():
-                run = RunFolder(folder)  # which is under way
+                run = RunFolder(folder)  # it is under way: only what was written first is read
                 plan = run.plan()
                 rig, scene, self.waypoints = run.rig(), plan.scene, plan.waypoints
             else:

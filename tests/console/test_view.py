@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,17 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
 from cdpr.console.view import SURE_IN_SPACE, RobotView, measured_data, nearest_data
+from executor.recording.run_folder import RunFolder
 from executor.remote import status
 from model.clearance import ClearanceModel
 from model.kinematics import cable_lengths
+from model.plan import load_plan
 from model.pose import Array, Pose
 from model.rig import load_rig
 from model.scene import load_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
-from tests.cli.plans import CONFIGS, RIG
+from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tracking.clearance import clearance_at
 from tracking.measurement import PoseMeasurement
 
@@ -41,7 +44,7 @@ def status_at(pose: Pose) -> dict[str, Any]:
 
 def test_the_closest_pair_is_shown_where_it_is() -> None:
     view = RobotView(THE_RIG, SCENE)
-    pose = Pose([*THE_RIG.home.position, -0.03, 0.02, -0.05], THE_RIG.home.rotation)
+    pose = Pose(THE_RIG.home.position + np.array([-0.03, 0.02, -0.05]), THE_RIG.home.rotation)
     seen = view.take(status_at(pose))
     assert seen is not None
     assert seen.pose.distance_to(pose) < 1e-4
@@ -55,6 +58,21 @@ def test_the_closest_pair_is_shown_where_it_is() -> None:
     # The points are on the surfaces, but for the radius of a cable that is nearest.
     assert np.linalg.norm(first - second) == pytest.approx(shown["now"], abs=0.3)
     assert shown["required"] == pytest.approx(1e3 * SCENE.obstacle_clearance)
+
+
+def test_a_run_that_is_under_way_is_seen_in_its_own_scene(tmp_path: Path) -> None:
+    """Its clearance is to the obstacles of its plan, not to those of the console's scene."""
+    write_short_plan(tmp_path / "short.json")
+    plan = load_plan(tmp_path / "short.json")
+    folder = RunFolder.create(tmp_path / "run")
+    folder.write_plan(plan.document)
+    folder.write_rig(THE_RIG.document)
+    view = RobotView(THE_RIG, SCENE)
+    with folder.held():
+        assert folder.is_under_way()
+        view.take({**status_at(THE_RIG.home), "folder": str(folder.path)})
+    assert [one.name for one in view.scene.obstacles] == [o.name for o in plan.scene.obstacles]
+    assert view.scene.obstacles != SCENE.obstacles
 
 
 def told(covariance: Array) -> dict[str, Any]:
