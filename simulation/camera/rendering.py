@@ -62,12 +62,25 @@ class CanvasRegion:
 
 
 def sample_rays(camera: Camera) -> Image32:
-    """Viewing ray (x, y, 1) of every sample, camera frame; shape (2 height, 2 width, 2)."""
-    columns = (np.arange(camera.width * SAMPLES) + 0.5) / SAMPLES - 0.5
-    rows = (np.arange(camera.height * SAMPLES) + 0.5) / SAMPLES - 0.5
-    points = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32)
-    straight = rays_of(camera.lens, camera.matrix, camera.distortion, points.astype(np.float64))
-    return np.asarray(straight, dtype=np.float32).reshape(points.shape)
+    """Viewing ray (x, y, 1) of every sample, camera frame; shape (2 height, 2 width, 2).
+
+    It takes a second to find them: cameras with the same lens and size share a read-only array.
+    """
+    matrix, distortion = (tuple(a.ravel().tolist()) for a in (camera.matrix, camera.distortion))
+    return _rays(camera.width, camera.height, camera.lens, matrix, distortion)
+
+
+@lru_cache(maxsize=2)
+def _rays(
+    width: int, height: int, lens: str, matrix: tuple[float, ...], distortion: tuple[float, ...]
+) -> Image32:
+    columns = (np.arange(width * SAMPLES) + 0.5) / SAMPLES - 0.5
+    rows = (np.arange(height * SAMPLES) + 0.5) / SAMPLES - 0.5
+    points = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32).astype(np.float64)
+    straight = rays_of(lens, np.array(matrix).reshape(3, 3), np.array(distortion), points)
+    rays = np.asarray(straight, dtype=np.float32).reshape(points.shape)
+    rays.flags.writeable = False
+    return rays
 
 
 def region_of(camera: Camera, points_in_camera: Array, margin: int = 2) -> CanvasRegion:
