@@ -24,8 +24,8 @@ from model.geometry.shapes import (
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig
 from model.scene import Scene
-from simulation.camera.camera import Optics, SyntheticCamera
-from simulation.camera.rendering import Canvas, draw_triangles, sample_rays, surface_of
+from simulation.camera.camera import Optics, SyntheticCamera, sample_rays
+from simulation.camera.rendering import Canvas, draw_triangles, surface_of
 from tests.tracking.tag_pictures import TagPrinter, small_camera
 from tracking.camera_model import rays_of
 
