@@ -11,7 +11,12 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 
 # Before NumPy is loaded: the suite runs on as many workers as there are cores, one thread each.
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+for variable in (
+    "OPENBLAS_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+):
     os.environ.setdefault(variable, "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # As in a terminal: under `nohup` or in the background programs would be deaf to these.

@@ -7,6 +7,7 @@ What stands still is drawn once; an image redraws the platform's surroundings an
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import cv2
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput
 from model.kinematics import cables_at
-from model.pose import PlatformMotion, Pose
+from model.pose import Array, PlatformMotion, Pose
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.cables import draw_cables
@@ -30,11 +31,10 @@ from simulation.camera.rendering import (
     draw_quad,
     draw_tag,
     region_of,
-    sample_rays,
     shade,
 )
 from simulation.ground_truth import Optics
-from tracking.camera_model import pixels_of
+from tracking.camera_model import pixels_of, rays_of
 
 if TYPE_CHECKING:
     from simulation.camera.rendering import Image8
@@ -105,6 +105,70 @@ def processed(picture: Image8, size: tuple[int, int], optics: Optics) -> Image8:
         _, coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, optics.jpeg])
         picture = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
     return picture
+
+
+# The ray behind every sample of the sensor.
+
+
+#: Samples from one ray that is undistorted to the next: a lens is smooth, and there are millions.
+RAY_STEP = 8
+#: Every so many rays one is checked; the others are at most about so far off, [rad].
+RAYS_CHECKED, RAY_TOLERANCE = 97, 1e-7
+
+
+def sample_rays(camera: Camera) -> Image32:
+    """Viewing ray (x, y, 1) of every sample, camera frame; shape (2 height, 2 width, 2).
+
+    Cameras with the same lens and size share them: the array is read-only.
+    """
+    matrix, distortion = (tuple(a.ravel().tolist()) for a in (camera.matrix, camera.distortion))
+    return _rays(camera.width, camera.height, camera.lens, matrix, distortion)
+
+
+@lru_cache(maxsize=2)
+def _rays(
+    width: int, height: int, lens: str, matrix: tuple[float, ...], distortion: tuple[float, ...]
+) -> Image32:
+    """Rays of a coarse grid, and cubics between them; where these are too far off, rays of all."""
+
+    def exact(points: Array) -> Array:
+        return rays_of(lens, np.array(matrix).reshape(3, 3), np.array(distortion), points)
+
+    (columns, across), (rows, down) = (_between(SAMPLES * size) for size in (width, height))
+    coarse = exact(np.stack(np.meshgrid(columns, rows), axis=-1)).reshape(len(rows), -1, 2)
+    rays = np.empty((SAMPLES * height, SAMPLES * width, 2), dtype=np.float32)
+    for axis in (0, 1):
+        rays[..., axis] = down @ coarse[..., axis] @ across.T
+    y, x = np.divmod(np.arange(0, rays.size // 2, RAYS_CHECKED), SAMPLES * width)
+    checked = exact((np.column_stack([x, y]) + 0.5) / SAMPLES - 0.5)
+    off = np.abs(rays[y, x] - checked).max(axis=1) / (1.0 + np.sum(checked**2, axis=1))
+    if not off.max() < RAY_TOLERANCE:
+        every = np.stack(np.meshgrid(np.arange(SAMPLES * width), np.arange(SAMPLES * height)), -1)
+        rays[:] = exact((every + 0.5) / SAMPLES - 0.5).reshape(rays.shape)
+    rays.flags.writeable = False
+    return rays
+
+
+def _between(count: int) -> tuple[Array, Array]:
+    """Where every `RAY_STEP`-th sample is, [px], and its weight in each of ``count`` samples.
+
+    Returns:
+        Pixels, shape (k,), reaching beyond both ends, and weights, shape (count, k).
+    """
+    whole, u = np.divmod(np.arange(count) / RAY_STEP, 1.0)
+    first = whole.astype(int)
+    nodes = (np.arange(-1, first[-1] + 3) * RAY_STEP + 0.5) / SAMPLES - 0.5
+    weights = np.zeros((count, len(nodes)))
+    for k, weight in enumerate(
+        (
+            -u * (u - 1.0) * (u - 2.0) / 6.0,
+            (u + 1.0) * (u - 1.0) * (u - 2.0) / 2.0,
+            -(u + 1.0) * u * (u - 2.0) / 2.0,
+            (u + 1.0) * u * (u - 1.0) / 6.0,
+        )
+    ):
+        weights[np.arange(count), first + k] = weight
+    return nodes, weights
 
 
 # Images one after the other.

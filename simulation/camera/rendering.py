@@ -1,8 +1,8 @@
 """What the synthetic camera draws on: brightness and depth behind every sample of the sensor.
 
 Each pixel is sampled 2 × 2 times (drawing once a pixel moves tag corners by 0.09 px); the samples
-are averaged at the end. Every sample's viewing ray is undistorted once, so that planes and
-triangles are met exactly, lens distortion included.
+are averaged at the end. Every sample has its undistorted viewing ray, so that planes and triangles
+are met exactly, lens distortion included.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from model.geometry.shapes import (
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
-from tracking.camera_model import pixels_of, rays_of
+from tracking.camera_model import pixels_of
 
 #: Samples a pixel along x and along y.
 SAMPLES = 2
@@ -59,15 +59,6 @@ class CanvasRegion:
         """Rows and columns, in samples when ``scale`` is `SAMPLES`."""
         rows = slice(self.top * scale, self.bottom * scale)
         return rows, slice(self.left * scale, self.right * scale)
-
-
-def sample_rays(camera: Camera) -> Image32:
-    """Viewing ray (x, y, 1) of every sample, camera frame; shape (2 height, 2 width, 2)."""
-    columns = (np.arange(camera.width * SAMPLES) + 0.5) / SAMPLES - 0.5
-    rows = (np.arange(camera.height * SAMPLES) + 0.5) / SAMPLES - 0.5
-    points = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32)
-    straight = rays_of(camera.lens, camera.matrix, camera.distortion, points.astype(np.float64))
-    return np.asarray(straight, dtype=np.float32).reshape(points.shape)
 
 
 def region_of(camera: Camera, points_in_camera: Array, margin: int = 2) -> CanvasRegion:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -26,6 +28,16 @@ def poses_before_the_camera(
     return poses
 
 
+@cache
+def sample_rays() -> Array:
+    """Of all 2 x 2 samples a pixel, camera frame, shape (n, 3); found once for all images."""
+    columns = (np.arange(SIZE[0] * _SUB) + 0.5) / _SUB - 0.5
+    rows = (np.arange(SIZE[1] * _SUB) + 0.5) / _SUB - 0.5
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
+    flat = cv2.undistortPoints(pixels, MATRIX, DISTORTION).reshape(-1, 2)
+    return np.column_stack([flat, np.ones(len(flat))])
+
+
 def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> np.ndarray:
     """What the camera sees of a print on a board, on a grey wall.
 
@@ -35,11 +47,7 @@ def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> n
         origin: Where the board's origin is on it, shape (2,), [m] from its top left corner.
         pose: Of the board's frame, whose x and y run along the print's, in the camera's.
     """
-    columns = (np.arange(SIZE[0] * _SUB) + 0.5) / _SUB - 0.5
-    rows = (np.arange(SIZE[1] * _SUB) + 0.5) / _SUB - 0.5
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
-    flat = cv2.undistortPoints(pixels, MATRIX, DISTORTION).reshape(-1, 2)
-    rays = np.column_stack([flat, np.ones(len(flat))]) @ pose.rotation
+    rays = sample_rays() @ pose.rotation
     eye = -pose.rotation.T @ pose.position
     places = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
     found = ((places + origin) / pixel - 0.5).astype(np.float32)

@@ -23,11 +23,9 @@ from calibration.targets.board import Seen
 from calibration.targets.chessboard import Chessboard
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector
+from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, sample_rays
 
 BOARD = Chessboard(9, 6, 0.025)
-SIZE = (640, 480)
-MATRIX = np.array([[600.0, 0.0, 322.0], [0.0, 603.0, 238.0], [0.0, 0.0, 1.0]])
-DISTORTION = np.array([-0.12, 0.05, 0.0008, -0.0006, 0.0])
 
 
 def board_poses(count: int) -> list[Pose]:
@@ -58,11 +56,7 @@ def views(count: int, noise: float, seed: int = 5) -> dict[str, Seen]:
 
 def board_picture(pose: Pose) -> np.ndarray:
     """The board rendered by meeting its plane with every ray, 2 x 2 samples a pixel."""
-    columns = (np.arange(SIZE[0] * 2) + 0.5) / 2 - 0.5
-    rows = (np.arange(SIZE[1] * 2) + 0.5) / 2 - 0.5
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
-    flat = cv2.undistortPoints(pixels, MATRIX, DISTORTION).reshape(-1, 2)
-    rays = np.column_stack([flat, np.ones(len(flat))]) @ pose.rotation
+    rays = sample_rays() @ pose.rotation
     origin = -pose.rotation.T @ pose.position
     places = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
     squares = np.floor(places).astype(int)

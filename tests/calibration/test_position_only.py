@@ -62,12 +62,9 @@ def test_positions_of_a_reflector_calibrate_a_rig(
 def test_a_wrong_reflector_fits_worse(rig: Rig, truth: Truth) -> None:
     right = followed(truth, REFLECTOR)
     wrong = replace(right, reflector=read_only(np.zeros(3)))
-    squares = [
-        float(np.sum(fit.residuals**2) + np.sum(fit.pose_misfits**2))
-        for fit in (
-            fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION).fit for data in (right, wrong)
-        )
-    ]
+    parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
+    fits = [RigFitter(parameters, data, LENGTH_DEVIATION).fit() for data in (right, wrong)]
+    squares = [float(np.sum(f.residuals**2) + np.sum(f.pose_misfits**2)) for f in fits]
     assert squares[1] > 2.0 * squares[0]
 
 

@@ -100,9 +100,15 @@ def test_a_camera_is_found_by_the_rigs_motion(folder, truth) -> None:
     assert far(found, truth) < 3.0
 
 
-def test_a_run_tells_its_poses_by_the_drives(short_plan: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    assert call("run", short_plan, "--rig", RIG, "-o", run, "--fast").code == 0
+@pytest.fixture(scope="module")
+def run(short_plan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run with the synthetic camera."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    assert call("run", short_plan, "--rig", RIG, "-o", path, "--fast").code == 0
+    return path
+
+
+def test_a_run_tells_its_poses_by_the_drives(run: Path) -> None:
     answer = call("calibrate", "extrinsics", RIG, run / "pictures", "--poses", run, "--json")
     assert answer.code == 3, answer  # a short straight path does not tell much
     found = json.loads(answer.out)
@@ -113,9 +119,8 @@ def test_a_run_tells_its_poses_by_the_drives(short_plan: Path, tmp_path: Path) -
         assert low <= place <= high
 
 
-def test_the_pictures_of_another_camera_are_refused(short_plan: Path, tmp_path: Path) -> None:
-    run, two = tmp_path / "run", tmp_path / "two.yaml"
-    assert call("run", short_plan, "--rig", RIG, "-o", run, "--fast").code == 0
+def test_the_pictures_of_another_camera_are_refused(run: Path, tmp_path: Path) -> None:
+    two = tmp_path / "two.yaml"
     document = yaml.safe_load(RIG.read_text())
     document["cameras"].append({**document["cameras"][0], "name": "side"})
     two.write_text(yaml.safe_dump(document))

@@ -25,7 +25,7 @@ def _apart(pose: Pose, other: Pose) -> float:
 def _distance_to_move(pose: Pose, start: Pose, end: Pose) -> float:
     """Smallest distance to a straight move by ternary search, as the path measures it, [m]."""
     low, high = 0.0, 1.0
-    for _ in range(45):
+    for _ in range(36):
         thirds = low + (high - low) / 3.0, high - (high - low) / 3.0
         near, far = (_apart(pose, interpolate(start, end, share)) for share in thirds)
         low, high = (low, thirds[1]) if near < far else (thirds[0], high)
@@ -45,7 +45,7 @@ def test_a_corner_keeps_the_tolerance_on_both_sides_and_uses_it(seed, turned):
     path = rounded(waypoints, tolerance, WEIGHT, always)
     (index,) = _rounded_corners(path)
     segment = path.segments[index]
-    samples = poses_of(*segment.at(np.linspace(0.0, segment.length, 21)))
+    samples = poses_of(*segment.at(np.linspace(0.0, segment.length, 11)))
     moves = list(pairwise(waypoints))
     off = [min(_distance_to_move(pose, *move) for move in moves) for pose in samples]
     nearest = min(_apart(pose, waypoints[1]) for pose in samples)

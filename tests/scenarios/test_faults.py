@@ -419,7 +419,8 @@ def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
     looks = "[0.2052217375521776, -0.4121263851345742, -0.7946433272763131, 0.3956992083985057]"
     assert looks in text
     rig = tmp_path / "rig.yaml"
-    rig.write_text(text.replace(looks, "[1, 0, 0, 0]"))
+    assert "rate_hz: 10" in text  # an image without the platform is searched all over
+    rig.write_text(text.replace(looks, "[1, 0, 0, 0]").replace("rate_hz: 10", "rate_hz: 5"))
     run = tmp_path / "run"
     answer = call("run", short_plan, "--rig", rig, "-o", run, "--fast")
     assert answer.code == 1, answer
@@ -431,4 +432,4 @@ def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
     assert codes.index("camera_sees_nothing") < codes.index("held"), "told while it moves"
     assert summary["final_state"] == "finished"
     assert summary["clearance_mm"]["source"] == "encoder"
-    assert summary["tag_error_mm"]["frames_without_pose"] == summary["tag_error_mm"]["frames"] > 30
+    assert summary["tag_error_mm"]["frames_without_pose"] == summary["tag_error_mm"]["frames"] > 15

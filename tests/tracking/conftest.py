@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import pytest
 
 from model.rig import Camera, Rig, load_rig
@@ -10,7 +9,6 @@ from model.scene import Scene, load_scene
 from simulation.camera.camera import SyntheticCamera
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-cv2.setNumThreads(1)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Tag
-from simulation.camera.rendering import Canvas, draw_tag, sample_rays
+from simulation.camera.camera import sample_rays
+from simulation.camera.rendering import Canvas, draw_tag
 from tests.tracking.tag_pictures import SIZE, small_camera
 from tracking.camera_model import pixels_of
 from tracking.detection.tags import tag_corners

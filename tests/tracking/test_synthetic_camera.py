@@ -24,9 +24,10 @@ from model.geometry.shapes import (
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig
 from model.scene import Scene
-from simulation.camera.camera import Optics, SyntheticCamera
-from simulation.camera.rendering import Canvas, draw_triangles, sample_rays, surface_of
+from simulation.camera.camera import Optics, SyntheticCamera, sample_rays
+from simulation.camera.rendering import Canvas, draw_triangles, surface_of
 from tests.tracking.tag_pictures import TagPrinter, small_camera
+from tracking.camera_model import rays_of
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.1
 SHAPES: list[Shape] = [
@@ -117,6 +118,23 @@ def test_every_shape_is_drawn_where_its_points_are(shape: Shape) -> None:
     assert np.all(inside.max(axis=0) <= pixels.max(axis=0) + slack)
     assert np.all(inside.max(axis=0) >= pixels.max(axis=0) + (slack - 1.0) * 0.5 - 2.5)
     assert np.nanmin(canvas.depth) >= points[:, 2].min() - radius - 1e-4
+
+
+@pytest.mark.parametrize(
+    ("lens", "focal", "distortion"),
+    [
+        ("pinhole", 300.0, [-0.12, 0.05, 0.0008, -0.0006, 0.01]),
+        ("pinhole", 110.0, [0.42, 0.01, 0.001, -0.001, 0.0, 0.73, 0.07, 0.0]),
+        ("fisheye", 90.0, [0.03, -0.02, 0.015, -0.005]),  # wider than rays are looked for
+    ],
+)
+def test_every_ray_is_that_of_its_sample(lens: str, focal: float, distortion: list[float]) -> None:
+    matrix = np.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
+    camera = replace(small_camera(()), lens=lens, matrix=matrix, distortion=np.array(distortion))
+    places = np.random.default_rng(3).integers(0, [640, 480], (2000, 2))
+    exact = rays_of(lens, matrix, camera.distortion, (places + 0.5) / 2.0 - 0.5)
+    off = np.abs(sample_rays(camera)[places[:, 1], places[:, 0]] - exact).max(axis=1)
+    assert (off < 2e-7 * (1.0 + np.sum(exact**2, axis=1))).all()
 
 
 @given(st.floats(0.02, 0.3), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
