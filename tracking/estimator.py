@@ -250,10 +250,10 @@ class PlatformEstimator:
             views, start = kept, bundle.camera_from_body
         return None
 
-    def _covariance(self, bundle: BundlePose) -> Array:
+    def _covariance(self, bundle: BundlePose, views: Sequence[TagView]) -> Array:
         """Of a pose by the scatter of its edges, along the world's axes, shape (6, 6), [m, rad]."""
         turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
-        return read_only(turn @ bundle.covariance @ turn.T)
+        return read_only(turn @ self._shared.scatter(bundle, views) @ turn.T)
 
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str
@@ -262,7 +262,7 @@ class PlatformEstimator:
         return PoseMeasurement(
             time,
             pose,
-            self._covariance(bundle),
+            self._covariance(bundle, views),
             tuple(sorted(view.tag.id for view in views)),
             bundle.reprojection,
             status,
