@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, stdtrit
 
+from model.cameras import SURE
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from model.rig import Camera, Tag
 from tracking.camera_model import project_undistorted
@@ -25,6 +26,11 @@ HUBER = 3.0
 #: The edges' stated deviations weigh as this many residuals when the covariance is scaled by
 #: how well all edges fit: few edges fit well by chance.
 PRIOR_WEIGHT = 12.0
+#: A cost larger by this factor than it should be is not taken for chance, and fewer degrees of
+#: freedom than these are not counted as fewer.
+CHANCE, FEWEST = 1.3, 4
+#: Of the intervals, [share].
+COVERAGE = 0.95
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
 
@@ -63,12 +69,20 @@ class BundlePose:
     certainties: Array
 
     def misfit(self, expected: float) -> float:
-        """How much worse the edges fit than they should, as a factor of their variances.
+        """How much larger the variances of the edges are than they state, by how well they fit.
+
+        Where they fit worse than chance explains, their noise is not what it was taken to be, and
+        what they state counts no more: their disagreement alone does, with Student's factor for how
+        few they are.
 
         Args:
             expected: The cost that they should have, such as `freedom`.
         """
-        return (PRIOR_WEIGHT + self.cost) / (PRIOR_WEIGHT + expected)
+        usual = (PRIOR_WEIGHT + self.cost) / (PRIOR_WEIGHT + expected)
+        if self.cost <= CHANCE * expected:
+            return usual
+        factor = stdtrit(max(expected, FEWEST), 0.5 + COVERAGE / 2.0) / SURE
+        return max(usual, self.cost / max(expected, 1.0) * float(factor) ** 2)
 
     @property
     def reprojection(self) -> float:

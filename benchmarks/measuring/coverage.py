@@ -180,7 +180,8 @@ def step_between(told: Pose, truth: Pose) -> Array:
 
 def lens_error(found: CameraCalibration, truth: Camera) -> float:
     """How far off points of the picture are at the distance, RMS, turned to fit best, [m]."""
-    across, down = np.meshgrid(np.linspace(0, 1279, 16), np.linspace(0, 719, 12))
+    # The middles of cells: ends of the picture would count twice as much as the rest.
+    across, down = np.meshgrid(np.arange(39.5, 1280.0, 80.0), np.arange(29.5, 720.0, 60.0))
     pixels = np.column_stack([across.ravel(), down.ravel()]).reshape(-1, 1, 2)
     rays = [
         np.column_stack([cv2.undistortPoints(pixels, m, d).reshape(-1, 2), np.ones(len(pixels))])

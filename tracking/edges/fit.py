@@ -20,6 +20,7 @@ from tracking.edges.profile import (
     DARK,
     DARK_SLOPE,
     INNER,
+    WHITE,
     compare,
 )
 from tracking.edges.sampling import (
@@ -28,6 +29,7 @@ from tracking.edges.sampling import (
     BOXED,
     COVARIANCE,
     HALF,
+    HIDDEN,
     INK,
     MIDDLE,
     MODULES,
@@ -436,6 +438,7 @@ def _write(
         wider += 0.5 * _correlated(column, gradients, weights) / (variance * column[k] * variance)
     found[OFFSET], found[TILT] = best[OFFSET], best[TILT]
     found[SPREAD], found[BOXED] = best[SPREAD], best[BOXED]
+    found[HIDDEN] = max(best[BRIGHT] - WHITE, 0.0) / (best[BRIGHT] - best[DARK])
     used = 0
     for weight in weights:
         used += 1 if weight > 0.1 else 0

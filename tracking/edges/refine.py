@@ -22,6 +22,7 @@ from tracking.edges.sampling import (
     COLUMNS,
     COVARIANCE,
     HALF,
+    HIDDEN,
     MIDDLE,
     OFFSET,
     OFFSET_VARIANCE,
@@ -176,6 +177,9 @@ FLOOR = 0.0015
 #: The second row of modules inside an edge is not modelled: this many times the share of it that
 #: the blur brings to the first row's middle, in deviations of the blur.
 SECOND_ROW = 1.0
+#: Where paper is overexposed only the foot of the step is seen, and the blur's shape decides on
+#: where it lies: this many deviations of the blur, times the share that is hidden.
+OVEREXPOSED = 0.15
 #: Where the blur is wider than this share of a module, corners are fitted again as long as they
 #: move by more than `NEAR` and half of what an edge may be off: what the modules beside an edge add
 #: hangs on where they lie.
@@ -303,7 +307,8 @@ def _doubt(found: Array, widths: Array) -> Array:
     spread = np.maximum(found[..., SPREAD], 1e-6)
     away = np.clip(widths / spread, 1.0, 20.0)
     tail = np.exp(-0.5 * away**2) / (np.sqrt(2.0 * np.pi) * away)  # of a bell, beyond a module
-    return np.asarray(np.hypot(FLOOR, SECOND_ROW * spread * tail))
+    hidden = OVEREXPOSED * found[..., HIDDEN]
+    return np.asarray(np.hypot(FLOOR, spread * np.hypot(SECOND_ROW * tail, hidden)))
 
 
 def _refined(corners: Array, lines: Lines, found: Array, tag: int) -> RefinedTag | None:
