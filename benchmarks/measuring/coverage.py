@@ -10,7 +10,7 @@ and projected here, with OpenCV's projection and nothing of the estimators that 
 NEES is the squared error of a pose in units of its covariance, 6 when that is exact. A verdict is
 right when it says good in labs of a kind whose errors, 95 %, are below what is wanted, and not good
 in those whose errors are above: the errors that were made, over all labs of that kind. It is asked
-for the limits of each kind, and near the level of the errors: for 1.25 times and 0.8 times that.
+for the limits of each kind, and near the level of the errors: for 1.5 times and two thirds of that.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 CORNER_PX, TAG_PX = 0.1, 0.03
 """Noise of corners of boards and of tags."""
 DISTANCE, PICTURES = 1.6, 5
-NEAR = 1.25
+NEAR = 1.5
 """How far from the level of the errors verdicts near it are asked for, as a factor."""
 BOARD = np.array([[0.03 * x, 0.03 * y, 0.0] for y in range(6) for x in range(9)])
 

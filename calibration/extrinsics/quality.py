@@ -64,7 +64,7 @@ class ExtrinsicCalibration:
         """How far off points of the work space are seen, 95 %, RMS, [m]."""
         arms = self.points - self.world_from_camera.position
         slopes = np.concatenate([np.hstack([np.eye(3), -skew(arm)]) for arm in arms])
-        return np.sqrt(3.0) * rms_bound(self.stated_covariance, slopes)  # of all axes
+        return float(np.sqrt(3.0)) * rms_bound(self.stated_covariance, slopes)  # of all axes
 
 
 def workspace_corners(rig: Rig) -> Array:

@@ -171,7 +171,7 @@ def test_a_smear_is_named_with_its_length(rig: Rig, camera: Camera, empty: Scene
     speed = length * np.linalg.norm(HERE.position - camera.world_from_camera.position)
     speed /= camera.matrix[0, 0] * exposure
     eye = SyntheticCamera(rig, empty, camera, seed=3, optics=replace(PLAIN, exposure=exposure))
-    motion = PlatformMotion(np.array([0.0, 0.0, speed]), np.zeros(3))
+    motion = PlatformMotion(speed * camera.world_from_camera.rotation[:, 0], np.zeros(3))
     image = eye.render(HERE, 0, motion)
     limits = replace(TrackerSettings(), position_deviation=1e-6)
     found = Tracker(rig, camera, limits).observe(image, 0.0)

@@ -72,7 +72,7 @@ _LEAST_EDGES = 6
 LEAST_SMEAR, LEAST_CLIPPED, MOST_CLIPPED = 3.0, 0.3, 0.9
 #: Edges sharper than those of a pixel that is a perfect square, seen through a lens, [px], and
 #: brightness that goes beyond paper and ink by more than this share of the contrast, are a
-#: camera's doing. Ends of what a pixel can show cut the rest off, and edges are not where they seem.
+#: camera's doing. Black and white cut the rest off, and edges are not where they seem to be.
 SHARP, OVERSHOOT = 0.385, 0.05
 
 
@@ -159,7 +159,7 @@ def _smear(normals: Array, spreads: Array) -> float:
 def _beside_edges(
     image: Image, starts: Array, along: Array, outward: Array, widths: Array
 ) -> tuple[float, float]:
-    """Median overshoot beside edges, share of the contrast, and share of edges with clipped paper."""
+    """Median overshoot, share of the contrast, and share of edges whose paper is clipped."""
     wide = widths >= _LEAST_MODULE
     if not wide.any():
         return 0.0, 0.0
