@@ -332,7 +332,7 @@ def _result(
     normal = jacobian.T @ (jacobian * _weights(errors)[:, None])
     freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
     try:
-        covariance = np.linalg.inv(normal)
+        covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError:  # too few edges to fix all six
         covariance = np.full((6, 6), np.inf)
     found = BundlePose(
