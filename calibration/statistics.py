@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from model.pose import Array
 
@@ -91,6 +92,28 @@ def kept_share(parts: int, numbers: int) -> float:
     Half of their usual weight, numbers by parts, is taken off.
     """
     return max(0.0, 1.0 - numbers / (2.0 * parts))
+
+
+# How large several numbers together are by chance, which is not how large each of them is.
+
+
+def rms_bound(covariance: Array, slopes: Array) -> float:
+    """What the RMS of quantities exceeds in one case of twenty, by normal errors they depend on.
+
+    Their squares' sum is taken as a multiple of a chi-squared one with the same mean and variance.
+    Of one quantity it is 1.96 deviations; of many independent ones hardly more than their RMS.
+
+    Args:
+        covariance: Of n errors, shape (n, n).
+        slopes: Of k quantities by them, shape (k, n).
+
+    Source: Satterthwaite, Biometrics Bulletin 2(6), 1946.
+    """
+    spread = covariance @ (slopes.T @ slopes) / len(slopes)
+    mean, square = float(np.trace(spread)), float(np.trace(spread @ spread))
+    if not 0.0 < square < np.inf:
+        return max(mean, 0.0)  # exactly known, or not at all
+    return float(np.sqrt(square / mean * chi2.ppf(CONFIDENCE, mean**2 / square)))
 
 
 # Huber's loss: what is far off counts by its distance, not by its square.

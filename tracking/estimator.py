@@ -13,6 +13,7 @@ from tracking.camera_model import Image, pixels_from_ideal, pixels_of
 from tracking.consensus import Consensus, agreeing
 from tracking.detection.decoder import carries_tag
 from tracking.detection.detector import Detection
+from tracking.detection.diagnostics import edge_faults
 from tracking.detection.tags import modules_across, tag_corners
 from tracking.edges.refine import refine
 from tracking.measurement import NoPose, Observation, PoseMeasurement
@@ -183,8 +184,9 @@ class PlatformEstimator:
             return NoPose(time, "no tag of the platform fits a pose", seen)
         views, bundle = fitted
         reason = doubt(self._settings, views, bundle, prior)
-        if reason:
-            return NoPose(time, reason, seen)
+        faults = edge_faults(image, self._camera, [view.seen for view in views], self._modules)
+        if reason or faults.unusable:
+            return NoPose(time, "; ".join(filter(None, (reason, str(faults)))), seen)
         found = self._measurement(time, views, bundle, status)
         if by_rows is None:
             return found
@@ -250,10 +252,10 @@ class PlatformEstimator:
             views, start = kept, bundle.camera_from_body
         return None
 
-    def _covariance(self, bundle: BundlePose) -> Array:
+    def _covariance(self, bundle: BundlePose, views: Sequence[TagView]) -> Array:
         """Of a pose by the scatter of its edges, along the world's axes, shape (6, 6), [m, rad]."""
         turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
-        return read_only(turn @ bundle.covariance @ turn.T)
+        return read_only(turn @ self._shared.scatter(bundle, views) @ turn.T)
 
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str
@@ -262,7 +264,7 @@ class PlatformEstimator:
         return PoseMeasurement(
             time,
             pose,
-            self._covariance(bundle),
+            self._covariance(bundle, views),
             tuple(sorted(view.tag.id for view in views)),
             bundle.reprojection,
             status,

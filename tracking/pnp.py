@@ -8,11 +8,13 @@ tag's mirror pose (a single square's usual trap) survives when more than one is 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
+from model.cameras import SURE
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from model.rig import Camera, Tag
 from tracking.camera_model import project_undistorted
@@ -24,6 +26,11 @@ HUBER = 3.0
 #: The edges' stated deviations weigh as this many residuals when the covariance is scaled by
 #: how well all edges fit: few edges fit well by chance.
 PRIOR_WEIGHT = 12.0
+#: A cost larger by this factor than it should be is not taken for chance, and fewer degrees of
+#: freedom than these are not counted as fewer.
+CHANCE, FEWEST = 1.3, 4
+#: Of the intervals, [share].
+COVERAGE = 0.95
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
 
@@ -45,6 +52,7 @@ class BundlePose:
         covariance: Of position [m] and rotation vector [rad] along the camera's axes, shape (6, 6).
         cost: Huber cost of the edges, in variances.
         second_best_cost: Cost of the best other pose, infinite without one.
+        freedom: Errors of edges beyond the pose's six numbers.
         edge_errors: Of each tag's edges in deviations, 0 where hidden, shape (t, 4).
         corner_errors: Of each tag's corners, RMS, shape (t,), [px]; of whole tags their corners,
             else of the edges that were measured.
@@ -55,9 +63,26 @@ class BundlePose:
     covariance: Array
     cost: float
     second_best_cost: float
+    freedom: int
     edge_errors: Array
     corner_errors: Array
     certainties: Array
+
+    def misfit(self, expected: float) -> float:
+        """How much larger the variances of the edges are than they state, by how well they fit.
+
+        Where they fit worse than chance explains, their noise is not what it was taken to be, and
+        what they state counts no more: their disagreement alone does, with Student's factor for how
+        few they are.
+
+        Args:
+            expected: The cost that they should have, such as `freedom`.
+        """
+        usual = (PRIOR_WEIGHT + self.cost) / (PRIOR_WEIGHT + expected)
+        if self.cost <= CHANCE * expected:
+            return usual
+        factor = stdtrit(max(expected, FEWEST), 0.5 + COVERAGE / 2.0) / SURE
+        return max(usual, self.cost / max(expected, 1.0) * float(factor) ** 2)
 
     @property
     def reprojection(self) -> float:
@@ -172,11 +197,36 @@ def moved_by_pixels(camera: Camera, views: Sequence[TagView], pose: Pose, shifts
     Returns:
         Shift [m] and turn [rad] along the camera's axes, shape (6, k).
     """
-    squares = _Squares.of(camera, views)
+    return _by_pixels(_Squares.of(camera, views), pose, shifts)[0]
+
+
+def expected_cost(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> float:
+    """The mean cost of a fitted pose whose corners are off by known causes beside their scatter.
+
+    Args:
+        camera: The camera that saw them.
+        views: The tags.
+        pose: ``camera_from_body`` that fits them.
+        shifts: Of each tag's ideal corners, by each of k independent causes of size 1, shape
+            (t, 8, k), [px].
+    """
+    left = _by_pixels(_Squares.of(camera, views), pose, shifts)[1]
+    measured = np.array([view.seen.edges for view in views])
+    scatter = max(1.0 - 3.0 / np.count_nonzero(measured), 0.0)  # the pose takes six errors off
+    variances = scatter + np.mean(np.sum(left**2, axis=1).reshape(-1, 4, 2), axis=2)[measured]
+    # Of a pair of normal errors of one variance, by parts: its size has Rayleigh's distribution.
+    near = 2.0 * variances * -np.expm1(-0.5 * HUBER**2 / np.maximum(variances, 1e-12))
+    beyond = 2.0 * HUBER * np.sqrt(2.0 * np.pi * variances)
+    return float(np.sum(near + beyond * ndtr(-HUBER / np.sqrt(np.maximum(variances, 1e-12)))))
+
+
+def _by_pixels(squares: _Squares, pose: Pose, shifts: Array) -> tuple[Array, Array]:
+    """How a pose moves with its corners, (6, k), and what errors of edges that leaves, (8 t, k)."""
     slopes = squares.jacobian(pose).reshape(-1, 6)
     causes = (squares.whitening @ shifts).reshape(len(slopes), -1)
     weighted = slopes * _weights(squares.errors(pose))[:, None]
-    return np.asarray(np.linalg.solve(slopes.T @ weighted, weighted.T @ causes))
+    steps = np.asarray(np.linalg.solve(slopes.T @ weighted, weighted.T @ causes))
+    return steps, causes - slopes @ steps
 
 
 def square_poses(camera: Camera, view: TagView) -> list[Pose]:
@@ -281,20 +331,21 @@ def _result(
     jacobian = squares.jacobian(pose).reshape(-1, 6)
     normal = jacobian.T @ (jacobian * _weights(errors)[:, None])
     freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
-    scale = (PRIOR_WEIGHT + cost) / (PRIOR_WEIGHT + max(freedom, 0))
     try:
-        covariance = scale * np.linalg.inv(normal)
+        covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError:  # too few edges to fix all six
         covariance = np.full((6, 6), np.inf)
-    return BundlePose(
+    found = BundlePose(
         pose,
-        read_only(covariance),
+        covariance,
         cost,
         rival,
+        max(freedom, 0),
         read_only(_edge_sizes(errors)),
         read_only(_corner_errors(squares, views, pose)),
         read_only(np.array([_certainty(view.seen) for view in views])),
     )
+    return replace(found, covariance=read_only(found.misfit(found.freedom) * covariance))
 
 
 def _certainty(seen: RefinedTag) -> float:

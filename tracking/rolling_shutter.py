@@ -30,8 +30,9 @@ from tracking.detection.tags import tag_corners
 from tracking.measurement import MEMORY, PoseMeasurement
 from tracking.pnp import BundlePose, TagView, refine_pnp
 
-#: Poses that a speed is taken from are this many readouts apart, where there are such.
-APART = 4.0
+#: Poses that a speed is taken from are this many readouts apart, where there are such: farther
+#: apart, acceleration that changes meanwhile counts for more than the poses' scatter.
+APART = 2.0
 #: Times that the motion is taken from the pose that was found with it.
 PASSES = 2
 #: Of the motion that a pose's dependence on it is found with, [m/s] and [rad/s].

@@ -18,7 +18,7 @@ from model.pose import Array, Pose, carried, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import ideal_slopes, ray_slopes, rays_of
 from tracking.detection.tags import tag_corners
-from tracking.pnp import TagView, moved_by_pixels
+from tracking.pnp import BundlePose, TagView, expected_cost, moved_by_pixels
 
 _GRID = 7
 """Points along each side of the picture at which a rotation is fitted to lens errors."""
@@ -120,6 +120,23 @@ class SharedErrors:
             + by_lens @ self._lens @ by_lens.T
             + by_tags @ by_tags.T
         )
+
+    def scatter(self, bundle: BundlePose, views: Sequence[TagView]) -> Array:
+        """Covariance of a pose by the scatter of its edges alone, camera's axes, shape (6, 6).
+
+        Edges that fit badly widen it. Where tags are off as stated, edges fit worse by that much,
+        and it is in `of` already: counted here once more, intervals would be too wide.
+
+        Args:
+            bundle: The pose in the camera's frame.
+            views: The tags that it rests on.
+        """
+        misfit, pose = bundle.misfit(bundle.freedom), bundle.camera_from_body
+        if self.whole is not None or not self._tag_error or misfit <= 1.0:
+            return bundle.covariance
+        by_tags = self._pixels_by_tags(views, pose)
+        left = bundle.misfit(expected_cost(self._camera, views, pose, by_tags))
+        return read_only(bundle.covariance * (max(left, 1.0) / misfit))
 
     def _pixels_by_lens(self, views: Sequence[TagView]) -> Array:
         """Slopes of the ideal pixels of all corners, shape (t, 8, n)."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import t as student
 
-from calibration.statistics import CONFIDENCE
+from calibration.statistics import CONFIDENCE, rms_bound
 from calibration.verdict import CalibrationVerdict, Issue
 from model.cameras import SURE
 from model.pose import Array, Pose, skew
@@ -62,10 +62,9 @@ class ExtrinsicCalibration:
     @property
     def error(self) -> float:
         """How far off points of the work space are seen, 95 %, RMS, [m]."""
-        grown = SURE**2 * self.stated_covariance
         arms = self.points - self.world_from_camera.position
-        slopes = [np.hstack([np.eye(3), -skew(arm)]) for arm in arms]
-        return float(np.sqrt(np.mean([np.trace(s @ grown @ s.T) for s in slopes])))
+        slopes = np.concatenate([np.hstack([np.eye(3), -skew(arm)]) for arm in arms])
+        return float(np.sqrt(3.0)) * rms_bound(self.stated_covariance, slopes)  # of all axes
 
 
 def workspace_corners(rig: Rig) -> Array:

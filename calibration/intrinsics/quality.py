@@ -86,7 +86,7 @@ def judge_camera(
     coverage, tilts = _coverage(result), _tilts(result)
     slopes = _without_rotation(*_grid_slopes(result))
     scale = distance / float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
-    error = scale * np.sqrt(2.0) * result.uncertainty.half_width_of(slopes)  # of both axes
+    error = scale * np.sqrt(2.0) * result.uncertainty.error_of(slopes)  # of both axes
     apart = slopes @ result.uncertainty.halves
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     bow, bent = bow_of(result)
@@ -148,7 +148,7 @@ def pixel_uncertainty(result: CameraCalibration, pixels: Array) -> Array:
     as_turns = np.linalg.lstsq(turns, over, rcond=None)[0]
     own, own_turns = _slopes(result, pixels)
     slopes = own - own_turns @ as_turns
-    each = [result.uncertainty.half_width_of(slope) for slope in slopes]
+    each = [result.uncertainty.error_of(slope) for slope in slopes]
     return np.asarray(np.sqrt(2.0) * np.array(each))  # of both axes
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from calibration.intrinsics.lens import LensModel
-from calibration.statistics import CONFIDENCE, jackknife, kept_share, widened
+from calibration.statistics import CONFIDENCE, jackknife, kept_share, rms_bound, widened
 from calibration.targets.board import Seen
 from model.cameras import SURE
 from model.errors import BadInput
@@ -53,19 +53,19 @@ class Uncertainty:
         quantile = _quantile(len(self.without)) / SURE
         return widened(self.covariance, self.without) * quantile**2
 
-    def half_width_of(self, slopes: Array) -> float:
-        """Half width of the 95 % interval of something that depends on all numbers, RMS.
+    def error_of(self, slopes: Array) -> float:
+        """How far off things are that depend on all numbers, 95 %, RMS.
 
         Taken as a whole by the scatter and by the jackknife, the larger counts: taken number by
         number, errors that cancel in the whole would not.
 
         Args:
-            slopes: Its derivatives by the numbers, shape (..., n).
+            slopes: Their derivatives by the numbers, shape (..., n).
         """
         flat = slopes.reshape(-1, slopes.shape[-1])
-        both = (self.covariance, jackknife(self.without))
-        squares = [float(np.einsum("pk,kl,pl->", flat, c, flat)) / len(flat) for c in both]
-        return _quantile(len(self.without)) * float(np.sqrt(max(*squares, 0.0)))
+        by_pictures = jackknife(self.without) * kept_share(*self.without.shape)
+        larger = max(rms_bound(one, flat) for one in (self.covariance, by_pictures))
+        return _quantile(len(self.without)) / SURE * larger
 
 
 def uncertainty_of(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from model.pose import Pose, matrix_from_rotation_vector
+from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
@@ -16,6 +17,7 @@ from tests.tracking.test_tracker import error_of
 from tracking.consensus import agreeing
 from tracking.measurement import NoPose, PoseMeasurement, predicted
 from tracking.pnp import TagView
+from tracking.settings import TrackerSettings
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.1, 0.1, 0.4])
@@ -132,6 +134,51 @@ def test_a_fast_platform_is_followed_by_its_speed(rig: Rig, camera: Camera, empt
         assert isinstance(found, PoseMeasurement)
         assert found.status == ("tracked" if frame else "found")
         assert found.pose.distance_to(truth) < 1e-3
+
+
+PLAIN = Optics(noise=1.5, blur=0.6)
+
+
+@pytest.mark.parametrize(
+    ("optics", "named"),
+    [
+        (replace(PLAIN, sharpening=2.0), "the image is sharpened: .*switch off"),
+        (replace(PLAIN, light=1.6), "paper is overexposed at 100% of the edges: shorten"),
+    ],
+)
+def test_images_whose_edges_are_not_where_they_seem_are_refused_by_name(
+    rig: Rig, camera: Camera, empty: Scene, optics: Optics, named: str
+) -> None:
+    """Their intervals held the truth in one of three images."""
+    image = SyntheticCamera(rig, empty, camera, seed=3, optics=optics).render(HERE, 0)
+    found = Tracker(rig, camera).observe(image, 0.0)
+    assert isinstance(found, NoPose)
+    assert re.search(named, found.reason)
+
+
+@pytest.mark.parametrize(
+    "optics", [PLAIN, Optics(), replace(PLAIN, sharpening=0.5), replace(PLAIN, jpeg=50)]
+)
+def test_images_as_cameras_take_them_are_not_refused(
+    rig: Rig, camera: Camera, empty: Scene, optics: Optics
+) -> None:
+    image = SyntheticCamera(rig, empty, camera, seed=3, optics=optics).render(HERE, 0)
+    assert isinstance(Tracker(rig, camera).observe(image, 0.0), PoseMeasurement)
+
+
+def test_a_smear_is_named_with_its_length(rig: Rig, camera: Camera, empty: Scene) -> None:
+    exposure, length = 0.01, 7.0
+    speed = length * np.linalg.norm(HERE.position - camera.world_from_camera.position)
+    speed /= camera.matrix[0, 0] * exposure
+    eye = SyntheticCamera(rig, empty, camera, seed=3, optics=replace(PLAIN, exposure=exposure))
+    motion = PlatformMotion(speed * camera.world_from_camera.rotation[:, 0], np.zeros(3))
+    image = eye.render(HERE, 0, motion)
+    limits = replace(TrackerSettings(), position_deviation=1e-6)
+    found = Tracker(rig, camera, limits).observe(image, 0.0)
+    assert isinstance(found, NoPose)
+    smear = re.search(r"smeared by (\d+) px: shorten the exposure", found.reason)
+    assert smear is not None
+    assert abs(int(smear[1]) - length) <= 1
 
 
 @pytest.mark.slow

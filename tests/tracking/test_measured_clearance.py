@@ -24,7 +24,12 @@ from tracking.edges.refine import RefinedTag
 from tracking.measurement import PoseMeasurement
 from tracking.multi_camera import together
 from tracking.pnp import TagView, moved, solve_pnp
-from tracking.shared_errors import SharedErrors, implied_rotation, require_stated_errors
+from tracking.shared_errors import (
+    SharedErrors,
+    implied_rotation,
+    require_stated_errors,
+    tag_error_slopes,
+)
 from tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -162,6 +167,46 @@ def test_one_number_of_the_operator_stands_for_all_that_is_shared(rig: Rig, crow
     assert stated is not None
     assert np.all(stated.uncertainties <= 1.96e-3 * (1.0 + 1e-9))
     assert np.all(stated.uncertainties >= 1.96e-3 / np.sqrt(2.0) * (1.0 - 1e-9))
+
+
+def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
+    """Edges fit worse where tags are off: that is no reason to widen the pose's own scatter."""
+    rng, scatter, values = np.random.default_rng(8), 0.03, []
+    camera = looking(rig)
+    count = 4 + camera.distortion.size
+    camera = replace(
+        camera,
+        error=None,
+        lens_covariance=np.zeros((count, count)),
+        place_covariance=np.zeros((6, 6)),
+    )
+    stated = replace(rig, tag_error=0.25e-3, outlet_error=0.0, anchor_error=0.0)
+    shared = SharedErrors(stated, camera)
+    for _ in range(400):
+        turn = matrix_from_rotation_vector(rng.normal(size=3) * 0.08)
+        pose = Pose(rng.uniform([-0.1, -0.1, 0.35], [0.15, 0.1, 0.55]), turn)
+        views = []
+        for view in square(rig, camera, pose):
+            shifts = tag_error_slopes(view.tag, 0.25e-3) @ rng.standard_normal(6)
+            points = pose.apply(tag_corners(view.tag) + shifts)
+            seen = project_undistorted(camera, camera.world_from_camera.inverse().apply(points))
+            seen = seen + scatter * rng.standard_normal(seen.shape)
+            whitening = np.eye(8) / scatter
+            corners = RefinedTag(seen, whitening, whitening @ seen.ravel(), np.ones(4, bool))
+            views.append(TagView(view.tag, corners))
+        bundle = solve_pnp(camera, views, camera.world_from_camera.inverse().compose(pose))
+        assert bundle is not None
+        found = camera.world_from_camera.compose(bundle.camera_from_body)
+        turn = np.kron(np.eye(2), camera.world_from_camera.rotation)
+        own = turn @ shared.scatter(bundle, views) @ turn.T
+        error = np.concatenate(
+            [
+                found.position - pose.position,
+                rotation_vector_from_matrix(found.rotation @ pose.rotation.T),
+            ]
+        )
+        values.append(error @ np.linalg.solve(own + shared.of(found, views), error))
+    assert 5.5 < np.mean(values) < 6.5
 
 
 @pytest.mark.parametrize("fisheye", [False, True])

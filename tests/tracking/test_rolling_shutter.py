@@ -15,6 +15,7 @@ from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
 from tracking.camera_model import pixels_of
 from tracking.measurement import PoseMeasurement
+from tracking.rolling_shutter import RecentMotion
 from tracking.tracker import Tracker
 
 READOUT, RATE = 0.03, 20.0
@@ -124,3 +125,19 @@ def test_a_motion_turns_and_shifts() -> None:
     half = motion.moved(before, 0.25)
     np.testing.assert_allclose(half.position, [0.05, 0.0, 0.0])
     assert half.angle_to(after) == pytest.approx(0.1)
+
+
+def test_the_motion_of_a_swing_is_found_to_a_hundredth() -> None:
+    """Back and forth at 100 mm/s as in the benchmark: its acceleration changes all the time."""
+    recent, swing, speed = RecentMotion(READOUT), 0.04, 0.1
+    off = []
+    for number in range(60):
+        time = number / 30.0
+        phase = speed / swing * time
+        pose = Pose.level([0.0, swing * np.sin(phase), 0.4])
+        motion = recent.at(time, pose)
+        if number > 6:
+            assert motion is not None
+            off.append(abs(motion.velocity[1] - speed * np.cos(phase)))
+        recent.add(PoseMeasurement(time, pose, np.eye(6) * 1e-9, (301,), 0.03, "tracked"))
+    assert max(off) < 0.012 * speed

@@ -20,13 +20,16 @@ from tracking.edges.profile import (
     DARK,
     DARK_SLOPE,
     INNER,
+    WHITE,
     compare,
 )
 from tracking.edges.sampling import (
     ACROSS,
+    ALIKE,
     BOXED,
     COVARIANCE,
     HALF,
+    HIDDEN,
     INK,
     MIDDLE,
     MODULES,
@@ -380,7 +383,7 @@ def _improve(pixels: Array, count: int, best: Array, most_spread: float, found: 
 
 
 #: Errors are taken to be alike over this many parts of an edge.
-ALIKE = 3
+LAGS = 3
 #: That errors are independent weighs as much as this many parts that show otherwise.
 INDEPENDENT = 8.0
 
@@ -405,8 +408,8 @@ def _correlated(column: Array, gradients: Array, weights: Array) -> float:
         for i in range(len(column)):
             pulls[k] += weights[k] * column[i] * gradients[k, i]
     total = 0.0
-    for apart in range(ALIKE + 1):
-        share = (1.0 if apart == 0 else 2.0) * (1.0 - apart / (ALIKE + 1.0))
+    for apart in range(LAGS + 1):
+        share = (1.0 if apart == 0 else 2.0) * (1.0 - apart / (LAGS + 1.0))
         for k in range(parts - apart):
             total += share * pulls[k] * pulls[k + apart]
     return total
@@ -435,13 +438,16 @@ def _write(
         wider += 0.5 * _correlated(column, gradients, weights) / (variance * column[k] * variance)
     found[OFFSET], found[TILT] = best[OFFSET], best[TILT]
     found[SPREAD], found[BOXED] = best[SPREAD], best[BOXED]
+    found[HIDDEN] = max(best[BRIGHT] - WHITE, 0.0) / (best[BRIGHT] - best[DARK])
     used = 0
     for weight in weights:
         used += 1 if weight > 0.1 else 0
     found[SHARE] = used / len(weights)
-    if used > 2 * ALIKE:
-        wider *= used / (used - ALIKE - 1.0)  # the fit has taken off what all parts share
+    found[ALIKE] = 1.0
+    if used > 2 * LAGS:
+        wider *= used / (used - LAGS - 1.0)  # the fit has taken off what all parts share
         wider = max(1.0, (INDEPENDENT + used * wider) / (INDEPENDENT + used))
         found[OFFSET_VARIANCE] *= wider
         found[COVARIANCE] *= wider
         found[TILT_VARIANCE] *= wider
+        found[ALIKE] = wider

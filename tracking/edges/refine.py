@@ -7,7 +7,7 @@ may be off. The lines are freed of lens distortion and meet at the corners.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,11 @@ from tracking.camera_model import Image, ideal_from_pixels, pixels_from_ideal
 from tracking.edges.coarse import locate_edges
 from tracking.edges.fit import fit_edges
 from tracking.edges.sampling import (
+    ALIKE,
     COLUMNS,
     COVARIANCE,
     HALF,
+    HIDDEN,
     MIDDLE,
     OFFSET,
     OFFSET_VARIANCE,
@@ -175,6 +177,9 @@ FLOOR = 0.0015
 #: The second row of modules inside an edge is not modelled: this many times the share of it that
 #: the blur brings to the first row's middle, in deviations of the blur.
 SECOND_ROW = 1.0
+#: Where paper is overexposed only the foot of the step is seen, and the blur's shape decides on
+#: where it lies: this many deviations of the blur, times the share that is hidden.
+OVEREXPOSED = 0.15
 #: Where the blur is wider than this share of a module, corners are fitted again as long as they
 #: move by more than `NEAR` and half of what an edge may be off: what the modules beside an edge add
 #: hangs on where they lie.
@@ -198,12 +203,16 @@ class RefinedTag:
         whitening: Shape (8, 8), [1/px].
         target: Shape (8,).
         edges: Which edges were measured, shape (4,).
+        spreads: Standard deviations of the blur across them, shape (4,), [px].
+        alike: How many times the variance of independent errors they have, shape (4,).
     """
 
     corners: Array
     whitening: Array
     target: Array
     edges: NDArray[np.bool_]
+    spreads: Array = field(default_factory=lambda: np.zeros(4))
+    alike: Array = field(default_factory=lambda: np.ones(4))
 
     @property
     def whole(self) -> bool:
@@ -257,7 +266,9 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
         again = inside & _unsettled(final - curves.ideal, found, widths, lines)[:, None, None]
         if not again.any():
             break
-    return [_refined(final, lines, t) if inside[t, 0, 0] else None for t in range(len(final))]
+    return [
+        _refined(final, lines, found, t) if inside[t, 0, 0] else None for t in range(len(final))
+    ]
 
 
 def load_kernels() -> None:
@@ -296,10 +307,11 @@ def _doubt(found: Array, widths: Array) -> Array:
     spread = np.maximum(found[..., SPREAD], 1e-6)
     away = np.clip(widths / spread, 1.0, 20.0)
     tail = np.exp(-0.5 * away**2) / (np.sqrt(2.0 * np.pi) * away)  # of a bell, beyond a module
-    return np.asarray(np.hypot(FLOOR, SECOND_ROW * spread * tail))
+    hidden = OVEREXPOSED * found[..., HIDDEN]
+    return np.asarray(np.hypot(FLOOR, spread * np.hypot(SECOND_ROW * tail, hidden)))
 
 
-def _refined(corners: Array, lines: Lines, tag: int) -> RefinedTag | None:
+def _refined(corners: Array, lines: Lines, found: Array, tag: int) -> RefinedTag | None:
     """Corners of a tag with the whitening that its lines' deviations give."""
     quad, edges = corners[tag], lines.good[4 * tag : 4 * tag + 4]
     if edges.sum() < 2:
@@ -318,4 +330,11 @@ def _refined(corners: Array, lines: Lines, tag: int) -> RefinedTag | None:
         target[2 * edge] = normal @ point / offset
         whitening[2 * edge + 1, start] = -normal / length / tilt
         whitening[2 * edge + 1, end] = normal / length / tilt
-    return RefinedTag(read_only(quad), read_only(whitening), read_only(target), edges.copy())
+    return RefinedTag(
+        read_only(quad),
+        read_only(whitening),
+        read_only(target),
+        edges.copy(),
+        read_only(found[tag, :, SPREAD]),
+        read_only(found[tag, :, ALIKE]),
+    )

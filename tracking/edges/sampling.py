@@ -84,7 +84,11 @@ COVARIANCE = 7
 TILT_VARIANCE = 8
 SHARE = 9
 """Share of the edge that looks like one."""
-COLUMNS = 10
+ALIKE = 10
+"""How many times the variance of independent errors it has, as they are alike along it."""
+HIDDEN = 11
+"""Share of the step from ink to paper that is brighter than a pixel can be."""
+COLUMNS = 12
 
 
 # How brightness rises across a blurred edge.
