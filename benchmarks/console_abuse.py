@@ -9,7 +9,7 @@ heads that are too long. The others come over sockets of pages without control: 
 types, values out of range, what is too long, binary, deep, commands, and what the operator's page
 said before. Nothing may move, nothing may be started, and the server's memory, threads and
 descriptors must stay where they were. Prints the figures; exit code 1 if anything was wrong. It
-takes a quarter of an hour.
+takes half an hour or more.
 """
 
 from __future__ import annotations

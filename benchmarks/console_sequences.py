@@ -3,7 +3,7 @@
     python benchmarks/console_sequences.py [--count 100000] [--seed 1]
 
 What happens, and how each cycle is judged, is in `tests/console/sequences.py`. Prints what was done
-and what was wrong; exit code 1 if anything was. 100 000 sequences take an hour.
+and what was wrong; exit code 1 if anything was. 100 000 sequences take hours.
 """
 
 from __future__ import annotations
