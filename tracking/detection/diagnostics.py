@@ -94,7 +94,7 @@ class EdgeFaults:
 
     @property
     def sharpened(self) -> bool:
-        """Whether the camera sharpened it so much that edges are not where they seem to be."""
+        """Whether the camera sharpened it until edges are not where they seem to be."""
         return self.spread < SHARP and self.overshoot > OVERSHOOT
 
     @property

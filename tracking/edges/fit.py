@@ -47,8 +47,6 @@ from tracking.edges.sampling import (
     tell_modules,
 )
 
-# The value of a rank among unsorted ones.
-
 
 @compiled
 def ranked(values: Array, count: int, rank: int) -> float:
@@ -76,7 +74,6 @@ def ranked(values: Array, count: int, rank: int) -> float:
 
 
 # Parts of an edge: a cable or a smudge that crosses it spoils some of them and not the others.
-
 
 #: Parts that fit this much worse than the usual one (in squares) do not count.
 FOREIGN = 9.0
@@ -155,7 +152,6 @@ def solved(factor: Array, vector: Array, size: int) -> None:
 
 
 # What is known of an edge before a pixel is seen; it settles what the pixels leave open.
-
 
 #: The blur's kind and how far from it blurs are.
 KIND, KIND_DEVIATION = 0.5, 0.3
