@@ -98,8 +98,8 @@ DRIVES: dict[str, Fault] = {
     "D PDOs mapped when operational": with_drives("maps-when-operational"),
     # In real time their set-up takes minutes, in turn.
     "D SDO answers take 300 ms": replace(with_drives("sdo-delay=300"), live=False),
+    "D every 5th SDO answer lost": replace(with_drives("sdo-lost=5"), live=False),
     "D every 7th SDO answer 800 ms late": with_drives("sdo-late=800"),
-    "D every 5th SDO answer lost": with_drives("sdo-lost=5"),
     "D SDO answers twice at the end": with_drives(script=answers_of(sdo_twice=0.03)),
     "D SDO answers lost at the end": with_drives(script=answers_of(sdo_lost=2)),
     "D no optional object": with_drives(
