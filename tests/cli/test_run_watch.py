@@ -18,7 +18,9 @@ def watched(
 ) -> tuple[LocalRequests, list[tuple[str, str]]]:
     """The board after so many moments, and what was told."""
     board, told = LocalRequests(), list[tuple[str, str]]()
-    status: Any = SimpleNamespace(take_cameras=lambda _cameras: None)
+    status: Any = SimpleNamespace(
+        take_cameras=lambda _cameras: None, take_measured=lambda *_measured: None
+    )
     watch = CameraWatch(
         RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE),
         status,

@@ -52,14 +52,15 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
     assert {row["obstacle"] for row in rows} == {"block"}
     with mcap.open("rb") as stream:
         messages = [
-            (channel.topic, json.loads(message.data))
+            (channel.topic, message.data)
             for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages()
         ]
+    measured = [json.loads(data) for topic, data in messages if topic == "/clearance"]
     counted = Counter(topic for topic, _ in messages)
     assert counted == {"/tag_pose": 3, "/tag_status": 3, "/clearance": 3}
-    distances = [content["distance_mm"] for topic, content in messages if topic == "/clearance"]
+    distances = [content["distance_mm"] for content in measured]
     assert distances == pytest.approx([float(row["clearance_mm"]) for row in rows], abs=1e-5)
-    highs = [content["at_most_mm"] for topic, content in messages if topic == "/clearance"]
+    highs = [content["at_most_mm"] for content in measured]
     assert highs == pytest.approx(at_most, abs=1e-5)
     names = sorted(path.name for path in drawn.iterdir())
     assert names == ["rendered_0.png", "rendered_1.png", "rendered_2.png"]

@@ -24,7 +24,7 @@ import numpy as np
 from cdpr.console.commands import Held, LetGo, parse_message
 from cdpr.console.session import Console, ConsoleFiles
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
-from executor.hold_to_run.session import jog_session
+from executor.hold_to_run.session import JogProver, jog_session
 from executor.state_machine import CycleRecord, State
 from model.clearance import ClearanceModel
 from model.errors import StoppedByOperator
@@ -192,7 +192,7 @@ class Sequences:
     def _start(self, verb: str, _arguments: object) -> None:
         self._started.append(verb)
 
-    def _on_cycle(self, record: CycleRecord, board: PressBoard) -> None:
+    def _on_cycle(self, record: CycleRecord, board: PressBoard, _: JogProver) -> None:
         self._judge.judge(record)
         self._cycle, self._now = self._cycle + 1, record.at
         if record.state is not State.MOVING:

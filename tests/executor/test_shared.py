@@ -45,11 +45,11 @@ def test_sealed_memory_cannot_be_written_to_by_anybody():
         with pytest.raises(TypeError):
             sealed.view[0] = 1
         with pytest.raises(PermissionError):
-            os.write(sealed._descriptor, b"x")
+            os.write(sealed.descriptor, b"x")
         with pytest.raises(PermissionError):
-            mmap.mmap(sealed._descriptor, sealed.size)
+            mmap.mmap(sealed.descriptor, sealed.size)
         with pytest.raises(PermissionError):
-            os.ftruncate(sealed._descriptor, 3)
+            os.ftruncate(sealed.descriptor, 3)
     finally:
         sealed.close()
 
