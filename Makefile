@@ -113,7 +113,7 @@ hil-makers: install  ## Its third part: rigs of three makes from doctor to relea
 hil-subset: install  ## Run those of them that take a few minutes, as .ci/run does
 	"$(BIN)/python" tools/hil/run.py --limit-s 1200 -m "hil and not slow"
 
-fuzz: install  ## Feed every reader and verb mutated files and odd arguments for an hour (MINUTES=10 FUZZ="--calls 4000")
+fuzz: install  ## Feed every reader and verb mutated files and odd arguments for an hour (MINUTES=10 FUZZ="--calls 500")
 	"$(BIN)/python" tools/fuzz/run.py --minutes $(or $(MINUTES),60) --seed 1 $(FUZZ)
 
 lint: install  ## Check style, types, import contracts, and that the docs build without a warning

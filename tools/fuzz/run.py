@@ -136,6 +136,7 @@ def _work(
     counts: Counter[str] = Counter()
     spent = {reader.name: 0.0 for reader in chosen} | ({} if verbs is None else {VERBS: 0.0})
     left = {name: _share(options, name == VERBS) for name in spent}
+    made = dict.fromkeys(spent, 0)
     by_name = {reader.name: reader for reader in chosen}
     seeds = {reader.name: reader.seed.read_bytes() for reader in chosen}
     beat, now = place / f"beat-{number}", place / f"now-{number}"
@@ -151,8 +152,8 @@ def _work(
             ),
         )
         while left[name] and time.monotonic() < began + 0.2:
-            chance = random.Random(f"{options.seed} {name} {number} {start} {left[name]}")
-            left[name] -= 1
+            chance = random.Random(f"{options.seed} {name} {number} {start} {made[name]}")
+            made[name], left[name] = made[name] + 1, left[name] - 1
             if name == VERBS:
                 counts.update(_verb(verbs, chance, now, keep))
                 continue
