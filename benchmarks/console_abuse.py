@@ -20,13 +20,13 @@ import json
 import os
 import random
 import sys
-import tempfile
 import time
 from collections import Counter
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from alone import alone
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
@@ -285,11 +285,7 @@ def main() -> int:
     options = parser.parse_args()
     wrong = []
     with ExitStack() as stack:
-        place = stack.enter_context(tempfile.TemporaryDirectory())
-        for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
-            os.environ[name] = place  # no run of another program is seen, and none is stopped
-        tempfile.tempdir = None
-        os.chdir(place)
+        stack.enter_context(alone())
         bus = stack.enter_context(drives(RIG, 7))
         process, address = stack.enter_context(console(RIG, bus))
         with operator(address) as me:
@@ -302,7 +298,6 @@ def main() -> int:
         with operator(address) as me:
             me.command("stop")
             me.until(lambda state: state["busy"] is None)
-        os.chdir("/")
     total = sum(attack.sent.values())
     print(f"{total} in {seconds:.0f} s: {dict(sorted(attack.sent.items()))}")
     print(f"the drives stood in all of {holder.moments} states with a session enabled")

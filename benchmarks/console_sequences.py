@@ -9,15 +9,15 @@ and what was wrong; exit code 1 if anything was. 100 000 sequences take hours.
 from __future__ import annotations
 
 import argparse
-import os
 import resource
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+
+from alone import alone  # noqa: E402
 
 from tests.console.sequences import sequences  # noqa: E402
 
@@ -28,15 +28,10 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place:
-        for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
-            os.environ[name] = place
-        tempfile.tempdir = None
-        os.chdir(place)
+    with alone():
         began = time.monotonic()
         figures = sequences(options.count, options.seed)
         seconds = time.monotonic() - began
-        os.chdir("/")
     print(figures.report())
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     print(f"{seconds:.0f} s, {most:.0f} MB at most")

@@ -13,7 +13,6 @@ import argparse
 import os
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -22,6 +21,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from alone import alone  # noqa: E402
 from playwright.sync_api import Page, expect  # noqa: E402
 
 from executor.remote.registry import find_runs  # noqa: E402
@@ -74,11 +74,7 @@ def main() -> int:
     options = parser.parse_args()
     found: dict[str, list[float]] = {"server": [], "connection": [], "session": []}
     with ExitStack() as stack:
-        place = stack.enter_context(tempfile.TemporaryDirectory())
-        for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
-            os.environ[name] = place  # no run of another program is seen, and none is stopped
-        tempfile.tempdir = None
-        os.chdir(place)
+        stack.enter_context(alone())
         bus = stack.enter_context(drives(RIG, 8))
         server, address = stack.enter_context(console(RIG, bus))
         host, _, rest = address.removeprefix("http://").partition("/")
@@ -98,7 +94,6 @@ def main() -> int:
         # A supervisor that is silent for 2 s ends the session, so it is stopped once.
         found["session"].append(once(page, "run", *stopped(session)))
         time.sleep(1.0)
-        os.chdir("/")
     for name, values in found.items():
         ordered = sorted(values)
         middle, most = ordered[len(ordered) // 2], ordered[-1]

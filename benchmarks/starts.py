@@ -16,7 +16,6 @@ import argparse
 import multiprocessing
 import os
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -26,6 +25,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+
+from alone import alone  # noqa: E402
 
 from drivers.can_bus import (  # noqa: E402
     BusSettings,
@@ -147,10 +148,7 @@ def main() -> int:
     options = parser.parse_args()
     begin, counts = time.monotonic(), Counter[str]()
     hogs = [multiprocessing.get_context("fork").Process(target=busy) for _ in range(options.busy)]
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
-            os.environ[name] = scratch
+    with alone() as folder:
         plan, rig = folder / "plan.json", folder / "rig.yaml"
         braked = RIG.read_text().replace("encoder: absolute", "encoder: absolute, brake: true")
         rig.write_text(braked)

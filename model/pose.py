@@ -121,6 +121,11 @@ class Pose:
         """Unit quaternion (w, x, y, z), w ≥ 0."""
         return quaternion_from_matrix(self.rotation)
 
+    @property
+    def tilt(self) -> float:
+        """Angle between the z axes of both frames, [rad]."""
+        return float(np.arccos(np.clip(self.rotation[2, 2], -1.0, 1.0)))
+
     def apply(self, points: ArrayLike) -> Array:
         """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""
         mapped: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.position

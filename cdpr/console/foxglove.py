@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,12 +13,12 @@ from foxglove.websocket import WebSocketServer
 
 from cdpr.console.view import RobotNow, RobotView
 from executor.recording.mcap_channels import (
-    OWN,
-    TYPED,
     Typed,
+    encoded,
     pose_message,
     robot_at,
     scene_at,
+    schema_of,
 )
 from model.clearance import Nearest
 from model.errors import Fault
@@ -81,8 +80,7 @@ class FoxgloveStream:
         self._told = status["events"]
 
     def _send(self, topic: str, content: Typed | dict[str, Any], now: int) -> None:
-        data = json.dumps(content).encode() if isinstance(content, dict) else content.encode()
-        self._channels[topic].log(data, log_time=now)
+        self._channels[topic].log(encoded(content), log_time=now)
 
 
 @contextmanager
@@ -147,13 +145,9 @@ def layout_text() -> str:
 
 
 def _channel(topic: str, context: Context) -> Channel:
-    if topic in TYPED:
-        return Channel(
-            topic, schema=TYPED[topic].get_schema(), message_encoding="protobuf", context=context
-        )
-    name, described = OWN[topic]
-    schema = Schema(name=name, encoding="jsonschema", data=json.dumps(described).encode())
-    return Channel(topic, schema=schema, message_encoding="json", context=context)
+    encoding, name, kind, text = schema_of(topic)
+    schema = Schema(name=name, encoding=kind, data=text)
+    return Channel(topic, schema=schema, message_encoding=encoding, context=context)
 
 
 def _drives(status: dict[str, Any]) -> dict[str, Any]:

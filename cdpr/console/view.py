@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,11 +53,10 @@ def scene_of(rig: Rig, scene: Scene | None) -> dict[str, Any]:
 
 def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
     """The platform as the page takes it: mm, and where cables leave their pulleys."""
-    tilt = float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
     turn = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
     return {
         "position_mm": (np.round(pose.position * 1e3, 2) + 0.0).tolist(),
-        "tilt_deg": round(tilt, 2) + 0.0,
+        "tilt_deg": round(math.degrees(pose.tilt), 2) + 0.0,
         "turn_deg": round(turn, 2) + 0.0,
         "rotation": np.round(pose.rotation, 6).reshape(-1).tolist(),
         "exits_mm": np.round(cables_at(rig, pose).exits * 1e3, 2).tolist(),

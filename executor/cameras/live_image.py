@@ -14,7 +14,6 @@ import stat
 import struct
 import time
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -104,7 +103,7 @@ def _noted(found: Observation) -> dict[str, Any]:
 
 
 class ImageReader:
-    """The side of who looks on, in another process; a context manager."""
+    """The side of who looks on, in another process."""
 
     def __init__(self, process: int, descriptor: int) -> None:
         """Opens the memory of a process.
@@ -129,17 +128,6 @@ class ImageReader:
             self._view.close()
             raise OSError("not an image")
         self._seen = 0
-
-    def __enter__(self) -> ImageReader:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Lets go of the memory."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,8 +16,8 @@ from executor.recording.mcap_channels import (
     OWN,
     TYPED,
     Message,
-    channel_of,
     column_of,
+    encoded,
     frame_of,
     nanoseconds,
     pose_message,
@@ -26,6 +25,7 @@ from executor.recording.mcap_channels import (
     robot_messages,
     rows_of,
     scene_messages,
+    schema_of,
     stamp_of,
     topic_of,
 )
@@ -170,32 +170,18 @@ def _write(path: Path, messages: Sequence[Message], start: int, attached: Sequen
         writer.start(profile="", library="cdpr")
         channels: dict[str, int] = {}
         for topic in sorted({topic for topic, _, _ in messages} | TYPED.keys() | OWN.keys()):
-            channels[topic] = _registered(writer, topic)
+            encoding, name, kind, text = schema_of(topic)
+            schema = writer.register_schema(name, kind, text)
+            channels[topic] = writer.register_channel(topic, encoding, schema)
         counts = dict.fromkeys(channels, 0)
         for topic, time, content in messages:
             at = start + nanoseconds(time)
-            data = _encoded(content) if isinstance(content, dict) else content.encode()
-            writer.add_message(channels[topic], at, data, at, counts[topic])
+            writer.add_message(channels[topic], at, encoded(content), at, counts[topic])
             counts[topic] += 1
         for file in attached:
-            data = file.read_bytes()
-            writer.add_attachment(start, start, file.name, "application/json", data)
+            content_of_file = file.read_bytes()
+            writer.add_attachment(start, start, file.name, "application/json", content_of_file)
         writer.finish()  # type: ignore[no-untyped-call]
-
-
-def _registered(writer: Writer, topic: str) -> int:
-    kind = TYPED.get(channel_of(topic))
-    if kind is None:
-        name, described = OWN[channel_of(topic)]
-        schema = writer.register_schema(name, "jsonschema", json.dumps(described).encode())
-        return writer.register_channel(topic, "json", schema)
-    typed = kind.get_schema()
-    schema = writer.register_schema(typed.name, typed.encoding, typed.data)
-    return writer.register_channel(topic, typed.encoding, schema)
-
-
-def _encoded(content: dict[str, Any]) -> bytes:
-    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 
 
 def _cycles(cycles: CycleTable, start: int) -> Iterator[Message]:

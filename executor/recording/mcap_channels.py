@@ -5,6 +5,7 @@ Source: the Foxglove schemas, https://docs.foxglove.dev/docs/sdk/schemas (well-k
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -122,6 +123,23 @@ def topic_of(channel: str, camera: str) -> str:
 def channel_of(topic: str) -> str:
     """The channel that a topic is of, whichever camera it is for."""
     return "/" + topic.split("/")[1]
+
+
+def schema_of(topic: str) -> tuple[str, str, str, bytes]:
+    """How messages are encoded, and of their schema its name, its own encoding and its text."""
+    kind = TYPED.get(channel_of(topic))
+    if kind is None:
+        name, described = OWN[channel_of(topic)]
+        return "json", name, "jsonschema", json.dumps(described).encode()
+    schema = kind.get_schema()
+    return schema.encoding, schema.name, schema.encoding, schema.data
+
+
+def encoded(content: Typed | dict[str, Any]) -> bytes:
+    """A message as it is written or sent."""
+    if isinstance(content, dict):
+        return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+    return content.encode()
 
 
 def nanoseconds(time: float) -> int:

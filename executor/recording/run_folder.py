@@ -247,7 +247,7 @@ class RunFolder:
         Raises:
             BadInput: It was changed, or has other cables than ``rig.json``.
         """
-        return self._of_this_rig(CycleTable.read_csv(self.path / CYCLES))
+        return self._with_cables(CycleTable.read_csv(self.path / CYCLES), self.rig().cable_count)
 
     def cycles_cut_short(self, cable_count: int) -> CycleTable:
         """Reads what a killed program wrote of ``cycles.csv``: its whole lines, or none.
@@ -260,10 +260,9 @@ class RunFolder:
         lines = whole_lines(self.path / CYCLES)
         if not lines:
             return no_cycles(cable_count)
-        return self._of_this_rig(CycleTable.of_lines(self.path / CYCLES, lines))
+        return self._with_cables(CycleTable.of_lines(self.path / CYCLES, lines), cable_count)
 
-    def _of_this_rig(self, table: CycleTable) -> CycleTable:
-        cables = self.rig().cable_count
+    def _with_cables(self, table: CycleTable, cables: int) -> CycleTable:
         if table.cable_count != cables:
             raise BadInput(
                 f"{CYCLES} has {table.cable_count} cables, {RIG} has {cables}",

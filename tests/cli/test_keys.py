@@ -33,6 +33,7 @@ from executor.state_machine import CycleRecord
 from model.errors import BadInput, StoppedByOperator
 from model.rig import load_rig
 from tests.cli.plans import RIG
+from tests.cli.program import call
 from tests.cli.test_monitor import status
 from tests.executor import fake_run
 
@@ -227,3 +228,12 @@ def test_the_monitor_shows_where_the_platform_is_by_the_runs_own_rig(tmp_path: P
     assert view.scene.obstacles, "those of the plan that is run"
     x, y, z = 1e3 * robot.pose.position
     assert f"platform {x:.1f}, {y:.1f}, {z:.1f} mm" in monitor._where(view, robot)
+
+
+def test_a_run_that_ends_before_it_says_a_word_is_a_message(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(monitor, "follow_run", lambda *_, **__: iter(()))
+    answer = call("monitor", "--once", "--wait")
+    assert answer.code == 1
+    assert "no active run" in answer.err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def test_what_was_seen_arrives_with_what_was_measured(
     pose = Pose(np.array([0.1, 0.2, 0.3]), np.eye(3))
     found = PoseMeasurement(1.5, pose, np.eye(6), (3, 7), 0.1, "tracked")
     assert not board.show(1, picture(1), found), "nobody looks"
-    with ImageReader(os.getpid(), memory.descriptor) as reader:
+    with closing(ImageReader(os.getpid(), memory.descriptor)) as reader:
         assert reader.newest() is None
         assert board.show(2, picture(2), found)
         newest = reader.newest()
@@ -70,7 +71,7 @@ def test_at_most_five_a_second_are_shown_and_none_when_nobody_looks(
     memory: SharedMemory, now: list[float]
 ) -> None:
     board, shown = ImageBoard(memory), []
-    with ImageReader(os.getpid(), memory.descriptor) as reader:
+    with closing(ImageReader(os.getpid(), memory.descriptor)) as reader:
         for frame in range(3000):
             now[0] += 0.01
             if frame < 1000:
@@ -84,7 +85,7 @@ def test_at_most_five_a_second_are_shown_and_none_when_nobody_looks(
 def test_half_an_image_is_none(memory: SharedMemory, now: list[float]) -> None:
     """The reader comes while the camera's process writes."""
     board = ImageBoard(memory)
-    with ImageReader(os.getpid(), memory.descriptor) as reader:
+    with closing(ImageReader(os.getpid(), memory.descriptor)) as reader:
         reader.newest()
         board.show(1, picture(1), NOTHING)
         (writes,) = live_image._NUMBER.unpack_from(memory.view, live_image._WRITES)
@@ -96,7 +97,7 @@ def test_half_an_image_is_none(memory: SharedMemory, now: list[float]) -> None:
 
 def test_an_image_that_does_not_fit_is_left_out(memory: SharedMemory, now: list[float]) -> None:
     board = ImageBoard(memory)
-    with ImageReader(os.getpid(), memory.descriptor) as reader:
+    with closing(ImageReader(os.getpid(), memory.descriptor)) as reader:
         reader.newest()
         wide = np.zeros((CAMERA.height, CAMERA.width + 1), np.uint8)
         assert not board.show(1, wide, NOTHING)

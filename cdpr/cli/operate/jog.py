@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from cdpr.cli.facts import show_cable, show_jogging
-from cdpr.cli.operate.keys import Keys
+from cdpr.cli.operate.keys import Keys, speed_by_key
 from cdpr.cli.operate.run import agreement, show, show_files
 from cdpr.cli.operate.supervision import RunSupervisor, SignalSupervisor, confirmation
 from cdpr.cli.options import (
@@ -112,8 +112,6 @@ DIRECTIONS = {
 HELP = "arrows x and y · page up and down z · + and - speed · f frame · space stop · q end"
 #: The line with the position is renewed this often, [s].
 SHOWN_EVERY = 0.2
-#: Of + and -, in per cent.
-SPEED_STEP = 10
 DEFAULT_PATH, NOT_HELD = PathOptions(), HeldOptions()
 
 
@@ -287,8 +285,7 @@ class JogKeys:
         elif key == "f":
             self._in_platform = not self._in_platform
         elif key in "+-":
-            change = SPEED_STEP if key == "+" else -SPEED_STEP
-            self._percent = min(max(self._percent + change, 1), 100)
+            self._percent = speed_by_key(self._percent, key)
 
     def _hold(self, key: str, presses: PressBoard) -> None:
         """The press goes on where it is the same key and has not ended; otherwise one begins."""

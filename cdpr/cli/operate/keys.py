@@ -9,6 +9,7 @@ import sys
 import termios
 import tty
 
+from executor.operator_requests import FASTEST, SLOWEST
 from model.errors import BadInput
 
 _ONE = re.compile(rb"\x1b[\[O][0-9;]*[A-Za-z~]|.", re.DOTALL)
@@ -22,6 +23,16 @@ NAMES = {
     b"5~": "page up",
     b"6~": "page down",
 }
+
+
+#: What + and - change a speed by, in per cent.
+SPEED_STEP = 10
+
+
+def speed_by_key(percent: int, key: str) -> int:
+    """A speed after ``+`` or ``-``, in per cent of the largest."""
+    step = SPEED_STEP if key == "+" else -SPEED_STEP
+    return min(max(percent + step, SLOWEST), FASTEST)
 
 
 class Keys:

@@ -7,9 +7,9 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Group
@@ -19,20 +19,23 @@ from rich.table import Table
 from rich.text import Text
 
 from cdpr.cli.facts import camera_line
-from cdpr.cli.operate.keys import Keys
+from cdpr.cli.operate.keys import Keys, speed_by_key
 from cdpr.cli.output import err, out, show_json
 from cdpr.console.view import RobotNow, RobotView
 from executor.recording.run_folder import RIG, RunFolder
-from executor.remote.client import follow_run, request_run, stop_runs
+from executor.remote.client import follow_run, no_run, request_run, stop_runs
 from executor.remote.protocol import make_line
 from model.errors import CdprError
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 
+if TYPE_CHECKING:
+    from cdpr.console.foxglove import FoxgloveStream
+
 #: Of a run that ended so; what ends without a word was killed.
 _EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
 _KEYS = "space stop · h hold · r resume · + and - speed · q leave"
-_SPEED_STEP, _BAR = 10, 20
+_BAR = 20
 _STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latched": "bold red"}
 
 
@@ -90,42 +93,54 @@ def monitor(
         write_atomic(foxglove_layout, layout_text() + "\n")
         return
     if once:
-        status = next(follow_run(process, rate, waits=True)) if wait else _now(process)
+        status = _first(process, rate) if wait else request_run("status", process, verb="monitor")
         if as_json:
             show_json(status)
         else:
             typer.echo(_plain(status))
-    elif as_json or not out.is_terminal:
-        _lines(_served(follow_run(process, rate, waits=wait), foxglove), as_json)
-    else:
-        _live(process, rate, foxglove)
+        return
+    with _foxglove(foxglove) as stream:
+        if as_json or not out.is_terminal:
+            _lines(follow_run(process, rate, waits=wait), as_json, stream)
+        else:
+            _live(process, rate, stream)
 
 
-def _served(looks: Iterator[dict[str, Any]], port: int | None) -> Iterator[dict[str, Any]]:
-    """The same looks, which are also sent to Foxglove; no port for no Foxglove."""
+def _first(process: int | None, rate: float) -> dict[str, Any]:
+    """How a run stands that is waited for.
+
+    Raises:
+        Fault: It ended without a word.
+    """
+    for status in follow_run(process, rate, waits=True):
+        return status
+    raise no_run("monitor")
+
+
+@contextmanager
+def _foxglove(port: int | None) -> Iterator[FoxgloveStream | None]:
+    """A server for Foxglove; none without a port."""
     if port is None:
-        yield from looks
+        yield None
         return
     from cdpr.console.foxglove import foxglove_stream
 
-    robot = _Robot()
     with foxglove_stream(port) as stream:
         err.print(f"Foxglove: open the connection {stream.address}", soft_wrap=True)
-        for status in looks:
-            stream.take(status, robot.seen(status))
-            yield status
+        yield stream
 
 
-def _now(process: int | None) -> dict[str, Any]:
-    return request_run("status", process, verb="monitor")
-
-
-def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
+def _lines(
+    looks: Iterator[dict[str, Any]], as_json: bool, stream: FoxgloveStream | None = None
+) -> None:
     """For a file or a program: a line a look, and each event once."""
     seen: list[dict[str, Any]] = []
     status: dict[str, Any] = {"state": "gone"}
+    robot = _Robot()
     try:
         for status in looks:
+            if stream is not None:
+                stream.take(status, robot.seen(status))
             if as_json:
                 typer.echo(json.dumps(status, allow_nan=False))
                 continue
@@ -139,7 +154,7 @@ def _lines(looks: Iterator[dict[str, Any]], as_json: bool) -> None:
     _tell_end(status, as_json)
 
 
-def _live(process: int | None, rate: float, foxglove: int | None) -> None:
+def _live(process: int | None, rate: float, stream: FoxgloveStream | None) -> None:
     status: dict[str, Any] = {"state": "gone"}
     robot = _Robot()
     try:
@@ -149,11 +164,12 @@ def _live(process: int | None, rate: float, foxglove: int | None) -> None:
         ):
             operator = _Operator(keys)
             live.update(Text("waiting for a run to begin; Ctrl-C ends the monitor"), refresh=True)
-            looks = follow_run(process, rate, waits=True, between=operator.between)
-            for status in _served(looks, foxglove):
+            for status in follow_run(process, rate, waits=True, between=operator.between):
                 operator.status = status
-                shown = _view(status, robot.seen(status), operator.line)
-                live.update(shown, refresh=True)
+                seen = robot.seen(status)
+                if stream is not None:
+                    stream.take(status, seen)
+                live.update(_view(status, seen, operator.line), refresh=True)
     except KeyboardInterrupt:
         return
     _tell_end(status, False)
@@ -189,8 +205,7 @@ class _Operator:
         elif key in "hr" and self.status:
             return [make_line("hold" if key == "h" else "resume")]
         elif key in "+-" and self.status:
-            step = _SPEED_STEP if key == "+" else -_SPEED_STEP
-            speed = min(max(self.status["wished"]["speed_percent"] + step, 1), 100)
+            speed = speed_by_key(self.status["wished"]["speed_percent"], key)
             self.status["wished"]["speed_percent"] = speed  # the next key counts from here
             return [make_line("speed", percent=speed)]
         return ()
@@ -312,7 +327,7 @@ def _ahead(stop: dict[str, Any]) -> str:
 
 def _where(view: RobotView, now: RobotNow) -> str:
     x, y, z = now.pose.position * 1e3
-    tilt = math.degrees(math.acos(min(max(now.pose.rotation[2, 2], -1.0), 1.0)))
+    tilt = math.degrees(now.pose.tilt)
     text = f"platform {x:.1f}, {y:.1f}, {z:.1f} mm, tilt {tilt:.2f}° by the drives"
     if now.nearest is None:
         return text
