@@ -249,9 +249,10 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     page.locator("input[name=scene-file]").first.check(force=True)
     page.locator("#make-plan").click()
     desk.view("teach")
-    for _ in range(2):
+    for taught in range(1, 3):
         page.locator("#teach").click()
         expect(page.locator("#notice")).to_have_text("teach: done")
+        expect(page.locator("#poses li")).to_have_count(taught)  # the next name follows from these
     page.locator("#pick").click()
     page.locator("#scene-canvas").click()
     page.locator("#pick-keep").click()

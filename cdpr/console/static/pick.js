@@ -1,7 +1,7 @@
 /* Picking a goal in the scene: a click on a plane at a chosen height gives a position, kept among the taught poses. */
 
 import { whyNot } from "./buttons.js";
-import { at, known, write } from "./elements.js";
+import { at, freeName, known, write } from "./elements.js";
 
 const MOVED_PX = 6; // a pointer that went farther turned the view
 
@@ -59,8 +59,7 @@ export class Pick {
 
   async #keep() {
     if (!this.#point) return this.#page.say("Click in the scene first.");
-    const taken = this.#page.situation().state.poses.map(({ name }) => name);
-    const name = taken.concat("").map((_, k) => `goal ${k + 1}`).find((one) => !taken.includes(one));
+    const name = freeName("goal", this.#page.situation().state.poses);
     const { ok } = await this.#page.command("teach_at", { name, position_mm: this.#point });
     if (!ok) return;
     this.end();

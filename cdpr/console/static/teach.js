@@ -1,6 +1,6 @@
 /* Taught poses: store where the platform is, name, order and remove them, plan a path through them. */
 
-import { at, chosen, known, make, write } from "./elements.js";
+import { at, chosen, freeName, known, make, write } from "./elements.js";
 
 export class Teach {
   #page;
@@ -14,7 +14,7 @@ export class Teach {
       at("teach").click();
     });
     at("teach").addEventListener("click", async () => {
-      const name = at("teach-name").value.trim() || this.#freeName();
+      const name = at("teach-name").value.trim() || freeName("pose", JSON.parse(this.#shown || "[]"));
       const { ok } = await page.command("teach", { name });
       if (ok) at("teach-name").value = "";
     });
@@ -31,11 +31,6 @@ export class Teach {
     const focused = document.activeElement?.dataset?.key;
     at("poses").replaceChildren(...poses.map((pose, k) => this.#row(pose, k, poses.length)));
     if (focused) at("poses").querySelector(`[data-key="${focused}"]`)?.focus();
-  }
-
-  #freeName() {
-    const taken = JSON.parse(this.#shown || "[]").map((pose) => pose.name);
-    return taken.concat("").map((_, k) => `pose ${k + 1}`).find((name) => !taken.includes(name));
   }
 
   #row({ name, position_mm: position }, index, count) {
