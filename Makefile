@@ -17,7 +17,7 @@ export NO_MKDOCS_2_WARNING := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo docs-run wheel test test-root test-quiet test-lowest test-python check-arm64 mutation fuzz hil hil-runs hil-table hil-makers hil-subset lint docs schema clean distclean
+.PHONY: help install demo docs-run wheel test test-root test-quiet test-lowest test-python check-arm64 mutation fuzz hil hil-runs hil-table hil-makers hil-epos4 hil-nanotec-c5e hil-akd hil-subset lint docs schema clean distclean
 
 help:  ## Show this help
 	@echo "cdpr: plan, prove, run and measure paths of cable-driven parallel robots"
@@ -107,8 +107,10 @@ hil-runs: install  ## Its first part: whole runs, homing, a master that dies or 
 hil-table: install  ## Its second part: the fault table
 	"$(BIN)/python" tools/hil/run.py --part table
 
-hil-makers: install  ## Its third part: rigs of three makes from doctor to release
-	"$(BIN)/python" tools/hil/run.py --part makers
+hil-makers: hil-epos4 hil-nanotec-c5e hil-akd  ## Its other parts: a rig of one make each, from doctor to release
+
+hil-epos4 hil-nanotec-c5e hil-akd: install
+	"$(BIN)/python" tools/hil/run.py --part $(@:hil-%=%)
 
 hil-subset: install  ## Run those of them that take a few minutes, as .ci/run does
 	"$(BIN)/python" tools/hil/run.py --limit-s 1200 -m "hil and not slow"

@@ -340,28 +340,36 @@ ACTS = [act for act, _ in _WEIGHTED]
 WEIGHTS = [weight for _, weight in _WEIGHTED]
 
 
-def open_files() -> int:
+def open_files() -> set[str]:
     """Descriptors of this process, without the one that keeps the cache of machine code."""
-    found = 0
+    found = set()
     for name in os.listdir("/proc/self/fd"):
         with suppress(OSError):  # the one by which the folder was read
-            found += "/kernels/" not in os.readlink(f"/proc/self/fd/{name}")
-    return found
+            found.add(f"{name} {os.readlink(f'/proc/self/fd/{name}')}")
+    return {file for file in found if "/kernels/" not in file}
 
 
-def children() -> list[str]:
+def children() -> set[str]:
     """Processes that this one started and that are there still."""
     tasks = Path("/proc/self/task")
     found = " ".join((task / "children").read_text() for task in tasks.iterdir())
-    return found.split()
+    return {f"process {number}" for number in found.split()}
+
+
+def held() -> set[str]:
+    """What this process would leave behind; what an earlier test left may end meanwhile."""
+    threads = {f"thread {thread.ident} {thread.name}" for thread in threading.enumerate()}
+    return threads | open_files() | children()
 
 
 def sequences(count: int, seed: int) -> Figures:
     """So many sequences; threads, sockets and processes that are left count as wrong."""
+    before, interval = held(), sys.getswitchinterval()
     sys.setswitchinterval(1e-4)  # the session and its socket's thread take turns all the time
-    before = threading.active_count(), open_files(), children()
-    figures = Sequences(seed).run(count)
-    after = threading.active_count(), open_files(), children()
-    if after != before:
-        figures.wrong.append(f"threads, descriptors, processes: {before} before, {after} after")
+    try:
+        figures = Sequences(seed).run(count)
+    finally:
+        sys.setswitchinterval(interval)
+    if left := held() - before:
+        figures.wrong.append(f"left behind: {sorted(left)}")
     return figures

@@ -1,7 +1,7 @@
 """Runs the tests marked `hil` on a virtual CAN bus: of this machine, else of a virtual one.
 
-    python tools/hil/run.py [--part runs|table|makers] [--artefacts DIR] [--limit-s S]
-        [pytest's arguments]
+    python tools/hil/run.py [--part runs|table|epos4|nanotec-c5e|akd] [--artefacts DIR]
+        [--limit-s S] [pytest's arguments]
     python tools/hil/run.py --missing
 
 The exit status is pytest's; 125 when there is no bus to run them on. With --missing it only names
@@ -32,16 +32,18 @@ NO_BUS = 125
 PYTEST = ("-m", "pytest", "-p", "no:cacheprovider")
 TABLE = "tests/hil/test_fault_table_on_vcan.py"
 MAKERS = "tests/hil/test_makers_on_vcan.py"
+MAKES = ("epos4", "nanotec-c5e", "akd")
 PARTS = {
     "": ("tests/hil",),
     "runs": ("tests/hil", f"--ignore={TABLE}", f"--ignore={MAKERS}"),
     "table": (TABLE,),
-    "makers": (MAKERS,),
+    **{make: (MAKERS, "-k", make) for make in MAKES},
 }
 """What a part runs; without a name, all."""
 NEEDED = {"ip": "iproute2", "candump": "can-utils"}
 NEEDED_BY_VM = {QEMU: "qemu-system-x86", str(BUSYBOX): "busybox-static"}
 KERNELS = "from executor.kernels import ready_to_simulate; ready_to_simulate()"
+PLAN = "configs/gachon_8_6.yaml configs/environment_1.yaml --rounds 1 --force --json -o"
 COMPILED = (
     "calibration",
     "cdpr",
@@ -84,7 +86,7 @@ def main() -> int:
                 return _on_host(tests, artefacts)
         print(f"hil: no AF_CAN here, so in a virtual machine; traces in {artefacts}", flush=True)
         with _alone():
-            _compile()
+            _compile(plans=options.part in MAKES)
             boot_files(_cache())
         return run_in_vm(_job(tests), artefacts, _cache(), options.limit_s)
     except VmFailed as error:
@@ -147,15 +149,21 @@ def _environment(artefacts: Path) -> dict[str, str]:
     return {"CDPR_HIL_CHANNEL": CHANNEL, "CDPR_HIL_ARTEFACTS": str(artefacts)}
 
 
-def _compile() -> None:
+def _compile(*, plans: bool) -> None:
     """What the programs run, here: it takes twenty times as long where instructions are counted.
 
-    To bytecode, and the simulated platform to machine code that both processors understand.
+    To bytecode, and the simulated platform to machine code that both processors understand; the
+    planner as well for a part that jogs along planned paths.
     """
     command = [sys.executable, "-m", "compileall", "-q", *COMPILED]
     subprocess.run(command, cwd=ROOT, check=False)  # a folder that is read-only costs time alone
     environment = {**os.environ, **_for_any_processor()}
     subprocess.run([sys.executable, "-c", KERNELS], cwd=ROOT, env=environment, check=True)
+    if plans:
+        words = ["plan", *PLAN.split(), str(_cache() / "plan.json")]
+        program = "from cdpr.cli import main; main()"
+        command = [sys.executable, "-c", program, *words]
+        subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, check=True)
 
 
 def _for_any_processor() -> dict[str, str]:
