@@ -6,7 +6,8 @@ Each pair is `cdpr run` of a short plan and then `cdpr release`, through the rea
 strict simulated drives in a process of their own that report a missed SYNC, set-point or heartbeat
 in any NMT-operational state. Counted are, apart from each other: starts and releases that came to
 their end; those that failed before a drive was enabled, or with an EMCY 8130h, 8250h or 8700h
-before it (a gap of the program's); and those that failed while the drives moved, because a cycle
+before it (a gap of the program's); those that failed before it for all eight simulated drives,
+which are one process, fell silent; and those that failed while the drives moved, because a cycle
 came late or the simulated drives were held up. The exit code is 1 when a gap was seen. Not a test.
 """
 
@@ -111,6 +112,8 @@ def outcome(what: str, code: int, early: list[int], followed: bool, said: str) -
         return f"{what}: GAP, EMCY {early[0]:04X}h before enabling"
     if code == 0:
         return f"{what}: came to its end"
+    if not followed and "all 8 drives stopped answering" in said:
+        return f"{what}: not begun, the simulated drives were held up"
     if not followed:
         return f"{what}: GAP, failed before enabling"
     late = "a cycle came late" if "cycles late" in said else "drives or replies held up"

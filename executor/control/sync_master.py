@@ -57,7 +57,10 @@ class ReplyTimeout:
             name for name, n in zip(self._names, self._cycles, strict=True) if n >= MISSING_CYCLES
         ]
         if gone:
-            what = f"{', '.join(gone)} stopped answering {doing}"
+            every = len(gone) == len(self._cycles)
+            which = f"all {len(gone)} drives" if every else ", ".join(gone)
+            cause = ": bus or supply" if every else ""
+            what = f"{which} stopped answering {doing}{cause}"
             raise HardwareMissing(what, where=where, why=why, next_step=next_step)
 
 

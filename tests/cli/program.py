@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import sys
 from collections.abc import Iterator
@@ -43,6 +44,8 @@ def call(*arguments: str | Path, answers: str = "") -> Answer:
             code = end.code
         else:
             code = 0
+        finally:
+            gc.unfreeze()  # it froze what is left of it, as the last thing that a program does
     assert code is None or isinstance(code, int)
     return Answer(code or 0, out.getvalue(), err.getvalue())
 

@@ -170,6 +170,13 @@ def test_a_drive_that_falls_silent_before_the_word_is_named() -> None:
     assert "nothing was enabled" in caught.value.next_step
 
 
+def test_drives_that_fall_silent_all_at_once_have_one_cause() -> None:
+    master, group, _ = made()
+    group.missing[:] = True
+    with pytest.raises(HardwareMissing, match=r"^all \d+ drives stopped answering .*: bus or sup"):
+        master.keep_until(lambda: None)
+
+
 def test_it_leaves_as_soon_as_no_drive_watches_it() -> None:
     master, group, clock = made(monitored_for=3)
     cycles: list[None] = []
