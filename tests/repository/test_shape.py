@@ -122,6 +122,10 @@ def test_documentation_lines_fit_a_screen(house: Any) -> None:
     assert house.long_lines() == []
 
 
+def test_no_two_classes_have_one_name(house: Any) -> None:
+    assert house.namesakes() == {}
+
+
 def test_what_breaks_a_limit_is_found(shape: Any, tmp_path: Path) -> None:
     body = "\n".join(["    x = 1"] * 81)
     for path, text in {
