@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
 from math import radians
@@ -32,14 +32,27 @@ from calibration.intrinsics.readout import (
     readout_result,
 )
 from calibration.intrinsics.result import CameraResult, camera_page, camera_result
-from calibration.pictures import Pictures, pictures_in, pictures_of, timed_pictures
-from calibration.results import ResultDocument, require_file_name, result_file_name, write_result
+from calibration.pictures import (
+    USUAL_PICTURES,
+    USUAL_TAG_PICTURES,
+    Pictures,
+    PicturesFrom,
+    opened_pictures,
+    pictures_in,
+    timed_pictures,
+)
+from calibration.results import (
+    CalibrationVerdict,
+    ResultDocument,
+    require_file_name,
+    result_file_name,
+    write_result,
+)
 from calibration.run_data import poses_by_picture, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
 from calibration.tag_map.observations import sights_of
 from calibration.tag_map.result import TagsResult, judge_layout, tags_page, tags_result
 from calibration.targets.board import Board, read_corners
-from calibration.verdict import CalibrationVerdict
 from executor.kernels import ready_to_measure
 from model.errors import BadInput, Fault, Refused
 from model.files.documents import write_atomic
@@ -54,11 +67,6 @@ from model.rig import Camera, Rig
 Result = TypeVar("Result", bound=ResultDocument, covariant=True)
 Found = TypeVar("Found", covariant=True)
 Quality = TypeVar("Quality", covariant=True)
-
-PicturesFrom = Pictures | str | Path | Callable[[], Pictures]
-"""Images, what opens them, or where they are: a folder, a video, a camera's index or address."""
-USUAL_PICTURES, USUAL_TAG_PICTURES = 20, 40
-"""Taken of a camera or a video to find where the camera is, and where tags are on the platform."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,15 +379,6 @@ def measure_readout(
     result = readout_result(found, verdict, speed, to.on)
     page = readout_page(found, verdict, result.date)
     return Calibration(result, page, found, verdict).saved_in(to.folder)
-
-
-def opened_pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
-    """The images of a source; ``usual`` of a camera or a video."""
-    if isinstance(pictures, Pictures):
-        return pictures
-    if callable(pictures):
-        return pictures()
-    return pictures_of(pictures, camera, None, usual)
 
 
 def calibrate_rig(

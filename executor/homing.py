@@ -19,8 +19,7 @@ from executor.control.winch_motion import WinchesStand
 from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
-from executor.operator_requests import RequestBoard
-from executor.supervision import Supervisor, require_confirmed
+from executor.supervision import RequestBoard, Supervisor, require_confirmed
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
 from model.errors import BadInput, Refused, StoppedByOperator
 from model.pose import Pose

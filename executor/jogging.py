@@ -26,10 +26,9 @@ from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
 from model.jit import KernelSet, compilation
 from model.plan import plan_from_document
-from model.pose import Array, Pose
+from model.pose import Array, Pose, largest_rotations
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
-from model.rotation_limits import largest_rotations
 from model.scene import Scene, nothing_in_the_way, scene_from_document
 from planner.kernels.jit import KERNELS
 from planner.planning import make_plan

@@ -22,7 +22,6 @@ from executor.drives import drives_of, is_simulated, left_alone, open_drives, re
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_for_simulating_process
-from executor.operator_requests import LocalRequests
 from executor.realtime.clock import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder
@@ -33,7 +32,7 @@ from executor.remote.server import serving
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
-from executor.supervision import Supervisor, require_confirmed
+from executor.supervision import LocalRequests, Supervisor, require_confirmed
 from executor.trajectory.prepare import PreparedRun, prepare
 from model.errors import BadInput, CdprError
 from model.plan import Plan, require_same_rig

@@ -16,8 +16,8 @@ from tracking.camera_model import Image
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
 from tracking.estimator import UNCERTAIN, UNSHARP
+from tracking.fusion import MultiCameraFusion, moments
 from tracking.measurement import NoPose, PoseMeasurement
-from tracking.multi_camera import MultiCameraFusion, moments
 from tracking.pose_log import LoggedPicture
 from tracking.shared_errors import require_stated_errors
 from tracking.tracker import Tracker

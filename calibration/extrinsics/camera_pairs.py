@@ -23,21 +23,14 @@ from calibration.extrinsics.quality import (
 )
 from calibration.extrinsics.result import extrinsics_page, extrinsics_result
 from calibration.intrinsics.calibrate import NOT_FOUND
-from calibration.procedures import (
-    USUAL_PICTURES,
-    Calibration,
-    Destination,
-    ExtrinsicsOutcome,
-    PicturesFrom,
-    opened_pictures,
-)
-from calibration.results import data_hash
+from calibration.pictures import USUAL_PICTURES, PicturesFrom, opened_pictures
+from calibration.procedures import Calibration, Destination, ExtrinsicsOutcome
+from calibration.results import Issue, data_hash
 from calibration.tag_map.bundle_adjustment import require_tags
 from calibration.tag_map.observations import TagSights, platform_pose, sights_of
 from calibration.targets.board import Board, Seen
-from calibration.targets.charuco import Charuco
+from calibration.targets.chessboards import Charuco
 from calibration.targets.tag_grid import TagGrid
-from calibration.verdict import Issue
 from executor.kernels import ready_to_measure
 from model.cameras import SURE
 from model.errors import BadInput

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from scipy.stats import t as student
 
+from calibration.results import CalibrationVerdict, Issue
 from calibration.statistics import CONFIDENCE, rms_bound
-from calibration.verdict import CalibrationVerdict, Issue
 from model.cameras import SURE
 from model.pose import Array, Pose, skew
 from model.rig import Camera, Rig

@@ -12,9 +12,8 @@ from pydantic import Field
 from calibration.extrinsics.quality import ExtrinsicCalibration
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, page_of, table_of
-from calibration.results import ResultDocument, common_keys
+from calibration.results import CalibrationVerdict, ResultDocument, common_keys
 from calibration.statistics import Interval
-from calibration.verdict import CalibrationVerdict
 from model.files.camera_file import PoseCovariance, PoseSlopes
 from model.files.documents import AnyNonNegative, PoseDocument, Vector
 from model.files.rig_file import RigDocument

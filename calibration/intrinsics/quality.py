@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.lens import LENSES, RADIAL, radial_share
-from calibration.verdict import CalibrationVerdict, Issue
+from calibration.results import CalibrationVerdict, Issue
 from model.pose import Array, rotation_vector_from_matrix
 from tracking.camera_model import rays_of
 

@@ -21,10 +21,9 @@ from scipy.stats import t as student
 
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, interval_rows, page_of, table_of
-from calibration.results import ResultDocument, common_keys
+from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import CONFIDENCE, Interval
 from calibration.tag_map.observations import TagSights
-from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
 from model.files.camera_file import Readout
 from model.files.documents import AnyNonNegative, Positive

@@ -11,10 +11,9 @@ from pydantic import Field
 
 from calibration.extrinsics.result import AXES, SCALES, pose_rows
 from calibration.report import Section, page_of, table_of
-from calibration.results import ResultDocument, common_keys
+from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import Interval
 from calibration.tag_map.bundle_adjustment import TagLayout
-from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
 from model.files.camera_file import TagDocument
 from model.files.documents import AnyNonNegative, PoseDocument, Positive

@@ -32,8 +32,8 @@ from model.files.scene_file import StopDocument
 from model.plan import plan_as_dict, plan_facts, save_plan
 from model.rig import load_rig
 from model.scene import Scene, load_scene
-from planner.options import PlanningOptions, settings_from_options
 from planner.planning import plan_path
+from planner.settings import PlanningOptions, settings_from_options
 
 _PANEL = "Open readings of the paper's text (docs/paper.md)"
 

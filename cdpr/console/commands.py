@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from executor.operator_requests import FASTEST, SLOWEST
 from executor.remote.protocol import STEPS_MM, Number, Share
+from executor.supervision import FASTEST, SLOWEST
 
 #: Longest message, [bytes].
 LONGEST = 4096

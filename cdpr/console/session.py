@@ -29,13 +29,12 @@ from cdpr.console.commands import (
     TakeCommand,
 )
 from cdpr.console.control import PageControl
-from cdpr.console.pictures import CameraPictures
 from cdpr.console.preview import preview
 from cdpr.console.started import StartedVerb, file_here
 from cdpr.console.state import Kept, jog_state, kept_state, measured_state, outcome_state
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
-from cdpr.console.watch import RunWatch
+from cdpr.console.watch import CameraPictures, RunWatch
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch

@@ -18,11 +18,11 @@ from executor.control.sync_master import SyncMaster
 from executor.hold_to_run.line import Piece, PieceRing
 from executor.hold_to_run.presses import PressReader, PressState
 from executor.interlock.reference import HomingReference
-from executor.operator_requests import OperatorRequests
 from executor.realtime.job import ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
+from executor.supervision import OperatorRequests
 from executor.trajectory.setpoints import CheckedSetpoints, Setpoints, fingerprint
 from model.errors import Fault
 from model.files.rig_file import RigDocument

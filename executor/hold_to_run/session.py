@@ -30,7 +30,6 @@ from executor.hold_to_run.presses import Press, PressBoard
 from executor.interlock.interlock import MotionInterlock
 from executor.jogging import FASTEST, measured_pose, with_speed
 from executor.kernels import ready_for_simulating_process
-from executor.operator_requests import LocalRequests
 from executor.realtime.clock import SimulatedClock
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
@@ -39,7 +38,7 @@ from executor.remote.registry import advertised
 from executor.remote.server import serving
 from executor.remote.status import JogStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
-from executor.supervision import Supervisor, require_confirmed
+from executor.supervision import LocalRequests, Supervisor, require_confirmed
 from executor.winch_runs import with_board
 from model.errors import CdprError
 from model.kinematics import cable_lengths

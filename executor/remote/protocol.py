@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from executor.operator_requests import FASTEST, SLOWEST, RequestBoard
+from executor.supervision import FASTEST, SLOWEST, RequestBoard
 from model.pose import Array
 
 

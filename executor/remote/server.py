@@ -10,8 +10,8 @@ import struct
 import threading
 from collections.abc import Iterator, Sequence
 
-from executor.operator_requests import RequestBoard
 from executor.remote.protocol import Presses, Told, answer_to, word_of
+from executor.supervision import RequestBoard
 
 #: A question is a line no longer than this, [bytes].
 LONGEST_QUESTION = 1024

@@ -22,7 +22,7 @@ from planner.check import check_path
 from planner.costs import KinematicCost
 from planner.edge_checks import ExactChecks
 from planner.path import PosePath
-from planner.rrt.edge_checks import exact_checks
+from planner.rrt.edges import exact_checks
 from planner.rrt.search import PaperPlanner, SearchResult
 from planner.rrt.variants import TEXT, AlgorithmVariant
 from planner.settings import CLEARANCE_RESERVE, CostName, PlannerSettings, SamplerName
@@ -250,7 +250,7 @@ def _measured(
 ) -> PathFigures:
     if result.path is None or not batch.measured:
         return PathFigures()
-    path, cost = planner.shortcut(result.path), _cost(batch.rig, batch.case.box)
+    path, cost = planner.rrt.path(result.path), _cost(batch.rig, batch.case.box)
     rig, poses = _rig(batch.rig, batch.case.box), [planner.space.pose(point) for point in path]
     clearance = passed = _NAN
     if batch.clearance and scene.obstacles:

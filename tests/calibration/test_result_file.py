@@ -16,10 +16,9 @@ from calibration.extrinsics.quality import (
     workspace_corners,
 )
 from calibration.extrinsics.result import extrinsics_result
-from calibration.load import load_result
-from calibration.results import write_result
+from calibration.result_files import load_result
+from calibration.results import CalibrationVerdict, Issue, write_result
 from calibration.statistics import Interval
-from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
 from model.rig import Rig, load_rig
 from tests.calibration.results import camera_result_of

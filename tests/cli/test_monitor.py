@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 
 from cdpr.cli.operate.monitor import _lines, _plain, _view
-from executor.operator_requests import LocalRequests
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import LocalRequests
 from model.rig import load_rig
 from tests.cli.plans import RIG
 

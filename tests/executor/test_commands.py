@@ -16,11 +16,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.operator_requests import LocalRequests, OperatorRequests
 from executor.remote.client import ask_all, last_word, no_answer, select_run
 from executor.remote.protocol import NotACommand, answer_to, make_line, parse_command
 from executor.remote.registry import Reached, advertised, find_runs
 from executor.remote.server import LONGEST_QUESTION, MOST_CLIENTS, serving
+from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput, Fault
 
 

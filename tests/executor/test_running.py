@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from cdpr.cli.operate.supervision import STOP_SIGNALS, stop_requests
-from executor.operator_requests import LocalRequests
 from executor.remote.registry import advertised, find_runs
+from executor.supervision import LocalRequests
 from model.errors import Refused
 
 #: A run as the command line makes one: tells that it is advertised, ends when it was asked to.
@@ -25,7 +25,7 @@ RUN = """
 import signal
 from cdpr.cli.operate.supervision import stop_requests
 from executor.remote.registry import advertised
-from executor.operator_requests import LocalRequests
+from executor.supervision import LocalRequests
 board = LocalRequests()
 with stop_requests(board), advertised() as listeners:
     print("advertised", flush=True)

@@ -7,8 +7,7 @@ import pytest
 
 from model.kinematics import structure_matrix
 from model.pose import Pose
-from model.statics.dexterity import condition_number, rms_anchor_radius
-from model.statics.wrench_sets import force_volume
+from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner import array_cache as stored
 from planner.costs import KinematicCost, LengthCost
 from planner.space import Lattice, corners_and_weights

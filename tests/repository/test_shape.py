@@ -23,12 +23,12 @@ INNER_IMPORTS: dict[str, set[str]] = {
     "a heavy library is loaded by the few calls that need it": {
         "cdpr/cli/app.py",
         "cdpr/cli/operate/monitor.py",
-        "cdpr/console/pictures.py",
+        "cdpr/console/watch.py",
         "executor/recording/run_folder.py",
         "executor/report/figures.py",
         "executor/report/tiles.py",
         "executor/run_result.py",
-        "model/geometry/shapes.py",
+        "model/shapes.py",
         "model/plan.py",
         "model/rig.py",
         "model/statics/tension_distribution.py",
@@ -51,7 +51,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "cdpr/cli/operate/console.py",
         "drivers/odrive/messages.py",
         "planner/parallel.py",
-        "tracking/detection/libraries.py",
+        "tracking/detection/detector.py",
     },
     "compiled kernels are loaded when their machine code is wanted": {
         "executor/kernels.py",

@@ -17,8 +17,8 @@ import pytest
 import executor.evaluation
 import executor.recording.summary
 import executor.runner
-from executor.operator_requests import LocalRequests, OperatorRequests
 from executor.recording.run_folder import RunFolder
+from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput
 from tests.cli.plans import RIG
 from tests.cli.program import Answer, call

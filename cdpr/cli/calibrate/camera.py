@@ -36,7 +36,7 @@ from cdpr.cli.options import (
 )
 from cdpr.cli.output import err
 from executor.cameras.sources import require_camera_source
-from executor.operator_requests import LocalRequests
+from executor.supervision import LocalRequests
 from model.errors import BadInput
 from model.files.output import make_folder
 from model.rig import load_rig

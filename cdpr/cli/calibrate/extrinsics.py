@@ -12,14 +12,8 @@ import typer
 from calibration.extrinsics.camera_pairs import locate_camera_by_another
 from calibration.extrinsics.result import moved_rows
 from calibration.extrinsics.surveyed_tags import Survey
-from calibration.pictures import Pictures, pictures_of
-from calibration.procedures import (
-    USUAL_PICTURES,
-    USUAL_TAG_PICTURES,
-    ExtrinsicsOutcome,
-    locate_camera,
-    locate_tags,
-)
+from calibration.pictures import USUAL_PICTURES, USUAL_TAG_PICTURES, Pictures, pictures_of
+from calibration.procedures import ExtrinsicsOutcome, locate_camera, locate_tags
 from calibration.tag_map.result import change_rows
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (

@@ -8,10 +8,9 @@ from typing import Annotated
 
 import typer
 
-from calibration.compare import compare
 from calibration.intrinsics.exchange import FORMATS, write_rig_with_camera
 from calibration.intrinsics.result import camera_named
-from calibration.load import load_result, write_calibrated_rig
+from calibration.result_files import compare, load_result, write_calibrated_rig
 from cdpr.cli.calibrate.output import CameraOption
 from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import err, show_facts, show_json

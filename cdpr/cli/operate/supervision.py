@@ -13,8 +13,7 @@ from typing import Any, TypeVar
 from rich.console import Console
 
 from cdpr.cli.output import err, out
-from executor.operator_requests import RequestBoard
-from executor.supervision import Supervisor
+from executor.supervision import RequestBoard, Supervisor
 from model.errors import BadInput
 
 _T = TypeVar("_T")

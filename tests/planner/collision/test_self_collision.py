@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from model.clearance import SelfModel
+from model.distances import segment_pair_distance
 from model.errors import BadInput
-from model.geometry.segments import segment_pair_distance
 from model.kinematics import cables_to
 from model.pose import Array
 from model.rig import Rig, load_rig
