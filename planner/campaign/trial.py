@@ -250,7 +250,7 @@ def _measured(
 ) -> PathFigures:
     if result.path is None or not batch.measured:
         return PathFigures()
-    path, cost = planner.rrt.path(result.path), _cost(batch.rig, batch.case.box)
+    path, cost = planner.shortcut(result.path), _cost(batch.rig, batch.case.box)
     rig, poses = _rig(batch.rig, batch.case.box), [planner.space.pose(point) for point in path]
     clearance = passed = _NAN
     if batch.clearance and scene.obstacles:

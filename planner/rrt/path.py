@@ -157,7 +157,7 @@ def paper_route(
 
 def _post_processed(raw: Array, planner: PaperPlanner, kinematic: KinematicCost) -> Array:
     """Algorithm 3; in the rewiring mode the path is then drawn tight as well."""
-    path = planner.rrt.path(raw)
+    path = planner.shortcut(raw)
     if planner.settings.mode == "paper" or len(path) == 2:
         return path
     cost: Cost = kinematic if planner.settings.cost == "kinematic" else LengthCost()
@@ -165,7 +165,7 @@ def _post_processed(raw: Array, planner: PaperPlanner, kinematic: KinematicCost)
     for _ in range(_ROUNDS):
         path = cheapest_through(path, planner.edge, cost, length / _SPREAD_POINTS)
         path = drawn_tight(path, planner.edge, cost)
-    return planner.rrt.path(path, _FOR_FEWER_CORNERS)
+    return planner.shortcut(path, _FOR_FEWER_CORNERS)
 
 
 def _no_solution(

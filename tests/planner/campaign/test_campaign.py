@@ -135,7 +135,7 @@ def test_a_trial_reports_what_its_search_and_the_independent_routes_find(
     planner = PaperPlanner(gachon, scene, settings, CLEARANCE_RESERVE)
     ends = np.array(scene.start.position), np.array(scene.goal.position)
     result = planner.search(*ends, np.random.default_rng(1))
-    path = planner.rrt.path(result.path)
+    path = planner.shortcut(result.path)
     assert (trial.nodes, trial.searches) == (len(result.points), result.iterations)
     report = check_path(gachon, scene, [planner.space.pose(point) for point in path])
     assert report.passed

@@ -159,7 +159,7 @@ def test_refusals_are_counted_and_named(searched, sampler) -> None:
 
 def test_algorithm_3_leaves_no_node_that_can_be_skipped_from_a_kept_one(searched) -> None:
     planner, result = searched(3, PAPER)
-    kept = planner.rrt.path(result.path)
+    kept = planner.shortcut(result.path)
     rows = [int(np.flatnonzero((result.path == node).all(axis=1))[0]) for node in kept]
     assert rows[0] == 0
     assert rows[-1] == len(result.path) - 1
@@ -171,7 +171,7 @@ def test_algorithm_3_leaves_no_node_that_can_be_skipped_from_a_kept_one(searched
 
 def test_algorithm_3_takes_no_dearer_shortcut_under_the_kinematic_cost(searched, cost) -> None:
     planner, result = searched(1, replace(PAPER, cost="kinematic"), seed=4)
-    kept = planner.rrt.path(result.path)
+    kept = planner.shortcut(result.path)
     field = planner.field
 
     def total(path: np.ndarray) -> float:
