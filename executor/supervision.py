@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from model.errors import StoppedByOperator
 
@@ -102,28 +102,6 @@ class LocalRequests:
 
 
 _T = TypeVar("_T")
-
-
-class Proposal(Protocol):
-    """What is about to happen; a `confirm` callback shows it and answers its question.
-
-    Attributes:
-        question: Asked of the operator.
-        otherwise: What a no leaves, such as ``nothing was moved``.
-    """
-
-    question: ClassVar[str]
-    otherwise: ClassVar[str]
-
-
-def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal) -> None:
-    """Asks before anything moves or changes; without a callback the caller has decided.
-
-    Raises:
-        StoppedByOperator: The answer was no.
-    """
-    if confirm is not None and not confirm(proposal):
-        raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
 
 
 class Supervisor:

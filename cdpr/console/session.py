@@ -38,11 +38,11 @@ from cdpr.console.watch import CameraPictures, RunWatch
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
-from executor.interlock.interlock import MotionInterlock
+from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
-from executor.service import StatusResult, reference_status
+from executor.service import StatusResult
 from executor.service import status as read_status
 from model.errors import CdprError, Refused
 from model.files.documents import millimetres, write_atomic
