@@ -13,7 +13,7 @@ from planner.rrt.variants import TEXT, AlgorithmVariant, ConeDraw, FailureRate, 
 
 SamplerName = Literal["adaptive", "goal-bias"]
 CostName = Literal["kinematic", "length"]
-Mode = Literal["paper", "rewire"]
+Mode = Literal["rewire", "paper"]
 
 CLEARANCE_RESERVE = 0.05e-3
 """Added to every clearance the scene asks for, [m], so that round-off in a plan's file (1 nm) and

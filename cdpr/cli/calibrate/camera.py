@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibration.intrinsics.lens import AUTO
+from calibration.intrinsics.lens import LensChoice
 from calibration.intrinsics.quality import FULL_COVERAGE
 from calibration.pictures import take_pictures
 from calibration.procedures import (
@@ -42,16 +41,6 @@ from model.files.output import make_folder
 from model.rig import load_rig
 
 
-class LensChoice(StrEnum):
-    """Models of lenses, and the choice among them."""
-
-    auto = AUTO
-    five = "five"
-    rational = "rational"
-    thin_prism = "thin-prism"
-    fisheye = "fisheye"
-
-
 @with_option_groups
 def camera(
     folder: Annotated[
@@ -81,7 +70,7 @@ def camera(
     ] = None,
     lens: Annotated[
         LensChoice, typer.Option(help="its model; auto: what fits held-out pictures best")
-    ] = LensChoice.auto,
+    ] = "auto",
     result: ResultOptions = NOWHERE,
 ) -> None:
     """Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.
@@ -114,7 +103,7 @@ def camera(
             name=name,
             wanted=wanted_mm / 1e3,
             distance=distance_m,
-            lens=lens.value,
+            lens=lens,
             to=to,
         )
         result.show(made, _facts(made))
@@ -138,7 +127,7 @@ def camera(
         name=name,
         wanted=wanted_mm / 1e3,
         distance=distance_m,
-        lens=lens.value,
+        lens=lens,
         to=to,
         listener=result.listener,
     )

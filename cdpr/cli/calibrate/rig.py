@@ -155,8 +155,7 @@ class Deviations:
             "offsets": self.offsets_mm / 1e3,
             "stiffness": self.stiffness_percent / 1e2,
         }
-        fixed = {group.value for group in known}
-        return {group: size for group, size in deviations.items() if group not in fixed}
+        return {group: size for group, size in deviations.items() if group not in known}
 
 
 DRAWING = Deviations()
