@@ -11,9 +11,8 @@ if TYPE_CHECKING:
     from calibration.geometry.pose_selection import measurement_poses
     from calibration.geometry.result import RigResult
     from calibration.intrinsics.result import CameraResult
-    from calibration.procedures import Calibration
     from calibration.result_files import load_result
-    from calibration.results import ResultDocument
+    from calibration.results import Calibration, ResultDocument
     from calibration.tag_map.result import TagsResult
     from calibration.targets.chessboards import Charuco, Chessboard
     from calibration.targets.circle_grid import CircleGrid

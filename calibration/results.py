@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import date
+from dataclasses import dataclass, field, replace
+from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import yaml
 from pydantic import AfterValidator, Field
@@ -27,7 +27,9 @@ from model.files.documents import (
     document_hash,
     write_atomic,
 )
+from model.files.output import make_place, require_new_file
 from model.files.rig_file import RigDocument
+from model.pages.page import html_table
 
 USE = (
     "use it: pass the result's file with --calibration, or write a new rig file with"
@@ -261,3 +263,111 @@ def data_hash(pieces: Iterable[bytes]) -> str:
     for piece in pieces:
         digest.update(piece)
     return f"sha256:{digest.hexdigest()}"
+
+
+# A finished calibration, and where it is written.
+
+
+Result = TypeVar("Result", bound=ResultDocument, covariant=True)
+Found = TypeVar("Found", covariant=True)
+Quality = TypeVar("Quality", covariant=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration(Generic[Result, Found, Quality]):
+    """A finished calibration.
+
+    Attributes:
+        result: As it is written to a file: numbers, intervals, verdict.
+        page: The report, HTML.
+        found: What it rests on.
+        quality: What it is good for.
+        facts: What was found beside the numbers, for people.
+        files: Result and report, where they were written.
+    """
+
+    result: Result
+    page: str
+    found: Found
+    quality: Quality
+    facts: Sequence[tuple[str, str]] = ()
+    files: tuple[Path, ...] = ()
+
+    @property
+    def order(self) -> int:
+        """When it is applied; with what follows, what `Rig.with_calibration` takes."""
+        return self.result.order
+
+    @property
+    def kind(self) -> str:
+        """What was calibrated, such as ``camera``."""
+        return self.result.kind
+
+    @property
+    def name(self) -> str:
+        """Which of its kind."""
+        return self.result.name
+
+    @property
+    def date(self) -> str:
+        """When, ISO 8601."""
+        return self.result.date
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this result in place.
+
+        Raises:
+            BadInput: The result is not about this rig.
+        """
+        return self.result.corrected(rig)
+
+    def __repr__(self) -> str:
+        """What was calibrated, and what it is good for."""
+        return f"<Calibration {self.kind} {self.name}, {self.date}: {self.result.verdict}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        rows = [*self.result.in_words(), ("verdict", self.result.verdict)]
+        return html_table(f"Calibration {self.kind} {self.name}", rows)
+
+    def saved_in(self, folder: Path | None) -> Self:
+        """The calibration with its result and report written into a folder; None writes nothing.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        if folder is None:
+            return self
+        written = write_result(folder, self.result)
+        report = written.with_suffix(".html")
+        write_atomic(report, self.page)
+        return replace(self, files=(written, report))
+
+
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """Where a result goes.
+
+    Attributes:
+        folder: For the result file and its report; None writes nothing.
+        replace: Files of the same name and day may be replaced.
+        on: The result's date; today when left out.
+    """
+
+    folder: Path | None = None
+    replace: bool = False
+    on: date = field(default_factory=lambda: datetime.now(UTC).date())
+
+    def require_free(self, kind: str, name: str) -> None:
+        """Makes the folder before the work, so that no work is lost.
+
+        Raises:
+            BadInput: It cannot be made or written to, or holds such a result or report.
+        """
+        if self.folder is None:
+            return
+        result = self.folder / result_file_name(kind, name, self.on.isoformat())
+        if self.folder.is_dir():
+            for file in (result, result.with_suffix(".html")):
+                require_new_file(file, self.replace)
+        make_place(self.folder)

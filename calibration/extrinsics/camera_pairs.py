@@ -21,11 +21,11 @@ from calibration.extrinsics.quality import (
     widths_of,
     workspace_corners,
 )
-from calibration.extrinsics.result import extrinsics_page, extrinsics_result
+from calibration.extrinsics.result import extrinsics_page, extrinsics_result, place_facts
 from calibration.intrinsics.calibrate import NOT_FOUND
 from calibration.pictures import USUAL_PICTURES, PicturesFrom, opened_pictures
-from calibration.procedures import Calibration, Destination, ExtrinsicsOutcome
-from calibration.results import Issue, data_hash
+from calibration.procedures import ExtrinsicsOutcome
+from calibration.results import Calibration, Destination, Issue, data_hash
 from calibration.tag_map.bundle_adjustment import require_tags
 from calibration.tag_map.observations import TagSights, platform_pose, sights_of
 from calibration.targets.board import Board, Seen
@@ -277,7 +277,8 @@ def locate_camera_by_another(
     verdict = judge_extrinsics(found, wanted)
     result = extrinsics_result(found, verdict, rig.document, to.on)
     page = extrinsics_page(found, result, verdict, camera.world_from_camera)
-    return Calibration(result, page, found, verdict).saved_in(to.folder)
+    facts = place_facts(found, camera.world_from_camera)
+    return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
 
 
 def _looks(

@@ -198,6 +198,15 @@ def extrinsics_page(
     )
 
 
+def place_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[str, str]]:
+    """What was found beside the numbers, for people; ``before`` is the pose in the rig file."""
+    return [
+        ("by", f"{found.by}, {found.pictures} images"),
+        *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
+        *moved_rows(before, found.world_from_camera),
+    ]
+
+
 def moved_rows(before: Pose, after: Pose) -> list[tuple[str, str]]:
     """How far a pose is from another, for people."""
     shift = (after.position - before.position) * 1e3

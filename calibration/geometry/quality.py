@@ -182,6 +182,23 @@ class RigQuality:
     turned: float
     tilt: float
 
+    def facts(self, found: RigCalibration) -> list[tuple[str, str]]:
+        """What was found beside the numbers, for people."""
+        what = "positions" if found.held_out.poses else "cables"
+        facts = [
+            (
+                "held out",
+                f"{what} RMS error at held-out samples {self.held_out * 1e3:.3f} mm;"
+                f" with the rig file {self.before * 1e3:.3f} mm; {len(found.measured)} samples",
+            ),
+            (
+                "in the workspace",
+                f"within {self.level * 1e3:.2g} mm, rotated within {self.turned * 1e3:.2g} mm"
+                " (95 %)",
+            ),
+        ]
+        return facts + [("not identified", line) for line in found.not_identified]
+
 
 def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     """The verdict.

@@ -66,6 +66,15 @@ class ReadoutCalibration:
     unused: Mapping[str, str]
     data_hash: str
 
+    def facts(self) -> list[tuple[str, str]]:
+        """What was found beside the number, for people."""
+        fastest, used = max(self.speeds.values()) * 1e3, len(self.speeds)
+        off = f"{self.before:.2f} standard deviations off before, {self.after:.2f} after"
+        return [
+            ("pictures", f"{used} used, the platform's speed up to {fastest:.0f} mm/s"),
+            ("edges", off),
+        ]
+
     @property
     def intervals(self) -> dict[str, Interval]:
         """The readout with its 95 % interval by the key of result files, [ms]."""

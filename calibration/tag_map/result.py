@@ -222,6 +222,16 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
     return rows
 
 
+def layout_facts(found: TagLayout) -> list[tuple[str, str]]:
+    """What was found beside the numbers, for people."""
+    used = f"{len(found.errors)} used, reprojection error {found.reprojection:.3f} px RMS"
+    moved = [
+        (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
+        for name, shift, turn, _, count in change_rows(found)
+    ]
+    return [("pictures", used), *moved]
+
+
 def _places(document: TagsResult) -> list[tuple[str, ...]]:
     told = dict(document.in_words())
     return [

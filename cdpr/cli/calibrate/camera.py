@@ -8,10 +8,8 @@ from typing import Annotated
 import typer
 
 from calibration.intrinsics.lens import LensChoice
-from calibration.intrinsics.quality import FULL_COVERAGE
 from calibration.pictures import take_pictures
 from calibration.procedures import (
-    CameraOutcome,
     calibrate_camera,
     calibrate_camera_from_corners,
     measure_readout,
@@ -106,7 +104,7 @@ def camera(
             lens=lens,
             to=to,
         )
-        result.show(made, _facts(made))
+        result.show(made)
         return
     board = printed.made()
     if live is None and (pictures is not None or size_px is not None):
@@ -131,7 +129,7 @@ def camera(
         to=to,
         listener=result.listener,
     )
-    result.show(made, _facts(made))
+    result.show(made)
 
 
 def _take_pictures(
@@ -151,25 +149,6 @@ def _take_pictures(
         )
     if requests.read().stop:
         err.print("capture stopped; the images so far are used")
-
-
-def _facts(made: CameraOutcome) -> list[tuple[str, str]]:
-    """What was found beside the numbers, for people."""
-    result, quality = made.found, made.quality
-    return [
-        ("lens", f"model {result.lens.name}, {len(result.distortion)} coefficients"),
-        ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
-        (
-            "boards were",
-            f"{quality.nearest:.3g} to {quality.farthest:.3g} m away; if not, the sizes are wrong",
-        ),
-        ("covered", f"{quality.covered:.0%} of the image; {FULL_COVERAGE:.0%} or more is good"),
-        (
-            "precision",
-            f"{quality.verdict.error * 1e3:.2g} mm at {quality.distance:.2f} m (95 %); two halves"
-            f" of the images differ by {quality.halves * 1e3:.2g} mm",
-        ),
-    ]
 
 
 # `cdpr calibrate readout`: how long a camera takes from its top row to its bottom row.
@@ -220,13 +199,4 @@ def readout(
         to=result.to,
         listener=result.listener,
     )
-    found = made.found
-    fastest = max(found.speeds.values())
-    facts = [
-        (
-            "pictures",
-            f"{len(found.speeds)} used, the platform's speed up to {fastest * 1e3:.0f} mm/s",
-        ),
-        ("edges", f"{found.before:.2f} standard deviations off before, {found.after:.2f} after"),
-    ]
-    result.show(made, facts)
+    result.show(made)
