@@ -166,6 +166,19 @@ class Comparison:
             return "use the newer one, or the one with the smaller intervals"
         return "find what was changed, moved or refocused in between, then calibrate again"
 
+    def facts(self) -> list[tuple[str, str]]:
+        """For people: the verdict, the next step, and every number."""
+        numbers = [
+            (
+                change.name,
+                f"{change.by:+.3g}, within {change.allowed:.2g} by chance"
+                f"{': CHANGED' if change.beyond else ''}",
+            )
+            for change in self.changes
+        ]
+        alone = [(name, "in one result only") for name in self.only_in_one]
+        return [("verdict", str(self)), ("next", self.next_step), *numbers, *alone]
+
     def as_dict(self) -> dict[str, object]:
         """For programs."""
         return {

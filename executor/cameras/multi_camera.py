@@ -16,8 +16,7 @@ from model.pose import Pose
 from model.progress import SILENT, Listener
 from tracking.clearance import INTERVAL, MeasuredClearance, clearance_of
 from tracking.fusion import MultiCameraFusion
-from tracking.measurement import PoseMeasurement
-from tracking.track import rates
+from tracking.measurement import PoseMeasurement, rates
 
 # Watches measured clearance, image by image, for one whose upper bound is below the limit.
 

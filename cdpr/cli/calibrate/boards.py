@@ -83,13 +83,13 @@ class BoardOptions:
         count, sides = (self.columns, self.rows), self._sides()
         match self.board:
             case "chessboard":
-                return Chessboard(*count, *sides)
+                return Chessboard(*count, sides[0])
             case "charuco":
-                return Charuco(*count, *sides, self.dictionary, self.legacy)
+                return Charuco(*count, sides[0], sides[1], self.dictionary, self.legacy)
             case "circles":
-                return CircleGrid(*count, *sides, self.asymmetric)
+                return CircleGrid(*count, sides[0], sides[1], self.asymmetric)
             case "tags":
-                return TagGrid(*count, *sides, self.family, self.first, self.order)
+                return TagGrid(*count, sides[0], sides[1], self.family, self.first, self.order)
 
     def _sides(self) -> list[float]:
         """The sizes of this kind of board, [m]."""

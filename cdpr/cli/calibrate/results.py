@@ -37,18 +37,7 @@ def diff(
     if as_json:
         show_json(found.as_dict())
     else:
-        title = f"{one.kind} {one.name}: from {one.date} to {other.date}"
-        facts = [("verdict", str(found)), ("next", found.next_step)]
-        facts += [
-            (
-                change.name,
-                f"{change.by:+.3g}, within {change.allowed:.2g} by chance"
-                f"{': CHANGED' if change.beyond else ''}",
-            )
-            for change in found.changes
-        ]
-        facts += [(name, "in one result only") for name in found.only_in_one]
-        show_facts(title, facts)
+        show_facts(f"{one.kind} {one.name}: from {one.date} to {other.date}", found.facts())
     if not found.agree:
         raise typer.Exit(3)
 
