@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from calibration.extrinsics.hand_eye import locate_by_motion
-from calibration.extrinsics.quality import ExtrinsicCalibration, judge_extrinsics
 from calibration.extrinsics.result import (
+    ExtrinsicCalibration,
     ExtrinsicsResult,
     extrinsics_page,
     extrinsics_result,
+    judge_extrinsics,
     place_facts,
 )
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags

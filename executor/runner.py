@@ -28,8 +28,7 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder
 from executor.recording.run_course import RunCourse, dated_folder
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State

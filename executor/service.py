@@ -23,8 +23,7 @@ from executor.interlock.locks import SetUpLock
 from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import State
 from executor.supervision import Supervisor

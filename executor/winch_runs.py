@@ -20,8 +20,7 @@ from executor.realtime.job import Armed, Ended
 from executor.realtime.process import RealTimeProcess, real_time_process
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.run_course import free_folder
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests, RequestBoard, Supervisor

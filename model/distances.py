@@ -12,7 +12,6 @@ which has the same proof as its stopping rule.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
 import fcl
@@ -63,13 +62,6 @@ def segment_pair_points(
     between = points_a - points_b
     best = np.argmin(_dot(between, between), axis=0)[None, ..., None]
     return np.take_along_axis(points_a, best, 0)[0], np.take_along_axis(points_b, best, 0)[0]
-
-
-def segment_pair_distance(start_a: Array, end_a: Array, start_b: Array, end_b: Array) -> Array:
-    """The distances of pairs of segments, shape (...), [m]; see `segment_pair_points`."""
-    point_a, point_b = segment_pair_points(start_a, end_a, start_b, end_b)
-    distance: Array = np.linalg.norm(point_a - point_b, axis=-1)
-    return distance
 
 
 def segment_box_points(start: Array, end: Array, half_size: Array) -> tuple[Array, Array]:
@@ -289,12 +281,6 @@ def _body_of_faces(points: Array, triangles: np.ndarray[Any, Any]) -> ConvexBody
     sides = (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return ConvexBody(points, 0.0, collision, _unit(normals), _unit(sides))
-
-
-@cache
-def _fan(count: int) -> Any:
-    """Triangles over ``count`` points as FCL wants them."""
-    return np.array([[3, 0, i, i + 1] for i in range(1, count - 1)]).ravel()
 
 
 def separation(first: ConvexBody, second: ConvexBody) -> Separation:

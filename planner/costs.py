@@ -26,7 +26,7 @@ from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
 from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner import space
-from planner.array_cache import stored
+from planner.kernels.jit import stored
 from planner.space import Lattice, corners_and_weights
 
 _SAMPLING = 0.010

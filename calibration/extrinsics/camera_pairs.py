@@ -15,13 +15,15 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.extrinsics.quality import (
+from calibration.extrinsics.result import (
     ExtrinsicCalibration,
+    extrinsics_page,
+    extrinsics_result,
     judge_extrinsics,
+    place_facts,
     widths_of,
     workspace_corners,
 )
-from calibration.extrinsics.result import extrinsics_page, extrinsics_result, place_facts
 from calibration.intrinsics.calibrate import NOT_FOUND
 from calibration.pictures import USUAL_PICTURES, PicturesFrom, opened_pictures
 from calibration.procedures import ExtrinsicsOutcome

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from calibration.extrinsics.quality import widths_of
+from calibration.extrinsics.result import widths_of
 from calibration.tag_map.observations import TagSights, TagViews, moved_tags
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, skew

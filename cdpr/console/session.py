@@ -22,13 +22,13 @@ from cdpr.console.commands import (
     Message,
     MoveCommand,
     NameCommand,
+    PageControl,
     PickCommand,
     PlanCommand,
     RenameCommand,
     SpeedCommand,
     TakeCommand,
 )
-from cdpr.console.control import PageControl
 from cdpr.console.preview import preview
 from cdpr.console.started import StartedVerb, file_here
 from cdpr.console.state import Kept, jog_state, kept_state, measured_state, outcome_state

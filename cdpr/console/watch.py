@@ -13,8 +13,8 @@ from typing import Any
 
 from executor.cameras.live_image import ImageReader, LiveImage
 from executor.remote.client import Answer, RunLink
+from executor.remote.command_socket import find_runs
 from executor.remote.protocol import make_line
-from executor.remote.registry import find_runs
 from model.rig import Rig
 
 #: While nothing moves, a new run is looked for this often, [s].

@@ -34,8 +34,7 @@ from executor.realtime.clock import SimulatedClock
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
 from executor.recording.run_course import free_folder
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import JogStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests, Supervisor

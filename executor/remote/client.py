@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from executor.remote.command_socket import Reached, find_runs
 from executor.remote.protocol import make_line
-from executor.remote.registry import Reached, find_runs
 from model.errors import BadInput, Fault
 from tracking.measurement import rates
 

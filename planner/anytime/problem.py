@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
-from planner.array_cache import stored
 from planner.collision.edges import edge_clearance, in_workspace, obstacles_free
 from planner.collision.self_collision import build_robot, is_open, self_edge_free
 from planner.collision.self_collision_regions import Robot
 from planner.collision.world import build_world
 from planner.costs import KinematicCost
-from planner.kernels.jit import inlined, kernel, leaf
+from planner.kernels.jit import inlined, kernel, leaf, stored
 from planner.kernels.primitives import Vector, along, minus, norm
 from planner.kernels.scene_arrays import World
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE, Weights

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.extrinsics.quality import (
+from calibration.extrinsics.result import (
     ExtrinsicCalibration,
+    extrinsics_result,
     judge_extrinsics,
     workspace_corners,
 )
-from calibration.extrinsics.result import extrinsics_result
 from calibration.result_files import load_result
 from calibration.results import CalibrationVerdict, Issue, write_result
 from calibration.statistics import Interval

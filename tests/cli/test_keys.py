@@ -24,9 +24,8 @@ from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import JogProver, jog_session
 from executor.remote import client
 from executor.remote.client import StopResult, follow_run
+from executor.remote.command_socket import Reached, advertised, serving
 from executor.remote.protocol import make_line, parse_command
-from executor.remote.registry import Reached, advertised
-from executor.remote.server import serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord
 from executor.supervision import LocalRequests

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from cdpr.cli.operate.supervision import STOP_SIGNALS, stop_requests
-from executor.remote.registry import advertised, find_runs
+from executor.remote.command_socket import advertised, find_runs
 from executor.supervision import LocalRequests
 from model.errors import Refused
 
@@ -24,7 +24,7 @@ from model.errors import Refused
 RUN = """
 import signal
 from cdpr.cli.operate.supervision import stop_requests
-from executor.remote.registry import advertised
+from executor.remote.command_socket import advertised
 from executor.supervision import LocalRequests
 board = LocalRequests()
 with stop_requests(board), advertised() as listeners:
@@ -231,7 +231,9 @@ def test_a_listener_of_another_user_is_not_spoken_to(folders, monkeypatch):
         real = os.getuid()
         other = os.stat(folders[0]).st_uid
         assert other == real
-        monkeypatch.setattr("executor.remote.registry.struct.unpack", lambda *_: (1, real + 1, 0))
+        monkeypatch.setattr(
+            "executor.remote.command_socket.struct.unpack", lambda *_: (1, real + 1, 0)
+        )
         assert _reached() == []
 
 
