@@ -19,7 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from calibration.extrinsics.quality import workspace_corners
+from calibration.extrinsics.result import workspace_corners
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
 from calibration.tag_map.observations import TagSights
 from model.pose import Array, Pose, matrix_from_rotation_vector, skew

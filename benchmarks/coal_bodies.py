@@ -9,8 +9,8 @@ from typing import Any
 import coal
 import numpy as np
 
-from model.geometry.shapes import Box, Capsule, ConvexHull, Cylinder, Shape, Sphere, TriangleMesh
 from model.pose import Array, Pose
+from model.shapes import Box, Capsule, ConvexHull, Cylinder, Shape, Sphere, TriangleMesh
 
 EXACT = 2e-7
 """How far coal's distances are trusted, [m]; those of cylinders are off by up to 1e-8."""

@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT))
 from alone import alone  # noqa: E402
 from playwright.sync_api import Page, expect  # noqa: E402
 
-from executor.remote.registry import find_runs  # noqa: E402
+from executor.remote.command_socket import find_runs  # noqa: E402
 from tests.cli.plans import RIG  # noqa: E402
 from tests.console.browsing import browser_at, chromium  # noqa: E402
 from tests.console.cut import CutConnection  # noqa: E402

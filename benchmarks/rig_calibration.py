@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from calibration.geometry.calibrate import fit_rig
 from calibration.geometry.model import DEFAULT_DEVIATIONS
 from calibration.geometry.quality import judge_rig
-from calibration.load import load_result
+from calibration.result_files import load_result
 from model.kinematics import poses_near
 from model.rig import Rig, load_rig
 from model.winches import WinchMap

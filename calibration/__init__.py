@@ -11,12 +11,10 @@ if TYPE_CHECKING:
     from calibration.geometry.pose_selection import measurement_poses
     from calibration.geometry.result import RigResult
     from calibration.intrinsics.result import CameraResult
-    from calibration.load import load_result
-    from calibration.procedures import Calibration
-    from calibration.results import ResultDocument
+    from calibration.result_files import load_result
+    from calibration.results import Calibration, ResultDocument
     from calibration.tag_map.result import TagsResult
-    from calibration.targets.charuco import Charuco
-    from calibration.targets.chessboard import Chessboard
+    from calibration.targets.chessboards import Charuco, Chessboard
     from calibration.targets.circle_grid import CircleGrid
     from calibration.targets.tag_grid import TagGrid
 
@@ -43,12 +41,11 @@ if not TYPE_CHECKING:
             "calibration.geometry.pose_selection": "measurement_poses",
             "calibration.geometry.result": "RigResult",
             "calibration.intrinsics.result": "CameraResult",
-            "calibration.load": "load_result",
+            "calibration.result_files": "load_result",
             "calibration.procedures": "Calibration",
             "calibration.results": "ResultDocument",
             "calibration.tag_map.result": "TagsResult",
-            "calibration.targets.charuco": "Charuco",
-            "calibration.targets.chessboard": "Chessboard",
+            "calibration.targets.chessboards": "Charuco Chessboard",
             "calibration.targets.circle_grid": "CircleGrid",
             "calibration.targets.tag_grid": "TagGrid",
         },

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from datetime import UTC, date, datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import radians
 from pathlib import Path
-from typing import Generic, Self, TypeVar
 
 import numpy as np
 
 from calibration.extrinsics.hand_eye import locate_by_motion
-from calibration.extrinsics.quality import ExtrinsicCalibration, judge_extrinsics
-from calibration.extrinsics.result import ExtrinsicsResult, extrinsics_page, extrinsics_result
+from calibration.extrinsics.result import (
+    ExtrinsicCalibration,
+    ExtrinsicsResult,
+    extrinsics_page,
+    extrinsics_result,
+    judge_extrinsics,
+    place_facts,
+)
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.geometry.calibrate import RigCalibration, fit_rig
 from calibration.geometry.model import DEFAULT_DEVIATIONS
@@ -32,132 +36,38 @@ from calibration.intrinsics.readout import (
     readout_result,
 )
 from calibration.intrinsics.result import CameraResult, camera_page, camera_result
-from calibration.pictures import Pictures, pictures_in, pictures_of, timed_pictures
-from calibration.results import ResultDocument, require_file_name, result_file_name, write_result
+from calibration.pictures import (
+    USUAL_PICTURES,
+    USUAL_TAG_PICTURES,
+    Pictures,
+    PicturesFrom,
+    opened_pictures,
+    pictures_in,
+    timed_pictures,
+)
+from calibration.results import (
+    Calibration,
+    CalibrationVerdict,
+    Destination,
+    require_file_name,
+)
 from calibration.run_data import poses_by_picture, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
 from calibration.tag_map.observations import sights_of
-from calibration.tag_map.result import TagsResult, judge_layout, tags_page, tags_result
+from calibration.tag_map.result import (
+    TagsResult,
+    judge_layout,
+    layout_facts,
+    tags_page,
+    tags_result,
+)
 from calibration.targets.board import Board, read_corners
-from calibration.verdict import CalibrationVerdict
 from executor.kernels import ready_to_measure
 from model.errors import BadInput, Fault, Refused
-from model.files.documents import write_atomic
-from model.files.output import make_place, require_new_file
-from model.files.rig_file import RigDocument
 from model.kinematics import NoCable
-from model.pages.page import html_table
 from model.pose import Pose, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
-
-Result = TypeVar("Result", bound=ResultDocument, covariant=True)
-Found = TypeVar("Found", covariant=True)
-Quality = TypeVar("Quality", covariant=True)
-
-PicturesFrom = Pictures | str | Path | Callable[[], Pictures]
-"""Images, what opens them, or where they are: a folder, a video, a camera's index or address."""
-USUAL_PICTURES, USUAL_TAG_PICTURES = 20, 40
-"""Taken of a camera or a video to find where the camera is, and where tags are on the platform."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibration(Generic[Result, Found, Quality]):
-    """A finished calibration.
-
-    Attributes:
-        result: As it is written to a file: numbers, intervals, verdict.
-        page: The report, HTML.
-        found: What it rests on.
-        quality: What it is good for.
-        files: Result and report, where they were written.
-    """
-
-    result: Result
-    page: str
-    found: Found
-    quality: Quality
-    files: tuple[Path, ...] = ()
-
-    @property
-    def order(self) -> int:
-        """When it is applied; with what follows, what `Rig.with_calibration` takes."""
-        return self.result.order
-
-    @property
-    def kind(self) -> str:
-        """What was calibrated, such as ``camera``."""
-        return self.result.kind
-
-    @property
-    def name(self) -> str:
-        """Which of its kind."""
-        return self.result.name
-
-    @property
-    def date(self) -> str:
-        """When, ISO 8601."""
-        return self.result.date
-
-    def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with this result in place.
-
-        Raises:
-            BadInput: The result is not about this rig.
-        """
-        return self.result.corrected(rig)
-
-    def __repr__(self) -> str:
-        """What was calibrated, and what it is good for."""
-        return f"<Calibration {self.kind} {self.name}, {self.date}: {self.result.verdict}>"
-
-    def _repr_html_(self) -> str:
-        """For notebooks."""
-        rows = [*self.result.in_words(), ("verdict", self.result.verdict)]
-        return html_table(f"Calibration {self.kind} {self.name}", rows)
-
-    def saved_in(self, folder: Path | None) -> Self:
-        """The calibration with its result and report written into a folder; None writes nothing.
-
-        Raises:
-            BadInput: The folder cannot be written to.
-        """
-        if folder is None:
-            return self
-        written = write_result(folder, self.result)
-        report = written.with_suffix(".html")
-        write_atomic(report, self.page)
-        return replace(self, files=(written, report))
-
-
-@dataclass(frozen=True, slots=True)
-class Destination:
-    """Where a result goes.
-
-    Attributes:
-        folder: For the result file and its report; None writes nothing.
-        replace: Files of the same name and day may be replaced.
-        on: The result's date; today when left out.
-    """
-
-    folder: Path | None = None
-    replace: bool = False
-    on: date = field(default_factory=lambda: datetime.now(UTC).date())
-
-    def require_free(self, kind: str, name: str) -> None:
-        """Makes the folder before the work, so that no work is lost.
-
-        Raises:
-            BadInput: It cannot be made or written to, or holds such a result or report.
-        """
-        if self.folder is None:
-            return
-        result = self.folder / result_file_name(kind, name, self.on.isoformat())
-        if self.folder.is_dir():
-            for file in (result, result.with_suffix(".html")):
-                require_new_file(file, self.replace)
-        make_place(self.folder)
-
 
 CameraOutcome = Calibration[CameraResult, CameraCalibration, CameraQuality]
 ExtrinsicsOutcome = Calibration[ExtrinsicsResult, ExtrinsicCalibration, CalibrationVerdict]
@@ -238,9 +148,8 @@ def _judged_camera(
 ) -> CameraOutcome:
     quality = judge_camera(found, wanted, distance)
     result = camera_result(found, quality, name, to.on)
-    return Calibration(
-        result, camera_page(found, quality, name, result.date), found, quality
-    ).saved_in(to.folder)
+    page, facts = camera_page(found, quality, name, result.date), quality.facts(found)
+    return Calibration(result, page, found, quality, facts).saved_in(to.folder)
 
 
 def locate_camera(
@@ -287,7 +196,8 @@ def locate_camera(
     verdict = judge_extrinsics(found, wanted)
     result = extrinsics_result(found, verdict, rig.document, to.on)
     page = extrinsics_page(found, result, verdict, camera.world_from_camera)
-    return Calibration(result, page, found, verdict).saved_in(to.folder)
+    facts = place_facts(found, camera.world_from_camera)
+    return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
 
 
 def locate_tags(
@@ -325,9 +235,8 @@ def locate_tags(
     found = measure_layout(rig, camera, sights, fixed_tag)
     verdict = judge_layout(found, wanted)
     result = tags_result(found, verdict, rig.document, to.on)
-    return Calibration(result, tags_page(found, result, verdict), found, verdict).saved_in(
-        to.folder
-    )
+    page = tags_page(found, result, verdict)
+    return Calibration(result, page, found, verdict, layout_facts(found)).saved_in(to.folder)
 
 
 def measure_readout(
@@ -370,16 +279,7 @@ def measure_readout(
     verdict = judge_readout(found, wanted, speed)
     result = readout_result(found, verdict, speed, to.on)
     page = readout_page(found, verdict, result.date)
-    return Calibration(result, page, found, verdict).saved_in(to.folder)
-
-
-def opened_pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
-    """The images of a source; ``usual`` of a camera or a video."""
-    if isinstance(pictures, Pictures):
-        return pictures
-    if callable(pictures):
-        return pictures()
-    return pictures_of(pictures, camera, None, usual)
+    return Calibration(result, page, found, verdict, found.facts()).saved_in(to.folder)
 
 
 def calibrate_rig(
@@ -443,6 +343,5 @@ def calibrate_rig(
                 next_step="check units, the order of the cables, the homing of the drives and"
                 " the rig file",
             ) from error
-    return Calibration(
-        result, rig_page(found, quality, name, result.date), found, quality
-    ).saved_in(to.folder)
+    page, facts = rig_page(found, quality, name, result.date), quality.facts(found)
+    return Calibration(result, page, found, quality, facts).saved_in(to.folder)

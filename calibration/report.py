@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
+from calibration.results import CalibrationVerdict
 from calibration.statistics import Interval
-from calibration.verdict import CalibrationVerdict
 from model.pages.page import bullets, list_table, page, paragraph, section, table
 
 

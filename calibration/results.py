@@ -1,6 +1,7 @@
 """Calibration results as dated YAML files, beside the rig file and never written into it.
 
-Every kind of result has the keys of `ResultDocument` and its own, which are those of the rig file.
+Every kind of result has the keys of `ResultDocument` and its own, which are those of the rig file,
+and a verdict: what it is good for in one sentence, and what to do where it is not.
 """
 
 from __future__ import annotations
@@ -8,15 +9,15 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import date
+from dataclasses import dataclass, field, replace
+from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import yaml
 from pydantic import AfterValidator, Field
 
 from calibration.statistics import Interval
-from calibration.verdict import CalibrationVerdict
 from model.errors import BadInput
 from model.files.documents import (
     AnyNonNegative,
@@ -26,7 +27,68 @@ from model.files.documents import (
     document_hash,
     write_atomic,
 )
+from model.files.output import make_place, require_new_file
 from model.files.rig_file import RigDocument
+from model.pages.page import html_table
+
+USE = (
+    "use it: pass the result's file with --calibration, or write a new rig file with"
+    " `cdpr calibrate apply`"
+)
+"""What to do with a result that is good enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class Issue:
+    """Something that a calibration lacks.
+
+    Attributes:
+        reason: Why it is not good enough.
+        next_step: What to do about it.
+    """
+
+    reason: str
+    next_step: str
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationVerdict:
+    """What a calibration is good for.
+
+    Attributes:
+        error: How far off what is measured with it may be, 95 %, [m].
+        wanted: What is good enough, [m].
+        where: The place or the conditions of that, such as ``at 0.6 m``.
+        reasons: Why it is not good enough; empty if it is.
+        next_steps: What to do about each, or with a good result.
+    """
+
+    error: float
+    wanted: float
+    where: str
+    reasons: tuple[str, ...]
+    next_steps: tuple[str, ...]
+
+    @classmethod
+    def of(cls, error: float, wanted: float, where: str, lacks: Sequence[Issue]) -> Self:
+        """The verdict of what was found to be lacking; each next step once."""
+        reasons = tuple(lack.reason for lack in lacks)
+        steps = tuple(dict.fromkeys(lack.next_step for lack in lacks)) or (USE,)
+        return cls(error, wanted, where, reasons, steps)
+
+    @property
+    def good(self) -> bool:
+        """Whether it is good enough."""
+        return not self.reasons
+
+    def __str__(self) -> str:
+        """The verdict in a sentence."""
+        if self.good:
+            return f"good enough for {self.error * 1e3:.2g} mm {self.where}"
+        return f"not good enough: {'; '.join(self.reasons)}"
+
+
+# Result files.
 
 
 def _is_date(text: str) -> str:
@@ -201,3 +263,111 @@ def data_hash(pieces: Iterable[bytes]) -> str:
     for piece in pieces:
         digest.update(piece)
     return f"sha256:{digest.hexdigest()}"
+
+
+# A finished calibration, and where it is written.
+
+
+Result = TypeVar("Result", bound=ResultDocument, covariant=True)
+Found = TypeVar("Found", covariant=True)
+Quality = TypeVar("Quality", covariant=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration(Generic[Result, Found, Quality]):
+    """A finished calibration.
+
+    Attributes:
+        result: As it is written to a file: numbers, intervals, verdict.
+        page: The report, HTML.
+        found: What it rests on.
+        quality: What it is good for.
+        facts: What was found beside the numbers, for people.
+        files: Result and report, where they were written.
+    """
+
+    result: Result
+    page: str
+    found: Found
+    quality: Quality
+    facts: Sequence[tuple[str, str]] = ()
+    files: tuple[Path, ...] = ()
+
+    @property
+    def order(self) -> int:
+        """When it is applied; with what follows, what `Rig.with_calibration` takes."""
+        return self.result.order
+
+    @property
+    def kind(self) -> str:
+        """What was calibrated, such as ``camera``."""
+        return self.result.kind
+
+    @property
+    def name(self) -> str:
+        """Which of its kind."""
+        return self.result.name
+
+    @property
+    def date(self) -> str:
+        """When, ISO 8601."""
+        return self.result.date
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this result in place.
+
+        Raises:
+            BadInput: The result is not about this rig.
+        """
+        return self.result.corrected(rig)
+
+    def __repr__(self) -> str:
+        """What was calibrated, and what it is good for."""
+        return f"<Calibration {self.kind} {self.name}, {self.date}: {self.result.verdict}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        rows = [*self.result.in_words(), ("verdict", self.result.verdict)]
+        return html_table(f"Calibration {self.kind} {self.name}", rows)
+
+    def saved_in(self, folder: Path | None) -> Self:
+        """The calibration with its result and report written into a folder; None writes nothing.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        if folder is None:
+            return self
+        written = write_result(folder, self.result)
+        report = written.with_suffix(".html")
+        write_atomic(report, self.page)
+        return replace(self, files=(written, report))
+
+
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """Where a result goes.
+
+    Attributes:
+        folder: For the result file and its report; None writes nothing.
+        replace: Files of the same name and day may be replaced.
+        on: The result's date; today when left out.
+    """
+
+    folder: Path | None = None
+    replace: bool = False
+    on: date = field(default_factory=lambda: datetime.now(UTC).date())
+
+    def require_free(self, kind: str, name: str) -> None:
+        """Makes the folder before the work, so that no work is lost.
+
+        Raises:
+            BadInput: It cannot be made or written to, or holds such a result or report.
+        """
+        if self.folder is None:
+            return
+        result = self.folder / result_file_name(kind, name, self.on.isoformat())
+        if self.folder.is_dir():
+            for file in (result, result.with_suffix(".html")):
+                require_new_file(file, self.replace)
+        make_place(self.folder)

@@ -12,7 +12,7 @@ from model.lazy import lazy_names
 
 if TYPE_CHECKING:
     from calibration.geometry.pose_selection import measurement_poses
-    from calibration.targets.chessboard import Chessboard
+    from calibration.targets.chessboards import Chessboard
     from cdpr.measurement import (
         calibrate_camera,
         calibrate_rig,
@@ -94,7 +94,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "calibration.geometry.pose_selection": "measurement_poses",
-            "calibration.targets.chessboard": "Chessboard",
+            "calibration.targets.chessboards": "Chessboard",
             "cdpr.measurement": (
                 "calibrate_camera calibrate_rig load_calibration locate_camera "
                 "locate_tags open_camera track"

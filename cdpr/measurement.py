@@ -8,19 +8,13 @@ from pathlib import Path
 
 from calibration.extrinsics.surveyed_tags import Survey
 from calibration.geometry.model import DEFAULT_DEVIATIONS
-from calibration.load import load_result
-from calibration.procedures import (
-    CameraOutcome,
-    Destination,
-    ExtrinsicsOutcome,
-    RigOutcome,
-    TagsOutcome,
-)
+from calibration.procedures import CameraOutcome, ExtrinsicsOutcome, RigOutcome, TagsOutcome
 from calibration.procedures import calibrate_camera as find_camera
 from calibration.procedures import calibrate_rig as find_rig
 from calibration.procedures import locate_camera as find_camera_pose
 from calibration.procedures import locate_tags as find_tags
-from calibration.results import ResultDocument
+from calibration.result_files import load_result
+from calibration.results import Destination, ResultDocument
 from calibration.targets.board import Board
 from drivers.cameras.files import ImageFolder
 from drivers.cameras.live import LiveCamera, VideoFile

@@ -12,8 +12,8 @@ from model.rig import Rig
 from model.scene import Scene
 from planner.check import verify
 from planner.check_report import CheckReport
-from planner.options import Objective, PlannerName, PlanningOptions, settings_from_options
 from planner.planning import plan_path
+from planner.settings import Objective, PlannerName, PlanningOptions, settings_from_options
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.maps import Question
 

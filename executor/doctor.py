@@ -26,9 +26,8 @@ from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
 if TYPE_CHECKING:
-    from drivers.can_bus import BusSettings
+    from drivers.can_bus import BusSettings, KernelInterface
     from drivers.cia402.inspection import Examined
-    from drivers.socketcan import KernelInterface
 
 PACKAGES = (
     "cdpr",
@@ -163,9 +162,8 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
 def rig_bus(rig: Rig) -> list[MachineCheck]:
     """Whether the bus of a rig is fast enough, is set up, and can be opened."""
     # After the libraries were looked at: it needs python-can.
-    from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
+    from drivers.can_bus import IN_PROCESS, BusSettings, can_interfaces, open_bus
     from drivers.can_load import check_bus_load
-    from drivers.socketcan import can_interfaces
 
     settings = BusSettings.of(rig)
     checks: list[MachineCheck] = []

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 from executor.cameras.open import look_at_rest
 from executor.cameras.sources import choose_one_camera, require_simulated_pictures
@@ -19,8 +18,8 @@ from executor.control.winch_motion import WinchesStand
 from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
-from executor.operator_requests import RequestBoard
-from executor.supervision import Supervisor, require_confirmed
+from executor.proposals import Facts, ForgetProposal, HomingProposal, require_confirmed
+from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
 from model.errors import BadInput, Refused, StoppedByOperator
 from model.pose import Pose
@@ -36,32 +35,6 @@ FEWEST_PICTURES, MOST_PICTURES = 5, 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HomingProposal:
-    """A homing that is about to wind cables in; see `executor.supervision.Proposal`.
-
-    Attributes:
-        rig: The robot.
-        target: Pretension, [N].
-        limit: Largest tension, [N].
-        reach: Largest length of a cable that is taken up, [m].
-        speed: Fastest winch, [m/s].
-        fastest: Winding in, which is slower where a drive reports late, [m/s].
-        camera: That measures the pose, and its source; None where the pose is stated.
-    """
-
-    question: ClassVar[str] = "Wind the cables in now?"
-    otherwise: ClassVar[str] = "nothing was moved"
-
-    rig: Rig
-    target: float
-    limit: float
-    reach: float
-    speed: float
-    fastest: float
-    camera: tuple[Camera, str] | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class HomeResult:
     """What a homing made.
 
@@ -72,6 +45,21 @@ class HomeResult:
 
     reference: HomingReference
     file: Path | None
+
+    def facts(self) -> Facts:
+        """Pose, its uncertainty, tensions and file, for people."""
+        reference, tensions = self.reference, self.reference.tensions_n
+        x, y, z = reference.pose.position_mm
+        known = f"{reference.uncertainty_mm:.3f} mm (one standard deviation)"
+        if reference.uncertainty_mm == 0.0:  # it is not measured how well a jig holds it
+            known = "that of the jig (not measured)"
+        kept = self.file or "not saved: simulated drives end with this process"
+        return [
+            ("platform", f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm, {reference.how}"),
+            ("uncertainty", known),
+            ("tensions", f"{min(tensions):.1f} to {max(tensions):.1f} N"),
+            ("reference", str(kept)),
+        ]
 
 
 def home(
@@ -171,20 +159,6 @@ def home(
     move_by_law(motion, at_rest)
     (reference,) = made
     return HomeResult(reference, None if in_process else interlock.file.path)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ForgetProposal:
-    """A reference that is about to be given up; see `executor.supervision.Proposal`.
-
-    Attributes:
-        interlock: Of the bus, whose reference it is.
-    """
-
-    question: ClassVar[str] = "Do all drive positions match the rig file?"
-    otherwise: ClassVar[str] = "the homing reference was not changed"
-
-    interlock: MotionInterlock
 
 
 def use_rig_file_counts(

@@ -8,7 +8,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,20 +15,20 @@ from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
 from executor.drives import current_pose, is_simulated, look_at, require_own_time
 from executor.interlock.interlock import MotionInterlock
+from executor.proposals import CableProposal, MotionProposal, require_confirmed
 from executor.recording.run_course import free_folder
 from executor.recording.run_folder import RunEvent, RunFolder
-from executor.runner import MotionProposal, RunOptions, RunResult, prepare_plan, run_prepared
-from executor.supervision import Supervisor, require_confirmed
+from executor.runner import RunOptions, RunResult, prepare_plan, run_prepared
+from executor.supervision import Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
 from model.errors import BadInput, Refused
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
 from model.jit import KernelSet, compilation
 from model.plan import plan_from_document
-from model.pose import Array, Pose
+from model.pose import Array, Pose, largest_rotations
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
-from model.rotation_limits import largest_rotations
 from model.scene import Scene, nothing_in_the_way, scene_from_document
 from planner.kernels.jit import KERNELS
 from planner.planning import make_plan
@@ -237,28 +236,6 @@ def _require_cable(rig: Rig, cable: int, length: float) -> None:
             why="a single cable is moved in short steps, under observation",
             next_step="use several steps",
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CableProposal:
-    """One winch that is about to move; see `executor.supervision.Proposal`.
-
-    Attributes:
-        rig: The robot.
-        cable: Its number, from 1.
-        length: Paid out, [m]; negative is wound in.
-        limit: Largest tension of any cable, [N].
-        speed: Of the winch, [m/s].
-    """
-
-    question: ClassVar[str] = "Move this cable now?"
-    otherwise: ClassVar[str] = "nothing was moved"
-
-    rig: Rig
-    cable: int
-    length: float
-    limit: float
-    speed: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

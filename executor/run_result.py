@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
+from drivers.can_bus import IN_PROCESS
 from executor.recording.csv_columns import TableFile
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
+from executor.recording.verdict import faults_among
 from model.pages.page import html_table
 
 if TYPE_CHECKING:
@@ -58,6 +60,37 @@ class RunResult:
         if self.passed:
             return 0
         return 130 if self.verdict == "STOPPED" else 1
+
+    def details(self) -> list[str]:
+        """What decided the verdict; after a failure the pages about its faults, and what to do."""
+        lines = [str(reason) for reason in self.summary["reasons"]]
+        if self.verdict == "FAILED":
+            codes = faults_among(event["code"] for event in self.summary["events"])
+            lines += [f"details: cdpr explain {code}" for code in codes]
+            lines.append(f"next: {self._next_step()}")
+        return lines
+
+    def _next_step(self) -> str:
+        """What to do after a run that failed."""
+        if self.summary["final_state"] in ("finished", "stopped"):
+            return "check the report for exceeded limits before the next run"
+        if self.summary.get("interface") == IN_PROCESS:
+            return "find the cause, then run again into a new folder"
+        return "find the cause and check the platform, then run `cdpr reset RIG`"
+
+    def missing_text(self) -> str:
+        """Files of the run that could not be written, why, and what to do; empty where all were."""
+        if not self.missing:
+            return ""
+        lines = [f"{self.folder}: some files of the run could not be written"]
+        for why in dict.fromkeys(self.missing.values()):
+            names = [name for name, reason in self.missing.items() if reason == why]
+            lines.append(f"  why: {', '.join(names)}: {why}")
+        removed = "the folder was removed during the run, and its record with it"
+        again = f"free some disk space if it is full, then `cdpr report {self.folder}`"
+        then = f"{again} to write the missing files" if self.folder.is_dir() else removed
+        lines.append(f"  next: the verdict and the exit code are valid; {then}")
+        return "\n".join(lines)
 
     @cached_property
     def cycles(self) -> Columns:

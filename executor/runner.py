@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from executor.cameras.multi_camera import CameraRecords, CameraWatch
 from executor.cameras.open import asked_rate, open_cameras, require_no_stop
@@ -22,18 +22,17 @@ from executor.drives import drives_of, is_simulated, left_alone, open_drives, re
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_for_simulating_process
-from executor.operator_requests import LocalRequests
+from executor.proposals import MotionProposal, require_confirmed
 from executor.realtime.clock import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder
 from executor.recording.run_course import RunCourse, dated_folder
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
-from executor.supervision import Supervisor, require_confirmed
+from executor.supervision import LocalRequests, Supervisor
 from executor.trajectory.prepare import PreparedRun, prepare
 from model.errors import BadInput, CdprError
 from model.plan import Plan, require_same_rig
@@ -44,7 +43,6 @@ from planner.check import verify
 from tracking.shared_errors import require_stated_errors
 
 __all__ = [
-    "MotionProposal",
     "RunOptions",
     "RunResult",
     "prepare_plan",
@@ -54,24 +52,6 @@ __all__ = [
 
 #: Without a camera the progress is reported this often, [Hz].
 PROGRESS_RATE = 10.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionProposal:
-    """A run that is about to move the platform; see `executor.supervision.Proposal`.
-
-    Attributes:
-        prepared: The checked run.
-        cameras: Those that measure it, with their sources.
-        clearance_stop: Whether too little measured clearance stops it.
-    """
-
-    question: ClassVar[str] = "Move the platform now?"
-    otherwise: ClassVar[str] = "nothing was moved"
-
-    prepared: PreparedRun
-    cameras: Mapping[Camera, str]
-    clearance_stop: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from pathlib import Path
+from shlex import quote
+from typing import Any
 
 import numpy as np
 
@@ -16,73 +18,22 @@ from drivers.factory import drive_states, read_drives
 from executor.control.standstill import FaultReset, Release, StandstillMotion
 from executor.drives import current_pose, left_alone, require_other_process, resting_drives_of
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
-from executor.interlock.interlock import MotionInterlock
+from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
 from executor.interlock.locks import SetUpLock
+from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import State
-from executor.supervision import Supervisor, require_confirmed
+from executor.supervision import Supervisor
 from executor.winch_runs import is_braked, release_drives, reset_drives
-from model.errors import CdprError, Refused
+from model.errors import CdprError
 from model.files.documents import PoseDocument
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
 from model.scene import nothing_in_the_way
-
-
-@dataclass(frozen=True, slots=True)
-class ReferenceStatus:
-    """The homing reference of a bus.
-
-    Attributes:
-        counts: Whether the drives still count from it.
-        why_not: Why they do not.
-        made: When it was made; None where none is kept.
-        how: The pose was known.
-        file: Where it is kept.
-    """
-
-    counts: bool
-    why_not: str | None
-    made: str | None
-    how: str | None
-    file: str | None
-
-    def __str__(self) -> str:
-        """Whether it is valid and how it was made, or why not."""
-        if not self.counts:
-            return f"not valid: {self.why_not}"
-        if not self.made:
-            return "none: absolute encoders match the rig file"
-        return f"valid, made {self.made} ({self.how})"
-
-
-def reference_status(
-    interlock: MotionInterlock, positions: Sequence[int] | None = None
-) -> ReferenceStatus:
-    """The reference of a bus.
-
-    Args:
-        interlock: Of the bus.
-        positions: Of its drives, [counts]; None where they were not asked.
-    """
-    why = interlock.why_unreferenced(positions)
-    try:
-        kept = interlock.kept_reference()
-    except Refused:  # the reason says so
-        kept = None
-    path = interlock.file.path
-    return ReferenceStatus(
-        counts=not why,
-        why_not=why or None,
-        made=kept.made if kept else None,
-        how=kept.how if kept else None,
-        file=str(path) if path.exists() else None,
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +82,58 @@ class StatusResult:
     pose: Pose | None = None
     why_no_pose: str | None = None
     missing: CdprError | None = None
+
+    def facts(self, rig_file: Path) -> Facts:
+        """The state for people, with what has to be done before a run.
+
+        Args:
+            rig_file: For the commands that are named.
+        """
+        latched = self.latched or "none"
+        if self.run is not None:
+            latched = f"none; process {self.run} is moving or resetting the rig, see `cdpr monitor`"
+        facts = [
+            ("rig", self.rig),
+            ("bus", self.bus),
+            ("latched fault", latched),
+            ("reference", str(self.reference)),
+        ]
+        if self.being_set_up:
+            unread = "not read: another program is preparing a motion or reading them"
+            facts.append(("drives", unread))
+        if self.pose is not None:
+            x, y, z = self.pose.position * 1000.0
+            place = f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm from the encoders, without a load"
+            facts.append(("platform", place))
+        elif self.why_no_pose is not None:
+            facts.append(("platform", self.why_no_pose))
+        next_step = self.next_step(rig_file)
+        return [*facts, ("next", next_step)] if next_step else facts
+
+    def next_step(self, rig_file: Path) -> str:
+        """What has to be done before anything can run; empty where nothing has, or a run is on."""
+        if self.run is not None or self.being_set_up:
+            return ""
+        file, steps = quote(str(rig_file)), []
+        if self.latched is not None:
+            steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
+        if not self.reference.counts:
+            ways = "--at-home, --pose-mm X Y Z or --camera SOURCE"
+            steps.append(f"cdpr home {file} with {ways}")
+        return "; then ".join(steps)
+
+    def drive_lines(self, names: Mapping[int, str]) -> list[str]:
+        """A line a drive.
+
+        Args:
+            names: Of the drives, by node (`Rig.drive_names`).
+        """
+        return [
+            f"{names[drive.node]:<19} {drive.state:<24} {drive.position:>11} counts"
+            f" {drive.tension:8.2f} N"
+            f"{'' if drive.set_up else '  not configured since power-up'}"
+            for drive in self.drives or ()
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """For `--json`: units in the keys, rounded."""
@@ -245,22 +248,6 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     return replace(read, pose=pose)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ResetProposal:
-    """A fault that is about to be taken off; see `executor.supervision.Proposal`.
-
-    Attributes:
-        bus: Interface and channel.
-        latched: What is latched, if anything.
-    """
-
-    question: ClassVar[str] = "Is the cause removed and the platform safe?"
-    otherwise: ClassVar[str] = "nothing was reset"
-
-    bus: str
-    latched: LatchedFault | None
-
-
 @dataclass(frozen=True, slots=True)
 class ResetResult:
     """How a rig is after a reset.
@@ -329,26 +316,6 @@ def reset(
             restarted=done.restarted,
             reference=reference_status(interlock, done.left.positions.tolist()),
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReleaseProposal:
-    """Drives that are about to lose their torque; see `executor.supervision.Proposal`.
-
-    Attributes:
-        rig: The robot.
-        bus: Interface and channel.
-        braked: Whether brakes hold the drums afterwards.
-        reference: Of the drives' counts, which is given up without brakes.
-    """
-
-    question: ClassVar[str] = "Is the platform supported, so that no cable carries it?"
-    otherwise: ClassVar[str] = "the drives hold as before"
-
-    rig: Rig
-    bus: str
-    braked: bool
-    reference: ReferenceStatus
 
 
 @dataclass(frozen=True, slots=True)

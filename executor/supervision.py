@@ -1,37 +1,107 @@
-"""What links a motion to the program that asks for it: a question before, stops while it moves."""
+"""What links a motion to its operator: a question before, and requests while it moves.
+
+The loop asks every cycle what the operator wants.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
-from executor.operator_requests import RequestBoard
 from model.errors import StoppedByOperator
 
-_T = TypeVar("_T")
 
-
-class Proposal(Protocol):
-    """What is about to happen; a `confirm` callback shows it and answers its question.
+@dataclass(frozen=True, slots=True)
+class StopReason:
+    """Why a run is to end without an operator's stop.
 
     Attributes:
-        question: Asked of the operator.
-        otherwise: What a no leaves, such as ``nothing was moved``.
+        code: Of the event that reports it.
+        text: A clause, with numbers.
     """
 
-    question: ClassVar[str]
-    otherwise: ClassVar[str]
+    code: str
+    text: str
 
 
-def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal) -> None:
-    """Asks before anything moves or changes; without a callback the caller has decided.
+@dataclass(frozen=True, slots=True)
+class OperatorRequests:
+    """All of it at one moment; each stays until it is changed.
 
-    Raises:
-        StoppedByOperator: The answer was no.
+    Attributes:
+        stop: End the run along the path.
+        for_what: The stop is wished for this, which the cameras saw, and with which code; None when
+            the operator wishes it.
+        hold: Come to rest on the path and wait there.
+        speed: Share of the planned speed along the path, from 0.01 to 1.
+        lost: Why the run has lost its supervisor; empty while it has one.
     """
-    if confirm is not None and not confirm(proposal):
-        raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
+
+    stop: bool = False
+    hold: bool = False
+    speed: float = 1.0
+    lost: str = ""
+    for_what: StopReason | None = None
+
+
+#: Slowest and fastest feed that may be asked for, [% of the planned speed].
+SLOWEST, FASTEST = 1, 100
+
+
+class RequestBoard(Protocol):
+    """Where wishes are put up. A stop cannot be taken back."""
+
+    def ask_stop(self, for_what: StopReason | None = None) -> None:
+        """The run is to end along the path.
+
+        Args:
+            for_what: What the cameras saw; None when the operator wishes it.
+        """
+
+    def ask_hold(self, hold: bool) -> None:
+        """The run is to wait on the path, or to go on."""
+
+    def ask_speed(self, percent: int) -> None:
+        """The run is to go at a share of the planned speed, from `SLOWEST` to `FASTEST`."""
+
+    def read(self) -> OperatorRequests:
+        """What is wished now."""
+
+
+class LocalRequests:
+    """The board of a loop that runs in this process; others may write to it at any time."""
+
+    def __init__(self) -> None:
+        """Nothing is wished yet."""
+        # One attribute each: a signal that interrupts one wish cannot undo another.
+        self._stop, self._hold, self._speed = False, False, 1.0
+        self._for_what: StopReason | None = None
+
+    def ask_stop(self, for_what: StopReason | None = None) -> None:
+        """See `RequestBoard`."""
+        if not self._stop:
+            self._for_what = for_what
+        self._stop = True
+
+    def ask_hold(self, hold: bool) -> None:
+        """See `RequestBoard`."""
+        self._hold = hold
+
+    def ask_speed(self, percent: int) -> None:
+        """See `RequestBoard`."""
+        self._speed = percent / 100.0
+
+    def read(self) -> OperatorRequests:
+        """See `RequestBoard`."""
+        return OperatorRequests(self._stop, self._hold, self._speed, for_what=self._for_what)
+
+
+# What links a motion to the program that asks for it: a question before, stops while it moves.
+
+
+_T = TypeVar("_T")
 
 
 class Supervisor:

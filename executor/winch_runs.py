@@ -15,17 +15,15 @@ from executor.drives import is_simulated, left_alone, unreferenced_drives_of
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
-from executor.operator_requests import LocalRequests, RequestBoard
 from executor.realtime.clock import SimulatedClock
 from executor.realtime.job import Armed, Ended
 from executor.realtime.process import RealTimeProcess, real_time_process
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.run_course import free_folder
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
-from executor.supervision import Supervisor
+from executor.supervision import LocalRequests, RequestBoard, Supervisor
 from model.errors import Fault, Refused, StoppedByOperator
 from model.pose import Pose
 from model.progress import Advance, Listener

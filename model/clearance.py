@@ -3,7 +3,7 @@
 A cable is the straight segment from its exit to its anchor, with the rig's cable radius; the
 platform is its box; pulley wheels are not bodies. Distances are between surfaces. Where bodies
 overlap they are negative: minus a way that suffices to part them. Each is proved by a separating
-plane (`model.geometry.convex`) and is at most 0.1 µm less than the true one, never more.
+plane (`model.distances`) and is at most 0.1 µm less than the true one, never more.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from model.geometry.convex import (
+from model.distances import (
     ConvexBody,
     Separation,
     box_body,
     convex_bodies,
     segment_body,
+    segment_box_points,
+    segment_pair_points,
     separation,
 )
-from model.geometry.segments import segment_box_points, segment_pair_points
 from model.kinematics import Cables, cables_at, cables_to
 from model.pose import Array, Pose
 from model.rig import Rig

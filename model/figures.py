@@ -13,9 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from model.geometry.shapes import Obstacle
-from model.geometry.solids import Solid, box_solid, solid_of
 from model.pose import Array, Pose
+from model.shapes import Obstacle, Solid, box_solid, solid_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput, Fault
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
-from model.statics.dexterity import rms_anchor_radius
+from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
     from model.rig import Rig

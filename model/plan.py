@@ -22,11 +22,10 @@ from model.files.plan_file import (
 )
 from model.files.reading import read_json
 from model.pages.page import html_table
-from model.pose import Pose
+from model.pose import Pose, largest_rotations
 from model.rig import NOT_IN_PLAN_HASH, Rig, rig_from_document
-from model.rotation_limits import largest_rotations
 from model.scene import Scene, scene_from_document
-from model.statics.dexterity import rms_anchor_radius
+from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

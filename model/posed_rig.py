@@ -9,10 +9,10 @@ import numpy as np
 
 from model.kinematics import cables_at, structure_matrix_of
 from model.pose import Array, Pose, read_only
-from model.statics.dexterity import condition_number, rms_anchor_radius
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
+from model.statics.wrench_sets import condition_number, rms_anchor_radius
 
 if TYPE_CHECKING:
     from model.rig import Rig

@@ -35,7 +35,9 @@ from model.files.scene_file import (
     StopDocument,
     payloads,
 )
-from model.geometry.shapes import (
+from model.pages.page import html_table
+from model.pose import Array, Pose, RotationLimits, read_only
+from model.shapes import (
     Box,
     Capsule,
     Cylinder,
@@ -47,9 +49,6 @@ from model.geometry.shapes import (
     encloses_convex,
     read_only_indices,
 )
-from model.pages.page import html_table
-from model.pose import Array, Pose, read_only
-from model.rotation_limits import RotationLimits
 
 if TYPE_CHECKING:
     from model.rig import Rig

@@ -27,10 +27,10 @@ from model.plan import Plan
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene, legs_of
-from model.statics.dexterity import rms_anchor_radius
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import STANDARD_GRAVITY, weight_wrench, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.bounds import Smallest, smallest_along, smallest_over_stretches
 from planner.check_report import (
     CheckReport,

@@ -21,17 +21,16 @@ from model.kinematics import cables_to, structure_matrix_of
 from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene
-from model.statics import dexterity, wrench_sets
-from model.statics.dexterity import condition_number, rms_anchor_radius
+from model.statics import wrench_sets
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
-from model.statics.wrench_sets import force_volume
+from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner import space
-from planner.array_cache import stored
+from planner.kernels.jit import stored
 from planner.space import Lattice, corners_and_weights
 
 _SAMPLING = 0.010
-_MODULES = (kinematics, dexterity, wrench_sets, space)
+_MODULES = (kinematics, wrench_sets, space)
 """What the indices on the lattice follow from, beside this module."""
 
 

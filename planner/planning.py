@@ -29,7 +29,13 @@ from planner.endpoints import require_room_for_the_way, require_usable_ends
 from planner.kernels.jit import planner_compilation
 from planner.path import Progress, Route
 from planner.rrt.variants import AlgorithmVariant
-from planner.settings import AnytimeSettings, OptimalSettings, PlannerSettings, TurningSettings
+from planner.settings import (
+    AnytimeSettings,
+    OptimalSettings,
+    PlannerSettings,
+    Settings,
+    TurningSettings,
+)
 from planner.space import PoseSpace, Space, TranslationSpace
 
 if TYPE_CHECKING:
@@ -40,8 +46,6 @@ if TYPE_CHECKING:
 # The whole way through a scene: its legs planned one after the other, and joined.
 
 
-Settings = PlannerSettings | OptimalSettings | TurningSettings
-"""Of any planner."""
 _LONG = 1000.0
 """Milliseconds or rounds from which the progress of a search is reported."""
 

@@ -36,6 +36,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+#: A verb of cdpr, after whose name options may follow.
+VERB = re.compile(r"^(cdpr (?:calibrate |bench )?\S+)")
 FENCE = re.compile(r"^```(sh|console|bash)\s*$")
 COMMENT = re.compile(r"^<!--\s*(.*?)\s*-->$")
 MARKER = re.compile(
@@ -78,7 +80,7 @@ class Block:
         """What the shell runs."""
         commands = self.commands.splitlines()
         if self.options:
-            commands = [f"{c} {self.options}" if c.startswith("cdpr ") else c for c in commands]
+            commands = [VERB.sub(rf"\1 {self.options}", command) for command in commands]
         if self.ready_at:
             commands = ["exec " + "\n".join(commands)]  # Ctrl-C reaches it, not its shell
         return "\n".join((*self.before, *commands))

@@ -9,10 +9,10 @@ from model.lazy import lazy_names
 if TYPE_CHECKING:
     from tracking.camera_check import CameraMoved
     from tracking.clearance import MeasuredClearance, clearance_of
+    from tracking.estimator import TrackerSettings
+    from tracking.fusion import MultiCameraFusion
     from tracking.measurement import NoPose, PoseMeasurement
-    from tracking.multi_camera import MultiCameraFusion
     from tracking.pose_log import write_pose_log
-    from tracking.settings import TrackerSettings
     from tracking.tracker import Tracker
 
 __all__ = [
@@ -33,10 +33,10 @@ if not TYPE_CHECKING:
         {
             "tracking.camera_check": "CameraMoved",
             "tracking.clearance": "MeasuredClearance clearance_of",
+            "tracking.estimator": "TrackerSettings",
+            "tracking.fusion": "MultiCameraFusion",
             "tracking.measurement": "NoPose PoseMeasurement",
-            "tracking.multi_camera": "MultiCameraFusion",
             "tracking.pose_log": "write_pose_log",
-            "tracking.settings": "TrackerSettings",
             "tracking.tracker": "Tracker",
         },
     )

@@ -1,26 +1,133 @@
-"""The platform in one image, by the squares of its tags."""
+"""The platform in one image, by the squares of its tags, and when its pose is believed.
+
+Which of the squares belong to the platform is decided by geometry. A tag of the same family and
+number may hang on a wall, lie on a table or stand on a screen. Every square allows two poses of the
+body; the pose that most squares agree on is the body's, and of a tag that is seen twice the square
+that fits it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import Image, pixels_from_ideal, pixels_of
-from tracking.consensus import Consensus, agreeing
-from tracking.detection.decoder import carries_tag
+from tracking.camera_model import Image, pixels_from_ideal, pixels_of, project_undistorted
 from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
-from tracking.detection.tags import modules_across, tag_corners
+from tracking.detection.tags import carries_tag, modules_across, tag_corners
 from tracking.edges.refine import refine
 from tracking.measurement import NoPose, Observation, PoseMeasurement
-from tracking.pnp import BundlePose, TagView, refine_pnp, solve_pnp
+from tracking.pnp import BundlePose, TagView, refine_pnp, solve_pnp, square_poses
 from tracking.rolling_shutter import FitByRows, RecentMotion, RollingShutter
-from tracking.settings import TrackerSettings
 from tracking.shared_errors import SharedErrors
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerSettings:
+    """When a pose is believed.
+
+    Attributes:
+        reprojection_px: Largest RMS error of the corners.
+        view_angle: Tags seen more aslant than this are left out, [rad].
+        position_deviation: Largest standard deviation of the position along any direction, [m].
+        jump: Largest way from the last pose beside what speed allows, [m].
+        jump_angle: Largest turn from the last pose, [rad].
+        speed: Fastest the platform is expected to go, [m/s].
+        turn: Largest turn from the home pose; no cable robot turns by a right angle, [rad].
+        single_tag_margin: By how much, in variances, a single tag's pose must fit better than its
+            mirror pose.
+        camera_moved_px: Frame tags farther off than this mean that the camera was moved.
+        camera_check_period: Images between checks of the camera.
+    """
+
+    reprojection_px: float = 0.5
+    view_angle: float = float(np.radians(76.0))
+    position_deviation: float = 0.003
+    jump: float = 0.03
+    jump_angle: float = 0.25
+    speed: float = 0.2
+    turn: float = float(np.radians(80.0))
+    single_tag_margin: float = 30.0
+    camera_moved_px: float = 1.0
+    camera_check_period: int = 10
+
+
+# Which of the squares that were seen belong to the body.
+
+
+#: A square agrees with a pose when its corners are this near, as a share of its own side, and [px].
+AGREEMENT, LEAST_AGREEMENT = 0.15, 3.0
+#: Poses that differ less are one and the same, [m].
+SAME = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Consensus:
+    """The squares that agree.
+
+    Attributes:
+        views: Of each tag at most one.
+        ambiguous: Numbers of tags that are seen more than once while it is unknown which is the
+            body's; then there are no views.
+    """
+
+    views: list[TagView]
+    ambiguous: tuple[int, ...] = ()
+
+
+def agreeing(
+    camera: Camera, views: Sequence[TagView], possible: Callable[[Pose], bool]
+) -> Consensus:
+    """The largest set of squares that agree on one possible pose of the body.
+
+    Args:
+        camera: The camera that saw them.
+        views: Squares with the tags whose numbers they carry; a tag may be there more than once.
+        possible: Whether the body can be at ``camera_from_body``.
+    """
+    found: list[tuple[int, float, Pose, list[TagView]]] = []
+    for view in views:
+        for pose in square_poses(camera, view):
+            if possible(pose):
+                fitting = _fitting(camera, views, pose)
+                misfit = sum(gap for gap, _ in fitting.values()) / max(1, len(fitting))
+                found.append((len(fitting), misfit, pose, [v for _, v in fitting.values()]))
+    if not found:
+        return Consensus([])
+    found.sort(key=lambda item: (-item[0], item[1]))
+    most, _, best, members = found[0]
+    chosen = {id(view) for view in members}
+    for count, _, pose, others in found[1:]:
+        elsewhere = not chosen & {id(view) for view in others}
+        if count == most and elsewhere and pose.distance_to(best) > SAME:
+            twice = sorted({view.tag.id for view in (*members, *others)})
+            return Consensus([], tuple(twice))
+    return Consensus(members)
+
+
+def _fitting(
+    camera: Camera, views: Sequence[TagView], pose: Pose
+) -> dict[int, tuple[float, TagView]]:
+    """Of each tag the square that fits a pose best, with its misfit, where one fits at all."""
+    best: dict[int, tuple[float, TagView]] = {}
+    for view in views:
+        points = pose.apply(tag_corners(view.tag))
+        if np.any(points[:, 2] < 1e-3):
+            continue
+        seen = view.seen.corners
+        side = float(np.sqrt(np.mean(np.sum((seen - np.roll(seen, 1, axis=0)) ** 2, axis=1))))
+        gap = float(
+            np.sqrt(np.mean(np.sum((project_undistorted(camera, points) - seen) ** 2, axis=1)))
+        )
+        near = gap < max(LEAST_AGREEMENT, AGREEMENT * side)
+        if near and (view.tag.id not in best or gap < best[view.tag.id][0]):
+            best[view.tag.id] = (gap, view)
+    return best
+
 
 # Why a pose that was found is not believed.
 

@@ -128,3 +128,10 @@ def extrapolate(
     share = (time - last.time) / (last.time - before.time)
     covariance = (1.0 + share) ** 2 * last.covariance + share**2 * before.covariance
     return replace(last, time=time, pose=pose, covariance=read_only(covariance))
+
+
+def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: int) -> str:
+    """Live figures: how fast, how long an image takes, how many tags are seen."""
+    fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
+    long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
+    return f"{fast} images/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"

@@ -16,8 +16,8 @@ from tracking.camera_model import Image
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
 from tracking.estimator import UNCERTAIN, UNSHARP
-from tracking.measurement import NoPose, PoseMeasurement
-from tracking.multi_camera import MultiCameraFusion, moments
+from tracking.fusion import MultiCameraFusion, moments
+from tracking.measurement import NoPose, PoseMeasurement, rates
 from tracking.pose_log import LoggedPicture
 from tracking.shared_errors import require_stated_errors
 from tracking.tracker import Tracker
@@ -219,13 +219,6 @@ def _without_end(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPicture]:
 
 #: Live figures are those of this many of the newest images.
 NEWEST = 10
-
-
-def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: int) -> str:
-    """Live figures: how fast, how long an image takes, how many tags are seen."""
-    fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
-    long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
-    return f"{fast} images/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
 
 
 class FrameRate:

@@ -11,12 +11,16 @@ from model.pose import Array, Pose, interpolate
 from model.rig import Camera, Rig
 from tracking.camera_check import CameraCheck, refuse_moved_camera
 from tracking.camera_model import Image, require_image_format
-from tracking.detection.detector import Detection, near_places, nearest_to, region_around
-from tracking.detection.libraries import make_detector
-from tracking.estimator import PlatformEstimator
+from tracking.detection.detector import (
+    Detection,
+    make_detector,
+    near_places,
+    nearest_to,
+    region_around,
+)
+from tracking.estimator import PlatformEstimator, TrackerSettings
 from tracking.measurement import NoPose, Observation, PoseMeasurement, predicted
 from tracking.rolling_shutter import RecentMotion
-from tracking.settings import TrackerSettings
 
 # Where the platform should be seen, by the positions of its drives.
 #

@@ -28,8 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from calibration.targets.board import Board, Seen
-from calibration.targets.charuco import Charuco
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Charuco, Chessboard
 from calibration.targets.circle_grid import CircleGrid
 from calibration.targets.tag_grid import TagGrid
 from tracking.camera_model import Image

@@ -27,7 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from calibration.extrinsics.quality import judge_extrinsics
+from calibration.extrinsics.result import judge_extrinsics
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
 from calibration.intrinsics.quality import judge_camera

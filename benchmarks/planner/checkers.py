@@ -13,11 +13,11 @@ import fcl
 import numba
 import numpy as np
 
-from model.geometry.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
 from model.kinematics import cables_at
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
+from model.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
 from planner.collision.edges import edge_free
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import World

@@ -52,7 +52,7 @@ def new_trees(start: Array, goal: Array, seed: int) -> Trees:
 def trees_handle(problem: PathProblem, trees: Trees) -> Handle:
     """Both as one reference.
 
-    Not by `planner.anytime.rounds.handle_of`: its kept code would then name a type of this module.
+    Not by `planner.anytime.path.handle_of`: its kept code would then name a type of this module.
     """
     return Handle(problem, trees)
 

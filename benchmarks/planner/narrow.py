@@ -28,9 +28,8 @@ from ours import first_path
 from passages import Passage, passages
 
 from model.pose import Array
-from planner.anytime.prepare import problem_of
-from planner.anytime.problem import PathProblem
-from planner.anytime.rounds import handle_of
+from planner.anytime.path import handle_of
+from planner.anytime.problem import PathProblem, problem_of
 from planner.anytime.state import new_search
 from planner.costs import KinematicCost
 from planner.settings import CLEARANCE_RESERVE, Weights

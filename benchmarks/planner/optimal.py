@@ -28,10 +28,8 @@ from rich.progress import Progress
 from model.pose import Array, Pose
 from model.rig import load_rig
 from model.scene import load_scene
-from planner.anytime.path import best_path
-from planner.anytime.prepare import problem_of
-from planner.anytime.problem import PathProblem
-from planner.anytime.rounds import advance, handle_of
+from planner.anytime.path import advance, best_path, handle_of
+from planner.anytime.problem import PathProblem, problem_of
 from planner.anytime.state import new_search
 from planner.check import check_path
 from planner.costs import KinematicCost

@@ -11,8 +11,8 @@ from result import Result
 
 from model.rig import Rig
 from model.scene import Scene
-from planner.anytime.prepare import problem_of
-from planner.anytime.rounds import advance, handle_of, sampled_path
+from planner.anytime.path import advance, handle_of, sampled_path
+from planner.anytime.problem import problem_of
 from planner.anytime.state import BEST, AnytimeSearch, Handle, new_search
 from planner.costs import KinematicCost
 from planner.kernels.jit import kernel

@@ -18,10 +18,9 @@ from model.rig import Rig
 from model.scene import Scene
 from planner.anytime.lattice_path import lattice_path
 from planner.anytime.local_search import MOST_VERTICES, Polyline, measure, polish
-from planner.anytime.prepare import problem_of
-from planner.anytime.problem import KINEMATIC, LENGTH, UNIT, VERTEX, PathProblem
+from planner.anytime.path import advance, handle_of
+from planner.anytime.problem import KINEMATIC, LENGTH, UNIT, VERTEX, PathProblem, problem_of
 from planner.anytime.random import seeded
-from planner.anytime.rounds import advance, handle_of
 from planner.anytime.state import BEST, new_search
 from planner.costs import KinematicCost
 from planner.settings import Weights

@@ -19,9 +19,8 @@ from model.pose import Array
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
 from planner.anytime_6d.moves import matrix_of, put_turned, turn_between
-from planner.anytime_6d.path import turning_problem
+from planner.anytime_6d.path import RotatingSearch, turning_problem
 from planner.anytime_6d.problem import RotatingProblem, move_allowed
-from planner.anytime_6d.rounds import RotatingSearch
 from planner.collision.rotating_edges import turning_edge_free
 from planner.collision.self_collision import self_turning_edge_free
 from planner.costs import KinematicCost

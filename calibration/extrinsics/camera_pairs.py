@@ -15,29 +15,24 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.extrinsics.quality import (
+from calibration.extrinsics.result import (
     ExtrinsicCalibration,
+    extrinsics_page,
+    extrinsics_result,
     judge_extrinsics,
+    place_facts,
     widths_of,
     workspace_corners,
 )
-from calibration.extrinsics.result import extrinsics_page, extrinsics_result
 from calibration.intrinsics.calibrate import NOT_FOUND
-from calibration.procedures import (
-    USUAL_PICTURES,
-    Calibration,
-    Destination,
-    ExtrinsicsOutcome,
-    PicturesFrom,
-    opened_pictures,
-)
-from calibration.results import data_hash
+from calibration.pictures import USUAL_PICTURES, PicturesFrom, opened_pictures
+from calibration.procedures import ExtrinsicsOutcome
+from calibration.results import Calibration, Destination, Issue, data_hash
 from calibration.tag_map.bundle_adjustment import require_tags
 from calibration.tag_map.observations import TagSights, platform_pose, sights_of
 from calibration.targets.board import Board, Seen
-from calibration.targets.charuco import Charuco
+from calibration.targets.chessboards import Charuco
 from calibration.targets.tag_grid import TagGrid
-from calibration.verdict import Issue
 from executor.kernels import ready_to_measure
 from model.cameras import SURE
 from model.errors import BadInput
@@ -284,7 +279,8 @@ def locate_camera_by_another(
     verdict = judge_extrinsics(found, wanted)
     result = extrinsics_result(found, verdict, rig.document, to.on)
     page = extrinsics_page(found, result, verdict, camera.world_from_camera)
-    return Calibration(result, page, found, verdict).saved_in(to.folder)
+    facts = place_facts(found, camera.world_from_camera)
+    return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
 
 
 def _looks(

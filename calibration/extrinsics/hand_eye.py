@@ -18,9 +18,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.extrinsics.quality import ExtrinsicCalibration, widths_of, workspace_corners
+from calibration.extrinsics.result import ExtrinsicCalibration, widths_of, workspace_corners
+from calibration.results import Issue
 from calibration.tag_map.observations import TagSights, platform_pose
-from calibration.verdict import Issue
 from model.errors import BadInput, InvalidFile, Problem
 from model.files.reading import CsvFile
 from model.pose import Array, Pose, read_only

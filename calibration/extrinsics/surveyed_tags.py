@@ -13,10 +13,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from calibration.extrinsics.quality import ExtrinsicCalibration, workspace_corners
+from calibration.extrinsics.result import ExtrinsicCalibration, workspace_corners
+from calibration.results import Issue
 from calibration.statistics import CONFIDENCE, widened
 from calibration.tag_map.observations import TagSights
-from calibration.verdict import Issue
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew

@@ -17,14 +17,13 @@ from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument, StopDocument
 from model.kinematics import NoCable, cables_at
 from model.plan import Plan, plan_from_document
-from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.pose import Array, Pose, largest_rotations, matrix_from_rotation_vector
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.rotation_limits import largest_rotations
 from model.scene import Scene, scene_from_document
-from model.statics.dexterity import rms_anchor_radius
 from model.statics.gravity import working_tensions
 from model.statics.tension_distribution import TensionInfeasible
+from model.statics.wrench_sets import rms_anchor_radius
 from model.winches import WinchMap
 from planner.planning import plan_path
 from planner.settings import OBJECTIVES, TurningSettings

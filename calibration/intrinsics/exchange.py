@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import cv2
@@ -150,7 +150,8 @@ def mrcal_text(camera: CameraDocument) -> str:
     )
 
 
-FORMATS: dict[str, Callable[[CameraDocument], str]] = {
+FormatName = Literal["opencv", "ros", "kalibr", "mrcal"]
+FORMATS: dict[FormatName, Callable[[CameraDocument], str]] = {
     "opencv": opencv_text,
     "ros": ros_text,
     "kalibr": kalibr_text,

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -98,6 +99,7 @@ LENSES = {
     )
 }
 """By name; the first one is tried first."""
+LensChoice = Literal["auto", "five", "rational", "thin-prism", "fisheye"]
 AUTO = "auto"
 """In place of a name: the model that fits held-out pictures best."""
 FOLDS = 4

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.lens import LENSES, RADIAL, radial_share
-from calibration.verdict import CalibrationVerdict, Issue
+from calibration.results import CalibrationVerdict, Issue
 from model.pose import Array, rotation_vector_from_matrix
 from tracking.camera_model import rays_of
 
@@ -67,6 +67,23 @@ class CameraQuality:
     def covered(self) -> float:
         """Share of the cells with corners."""
         return float(np.mean(self.coverage > 0))
+
+    def facts(self, found: CameraCalibration) -> list[tuple[str, str]]:
+        """What was found beside the numbers, for people."""
+        return [
+            ("lens", f"model {found.lens.name}, {len(found.distortion)} coefficients"),
+            ("corners", f"{found.error:.3f} px off (RMS) in {len(found.views)} pictures"),
+            (
+                "boards were",
+                f"{self.nearest:.3g} to {self.farthest:.3g} m away; if not, the sizes are wrong",
+            ),
+            ("covered", f"{self.covered:.0%} of the image; {FULL_COVERAGE:.0%} or more is good"),
+            (
+                "precision",
+                f"{self.verdict.error * 1e3:.2g} mm at {self.distance:.2f} m (95 %); two halves"
+                f" of the images differ by {self.halves * 1e3:.2g} mm",
+            ),
+        ]
 
 
 def judge_camera(

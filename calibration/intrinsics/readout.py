@@ -21,10 +21,9 @@ from scipy.stats import t as student
 
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, interval_rows, page_of, table_of
-from calibration.results import ResultDocument, common_keys
+from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import CONFIDENCE, Interval
 from calibration.tag_map.observations import TagSights
-from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
 from model.files.camera_file import Readout
 from model.files.documents import AnyNonNegative, Positive
@@ -66,6 +65,15 @@ class ReadoutCalibration:
     after: float
     unused: Mapping[str, str]
     data_hash: str
+
+    def facts(self) -> list[tuple[str, str]]:
+        """What was found beside the number, for people."""
+        fastest, used = max(self.speeds.values()) * 1e3, len(self.speeds)
+        off = f"{self.before:.2f} standard deviations off before, {self.after:.2f} after"
+        return [
+            ("pictures", f"{used} used, the platform's speed up to {fastest:.0f} mm/s"),
+            ("edges", off),
+        ]
 
     @property
     def intervals(self) -> dict[str, Interval]:

@@ -3,7 +3,7 @@
 Every image may be taken from anywhere; its camera pose is an unknown as well (bundle adjustment).
 Images give the layout only up to a rigid motion of the platform's frame; it is put where the
 layout fits the rig file best, or where one tag is as there. What an image says of the layout, its
-camera pose projected out, is added up as in `calibration.intrinsics.uncertainty`.
+camera pose projected out, is added up as in `calibration.intrinsics.calibrate`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from calibration.extrinsics.quality import widths_of
+from calibration.extrinsics.result import widths_of
 from calibration.tag_map.observations import TagSights, TagViews, moved_tags
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, skew

@@ -10,19 +10,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.intrinsics.views import as_in, is_duplicate_view
 from calibration.results import data_hash
+from calibration.statistics import as_in, is_duplicate_view
 from model.errors import BadInput
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, project_undistorted
-from tracking.detection.detector import Detection
+from tracking.detection.detector import Detection, make_detector
 from tracking.detection.diagnostics import diagnose_tags
-from tracking.detection.libraries import make_detector
 from tracking.detection.tags import CORNER_SIGNS, modules_across
 from tracking.edges.refine import RefinedTag, refine
+from tracking.estimator import TrackerSettings
 from tracking.pnp import BundlePose, TagView, moved, solve_pnp
-from tracking.settings import TrackerSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

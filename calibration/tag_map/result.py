@@ -11,10 +11,9 @@ from pydantic import Field
 
 from calibration.extrinsics.result import AXES, SCALES, pose_rows
 from calibration.report import Section, page_of, table_of
-from calibration.results import ResultDocument, common_keys
+from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import Interval
 from calibration.tag_map.bundle_adjustment import TagLayout
-from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
 from model.files.camera_file import TagDocument
 from model.files.documents import AnyNonNegative, PoseDocument, Positive
@@ -221,6 +220,16 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
             )
         )
     return rows
+
+
+def layout_facts(found: TagLayout) -> list[tuple[str, str]]:
+    """What was found beside the numbers, for people."""
+    used = f"{len(found.errors)} used, reprojection error {found.reprojection:.3f} px RMS"
+    moved = [
+        (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
+        for name, shift, turn, _, count in change_rows(found)
+    ]
+    return [("pictures", used), *moved]
 
 
 def _places(document: TagsResult) -> list[tuple[str, ...]]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.targets.board import Board
-from calibration.targets.charuco import Charuco
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Charuco, Chessboard
 from calibration.targets.circle_grid import CircleGrid
 from calibration.targets.tag_grid import TagGrid
 from model.errors import BadInput
@@ -262,6 +262,7 @@ def _file(objects: list[bytes]) -> bytes:
 # Prints on paper: in exact size, with a ruler to prove it, or refused.
 
 
+PaperName = Literal["a4", "a3", "letter"]
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height upright, [mm]."""
 MARGIN_MM = 5.0

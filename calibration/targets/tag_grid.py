@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from tracking.detection.diagnostics import diagnose_tags
 from tracking.detection.tags import CORNER_SIGNS, dictionary, modules_across, upright_corners
 from tracking.edges.refine import refine
 
+TagOrder = Literal["rows", "kalibr"]
 ORDERS = {
     "rows": "numbered from the top left, rows downward",
     "kalibr": "numbered from the bottom left, rows upward, as Kalibr prints them",

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 import os
-import stat
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 from model.errors import BadInput
-from model.files.reading import shown, unreadable
+from model.files.output import file_identity, refuse_overwriting
+from model.files.reading import shown
 
 OUTPUTS = ("output", "mcap", "overlay")
 """The arguments that name what a verb writes; every other path is read."""
@@ -27,8 +26,6 @@ MOST_OF = {"seed": MOST_SEED, "workers": 1024, "columns": 1000, "rows": 1000, "s
 LONGEST_TEXT = 100
 """Of a name that becomes part of a file's, [bytes]."""
 NAMES = ("name", "channel", "interface")
-
-Identity = tuple[int, int] | str
 
 
 def check_arguments(arguments: Mapping[str, object]) -> None:
@@ -47,40 +44,6 @@ def check_arguments(arguments: Mapping[str, object]) -> None:
     outputs = {_option(n): p for n in OUTPUTS for p in _paths(n, given.get(n, ()))}
     inputs = [p for n, values in given.items() if n not in OUTPUTS for p in _inputs(values)]
     refuse_overwriting(outputs, inputs)
-
-
-def refuse_overwriting(outputs: Mapping[str, Path], inputs: Iterable[Path]) -> None:
-    """Refuses outputs that are an input, a file in an input folder, or one another.
-
-    Links of both kinds are seen through; what does not exist yet is compared by where it will be.
-
-    Args:
-        outputs: What is written, by what names it on the command line.
-        inputs: What is read.
-
-    Raises:
-        BadInput: Writing would destroy something.
-    """
-    taken: dict[Identity, str] = {}
-    for name, path in outputs.items():
-        _require_writable_kind(path, name)
-        other = taken.setdefault(_identity(path), name)
-        if other != name:
-            raise BadInput(
-                f"{other} and {name} name the same file",
-                where=shown(path),
-                why="one would overwrite the other",
-                next_step="give each output its own name",
-            )
-    for source in inputs:
-        for identity in _identities(source):
-            if identity in taken:
-                raise BadInput(
-                    f"{taken[identity]} would overwrite an input of this command",
-                    where=shown(outputs[taken[identity]]),
-                    why=f"it is the same as {shown(source)}, or inside it",
-                    next_step="choose another name for the output; --force does not help here",
-                )
 
 
 def _single(arguments: Mapping[str, object]) -> Iterator[tuple[str, list[object]]]:
@@ -103,7 +66,7 @@ def _check(name: str, value: object) -> None:
         case float():
             _check_number(name, value)
         case Path():
-            _identity(value)
+            file_identity(value)
         case str():
             _check_text(name, value)
 
@@ -127,7 +90,7 @@ def _check_text(name: str, text: str) -> None:
         hint = f"give a name of {LONGEST_TEXT} bytes at most"
         raise BadInput(what, where=shown(text), next_step=hint)
     if "://" not in text:
-        _identity(Path(text))
+        file_identity(Path(text))
 
 
 def _option(name: str) -> str:
@@ -149,41 +112,3 @@ def _inputs(values: Iterable[object]) -> Iterator[Path]:
             for text in {value, value.partition("=")[2]} - {""}:
                 if os.path.exists(text):
                     yield Path(text)
-
-
-def _require_writable_kind(path: Path, name: str) -> None:
-    if isinstance(_identity(path), str):
-        return
-    mode = path.stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise BadInput(
-            f"{name} is not a regular file but a device, a pipe or a socket",
-            where=shown(path),
-            why="writing would replace it with a file",
-            next_step="name a file or a folder",
-        )
-
-
-def _identity(path: Path) -> Identity:
-    """What two paths of one file have in common; of no file yet, where it will be.
-
-    Raises:
-        BadInput: No file can have such a path.
-    """
-    try:
-        found = path.stat()
-    except (FileNotFoundError, NotADirectoryError, PermissionError):
-        return os.path.realpath(path)
-    except (OSError, ValueError) as error:
-        raise unreadable(path, error) from None
-    return found.st_dev, found.st_ino
-
-
-def _identities(path: Path) -> Iterator[Identity]:
-    """Of an input, and of the files in it where it is a folder."""
-    yield _identity(path)
-    with suppress(OSError), os.scandir(path) as entries:  # of what is no folder, the verb says so
-        for entry in entries:
-            if not entry.is_dir():
-                with suppress(BadInput):  # a link that leads nowhere
-                    yield _identity(Path(entry.path))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Annotated
 
 import typer
 
 from cdpr.cli.output import out
-from executor.recording.verdict import fault_codes, page_text
-from model.errors import BadInput
+from executor.recording.verdict import fault_titles, page_of_fault
 
 
 def explain(
@@ -25,19 +23,8 @@ def explain(
 
       cdpr explain drive_silent
     """
-    codes = fault_codes()
     if code is None:
-        for known in codes:
-            title = page_text(known).split("\n", 1)[0].removeprefix("# ")
+        for known, title in fault_titles().items():
             out.print(f"  {known:<22} {title}", markup=False, soft_wrap=True)
         return
-    if code not in codes:
-        near = difflib.get_close_matches(code, codes, n=1)
-        raise BadInput(
-            f"there is no fault code {code!r}",
-            where="cdpr explain",
-            next_step=f"run `cdpr explain {near[0]}`"
-            if near
-            else f"use one of: {', '.join(codes)}",
-        )
-    out.print(page_text(code).rstrip(), markup=False, soft_wrap=True)
+    out.print(page_of_fault(code).rstrip(), markup=False, soft_wrap=True)

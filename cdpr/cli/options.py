@@ -94,7 +94,7 @@ CalibrationOption = Annotated[
 
 
 def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
-    """See `calibration.load.with_calibrations`.
+    """See `calibration.result_files.with_calibrations`.
 
     Raises:
         BadInput: A file cannot be used, or is not about this rig.
@@ -102,7 +102,7 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
     if not files:
         return rig
     # Scientific libraries, of which `cdpr stop` and others without this option must not wait.
-    from calibration.load import with_calibrations
+    from calibration.result_files import with_calibrations
 
     return with_calibrations(rig, files, Terminal())
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from enum import StrEnum
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any
@@ -32,65 +31,11 @@ from model.files.scene_file import StopDocument
 from model.plan import plan_as_dict, plan_facts, save_plan
 from model.rig import load_rig
 from model.scene import Scene, load_scene
-from planner.options import PlanningOptions, settings_from_options
 from planner.planning import plan_path
+from planner.rrt.variants import ConeDraw, FailureRate, Focus, Steer
+from planner.settings import Mode, Objective, PlannerName, PlanningOptions, settings_from_options
 
 _PANEL = "Open readings of the paper's text (docs/paper.md)"
-
-
-class PlannerName(StrEnum):
-    """Which planner searches."""
-
-    optimal = "optimal"
-    adaptive = "adaptive"
-    goal_bias = "goal-bias"
-
-
-class CostName(StrEnum):
-    """What makes a path good."""
-
-    length = "length"
-    kinematic = "kinematic"
-    clearance = "clearance"
-    capacity = "capacity"
-
-
-class ModeName(StrEnum):
-    """How far the paper's search goes."""
-
-    rewire = "rewire"
-    paper = "paper"
-
-
-class FailureRateName(StrEnum):
-    """The rate e_r at which samples are drawn backward."""
-
-    streak = "k/(k+1)"
-    streak_and_two = "k/(k+2)"
-    tree = "tree"
-    node = "node"
-
-
-class FocusName(StrEnum):
-    """The node x_c that the forward cone opens to."""
-
-    last_failed = "last-failed"
-    most_failed = "most-failed"
-    highest_rate = "highest-rate"
-
-
-class ConeDrawName(StrEnum):
-    """How points of the forward cone are drawn."""
-
-    radius = "radius"
-    volume = "volume"
-
-
-class SteerName(StrEnum):
-    """How far a new node is from the one it grows from."""
-
-    full_step = "full-step"
-    to_sample = "to-sample"
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +45,9 @@ class SearchOptions:
     planner: Annotated[
         PlannerName,
         typer.Option(help="optimal (recommended), the paper's, or half of all samples at the goal"),
-    ] = PlannerName.optimal
+    ] = "optimal"
     cost: Annotated[
-        CostName | None,
+        Objective | None,
         typer.Option(help="objective (default: length; the paper's planners: kinematic)"),
     ] = None
     weight: Annotated[
@@ -132,7 +77,7 @@ class SearchOptions:
         ),
     ] = False
     mode: Annotated[
-        ModeName | None,
+        Mode | None,
         typer.Option(help="the paper's planners: RRT* (rewire), or stop at the first path (paper)"),
     ] = None
     max_iterations: Annotated[
@@ -140,18 +85,16 @@ class SearchOptions:
         typer.Option(min=1, max=1_000_000, help="the paper's planners: largest number of samples"),
     ] = None
     failure_rate: Annotated[
-        FailureRateName | None,
+        FailureRate | None,
         typer.Option(help="e_r, k: failures in a row", rich_help_panel=_PANEL),
     ] = None
-    focus: Annotated[
-        FocusName | None, typer.Option(help="the node x_c", rich_help_panel=_PANEL)
-    ] = None
+    focus: Annotated[Focus | None, typer.Option(help="the node x_c", rich_help_panel=_PANEL)] = None
     cone_draw: Annotated[
-        ConeDrawName | None,
+        ConeDraw | None,
         typer.Option(help="r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL),
     ] = None
     steer: Annotated[
-        SteerName | None,
+        Steer | None,
         typer.Option(help="steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL),
     ] = None
     spacing_mm: Annotated[
@@ -167,13 +110,8 @@ class SearchOptions:
 
     def with_seed(self, seed: int) -> PlanningOptions:
         """As the planner's library takes them."""
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
-        plain: dict[str, Any] = {
-            name: value.value if isinstance(value, StrEnum) else value
-            for name, value in given.items()
-            if value is not None
-        }
-        return PlanningOptions(seed=seed, **plain)
+        given: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        return PlanningOptions(seed=seed, **{k: v for k, v in given.items() if v is not None})
 
 
 DEFAULT_SEARCH = SearchOptions()

@@ -21,8 +21,8 @@ from cdpr.cli.options import (
 from cdpr.cli.output import Terminal, out
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
 from executor.kernels import ready_to_simulate
-from executor.operator_requests import LocalRequests
 from executor.realtime.scheduling import real_time
+from executor.supervision import LocalRequests
 from model.errors import BadInput
 from model.plan import load_plan, require_same_rig
 from model.pose import Pose

@@ -9,14 +9,13 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.arguments import refuse_overwriting
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import Terminal, show_facts, show_json
 from executor.cameras.sources import parse_camera_sources
-from executor.operator_requests import LocalRequests
+from executor.supervision import LocalRequests
 from executor.track import own_drawing, own_file, require_plan_used, track_sources
-from model.files.output import require_new_file
+from model.files.output import refuse_overwriting, require_new_file
 from model.plan import load_plan, require_same_rig
 from model.rig import Camera, load_rig
 from model.scene import load_scene

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -20,6 +20,7 @@ from planner.workspace.compute import map_workspace, workspace_grids
 from planner.workspace.files import write_maps
 from planner.workspace.grid import parsed_slice
 from planner.workspace.maps import Question
+from planner.workspace.report import summary_facts
 
 
 def workspace(
@@ -96,7 +97,8 @@ def workspace(
     if as_json:
         show_json({"folder": str(output), "maps": summary})
     else:
-        show_facts(f"maps of {the_rig.name} in {output}", _sentences(summary, output))
+        facts = [*summary_facts(summary), ("next", f"open {output / 'index.html'}")]
+        show_facts(f"maps of {the_rig.name} in {output}", facts)
 
 
 def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array | None:
@@ -106,19 +108,3 @@ def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array 
     if not 1e-6 < norm < np.inf:
         raise BadInput("the rotation is not a quaternion w x y z of non-zero length")
     return matrix_from_quaternion(np.array(rotation_wxyz) / norm)
-
-
-def _sentences(summary: dict[str, Any], folder: Path) -> list[tuple[str, str]]:
-    facts = []
-    for name, found in summary.items():
-        share = found["share"]
-        margin = found["range"]["capacity_margin_n"]
-        text = (
-            f"{found['points']} points; wrench closure {share['closed'] * 100:.1f} %,"
-            f" feasible {share['feasible'] * 100:.1f} %, allowed {share['allowed'] * 100:.1f} %"
-        )
-        if margin is not None:
-            text += f"; capacity margin {margin[0]:.1f} to {margin[1]:.1f} N"
-        facts.append((name.replace("_", " "), text))
-    facts.append(("next", f"open {folder / 'index.html'}"))
-    return facts

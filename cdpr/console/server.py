@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import secrets
 import socket
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -28,6 +29,7 @@ from cdpr.console.session import MADE, Console
 from cdpr.console.view import scene_of
 from executor.recording.run_course import RUNS
 from executor.recording.verdict import fault_codes, page_text
+from model.errors import BadInput
 
 #: States a second.
 RATE = 20.0
@@ -300,3 +302,45 @@ def _says(path: Path, word: str) -> bool:
     with suppress(OSError), path.open(encoding="utf-8", errors="replace") as stream:
         return word in stream.read(100_000)
     return False
+
+
+def run_server(console: Console, host: str, port: int, on_ready: Callable[[str], None]) -> None:
+    """Serves the pages until it is interrupted.
+
+    Args:
+        console: What is shown and done.
+        host: Address to listen on.
+        port: 0 for a free one.
+        on_ready: Called with the address of the page, once it can be opened.
+
+    Raises:
+        BadInput: The address cannot be used.
+    """
+    with _listening(host, port) as listener:
+        server = ConsoleServer(console, host=host)
+        on_ready(f"http://{host}:{listener.getsockname()[1]}/?token={server.token}")
+        config = uvicorn.Config(server.app(), log_level="warning", ws_max_size=4096)
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+@contextmanager
+def _listening(host: str, port: int) -> Iterator[socket.socket]:
+    """A socket for the pages.
+
+    Raises:
+        BadInput: The address cannot be used.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((host, port))
+            listener.listen(64)  # before the address is printed
+        except OSError as error:
+            raise BadInput(
+                f"cannot listen on {host}:{port}: {error.strerror or error}",
+                where="--port",
+                why="another program uses the port, or the address is not this machine's",
+                next_step="pass another --port, or 0 for a free one",
+            ) from None
+        yield listener

@@ -22,28 +22,27 @@ from cdpr.console.commands import (
     Message,
     MoveCommand,
     NameCommand,
+    PageControl,
     PickCommand,
     PlanCommand,
     RenameCommand,
     SpeedCommand,
     TakeCommand,
 )
-from cdpr.console.control import PageControl
-from cdpr.console.pictures import CameraPictures
 from cdpr.console.preview import preview
 from cdpr.console.started import StartedVerb, file_here
 from cdpr.console.state import Kept, jog_state, kept_state, measured_state, outcome_state
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
-from cdpr.console.watch import RunWatch
+from cdpr.console.watch import CameraPictures, RunWatch
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
-from executor.interlock.interlock import MotionInterlock
+from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
-from executor.service import StatusResult, reference_status
+from executor.service import StatusResult
 from executor.service import status as read_status
 from model.errors import CdprError, Refused
 from model.files.documents import millimetres, write_atomic

@@ -15,8 +15,7 @@ from model.files.documents import Document, Name, PoseDocument, write_atomic
 from model.files.reading import parse_json, read_text
 from model.files.scene_file import RotationLimitsDocument, SceneDocument, StopDocument
 from model.files.validation import problems_of
-from model.pose import Pose
-from model.rotation_limits import largest_rotations
+from model.pose import Pose, largest_rotations
 from model.scene import Scene
 
 #: Of the poses.

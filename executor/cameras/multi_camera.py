@@ -8,16 +8,15 @@ from typing import Any
 
 from executor.cameras.client import BLIND_PICTURES, CameraClient
 from executor.cameras.process import CameraSample, FrameRequest, unseen
-from executor.operator_requests import RequestBoard, StopReason
 from executor.recording.run_course import CameraRecord
 from executor.remote.status import RunStatus
+from executor.supervision import RequestBoard, StopReason
 from model.clearance import ClearanceModel
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from tracking.clearance import INTERVAL, MeasuredClearance, clearance_of
-from tracking.measurement import PoseMeasurement
-from tracking.multi_camera import MultiCameraFusion
-from tracking.track import rates
+from tracking.fusion import MultiCameraFusion
+from tracking.measurement import PoseMeasurement, rates
 
 # Watches measured clearance, image by image, for one whose upper bound is below the limit.
 

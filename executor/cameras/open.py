@@ -19,9 +19,9 @@ from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, 
 from executor.cameras.sources import SYNTHETIC
 from executor.cameras.static_pose import looks_at_rest
 from executor.kernels import ready_for_camera_processes, ready_to_measure
-from executor.operator_requests import RequestBoard
 from executor.realtime.shared_memory import SharedMemory
 from executor.recording.run_folder import RunFolder
+from executor.supervision import RequestBoard
 from model.clearance import ClearanceModel
 from model.errors import Fault, StoppedByOperator
 from model.files.rig_file import RigDocument

@@ -244,8 +244,3 @@ def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
             why="a real camera takes images in real time; a fast run would end before",
             next_step="leave out --fast, or pass --camera synthetic",
         )
-
-
-def describe_cameras(eyes: Mapping[Camera, str]) -> str:
-    """The cameras of a run and their sources, in a few words."""
-    return ", ".join(f"{camera.name} ({source})" for camera, source in eyes.items())

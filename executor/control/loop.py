@@ -18,7 +18,6 @@ from executor.control.cycle import Cycle, CycleResult
 from executor.control.feed import Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, left_otherwise
-from executor.operator_requests import OperatorRequests
 from executor.safety.gate import Purpose
 from executor.safety.monitor import Alarm, StopReaction
 from executor.state_machine import (
@@ -30,6 +29,7 @@ from executor.state_machine import (
     State,
     shared_causes,
 )
+from executor.supervision import OperatorRequests
 from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused

@@ -11,10 +11,10 @@ from executor.control.loop import Loop
 from executor.control.preconditions import require_still_referenced
 from executor.control.sync_master import SyncMaster
 from executor.interlock.reference import HomingReference
-from executor.operator_requests import OperatorRequests
 from executor.realtime.job import ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent
+from executor.supervision import OperatorRequests
 from executor.trajectory.dwell import Schedule
 from executor.trajectory.setpoints import CheckedSetpoints
 from model.files.rig_file import RigDocument

@@ -11,13 +11,13 @@ from executor.control.loop import Loop
 from executor.control.path_job import PathMotion
 from executor.control.sync_master import SyncMaster
 from executor.interlock.interlock import MotionInterlock
-from executor.operator_requests import RequestBoard
 from executor.realtime.clock import Clock
 from executor.realtime.job import MakeDrives
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder, RunLog
 from executor.state_machine import ON_PATH, CycleRecord, State
+from executor.supervision import RequestBoard
 from executor.trajectory.dwell import load_changes
 from executor.trajectory.prepare import PreparedRun
 from executor.trajectory.setpoints import checked_setpoints_of

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, late_fault, left_otherwise
-from executor.operator_requests import OperatorRequests
 from executor.realtime.job import ReadyDrives
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import OperatorRequests
 from model.errors import CdprError, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import Rig

@@ -19,11 +19,11 @@ from executor.control.loop import Loop
 from executor.control.preconditions import with_reduced_limits
 from executor.control.sync_master import SyncMaster
 from executor.control.winch_laws import WinchLaw
-from executor.operator_requests import OperatorRequests, RequestBoard
 from executor.realtime.clock import Clock
 from executor.realtime.job import Armed, Ended, MotionTask, Procedure, ReadyDrives, Records
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
+from executor.supervision import OperatorRequests, RequestBoard
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.errors import Refused, StoppedByOperator
 from model.pose import Pose

@@ -23,7 +23,7 @@ from model.errors import Refused
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
-from model.statics.dexterity import rms_anchor_radius
+from model.statics.wrench_sets import rms_anchor_radius
 
 #: Rows of a piece: of the first, which must be proved at once, and of a later one at most.
 FIRST_ROWS, MOST_ROWS = 10, 40

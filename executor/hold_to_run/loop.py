@@ -16,13 +16,13 @@ from executor.control.loop import Loop
 from executor.control.preconditions import require_still_referenced
 from executor.control.sync_master import SyncMaster
 from executor.hold_to_run.line import Piece, PieceRing
-from executor.hold_to_run.presses import Held, PressReader
+from executor.hold_to_run.presses import PressReader, PressState
 from executor.interlock.reference import HomingReference
-from executor.operator_requests import OperatorRequests
 from executor.realtime.job import ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
+from executor.supervision import OperatorRequests
 from executor.trajectory.setpoints import CheckedSetpoints, Setpoints, fingerprint
 from model.errors import Fault
 from model.files.rig_file import RigDocument
@@ -45,7 +45,7 @@ class JogLoop(Loop):
         here: CheckedSetpoints,
         master: SyncMaster,
         *,
-        held: Callable[[float], Held],
+        held: Callable[[float], PressState],
         pieces: Callable[[], Iterable[Piece]],
         wishes: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],

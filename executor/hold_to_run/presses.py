@@ -49,7 +49,7 @@ class PressRule:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class PressState:
     """What the loop is given.
 
     Attributes:
@@ -175,7 +175,7 @@ class PressReader:
         self._memory, self._rule = memory, PressRule()
         self._entry = _ENTRY.pack(0, math.nan, 100, False)
 
-    def read(self, now: float) -> Held:
+    def read(self, now: float) -> PressState:
         """What is held now, on the loop's clock [s]; of a half-written entry, what was before."""
         content = bytes(self._memory.view[:_SIZE])
         entry, check = content[: _ENTRY.size], content[_ENTRY.size :]
@@ -184,4 +184,4 @@ class PressReader:
         number, heard, percent, ends = _ENTRY.unpack(self._entry)
         held = number > 0 and self._rule.held(number, heard, now)
         share = min(max(percent, 1), 100) / 100.0
-        return Held(number if held else 0, share, ends)
+        return PressState(number if held else 0, share, ends)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
@@ -30,16 +29,15 @@ from executor.hold_to_run.presses import Press, PressBoard
 from executor.interlock.interlock import MotionInterlock
 from executor.jogging import FASTEST, measured_pose, with_speed
 from executor.kernels import ready_for_simulating_process
-from executor.operator_requests import LocalRequests
+from executor.proposals import JogProposal, require_confirmed
 from executor.realtime.clock import SimulatedClock
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
 from executor.recording.run_course import free_folder
-from executor.remote.registry import advertised
-from executor.remote.server import serving
+from executor.remote.command_socket import advertised, serving
 from executor.remote.status import JogStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
-from executor.supervision import Supervisor, require_confirmed
+from executor.supervision import LocalRequests, Supervisor
 from executor.winch_runs import with_board
 from model.errors import CdprError
 from model.kinematics import cable_lengths
@@ -56,24 +54,6 @@ AHEAD = 0.4
 CERTAIN = 2.0
 #: A session in which nothing is held for so long ends by itself, [s]: cables relax.
 IDLE = 300.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JogProposal:
-    """A session that is about to enable the drives; see `executor.supervision.Proposal`.
-
-    Attributes:
-        rig: The robot; its motion has the jog speed.
-        scene: What is in the way.
-        start: Where the platform is, ``world_from_platform``.
-    """
-
-    question: ClassVar[str] = "Enable the drives for jogging now?"
-    otherwise: ClassVar[str] = "nothing was enabled"
-
-    rig: Rig
-    scene: Scene
-    start: Pose
 
 
 class JogProver:

@@ -7,6 +7,7 @@ begin where the rig file says.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
@@ -258,3 +259,57 @@ class MotionInterlock:
 
     def _refusal(self, what: str, why: str) -> Refused:
         return Refused(what, where=f"reference {self.file.path}", why=why, next_step=AGAIN)
+
+
+# The reference of a bus, for people and programs.
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceStatus:
+    """The homing reference of a bus.
+
+    Attributes:
+        counts: Whether the drives still count from it.
+        why_not: Why they do not.
+        made: When it was made; None where none is kept.
+        how: The pose was known.
+        file: Where it is kept.
+    """
+
+    counts: bool
+    why_not: str | None
+    made: str | None
+    how: str | None
+    file: str | None
+
+    def __str__(self) -> str:
+        """Whether it is valid and how it was made, or why not."""
+        if not self.counts:
+            return f"not valid: {self.why_not}"
+        if not self.made:
+            return "none: absolute encoders match the rig file"
+        return f"valid, made {self.made} ({self.how})"
+
+
+def reference_status(
+    interlock: MotionInterlock, positions: Sequence[int] | None = None
+) -> ReferenceStatus:
+    """The reference of a bus.
+
+    Args:
+        interlock: Of the bus.
+        positions: Of its drives, [counts]; None where they were not asked.
+    """
+    why = interlock.why_unreferenced(positions)
+    try:
+        kept = interlock.kept_reference()
+    except Refused:  # the reason says so
+        kept = None
+    path = interlock.file.path
+    return ReferenceStatus(
+        counts=not why,
+        why_not=why or None,
+        made=kept.made if kept else None,
+        how=kept.how if kept else None,
+        file=str(path) if path.exists() else None,
+    )

@@ -9,9 +9,9 @@ from typing import Protocol
 
 from drivers.drive_group import DriveGroup
 from executor.control.sync_master import SyncMaster
-from executor.operator_requests import OperatorRequests
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedMemory
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import OperatorRequests
 from model.errors import CdprError
 from model.pose import Pose
 from model.rig import Rig

@@ -15,8 +15,8 @@ from dataclasses import asdict, replace
 from multiprocessing.reduction import DupFd
 from typing import Protocol
 
-from executor.operator_requests import OperatorRequests, StopReason
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import OperatorRequests, StopReason
 from model.pose import Pose
 
 

@@ -16,11 +16,10 @@ from executor.recording.cycle_table import CycleTable
 from executor.recording.summary import RunContext
 from model.cameras import Camera
 from model.files.camera_file import FISHEYE
-from model.geometry.shapes import Obstacle
-from model.geometry.solids import solid_of
 from model.kinematics import cables_to
 from model.pose import Array, Pose
 from model.rig import Rig
+from model.shapes import Obstacle, solid_of
 
 Schema = dict[str, Any]
 #: A message of Foxglove's.

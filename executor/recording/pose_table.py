@@ -21,7 +21,7 @@ from executor.recording.csv_columns import (
 )
 from executor.recording.cycle_table import CycleTable
 from model.pose import Array, Pose
-from tracking.encoder_fusion import Measured, fused
+from tracking.fusion import Measured, fused
 from tracking.pose_log import POSE_COLUMNS
 
 _POSE_MM, _DEG = 1e3, float(np.degrees(1.0))

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from executor.recording.pose_table import PoseTable
 from executor.recording.run_course import CameraRecord
 from executor.safety.limits import tension_limits
 from executor.state_machine import ON_PATH
+from model.errors import BadInput
 from model.rig import Rig
 from model.scene import Scene
 from tracking.clearance import INTERVAL
@@ -363,6 +365,26 @@ def page_text(code: str) -> str:
     """The page about a fault of `fault_codes`, as Markdown without links."""
     text = (_folder() / f"{code}.md").read_text(encoding="utf-8")
     return re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", text)
+
+
+def page_of_fault(code: str) -> str:
+    """The page about a fault that somebody names, see `page_text`.
+
+    Raises:
+        BadInput: There is none of that code; with the nearest, or all.
+    """
+    codes = fault_codes()
+    if code in codes:
+        return page_text(code)
+    near = get_close_matches(code, codes, n=1)
+    next_step = f"run `cdpr explain {near[0]}`" if near else f"use one of: {', '.join(codes)}"
+    raise BadInput(f"there is no fault code {code!r}", where="cdpr explain", next_step=next_step)
+
+
+def fault_titles() -> dict[str, str]:
+    """Titles of all pages about faults, by code."""
+    first_lines = ((code, page_text(code).split("\n", 1)[0]) for code in fault_codes())
+    return {code: line.removeprefix("# ") for code, line in first_lines}
 
 
 def _folder() -> Path:

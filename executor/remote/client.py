@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from executor.remote.command_socket import Reached, find_runs
 from executor.remote.protocol import make_line
-from executor.remote.registry import Reached, find_runs
 from model.errors import BadInput, Fault
+from tracking.measurement import rates
 
 #: A run answers within this, [s]: its socket has a thread of its own.
 ANSWER_TIMEOUT = 2.0
@@ -299,3 +300,79 @@ def _followed(
             status = answer.status
         yield status
         lines = between(1.0 / rate)
+
+
+# The status of a run as text, see `executor.remote.status`.
+
+
+def status_text(status: Mapping[str, Any]) -> str:
+    """All of it."""
+    drives = [
+        f"  drive {d['node']:<3} {d['state']:<24} {d['position_counts']:>11}"
+        f" ({d['position_counts'] - d['set_counts']:+d}) counts {d['tension_n']:8.2f} N"
+        for d in status["drives"]
+    ]
+    cameras = [f"  camera {camera_line(camera)}" for camera in status["cameras"]]
+    events = [f"  {e['time_s']:9.3f} s  {e['code']}: {e['text']}" for e in status["events"]]
+    first = f"process {status['process']}: {status['rig']} on {status['bus']}, {status['folder']}"
+    return "\n".join([first, status_line(status), *drives, *cameras, *events])
+
+
+def status_line(status: Mapping[str, Any]) -> str:
+    """One line: where the run is."""
+    if status["cycle"] is None:
+        return f"{status['state']}  {status['rig']} on {status['bus']}"
+    parts = [
+        f"{status['elapsed_s']:9.3f} s",
+        status["state"],
+        _progress(status),
+        f"{status['feed_percent']:.0f} % of {status['wished']['speed_percent']} %",
+        _lateness(status),
+        f"following error {_number(status['following_error_mm'], '.3f')} mm",
+        f"{status['lost_replies']} lost replies",
+        f"{status['rejected_frames']} rejected, {status['error_frames']} error frames",
+    ]
+    return "  ".join(parts)
+
+
+def _progress(status: Mapping[str, Any]) -> str:
+    if status["path_mm"] is None:
+        return f"{status['row']:.0f} % done"
+    return f"{status['path_mm']:.1f} of {status['path_length_mm']:.1f} mm"
+
+
+def _lateness(status: Mapping[str, Any]) -> str:
+    if status["simulated_time"]:
+        return "simulated time"
+    return f"late {status['lateness_ms']:.2f} ms, at most {status['worst_lateness_ms']:.2f} ms"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def next_stop_line(status: Mapping[str, Any]) -> str:
+    """The stop that comes next, how far and how soon; empty where none is known."""
+    stop = status["next_stop"]
+    if stop is None:
+        return ""
+    seconds = "" if stop["seconds"] is None else f", {stop['seconds']:.1f} s"
+    return f"next: {stop['name']} in {stop['distance_mm']:.1f} mm{seconds}"
+
+
+def camera_line(camera: Mapping[str, Any]) -> str:
+    """One camera while images are measured.
+
+    Args:
+        camera: As the status has it.
+    """
+    parts = [
+        f"{camera['name']} ({camera['source']})",
+        rates(camera["pictures_per_second"], camera["measuring_ms"], len(camera["tags"])),
+        f"{camera['poses']} of {camera['pictures']} with a pose",
+    ]
+    if camera["dropped"]:
+        parts.append(f"{camera['dropped']} dropped")
+    if camera["trouble"]:
+        parts.append(camera["trouble"])
+    return ", ".join(parts)

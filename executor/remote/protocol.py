@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from executor.operator_requests import FASTEST, SLOWEST, RequestBoard
+from executor.supervision import FASTEST, SLOWEST, RequestBoard
 from model.pose import Array
 
 
@@ -25,13 +25,13 @@ class _Question(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-class PlainCommand(_Question):
+class RunCommand(_Question):
     """A command without a number."""
 
     command: Literal["status", "stop", "hold", "resume"]
 
 
-class SpeedCommand(_Question):
+class FeedCommand(_Question):
     """How fast to go, in per cent of the planned speed."""
 
     command: Literal["speed"]
@@ -77,7 +77,7 @@ class EndCommand(_Question):
 
 
 JogCommand = HeldCommand | LetGoCommand | EndCommand
-Command = PlainCommand | SpeedCommand | JogCommand
+Command = RunCommand | FeedCommand | JogCommand
 _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="command")])
 
 
@@ -166,8 +166,8 @@ def _line(answer: dict[str, Any]) -> bytes:
     return json.dumps(answer, allow_nan=False).encode() + b"\n"
 
 
-def _put_up(command: PlainCommand | SpeedCommand, board: RequestBoard) -> None:
-    if isinstance(command, SpeedCommand):
+def _put_up(command: RunCommand | FeedCommand, board: RequestBoard) -> None:
+    if isinstance(command, FeedCommand):
         board.ask_speed(command.percent)
     elif command.command == "stop":
         board.ask_stop()

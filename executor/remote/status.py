@@ -35,9 +35,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from drivers.factory import drive_states
-from executor.operator_requests import RequestBoard
 from executor.recording.run_folder import RunEvent
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import RequestBoard
 from executor.trajectory.prepare import PreparedRun
 from model.pose import Pose
 from model.rig import Rig

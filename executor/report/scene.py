@@ -8,14 +8,13 @@ import numpy as np
 
 from executor.recording.clearance import ClearanceTable
 from executor.report.run_data import RunData
-from model.geometry.shapes import Obstacle, convex_hull
-from model.geometry.solids import Solid, box_solid, solid_of
 from model.kinematics import cables_to
 from model.pages.scene import Label, Moment, SceneFigure, SceneSurface, Stroke, grid_floor, viewer
 from model.plan import Plan
 from model.pose import Array, Pose, matrix_from_quaternion
 from model.rig import Rig
 from model.scene import Scene
+from model.shapes import Obstacle, Solid, box_solid, convex_hull, solid_of
 
 MOST_MOMENTS = 400
 MOST_BRANCHES = 4000

@@ -14,7 +14,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -232,11 +231,6 @@ def _in_chart(origin: Pose, pose: Pose) -> Array:
 def poses_of(positions: Array, rotations: Array) -> list[Pose]:
     """The rows of `Path.at` as poses."""
     return [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
-
-
-def polyline(waypoints: Sequence[Pose], weight: float) -> Path:
-    """The path with sharp corners."""
-    return Path(tuple(line(a, b, weight) for a, b in pairwise(waypoints)))
 
 
 # Rounds the corners of a plan as far as the tolerance and the clearance allow.

@@ -19,7 +19,7 @@ from model.clearance import ClearanceModel
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene
-from model.statics.dexterity import rms_anchor_radius
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.check import parted
 from planner.check_report import VerifiedPlan
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from model.errors import AlreadyExists, BadInput
+from model.files.reading import shown, unreadable
 
 
 def require_new_file(path: Path, replace: bool = False) -> None:
@@ -70,3 +74,79 @@ def make_place(folder: Path) -> None:
             where=str(folder),
             next_step="name a folder where you have write permission",
         )
+
+
+Identity = tuple[int, int] | str
+"""Of a file: device and inode; of what does not exist yet, where it will be."""
+
+
+def refuse_overwriting(outputs: Mapping[str, Path], inputs: Iterable[Path]) -> None:
+    """Refuses outputs that are an input, a file in an input folder, or one another.
+
+    Links of both kinds are seen through; what does not exist yet is compared by where it will be.
+
+    Args:
+        outputs: What is written, by what names it, such as ``--output``.
+        inputs: What is read.
+
+    Raises:
+        BadInput: Writing would destroy something.
+    """
+    taken: dict[Identity, str] = {}
+    for name, path in outputs.items():
+        _require_writable_kind(path, name)
+        other = taken.setdefault(file_identity(path), name)
+        if other != name:
+            raise BadInput(
+                f"{other} and {name} name the same file",
+                where=shown(path),
+                why="one would overwrite the other",
+                next_step="give each output its own name",
+            )
+    for source in inputs:
+        for identity in _identities(source):
+            if identity in taken:
+                raise BadInput(
+                    f"{taken[identity]} would overwrite an input of this command",
+                    where=shown(outputs[taken[identity]]),
+                    why=f"it is the same as {shown(source)}, or inside it",
+                    next_step="choose another name for the output; --force does not help here",
+                )
+
+
+def _require_writable_kind(path: Path, name: str) -> None:
+    if isinstance(file_identity(path), str):
+        return
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise BadInput(
+            f"{name} is not a regular file but a device, a pipe or a socket",
+            where=shown(path),
+            why="writing would replace it with a file",
+            next_step="name a file or a folder",
+        )
+
+
+def file_identity(path: Path) -> Identity:
+    """What two paths of one file have in common; of no file yet, where it will be.
+
+    Raises:
+        BadInput: No file can have such a path.
+    """
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return os.path.realpath(path)
+    except (OSError, ValueError) as error:
+        raise unreadable(path, error) from None
+    return found.st_dev, found.st_ino
+
+
+def _identities(path: Path) -> Iterator[Identity]:
+    """Of an input, and of the files in it where it is a folder."""
+    yield file_identity(path)
+    with suppress(OSError), os.scandir(path) as entries:  # of what is no folder, the verb says so
+        for entry in entries:
+            if not entry.is_dir():
+                with suppress(BadInput):  # a link that leads nowhere
+                    yield file_identity(Path(entry.path))

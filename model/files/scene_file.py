@@ -24,7 +24,7 @@ from model.files.documents import (
     Triple,
     Vector,
 )
-from model.rotation_limits import RotationLimits
+from model.pose import RotationLimits
 
 # What the platform carries, and what picking up and putting down make of it.
 #

@@ -23,8 +23,6 @@ Integers = NDArray[np.int64]
 
 NODES = 2048
 """Room for nodes in each tree; a full tree takes no more and is still joined to."""
-MOST_ON_PATH = 128
-"""Room for the vertices of a path."""
 _FROM_INSIDE = 0.25
 """Part of the samples that are uniform in the workspace box."""
 

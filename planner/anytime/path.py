@@ -1,4 +1,10 @@
-"""From start to goal with the planner we recommend: rounds until the budget is spent."""
+"""From start to goal with the planner we recommend: rounds until the budget is spent.
+
+Some first paths, and more and more polishing of the best of them. A round costs a fraction of a
+millisecond, and depends on the seed and on the rounds before alone. So a search can end after any
+of them, and be repeated from the number of rounds. The best path is kept apart from those under
+work, so that more rounds never give a worse one.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +18,264 @@ import numpy as np
 from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
+from planner.anytime.connect import connect
 from planner.anytime.infeasibility import no_path
-from planner.anytime.local_search import measure, polyline_of
-from planner.anytime.prepare import problem_of, set_weights
-from planner.anytime.problem import ASK_PROOF, LEAST_MARGIN, UNIT, PathProblem
-from planner.anytime.rounds import advance, handle_of, measure_again
-from planner.anytime.state import BEST, AnytimeSearch, new_search
+from planner.anytime.lattice_path import lattice_path
+from planner.anytime.local_search import Polyline, cost_of, measure, polish, polyline_of
+from planner.anytime.passages import through_passages
+from planner.anytime.problem import (
+    ASK_PROOF,
+    CLEARANCE,
+    KINEMATIC,
+    LEAST_MARGIN,
+    NO_MARGIN,
+    UNIT,
+    VERTEX,
+    PathProblem,
+    problem_of,
+    set_weights,
+)
+from planner.anytime.random import uniform
+from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search
 from planner.costs import KinematicCost
+from planner.kernels.jit import kernel, leaf
 from planner.path import LEAST_ROUNDS_WITH_LIMIT, LengthLimit, Progress, Route
 from planner.settings import LEAST_ROUNDS, OptimalSettings
+from planner.wrench.translation import edge_held
+
+_TRIALS, _SLOW_TRIALS = 400, 100
+"""Changes tried in a round; the second where clearances are asked for or edges have pulleys."""
+_TURNS = ((20, 8), (40, 15), (100, 30), (300, 90), (600, 180))
+"""Samples of the two trees and of the roadmap in a round without a path, taking turns."""
+_SAMPLES_OF_TREES = 4000
+"""After this many without a path the two trees are restarted."""
+_LATTICE_EVERY = 4
+"""One in this many rounds without a path goes to the lattice, which narrow gaps slip through."""
+_COARSE, _MIDDLE = 4, 2
+_SPREAD = 1.0
+_FINE, _FINE_FOR_LENGTH = 1, 9
+"""Which of the first paths comes from all points of the grid; it takes longest where the cost is
+not the length, and finds the narrow ways that matter then."""
+_ANOTHER_EVERY = 8
+"""After the first `KEPT` rounds, one in this many begins with a new path."""
+_TO_THE_BEST = 0.7
+_VERTEX_PRICES = ((2, 1.5e-3), (5, 5e-4), (12, 2e-4))
+"""What a vertex must save, as share of the straight path, up to a number of rounds of polishing."""
+_LAST_VERTEX_PRICE = 1e-4
+_PATIENCE = 8
+"""Rounds without a path after which the grid's margins are no longer relied upon."""
+
+
+@kernel
+def handle_of(problem: PathProblem, search: AnytimeSearch) -> Handle:
+    """Both as one reference; what is changed in them later is changed for it, too."""
+    return Handle(problem, search)
+
+
+@kernel
+def advance(handle: Handle, rounds: int) -> float:
+    """Does some rounds; returns the cost of the best path so far, infinite without one.
+
+    Where the grid's margins mislead, `PathProblem.terms` is changed: where they leave no path they
+    are no longer asked, which shows whether obstacles do; and where a path is found that is not
+    proved to hold the wrenches, proofs are asked for from then on.
+    """
+    problem, search = handle.problem, handle.search
+    for _ in range(rounds):
+        begun = search.totals[0]
+        search.totals[0] += 1
+        if begun == _PATIENCE and search.costs[BEST] == math.inf and _may_mislead(problem):
+            _begin_anew(problem, search, NO_MARGIN)
+        kept = _chosen(search, begun)
+        if search.counts[kept, 0] == 0:
+            kept = _begin(problem, search, kept)
+            if kept < 0:
+                continue
+        problem.terms[VERTEX] = _vertex_price(problem, search, float(search.polished[kept]))
+        line = _line(search, kept)
+        polish(problem, line, search.state, _trials(problem))
+        search.polished[kept] += 1
+        search.costs[kept] = cost_of(problem, line)
+        if _worth(problem, search, kept) < _worth(problem, search, BEST):
+            _remember(problem, search, kept)
+    return search.costs[BEST]  # type: ignore[no-any-return]
+
+
+@kernel
+def measure_again(problem: PathProblem, search: AnytimeSearch) -> None:
+    """Recomputes the costs of all paths, after a change of the objective."""
+    for k in range(KEPT + 1):
+        if search.counts[k, 0] > 0:
+            search.costs[k] = measure(problem, _line(search, k))
+
+
+@kernel
+def _cheapest(search: AnytimeSearch) -> int:
+    """The number of the cheapest of the paths under work."""
+    best = 0
+    for k in range(1, KEPT):
+        if search.costs[k] < search.costs[best]:
+            best = k
+    return best
+
+
+@kernel
+def _worth(problem: PathProblem, search: AnytimeSearch, k: int) -> float:
+    """The cost of a path with the last price of its vertices: what the best has least of."""
+    price = _vertex_price(problem, search, math.inf)
+    return search.costs[k] + price * search.counts[k, 0]  # type: ignore[no-any-return]
+
+
+@kernel
+def _remember(problem: PathProblem, search: AnytimeSearch, kept: int) -> None:
+    """Keeps a path as the best, if wrenches are proved to be held along it; else restarts."""
+    line = _line(search, kept)
+    if _may_mislead(problem):
+        for i in range(line.counts[0] - 1):
+            start, end = line.points[i], line.points[i + 1]
+            if not edge_held(problem.world, problem.load, problem.holding, start, end):
+                _begin_anew(problem, search, ASK_PROOF)
+                return
+    search.points[BEST], search.edges[BEST] = line.points, line.edges
+    search.counts[BEST, 0], search.costs[BEST] = line.counts[0], search.costs[kept]
+
+
+@kernel
+def _may_mislead(problem: PathProblem) -> bool:
+    """Whether edges are allowed by interpolated margins, which prove nothing."""
+    return not problem.holding.everywhere and problem.terms[LEAST_MARGIN] != ASK_PROOF
+
+
+@kernel
+def _begin_anew(problem: PathProblem, search: AnytimeSearch, least: float) -> None:
+    """Forgets all but the best path, and asks for another least margin from now on."""
+    problem.terms[LEAST_MARGIN] = least
+    search.totals[2] += search.grown[2]
+    search.totals[3], search.totals[5] = 0, search.totals[0]
+    search.counts[:KEPT, 0], search.costs[:KEPT] = 0, math.inf
+    search.totals[2] += search.made[1]
+    search.grown[:], search.made[:], search.polished[:] = 0, 0, 0
+
+
+@kernel
+def _trials(problem: PathProblem) -> int:
+    slow = problem.world.pulley > 0.0 or problem.terms[CLEARANCE] > 0.0
+    return _SLOW_TRIALS if slow else _TRIALS
+
+
+@kernel
+def _line(search: AnytimeSearch, kept: int) -> Polyline:
+    return Polyline(search.points[kept], search.edges[kept], search.counts[kept])
+
+
+@kernel
+def _chosen(search: AnytimeSearch, begun: int) -> int:
+    """Which path to work on; one without vertices is to be found first."""
+    best, worst = _cheapest(search), 0
+    for k in range(1, KEPT):
+        if search.costs[k] > search.costs[worst]:
+            worst = k
+    if search.totals[3] < KEPT or search.costs[best] == math.inf:
+        return worst
+    if begun % _ANOTHER_EVERY == 0:
+        search.counts[worst, 0] = 0
+        return worst
+    if uniform(search.state) < _TO_THE_BEST:
+        return best
+    other = int(uniform(search.state) * KEPT)
+    return other if search.counts[other, 0] > 0 else best
+
+
+@kernel
+def _begin(problem: PathProblem, search: AnytimeSearch, kept: int) -> int:
+    """Finds another path for a place; else the best path, or -1 where there is none."""
+    line, grown = _line(search, kept), search.grown
+    search.costs[kept], line.counts[0] = math.inf, 0
+    begun = search.totals[3]
+    search.totals[3] += 1
+    is_first = search.totals[4] == 0
+    fine = _FINE if problem.terms[KINEMATIC] > 0.0 else _FINE_FOR_LENGTH
+    on_lattice = begun == fine or begun % 2 == 1
+    if is_first:
+        on_lattice = begun % _LATTICE_EVERY == 1
+    if on_lattice:
+        stride, spread = _COARSE if begun % 4 == 1 else _MIDDLE, _SPREAD
+        if begun == fine:
+            stride, spread = _MIDDLE if problem.world.pulley > 0.0 else 1, 0.0
+        found = lattice_path(
+            problem, search.ends, search.state, stride, spread, line.points, line.counts
+        )
+    else:
+        found = sampled_path(problem, search, line.points)
+    if found == 0:
+        best = _cheapest(search)
+        return best if search.costs[best] < math.inf else -1
+    if not on_lattice:
+        search.totals[1] += grown[0] + grown[1]
+        search.totals[2] += grown[2]
+        search.totals[2] += search.made[1]
+        grown[:], search.made[:] = 0, 0
+    line.counts[0], search.polished[kept] = found, 0
+    if search.totals[4] == 0:
+        search.totals[4], search.first[:] = found, line.points
+    search.costs[kept] = measure(problem, line)
+    return kept
+
+
+@leaf
+def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> int:
+    """A path by two trees, or by a roadmap where they miss a gap: its vertices, 0 for none."""
+    if search.grown[3] >= _SAMPLES_OF_TREES:
+        search.totals[2] += search.grown[2]
+        for i in range(len(search.grown)):
+            search.grown[i] = 0
+    for in_trees, in_passages in _TURNS:
+        found = connect(
+            problem,
+            search.ends,
+            search.state,
+            search.trees,
+            search.parents,
+            search.grown,
+            in_trees,
+            points,
+        )
+        if found == 0:
+            found = through_passages(
+                problem,
+                search.ends,
+                search.state,
+                search.places,
+                search.above,
+                search.parts,
+                search.made,
+                search.trees,
+                search.parents,
+                search.grown,
+                in_passages,
+                points,
+            )
+        if found > 0:
+            return found
+    return 0
+
+
+@kernel
+def _vertex_price(problem: PathProblem, search: AnytimeSearch, polished: float) -> float:
+    """What a vertex must save, after a number of rounds of polishing."""
+    straight = 0.0
+    for axis in range(3):
+        straight += (search.ends[1, axis] - search.ends[0, axis]) ** 2
+    share = _LAST_VERTEX_PRICE
+    for rounds, price in _VERTEX_PRICES:
+        if polished < rounds:
+            share = price
+            break
+    return share * math.sqrt(straight) * problem.terms[UNIT]  # type: ignore[no-any-return]
+
+
+# From start to goal with the planner we recommend: rounds until the budget is spent.
+
 
 Clock = Callable[[], float]
 

@@ -90,7 +90,7 @@ Handle: Any = _PlainHandle if config.DISABLE_JIT else _CompiledHandle  # type: i
 """A problem and the state of a search in it (``problem``, ``search``), as one reference.
 
 At every call from Python Numba looks at each array that it is given; the fifty of a problem and a
-search take longer than many a search. `planner.anytime.rounds.handle_of` makes a handle.
+search take longer than many a search. `planner.anytime.path.handle_of` makes a handle.
 """
 
 

@@ -96,7 +96,7 @@ def matrix_of(pose: Array) -> Array:
     return matrix
 
 
-# The scene's rotation limits along a move; `model.rotation_limits` is the definition.
+# The scene's rotation limits along a move; `model.pose` is the definition.
 
 
 @kernel

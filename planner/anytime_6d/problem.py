@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from model.statics.dexterity import rms_anchor_radius
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.anytime_6d.moves import (
     matrix_of,
     move_length,

@@ -1,16 +1,24 @@
-"""The three ways in which the planner's kernels are compiled; they call each other.
+"""The three ways in which the planner's kernels are compiled, and arrays kept beside their code.
 
-Where the machine code is kept: `model.jit`.
+The kernels call each other. Where the machine code is kept: `model.jit`. The folder is named after
+the content of the kernels, so a change of theirs forgets the arrays that they made. Where no folder
+can be written, arrays are recomputed.
 """
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from model.jit import KernelSet, compilation, compiled
+import numpy as np
+from numpy.typing import NDArray
+
+from model.files.documents import content_hash
+from model.jit import KernelSet, cache_folder, compilation, compiled
 from model.progress import Listener
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -47,3 +55,61 @@ def leaf(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """As `leaf`, made part of its callers: a tuple of arrays is a hundred words to hand over."""
     return compiled(function, *KERNELS, counts_arrays=False, is_inlined=True)
+
+
+# Arrays that depend on rig and load alone, kept between runs beside the kernels that made them.
+
+
+Kind = TypeVar("Kind", bound=np.generic)
+
+_MOST_FILES = 200
+"""Kept of one name; the oldest go."""
+
+
+def stored(
+    name: str, key: Any, shape: tuple[int, ...], compute: Callable[[], NDArray[Kind]]
+) -> NDArray[Kind]:
+    """An array from the user's cache, or computed and kept there.
+
+    Args:
+        name: What it is, for its file.
+        key: Everything it depends on, JSON-like.
+        shape: That it must have to be believed.
+        compute: Makes it.
+    """
+    folder = cache_folder(*KERNELS)
+    if folder is None:
+        return compute()
+    path = folder / f"{name}-{content_hash(key).removeprefix('sha256:')[:24]}.npy"
+    try:
+        found = np.load(path, allow_pickle=False)
+        if found.shape == shape:
+            return found  # type: ignore[no-any-return]
+    except (OSError, ValueError, EOFError):  # not there yet, or cut off: recomputed below
+        pass
+    made = compute()
+    _keep(path, made)
+    _forget_oldest(folder, name)
+    return made
+
+
+def _forget_oldest(folder: Path, name: str) -> None:
+    try:
+        files = sorted(folder.glob(f"{name}-*.npy"), key=lambda file: file.stat().st_mtime)
+        for file in files[:-_MOST_FILES]:
+            file.unlink()
+    except OSError:  # another process was faster, or it is not ours to remove
+        return
+
+
+def _keep(path: Path, array: NDArray[Any]) -> None:
+    """Writes a file whole or not at all; a cache that cannot be written is left as it is."""
+    temporary = ""
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            temporary = file.name
+            np.save(file, array)
+        os.replace(temporary, path)
+    except OSError:
+        if temporary:
+            Path(temporary).unlink(missing_ok=True)

@@ -152,7 +152,7 @@ def segment_box_definition(
     return float(np.min(np.linalg.norm(points - np.clip(points, -half, half), axis=1)))
 
 
-# The distance of two segments, in closed form; its definition is `model.geometry.segments`.
+# The distance of two segments, in closed form; its definition is `model.distances`.
 
 
 @kernel

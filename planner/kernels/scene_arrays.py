@@ -12,7 +12,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from model.geometry.shapes import (
+from model.pose import Array, Pose
+from model.scene import Scene
+from model.shapes import (
     Box,
     Capsule,
     ConvexHull,
@@ -23,8 +25,6 @@ from model.geometry.shapes import (
     TriangleMesh,
     shape_points,
 )
-from model.pose import Array, Pose
-from model.scene import Scene
 from planner.kernels.jit import leaf
 from planner.kernels.primitives import Vector, dot
 

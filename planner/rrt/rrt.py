@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from planner.edge_checks import FREE, REASONS
 from planner.kernels.jit import kernel
-from planner.rrt.cost_field import CostField, edge_cost
-from planner.rrt.edge_checks import EdgeLimits, problem
+from planner.rrt.edges import CostField, EdgeLimits, edge_cost, problem
 from planner.rrt.sampling import (
     Tallies,
     backward,
@@ -75,7 +74,7 @@ class Search(NamedTuple):
         tallies: How expansions went.
         counts: By name: iterations, the last one to be, edges checked, the goal's node or -1, edges
             refused; shape (5,).
-        reasons: Edges refused by reason (`planner.rrt.edge_checks`), shape (5,).
+        reasons: Edges refused by reason (`planner.rrt.edges`), shape (5,).
         refused: The latest of them, both ends, shape (KEPT_REFUSALS, 2, n).
         closest: Smallest distance of a node to the goal, shape (1,).
         found: Scratch space for neighbours, shape (capacity,).

@@ -15,8 +15,16 @@ from planner.costs import KinematicCost
 from planner.edge_checks import FREE, OBSTACLE, REASONS, ExactChecks
 from planner.kernels.jit import kernel
 from planner.path import Progress
-from planner.rrt.cost_field import CostField, edge_cost, kinematic_field, length_field
-from planner.rrt.edge_checks import EdgeLimits, exact_checks, limits_of, problem
+from planner.rrt.edges import (
+    CostField,
+    EdgeLimits,
+    edge_cost,
+    exact_checks,
+    kinematic_field,
+    length_field,
+    limits_of,
+    problem,
+)
 from planner.rrt.rrt import (
     CHECKS,
     ITERATIONS,

@@ -219,9 +219,3 @@ def _outward(triangles: Array, inner: Array) -> Array:
     wrong = np.einsum("ki,ki->k", normals, inner - triangles[:, 0]) > 0.0
     turned: Array = np.where(wrong[:, None, None], triangles[:, ::-1], triangles)
     return turned
-
-
-def enclosed_volume(triangles: Array) -> float:
-    """Volume within a closed surface of triangles, shape (t, 3, 3) (divergence theorem)."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    return float(np.einsum("ki,ki->", a, np.cross(b, c)) / 6.0)

@@ -17,11 +17,15 @@ from model.kinematics import Cables, NoCable, cables_to, structure_matrix_of
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
-from model.statics.dexterity import condition_number, rms_anchor_radius
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
 from model.statics.wrench_closure import closure_margin
-from model.statics.wrench_sets import checked_length, force_volume
+from model.statics.wrench_sets import (
+    checked_length,
+    condition_number,
+    force_volume,
+    rms_anchor_radius,
+)
 from planner.space import Lattice
 
 Values = dict[str, Array]

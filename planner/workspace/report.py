@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -169,6 +169,26 @@ def summary_of(maps: Maps) -> dict[str, Any]:
             for quantity in shown_in(maps)
         },
     }  # fmt: skip
+
+
+def summary_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """A line a map for people.
+
+    Args:
+        summary: Of each map, see `summary_of`, by its name.
+    """
+    facts = []
+    for name, found in summary.items():
+        share = found["share"]
+        margin = found["range"]["capacity_margin_n"]
+        text = (
+            f"{found['points']} points; wrench closure {share['closed'] * 100:.1f} %,"
+            f" feasible {share['feasible'] * 100:.1f} %, allowed {share['allowed'] * 100:.1f} %"
+        )
+        if margin is not None:
+            text += f"; capacity margin {margin[0]:.1f} to {margin[1]:.1f} N"
+        facts.append((name.replace("_", " "), text))
+    return facts
 
 
 def _answers(maps: Maps) -> dict[str, NDArray[np.bool_]]:

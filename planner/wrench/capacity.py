@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
-from model.statics.dexterity import rms_anchor_radius
 from model.statics.gravity import STANDARD_GRAVITY
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.costs import external_wrenches
 from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel

@@ -15,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.files.camera_file import drawn_upside_down, opencv_dictionary
-from model.geometry.shapes import (
+from model.pose import Array, Pose
+from model.rig import Camera, Rig, Tag
+from model.scene import Scene
+from model.shapes import (
     Box,
     Capsule,
     ConvexHull,
@@ -27,9 +30,6 @@ from model.geometry.shapes import (
     convex_hull,
     shape_points,
 )
-from model.pose import Array, Pose
-from model.rig import Camera, Rig, Tag
-from model.scene import Scene
 from tracking.camera_model import pixels_of
 
 #: Samples a pixel along x and along y.

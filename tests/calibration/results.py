@@ -5,9 +5,8 @@ from __future__ import annotations
 from datetime import date
 
 from calibration.intrinsics.result import CameraResult
-from calibration.results import common_keys
+from calibration.results import CalibrationVerdict, common_keys
 from calibration.statistics import Interval
-from calibration.verdict import CalibrationVerdict
 
 
 def camera_result_of(name: str = "front", fx: float = 905.0, size=(1280, 720)) -> CameraResult:

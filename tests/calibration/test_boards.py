@@ -15,10 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.intrinsics.calibrate import fit_camera
-from calibration.intrinsics.views import EvenSample
+from calibration.statistics import EvenSample
 from calibration.targets.board import mirrored
-from calibration.targets.charuco import Charuco
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Charuco, Chessboard
 from calibration.targets.circle_grid import CircleGrid
 from calibration.targets.tag_grid import TagGrid
 from model.errors import BadInput

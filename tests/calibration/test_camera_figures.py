@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views, fit_camera
-from calibration.intrinsics.figures import (
+from calibration.intrinsics.quality import judge_camera, picture_grid, pixel_uncertainty
+from calibration.intrinsics.result import (
+    camera_page,
     radial_pattern,
     residual_arrows,
     uncertainty_figure,
     worst_picture,
 )
-from calibration.intrinsics.quality import judge_camera, picture_grid, pixel_uncertainty
-from calibration.intrinsics.result import camera_page
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Chessboard
 from tests.calibration.board_pictures import picture_of, poses_before_the_camera, with_noise
 from tests.calibration.test_lens_models import SIZE, TRUTH, views
 

@@ -18,7 +18,7 @@ from calibration.extrinsics.camera_pairs import (
     require_oriented,
 )
 from calibration.targets.board import Seen
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Chessboard
 from calibration.targets.tag_grid import TagGrid
 from model.errors import BadInput
 from model.files.documents import PoseDocument

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.intrinsics.capture import CaptureGuide
+from calibration.pictures import CaptureGuide
 from calibration.targets.board import Seen
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Chessboard
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from calibration.compare import compare
+from calibration.result_files import compare
 from model.errors import BadInput
 from tests.calibration.results import camera_result_of
 

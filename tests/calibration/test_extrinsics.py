@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.extrinsics.quality import (
+from calibration.extrinsics.result import (
     ExtrinsicCalibration,
+    extrinsics_result,
     judge_extrinsics,
     workspace_corners,
 )
-from calibration.extrinsics.result import extrinsics_result
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
-from calibration.load import load_result
+from calibration.result_files import load_result
 from calibration.results import write_result
 from calibration.tag_map.observations import sights_of
 from model.cameras import SURE

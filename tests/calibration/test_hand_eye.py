@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.extrinsics.hand_eye import locate_by_motion, read_poses
-from calibration.extrinsics.quality import judge_extrinsics
+from calibration.extrinsics.result import judge_extrinsics
 from calibration.tag_map.observations import TagSights
 from model.errors import BadInput, InvalidFile
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix

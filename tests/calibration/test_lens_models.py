@@ -26,7 +26,7 @@ from calibration.intrinsics.quality import (
     picture_grid,
 )
 from calibration.targets.board import Seen
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Chessboard
 from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from calibration.targets.board import Board
-from calibration.targets.charuco import Charuco
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Charuco, Chessboard
 from calibration.targets.circle_grid import CircleGrid
 from calibration.targets.printing import (
     MARGIN_MM,

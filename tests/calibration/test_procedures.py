@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.load import load_result
 from calibration.pictures import Pictures, pictures_in
-from calibration.procedures import Destination, calibrate_camera
-from calibration.targets.chessboard import Chessboard
+from calibration.procedures import calibrate_camera
+from calibration.result_files import load_result
+from calibration.results import Destination
+from calibration.targets.chessboards import Chessboard
 from model.errors import BadInput
 from model.progress import Listener
 from tests.cli.test_calibrate_camera import pictures

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.load import load_result
 from calibration.procedures import measure_readout
+from calibration.result_files import load_result
 from model.errors import BadInput
 from model.pose import PlatformMotion, Pose
 from model.rig import Rig, load_rig

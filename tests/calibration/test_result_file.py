@@ -10,16 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.extrinsics.quality import (
+from calibration.extrinsics.result import (
     ExtrinsicCalibration,
+    extrinsics_result,
     judge_extrinsics,
     workspace_corners,
 )
-from calibration.extrinsics.result import extrinsics_result
-from calibration.load import load_result
-from calibration.results import write_result
+from calibration.result_files import load_result
+from calibration.results import CalibrationVerdict, Issue, write_result
 from calibration.statistics import Interval
-from calibration.verdict import CalibrationVerdict, Issue
 from model.errors import BadInput
 from model.rig import Rig, load_rig
 from tests.calibration.results import camera_result_of

@@ -32,11 +32,10 @@ from calibration.geometry.measurements import (
     tension_sigma,
 )
 from calibration.geometry.model import DEFAULT_DEVIATIONS, CountedLengths, Parameters, RigModel
-from calibration.geometry.quality import judge_rig, judged_places
+from calibration.geometry.quality import compliance_told, differences_told, judge_rig, judged_places
 from calibration.geometry.report import number_rows, rig_page
 from calibration.geometry.result import RigResult, require_one_drawing, rig_result
-from calibration.geometry.stiffness import compliance_told, differences_told
-from calibration.load import load_result
+from calibration.result_files import load_result
 from model.errors import BadInput, InvalidFile
 from model.files.rig_file import RigDocument
 from model.kinematics import poses_near

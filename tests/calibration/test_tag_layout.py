@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calibration.load import load_result
+from calibration.result_files import load_result
 from calibration.results import write_result
 from calibration.tag_map.bundle_adjustment import (
     TagLayout,

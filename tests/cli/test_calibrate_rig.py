@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.geometry.model import DEFAULT_DEVIATIONS
-from calibration.load import load_result
+from calibration.result_files import load_result
 from cdpr.cli.calibrate import rig as rig_verb
 from model.kinematics import poses_near
 from model.rig import Rig, load_rig

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from calibration.load import load_result
+from calibration.result_files import load_result
 from calibration.results import write_result
 from model.rig import load_rig
 from tests.calibration.results import camera_result_of

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers import socketcan
+from drivers import can_bus
 from drivers.cameras import live as cameras
-from drivers.can_bus import BusSettings
-from drivers.socketcan import KernelInterface, can_interfaces, parse_interfaces
+from drivers.can_bus import BusSettings, KernelInterface, can_interfaces, parse_interfaces
 from executor import doctor
 from executor.doctor import MachineCheck, kernel_bus, memory_check, priority_check
 from simulation.drives.eds_file import profile_path, read_eds
@@ -134,7 +133,7 @@ def test_an_ip_that_says_something_else_is_told(tmp_path: Path) -> None:
     program.chmod(0o755)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PATH", str(tmp_path), prepend=":")
-        with pytest.raises(socketcan.HardwareMissing, match="did not list"):
+        with pytest.raises(can_bus.HardwareMissing, match="did not list"):
             can_interfaces()
 
 

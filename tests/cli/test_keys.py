@@ -22,14 +22,13 @@ from cdpr.cli.operate.keys import NAMES, Keys, names_of
 from cdpr.cli.operate.supervision import SignalSupervisor
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import JogProver, jog_session
-from executor.operator_requests import LocalRequests
 from executor.remote import client
 from executor.remote.client import StopResult, follow_run
+from executor.remote.command_socket import Reached, advertised, serving
 from executor.remote.protocol import make_line, parse_command
-from executor.remote.registry import Reached, advertised
-from executor.remote.server import serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord
+from executor.supervision import LocalRequests
 from model.errors import BadInput, StoppedByOperator
 from model.rig import load_rig
 from tests.cli.plans import RIG

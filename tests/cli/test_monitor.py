@@ -11,10 +11,11 @@ import pytest
 import typer
 from rich.console import Console
 
-from cdpr.cli.operate.monitor import _lines, _plain, _view
-from executor.operator_requests import LocalRequests
+from cdpr.cli.operate.monitor import _lines, _view
+from executor.remote.client import status_text
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import LocalRequests
 from model.rig import load_rig
 from tests.cli.plans import RIG
 
@@ -78,7 +79,7 @@ def live(told: dict[str, Any]) -> str:
     return console.file.getvalue()
 
 
-@pytest.mark.parametrize("shown", [live, _plain])
+@pytest.mark.parametrize("shown", [live, status_text])
 def test_everything_of_a_run_is_shown_as_it_is(shown: Any) -> None:
     text = shown(status())
     for part in (
@@ -91,14 +92,14 @@ def test_everything_of_a_run_is_shown_as_it_is(shown: Any) -> None:
         assert part.lower() in text.lower(), part
 
 
-@pytest.mark.parametrize("shown", [live, _plain])
+@pytest.mark.parametrize("shown", [live, status_text])
 def test_a_run_that_is_prepared_or_in_simulated_time_is_shown_too(shown: Any) -> None:
     nothing = dict.fromkeys(("elapsed_s", "cycle", "row", "path_mm", "feed_percent", "lateness_ms"))
     assert "preparing" in shown(status(state="preparing", drives=[], events=[], **nothing))
     assert "simulated time" in shown(status(simulated_time=True, lateness_ms=None))
 
 
-@pytest.mark.parametrize("shown", [live, _plain])
+@pytest.mark.parametrize("shown", [live, status_text])
 def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> None:
     rig = load_rig(RIG)
     told = WinchStatus(rig, LocalRequests(), simulated_time=False)

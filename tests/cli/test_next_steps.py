@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 
 from calibration.results import write_result
-from cdpr.cli.facts import show_summary
-from cdpr.cli.operate.service import _next_step
+from cdpr.cli.operate.run import show
 from cdpr.cli.output import progress_bar
+from executor.interlock.interlock import ReferenceStatus
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as told
-from executor.service import ReferenceStatus, StatusResult
+from executor.run_result import RunResult
+from executor.service import StatusResult
 from model.errors import Fault
 from model.rig import load_rig
 from model.scene import load_scene
@@ -82,7 +83,7 @@ def test_a_run_that_failed_has_a_next_step_and_its_faults_explained(
         "interface": interface,
         "events": [{"code": "moving"}, {"code": "drive_silent"}],
     }
-    show_summary(summary, Path("run"), as_json=False)
+    show(RunResult(Path("run"), summary), as_json=False)
     lines = capsys.readouterr().out.splitlines()
     assert says in lines[-1]
     assert lines[-1].startswith("  next: ")
@@ -97,7 +98,7 @@ def test_a_run_that_went_well_points_to_no_fault(
     """A reply that was lost and did not matter is no reason to read about it."""
     events = [{"code": "pass"}, {"code": "reply_lost"}]
     summary = {"verdict": verdict, "sentence": "", "reasons": [], "events": events}
-    show_summary(summary, Path("run"), as_json=False)
+    show(RunResult(Path("run"), summary), as_json=False)
     assert "details" not in capsys.readouterr().out
 
 
@@ -109,12 +110,12 @@ STANDING = StatusResult(
 
 def test_status_says_what_has_to_be_done_before_a_run() -> None:
     rig = Path("my rig.yaml")
-    assert _next_step(rig, STANDING) == ""
+    assert STANDING.next_step(rig) == ""
     lost = replace(STANDING, reference=replace(REFERENCED, counts=False))
-    assert _next_step(rig, lost).startswith("cdpr home 'my rig.yaml'")
-    both = _next_step(rig, replace(lost, latched="cable 3 is slack"))
+    assert lost.next_step(rig).startswith("cdpr home 'my rig.yaml'")
+    both = replace(lost, latched="cable 3 is slack").next_step(rig)
     assert both.index("cdpr reset 'my rig.yaml'") < both.index("cdpr home 'my rig.yaml'")
-    assert _next_step(rig, replace(lost, run=17)) == ""
+    assert replace(lost, run=17).next_step(rig) == ""
 
 
 def test_monitor_calls_itself_by_its_name() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from executor.cameras.client import CameraClient
 from executor.cameras.multi_camera import CameraWatch, RunCameras
-from executor.operator_requests import LocalRequests, StopReason
+from executor.supervision import LocalRequests, StopReason
 from tests.executor.test_run_cameras import MODEL, RATE, Scripted
 
 

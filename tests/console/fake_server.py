@@ -33,7 +33,6 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from executor.report.scene import frame_surface, platform_surface
-from model.geometry.solids import box_solid
 from model.pages.page import resource
 from model.pages.scene import (
     Label,
@@ -46,6 +45,7 @@ from model.pages.scene import (
 )
 from model.pose import Array, Pose
 from model.rig import load_rig
+from model.shapes import box_solid
 from model.statics.gravity import working_tensions
 
 ROOT = Path(__file__).parents[2]

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from cdpr.console.control import PageControl
+from cdpr.console.commands import PageControl
 
 
 class ControlMachine(RuleBasedStateMachine):

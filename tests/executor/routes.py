@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from executor.trajectory.path import Path, line
 from model.pose import Pose
 from model.rig import Motion
 
@@ -79,3 +83,8 @@ def steps_between(positions: Array, rotations: Array, weight: float = WEIGHT) ->
 def always(_poses: object) -> bool:
     """No obstacle anywhere."""
     return True
+
+
+def polyline(waypoints: Sequence[Pose], weight: float) -> Path:
+    """The path with sharp corners."""
+    return Path(tuple(line(a, b, weight) for a, b in pairwise(waypoints)))

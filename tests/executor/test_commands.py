@@ -16,11 +16,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.operator_requests import LocalRequests, OperatorRequests
 from executor.remote.client import ask_all, last_word, no_answer, select_run
+from executor.remote.command_socket import (
+    LONGEST_QUESTION,
+    MOST_CLIENTS,
+    Reached,
+    advertised,
+    find_runs,
+    serving,
+)
 from executor.remote.protocol import NotACommand, answer_to, make_line, parse_command
-from executor.remote.registry import Reached, advertised, find_runs
-from executor.remote.server import LONGEST_QUESTION, MOST_CLIENTS, serving
+from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput, Fault
 
 
@@ -215,7 +221,7 @@ def test_a_run_that_could_not_be_stopped_from_elsewhere_any_more_is_stopped(monk
     def break_down(*_: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr("executor.remote.server.answer_to", break_down)
+    monkeypatch.setattr("executor.remote.command_socket.answer_to", break_down)
     with find_runs() as runs:
         assert ask_all(runs, "status")[0].ended
     assert board.read().stop

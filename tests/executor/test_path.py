@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from executor.trajectory.path import MIDDLE_SHARE, Path, corner, line, polyline, poses_of
+from executor.trajectory.path import MIDDLE_SHARE, Path, corner, line, poses_of
 from model.pose import Pose, interpolate
-from tests.executor.routes import WEIGHT, at_mm, random_pose, steps_between
+from tests.executor.routes import WEIGHT, at_mm, polyline, random_pose, steps_between
 
 seeds = st.integers(0, 2**32 - 1)
 SIDES = st.sampled_from([0.0, 0.4])

@@ -12,21 +12,22 @@ from hypothesis.extra.numpy import arrays
 
 from executor.recording.run_folder import RunEvent
 from executor.report.tiles import event_table
-from model.geometry.shapes import (
+from model.pages.charts import spread, thinned, with_gaps
+from model.pages.scene import Eye
+from model.pose import Pose
+from model.shapes import (
     Box,
     Capsule,
     Cylinder,
     Obstacle,
     Shape,
+    Solid,
     Sphere,
     TriangleMesh,
     convex_hull,
     shape_points,
+    solid_of,
 )
-from model.geometry.solids import Solid, solid_of
-from model.pages.charts import spread, thinned, with_gaps
-from model.pages.scene import Eye
-from model.pose import Pose
 
 SHAPES: dict[str, Shape] = {
     "box": Box(np.array([0.1, 0.2, 0.3])),

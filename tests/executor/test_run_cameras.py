@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.cli.facts import camera_line
 from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
 from executor.cameras.client import BLIND_PICTURES, CameraClient, wait_until_ready
 from executor.cameras.multi_camera import HURRY, PATIENCE, ROUND, RunCameras
 from executor.cameras.process import CameraProcess, CameraSample, FrameRequest
+from executor.remote.client import camera_line
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Fault
 from model.pose import Pose

@@ -16,16 +16,16 @@ from pathlib import Path
 import pytest
 
 from cdpr.cli.operate.supervision import STOP_SIGNALS, stop_requests
-from executor.operator_requests import LocalRequests
-from executor.remote.registry import advertised, find_runs
+from executor.remote.command_socket import advertised, find_runs
+from executor.supervision import LocalRequests
 from model.errors import Refused
 
 #: A run as the command line makes one: tells that it is advertised, ends when it was asked to.
 RUN = """
 import signal
 from cdpr.cli.operate.supervision import stop_requests
-from executor.remote.registry import advertised
-from executor.operator_requests import LocalRequests
+from executor.remote.command_socket import advertised
+from executor.supervision import LocalRequests
 board = LocalRequests()
 with stop_requests(board), advertised() as listeners:
     print("advertised", flush=True)
@@ -231,7 +231,9 @@ def test_a_listener_of_another_user_is_not_spoken_to(folders, monkeypatch):
         real = os.getuid()
         other = os.stat(folders[0]).st_uid
         assert other == real
-        monkeypatch.setattr("executor.remote.registry.struct.unpack", lambda *_: (1, real + 1, 0))
+        monkeypatch.setattr(
+            "executor.remote.command_socket.struct.unpack", lambda *_: (1, real + 1, 0)
+        )
         assert _reached() == []
 
 

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.operator_requests import OperatorRequests, StopReason
 from executor.realtime import shared_memory as shared_board
 from executor.realtime.shared_memory import (
     SILENCE,
@@ -26,6 +25,7 @@ from executor.realtime.shared_memory import (
     unpack_event,
 )
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import OperatorRequests, StopReason
 from model.pose import Pose
 
 SLOTS, CONTENT = 8, 40

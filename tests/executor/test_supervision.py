@@ -8,8 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from executor.operator_requests import LocalRequests
-from executor.supervision import Supervisor
+from executor.supervision import LocalRequests, Supervisor
 from model.errors import StoppedByOperator
 
 PATIENCE_S = 20.0

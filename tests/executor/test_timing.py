@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.trajectory.path import Path, polyline, rounded
+from executor.trajectory.path import Path, rounded
 from executor.trajectory.time_scaling import TimeLaw, length_to_change, s_curve, time_law
 from model.errors import Fault
 from model.pose import Pose
 from model.rig import Motion
-from tests.executor.routes import GACHON, HALL, WEIGHT, always, at_mm, random_route
+from tests.executor.routes import GACHON, HALL, WEIGHT, always, at_mm, polyline, random_route
 
 seeds = st.integers(0, 2**32 - 1)
 motions = st.sampled_from([GACHON, HALL, replace(GACHON, jerk=0.05), replace(HALL, jerk=300.0)])

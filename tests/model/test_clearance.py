@@ -12,14 +12,20 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from model.clearance import ClearanceModel, SelfModel
+from model.distances import (
+    box_body,
+    convex_bodies,
+    segment_body,
+    segment_box_points,
+    segment_pair_points,
+    separation,
+)
 from model.files.scene_file import SceneDocument
-from model.geometry.convex import box_body, convex_bodies, segment_body, separation
-from model.geometry.segments import segment_box_points, segment_pair_points
-from model.geometry.shapes import Box, Capsule, Cylinder, Sphere, TriangleMesh, convex_hull
 from model.kinematics import cables_at
 from model.pose import Pose, interpolate
 from model.rig import load_rig, rig_from_document
 from model.scene import load_scene, scene_from_document
+from model.shapes import Box, Capsule, Cylinder, Sphere, TriangleMesh, convex_hull
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")

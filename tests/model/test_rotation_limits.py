@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from model.pose import Pose, interpolate
-from model.rotation_limits import RotationLimits, largest_rotations
+from model.pose import Pose, RotationLimits, interpolate, largest_rotations
 
 seeds = st.integers(0, 2**32 - 1)
 

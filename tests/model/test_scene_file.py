@@ -12,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.errors import BadInput, InvalidFile
-from model.geometry.shapes import (
+from model.pose import Pose
+from model.scene import load_scene
+from model.shapes import (
     Box,
     Capsule,
     ConvexHull,
@@ -22,8 +24,6 @@ from model.geometry.shapes import (
     convex_hull,
     shape_points,
 )
-from model.pose import Pose
-from model.scene import load_scene
 from tests.model.rig_builds import CONFIGS, scene_data, scene_of
 
 TETRAHEDRON = [[0, 0, 0], [100, 0, 0], [0, 100, 0], [0, 0, 100]]

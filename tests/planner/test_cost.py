@@ -7,10 +7,9 @@ import pytest
 
 from model.kinematics import structure_matrix
 from model.pose import Pose
-from model.statics.dexterity import condition_number, rms_anchor_radius
-from model.statics.wrench_sets import force_volume
-from planner import array_cache as stored
+from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner.costs import KinematicCost, LengthCost
+from planner.kernels import jit as stored
 from planner.space import Lattice, corners_and_weights
 
 

@@ -7,8 +7,14 @@ import math
 import pytest
 
 from model.errors import BadInput
-from planner.options import PlanningOptions, settings_from_options
-from planner.settings import OBJECTIVES, OptimalSettings, PlannerSettings, TurningSettings
+from planner.settings import (
+    OBJECTIVES,
+    OptimalSettings,
+    PlannerSettings,
+    PlanningOptions,
+    TurningSettings,
+    settings_from_options,
+)
 
 
 def test_nothing_asked_gives_the_planner_we_recommend_for_the_shortest_path() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner.costs import LengthCost
-from planner.shortcut import cheapest_through, drawn_tight
+from planner.rrt.path import cheapest_through, drawn_tight
 
 COST = LengthCost()
 

@@ -23,12 +23,12 @@ INNER_IMPORTS: dict[str, set[str]] = {
     "a heavy library is loaded by the few calls that need it": {
         "cdpr/cli/app.py",
         "cdpr/cli/operate/monitor.py",
-        "cdpr/console/pictures.py",
+        "cdpr/console/watch.py",
         "executor/recording/run_folder.py",
         "executor/report/figures.py",
         "executor/report/tiles.py",
         "executor/run_result.py",
-        "model/geometry/shapes.py",
+        "model/shapes.py",
         "model/plan.py",
         "model/rig.py",
         "model/statics/tension_distribution.py",
@@ -51,7 +51,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "cdpr/cli/operate/console.py",
         "drivers/odrive/messages.py",
         "planner/parallel.py",
-        "tracking/detection/libraries.py",
+        "tracking/detection/detector.py",
     },
     "compiled kernels are loaded when their machine code is wanted": {
         "executor/kernels.py",
@@ -120,6 +120,10 @@ def test_every_package_names_what_is_public(house: Any) -> None:
 
 def test_documentation_lines_fit_a_screen(house: Any) -> None:
     assert house.long_lines() == []
+
+
+def test_no_two_classes_have_one_name(house: Any) -> None:
+    assert house.namesakes() == {}
 
 
 def test_what_breaks_a_limit_is_found(shape: Any, tmp_path: Path) -> None:

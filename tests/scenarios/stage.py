@@ -18,11 +18,11 @@ from drivers.factory import make_drive_group
 from executor.cameras.multi_camera import CameraRecords
 from executor.control.path_runs import Outcome, run_in_process
 from executor.evaluation import evaluate, write_end
-from executor.operator_requests import LocalRequests
 from executor.recording.recorder import FrameTrigger, Recorder
 from executor.recording.run_course import RunCourse
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.status import RunStatus
+from executor.supervision import LocalRequests
 from executor.trajectory.prepare import PreparedRun
 from model.pose import Array, Pose
 from simulation.drives.cia402 import SimulatedDrive

@@ -13,9 +13,9 @@ import yaml
 
 from executor.cameras.multi_camera import ClearanceMonitor
 from executor.cameras.process import CameraWorker, FrameRequest
-from executor.operator_requests import StopReason
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
+from executor.supervision import StopReason
 from executor.trajectory.prepare import PreparedRun
 from model.clearance import ClearanceModel
 from model.files.scene_file import SceneDocument

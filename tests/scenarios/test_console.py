@@ -19,7 +19,7 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 from executor.remote.client import stop_runs
-from executor.remote.registry import find_runs
+from executor.remote.command_socket import find_runs
 from tests.cli.plans import CONFIGS
 from tests.scenarios.test_processes import program
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from executor.remote.registry import find_runs
+from executor.remote.command_socket import find_runs
 from tests.console.browsing import browser_at, chromium
 from tests.console.cut import CutConnection
 from tests.scenarios.test_console import console, drives

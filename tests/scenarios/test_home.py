@@ -26,11 +26,11 @@ from executor.drives import current_pose
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
 from executor.jogging import straight_way
-from executor.operator_requests import LocalRequests
 from executor.realtime.clock import SimulatedClock
 from executor.realtime.job import ReadyDrives
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import LocalRequests
 from executor.trajectory.prepare import PreparedRun, prepare
 from model.errors import CdprError, Fault, Refused, StoppedByOperator
 from model.plan import plan_from_document

@@ -23,7 +23,7 @@ from executor.recording.resume import run_end
 from executor.recording.run_course import RunCourse
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.remote.client import ask_all
-from executor.remote.registry import find_runs
+from executor.remote.command_socket import find_runs
 from executor.trajectory.prepare import PreparedRun
 from model.errors import BadInput, Refused
 from tests.cli.plans import RIG

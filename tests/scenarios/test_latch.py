@@ -14,7 +14,7 @@ from drivers.can_bus import BusSettings
 from drivers.cia402.state_machine import DriveState
 from executor.interlock.fault_latch import FaultLatch
 from executor.remote.client import ask_all
-from executor.remote.registry import find_runs
+from executor.remote.command_socket import find_runs
 from executor.state_machine import State
 from executor.trajectory.prepare import PreparedRun
 from model.errors import Refused

@@ -12,6 +12,7 @@ import pytest
 from executor import jogging, runner
 from executor.homing import home
 from executor.interlock.interlock import MotionInterlock
+from executor.proposals import MotionProposal
 from executor.recording.run_folder import RunEvent, RunFolder
 from model.errors import BadInput, StoppedByOperator
 from model.plan import Plan, load_plan
@@ -50,7 +51,7 @@ def test_a_run_gives_its_verdict_its_tables_and_its_events(
 def test_a_no_before_the_motion_leaves_nothing(plan: Plan, rig: Rig, tmp_path: Path) -> None:
     asked: list[str] = []
 
-    def refuse(proposal: runner.MotionProposal) -> bool:
+    def refuse(proposal: MotionProposal) -> bool:
         asked.append(proposal.question)
         return False
 

@@ -17,7 +17,7 @@ import pytest
 
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import ask_all
-from executor.remote.registry import find_runs
+from executor.remote.command_socket import find_runs
 from model.rig import load_rig
 
 ROOT = Path(__file__).parents[2]

@@ -17,8 +17,8 @@ import pytest
 import executor.evaluation
 import executor.recording.summary
 import executor.runner
-from executor.operator_requests import LocalRequests, OperatorRequests
 from executor.recording.run_folder import RunFolder
+from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput
 from tests.cli.plans import RIG
 from tests.cli.program import Answer, call
@@ -232,8 +232,8 @@ def test_standard_output_that_is_full_leaves_the_verdict_on_the_other(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("cdpr.cli.operate.supervision.show_before", lambda *_, **__: None)
-    monkeypatch.setattr("cdpr.cli.facts.out.print", full)
+    monkeypatch.setattr("cdpr.cli.operate.supervision.show_proposal", lambda *_, **__: None)
+    monkeypatch.setattr("cdpr.cli.operate.run.out.print", full)
     answer = run("stop")
     assert answer.code == 130, answer
     assert "STOPPED " in answer.err

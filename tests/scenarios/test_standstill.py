@@ -15,9 +15,9 @@ from drivers.factory import make_drive_group, read_drives
 from executor.control.preconditions import set_up_here
 from executor.control.standstill import FaultReset, Release, Standstill
 from executor.control.sync_master import SyncMaster
-from executor.operator_requests import OperatorRequests
 from executor.realtime.clock import SimulatedClock
 from executor.state_machine import CycleRecord, State
+from executor.supervision import OperatorRequests
 from model.errors import CdprError, Refused, StoppedByOperator
 from model.rig import load_rig
 from simulation.drives.cia402 import SimulatedDrive

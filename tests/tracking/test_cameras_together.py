@@ -15,8 +15,8 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
+from tracking.fusion import MultiCameraFusion, together
 from tracking.measurement import NoPose, PoseMeasurement, extrapolate
-from tracking.multi_camera import MultiCameraFusion, together
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.05, 0.05, 0.4])

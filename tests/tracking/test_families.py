@@ -18,7 +18,7 @@ from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_pictures import Condition, HardPrinter
 from tests.tracking.tag_pictures import FAMILY
 from tracking.camera_model import pixels_from_ideal
-from tracking.detection.libraries import make_detector
+from tracking.detection.detector import make_detector
 from tracking.detection.tags import modules_across
 from tracking.edges.refine import refine
 from tracking.measurement import PoseMeasurement

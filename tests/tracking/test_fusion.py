@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from tracking.encoder_fusion import GATE, OUTLIERS, Measured, fused
+from tracking.fusion import GATE, OUTLIERS, Measured, fused
 
 CYCLE, PERIOD = 0.01, 0.1
 TAG = np.array([3e-4] * 3 + [np.radians(0.03)] * 3)

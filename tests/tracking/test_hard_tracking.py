@@ -14,10 +14,9 @@ from model.rig import Camera, Rig, Tag
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.consensus import agreeing
+from tracking.estimator import TrackerSettings, agreeing
 from tracking.measurement import NoPose, PoseMeasurement, predicted
 from tracking.pnp import TagView
-from tracking.settings import TrackerSettings
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.1, 0.1, 0.4])

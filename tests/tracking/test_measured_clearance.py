@@ -21,8 +21,8 @@ from tracking.camera_model import ideal_from_pixels, pixels_from_ideal, project_
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
+from tracking.fusion import together
 from tracking.measurement import PoseMeasurement
-from tracking.multi_camera import together
 from tracking.pnp import TagView, moved, solve_pnp
 from tracking.shared_errors import (
     SharedErrors,

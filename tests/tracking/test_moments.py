@@ -8,8 +8,8 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tracking.fusion import moments
 from tracking.measurement import NoPose
-from tracking.multi_camera import moments
 from tracking.pose_log import LoggedPicture
 
 TIMES = st.lists(st.integers(0, 60), max_size=20, unique=True).map(sorted)

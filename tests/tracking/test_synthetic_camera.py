@@ -10,7 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.errors import BadInput
-from model.geometry.shapes import (
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Camera, Rig
+from model.scene import Scene
+from model.shapes import (
     Box,
     Capsule,
     Cylinder,
@@ -21,9 +24,6 @@ from model.geometry.shapes import (
     convex_hull,
     shape_points,
 )
-from model.pose import Pose, matrix_from_rotation_vector
-from model.rig import Camera, Rig
-from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera, sample_rays
 from simulation.camera.rendering import Canvas, draw_triangles, surface_of
 from tests.tracking.tag_pictures import TagPrinter, small_camera

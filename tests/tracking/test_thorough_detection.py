@@ -9,9 +9,8 @@ import pytest
 from tests.tracking.hard_pictures import Condition, HardPrinter
 from tests.tracking.tag_pictures import FAMILY
 from tracking.camera_model import Region
-from tracking.detection.decoder import TagDecoder, carries_tag
 from tracking.detection.detector import TagDetector
-from tracking.detection.tags import CORNER_SIGNS, official_modules
+from tracking.detection.tags import CORNER_SIGNS, TagDecoder, carries_tag, official_modules
 
 HARD = {
     "small": Condition(side_px=12.5),

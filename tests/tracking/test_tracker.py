@@ -21,8 +21,8 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tracking.camera_check import CameraMoved
+from tracking.estimator import TrackerSettings
 from tracking.measurement import NoPose, PoseMeasurement
-from tracking.settings import TrackerSettings
 from tracking.tracker import Tracker
 
 

@@ -21,7 +21,7 @@ CALL_S, SILENT_S, LONG_S = 10, 25, 6
 """Of a call: processor time, time in all, and time that a long one is watched for, [s]."""
 
 PRELOADED = (
-    "calibration.load",
+    "calibration.result_files",
     "executor.trajectory.prepare",
     "executor.report.page",
     "planner.planning",

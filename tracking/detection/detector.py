@@ -1,4 +1,4 @@
-"""Finding tags in an image, in all of it or in a part, by their numbers."""
+"""Finding tags in an image, in all of it or in a part, by the detector that a rig file names."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from model.errors import BadInput
+from model.files.camera_file import DETECTORS
 from model.pose import Array, read_only
 from model.rig import Camera, Tag
 from tracking.camera_model import Image, Region, pixels_of
-from tracking.detection.decoder import TagDecoder
-from tracking.detection.tags import dictionary, tag_corners, upright_corners
+from tracking.detection.tags import TagDecoder, dictionary, tag_corners, upright_corners
 
 # Squares in an image that may be tags, also small, faint and blurred ones.
 
@@ -255,3 +256,75 @@ def _pixels(camera: Camera, points: Array) -> Array | None:
     """Pixels of points of the world, None when one is not in front of the camera."""
     in_camera = camera.world_from_camera.inverse().apply(points)
     return None if np.any(in_camera[:, 2] < NEAREST) else pixels_of(camera, in_camera)
+
+
+# The detector of tags that a rig file names.
+
+
+def make_detector(name: str, family: str) -> TagDetector:
+    """A detector by its name in rig files.
+
+    Args:
+        name: One of `model.files.rig_file.DETECTORS`.
+        family: Such as ``tag36h11``.
+
+    Raises:
+        BadInput: It is not known, not installed, or does not find the family.
+    """
+    if name not in DETECTORS:
+        raise BadInput(
+            f"unknown tag detector {name!r}", next_step=f"use one of {', '.join(DETECTORS)}"
+        )
+    if name == "apriltag":
+        return AprilTagLibrary(family)
+    return TagDetector(family)
+
+
+# Finding tags with pyapriltags, the AprilTag project's own detector (extra ``apriltag``).
+
+
+#: Its families among those of rig files.
+FAMILIES = ("tag16h5", "tag25h9", "tag36h11")
+
+
+class AprilTagLibrary(TagDetector):
+    """As `TagDetector`, by pyapriltags: better at small and faint tags, some times slower.
+
+    Plainly it looks at an image of half the size, thoroughly at the whole one.
+
+    Args:
+        family: Such as ``tag36h11``.
+
+    Raises:
+        BadInput: It does not know the family, or is not installed.
+    """
+
+    def __init__(self, family: str) -> None:
+        if family not in FAMILIES:
+            raise BadInput(
+                f"pyapriltags does not find tags of the family {family!r}",
+                where="tags: detector",
+                next_step=f"use the detector 'opencv', or one of {', '.join(FAMILIES)}",
+            )
+        try:
+            from pyapriltags import Detector
+        except ImportError as error:
+            raise BadInput(
+                "the tag detector 'apriltag' is not installed",
+                where="tags: detector",
+                why=str(error),
+                next_step="install it with `pip install 'cdpr[apriltag]'`, or use 'opencv'",
+            ) from None
+        super().__init__(family)
+        self._halved = Detector(families=family, nthreads=1, quad_decimate=2.0)
+        self._full = Detector(families=family, nthreads=1, quad_decimate=1.0)
+
+    def _detect(self, image: Image, thorough: bool) -> list[Detection]:
+        detector = self._full if thorough else self._halved
+        found = detector.detect(np.ascontiguousarray(image))
+        return [Detection(int(tag.tag_id), _our_corners(tag.corners)) for tag in found]
+
+
+def _our_corners(corners: Array) -> Array:
+    """Its corners run from the bottom left against the clock, and pixels' centres lie at 0.5."""
+    return np.asarray(corners, dtype=np.float64)[::-1] - 0.5

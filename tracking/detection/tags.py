@@ -1,12 +1,17 @@
-"""Tag families: their images and the corners of a tag.
+"""Tag families: their images, the corners of a tag, and which tag a square in an image shows.
 
 OpenCV draws every AprilTag family turned by 180° against the images of the AprilTag project,
 which labs print; ArUco markers are printed as OpenCV draws them. A tag's frame here is that of the
 printed image: x right, y up, z out of it.
+
+A tag is read by correlation of its brightness with all patterns. Unlike a decision module by module
+this reads tags whose modules run into each other: seen from far, out of focus, in motion, or with
+little contrast.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -14,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
-from model.files.camera_file import FAMILIES, drawn_upside_down, opencv_dictionary
+from model.files.camera_file import FAMILIES, drawn_upside_down, opencv_dictionary, tags_in
 from model.pose import Array
 from model.rig import Tag
+from tracking.camera_model import Image
 
 #: Top left, top right, bottom right, bottom left of the upright image, in half sides.
 CORNER_SIGNS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
@@ -58,3 +64,139 @@ def tag_corners(tag: Tag) -> Array:
     """Corners of a tag in the frame of its carrier (platform or world), shape (4, 3), [m]."""
     flat = np.column_stack([CORNER_SIGNS * tag.size / 2.0, np.zeros(4)])
     return tag.pose.apply(flat)
+
+
+# Which tag a square shows, by correlation of its brightness with all patterns.
+
+
+#: Correlation with its pattern that a tag of 36 modules and more must reach. Patterns of a family
+#: correlate by about 0.4, and a square of anything with the best of them by 0.7 one time in a
+#: hundred. Fewer modules match by chance more often, so they must fit better.
+LEAST_CORRELATION = 0.78
+LEAST_MODULES = 36
+#: By how much the second best number must be behind.
+MARGIN = 0.1
+#: Share of the contrast inside a tag that its black border must have against the white around it.
+BORDER_CONTRAST = 0.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """The tag that a square shows.
+
+    Attributes:
+        id: Its number.
+        corners: In the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2), [px].
+        correlation: Of brightness and pattern, at most 1.
+    """
+
+    id: int
+    corners: Array
+    correlation: float
+
+
+class TagDecoder:
+    """Knows all patterns of a family.
+
+    Args:
+        family: Such as ``tag36h11``.
+
+    Raises:
+        BadInput: The family is not known.
+    """
+
+    def __init__(self, family: str) -> None:
+        self._side = modules_across(family)
+        inner = [official_modules(family, n)[1:-1, 1:-1] for n in range(tags_in(family))]
+        patterns = np.array(inner, dtype=np.float64)
+        turned = [np.rot90(patterns, k, axes=(1, 2)).reshape(len(inner), -1) for k in range(4)]
+        self._book = _normalised(np.stack(turned, axis=1))  # (n, 4, modules)
+        modules = self._book.shape[-1]
+        self.least = 1.0 - (1.0 - LEAST_CORRELATION) * min(1.0, modules / LEAST_MODULES)
+
+    def read(self, image: Image, square: Array) -> Reading | None:
+        """The tag in a square, or None when it shows none for sure.
+
+        Args:
+            image: Grey image.
+            square: Corners clockwise on the screen from any, shape (4, 2), [px].
+        """
+        values = module_brightness(image, square, self._side, around=1)
+        inner = values[2:-2, 2:-2].ravel()
+        if not _has_border(values, inner):
+            return None
+        scores = self._book @ _normalised(inner)
+        best = int(np.argmax(scores))
+        number, turns = divmod(best, 4)
+        rest = np.delete(scores, number, axis=0)
+        second = float(rest.max()) if rest.size else 0.0
+        found = float(scores.flat[best])
+        if found < self.least or found - second < MARGIN:
+            return None
+        # The pattern turned counter-clockwise by k quarters fits, so its top left is corner -k.
+        return Reading(number, np.roll(square, turns, axis=0), found)
+
+
+def module_brightness(image: Image, square: Array, modules: int, around: int = 0) -> Array:
+    """Brightness in the middle of every module of a square.
+
+    Args:
+        image: Grey image.
+        square: Corners, the first at the upper left of the result, shape (4, 2), [px].
+        modules: Along the side of the square.
+        around: Rings of modules outside the square that are read too.
+
+    Returns:
+        Shape (modules + 2 around, modules + 2 around).
+    """
+    plane = np.array([[0, 0], [modules, 0], [modules, modules], [0, modules]], dtype=np.float32)
+    turn = cv2.getPerspectiveTransform(plane, square.astype(np.float32))
+    middle = np.arange(-around, modules + around) + 0.5
+    grid = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 1, 2)
+    side = modules + 2 * around
+    places = cv2.perspectiveTransform(grid, turn).astype(np.float32).reshape(side, side, 2)
+    column, row = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+    values = cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float64)
+
+
+def _has_border(values: Array, inner: Array) -> bool:
+    """Whether the square is dark all around and bright outside, as a tag is."""
+    ring = np.concatenate([values[1, 1:-1], values[-2, 1:-1], values[2:-2, 1], values[2:-2, -2]])
+    outside = np.concatenate([values[0, 1:-1], values[-1, 1:-1], values[1:-1, 0], values[1:-1, -1]])
+    contrast = float(inner.max() - inner.min())
+    return contrast > 0.0 and float(np.median(outside) - np.median(ring)) > (
+        BORDER_CONTRAST * contrast
+    )
+
+
+def _normalised(values: Array) -> Array:
+    """Of mean 0 and length 1 along the last axis."""
+    centred = values - values.mean(axis=-1, keepdims=True)
+    length = np.linalg.norm(centred, axis=-1, keepdims=True)
+    return np.asarray(centred / np.maximum(length, 1e-12))
+
+
+# Whether a square in the image carries a given tag's pattern.
+
+
+#: Least correlation of brightness and pattern; another tag's pattern reaches about 0.5.
+LEAST_KNOWN_CORRELATION = 0.75
+
+
+def carries_tag(image: Image, corners: Array, family: str, number: int) -> bool:
+    """Compares the inner modules of a square with a tag's.
+
+    Args:
+        image: Grey image.
+        corners: In the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2), [px], as in
+            the image.
+        family: Such as ``tag36h11``.
+        number: Number in the family.
+    """
+    values = module_brightness(image, corners, modules_across(family))
+    seen = values[1:-1, 1:-1].ravel()
+    wanted = official_modules(family, number)[1:-1, 1:-1].ravel().astype(np.float64)
+    seen, wanted = seen - seen.mean(), wanted - wanted.mean()
+    size = float(np.linalg.norm(seen) * np.linalg.norm(wanted))
+    return size > 0.0 and float(seen @ wanted) > LEAST_KNOWN_CORRELATION * size

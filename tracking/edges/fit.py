@@ -13,24 +13,20 @@ import numpy as np
 from model.jit import compiled
 from model.pose import Array
 from tracking.camera_model import Image
-from tracking.edges.profile import (
-    BEYOND_PAPER,
-    BRIGHT,
-    BRIGHT_SLOPE,
-    DARK,
-    DARK_SLOPE,
-    INNER,
-    WHITE,
-    compare,
-)
 from tracking.edges.sampling import (
     ACROSS,
     ALIKE,
+    BEYOND_PAPER,
     BOXED,
+    BRIGHT,
+    BRIGHT_SLOPE,
     COVARIANCE,
+    DARK,
+    DARK_SLOPE,
     HALF,
     HIDDEN,
     INK,
+    INNER,
     MIDDLE,
     MODULES,
     OFFSET,
@@ -40,6 +36,8 @@ from tracking.edges.sampling import (
     TILT,
     TILT_VARIANCE,
     VALUE,
+    WHITE,
+    compare,
     edge_frame,
     plane_of,
     sample_edge,

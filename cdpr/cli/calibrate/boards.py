@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from calibration.targets.board import Board
-from calibration.targets.charuco import Charuco
-from calibration.targets.chessboard import Chessboard
+from calibration.targets.chessboards import Charuco, Chessboard
 from calibration.targets.circle_grid import CircleGrid
-from calibration.targets.printing import printout
-from calibration.targets.tag_grid import TagGrid
+from calibration.targets.printing import PaperName, printout
+from calibration.targets.tag_grid import TagGrid, TagOrder
 from cdpr.cli.options import JsonOption, with_option_groups
 from cdpr.cli.output import show_facts, show_json
 from model.errors import BadInput
@@ -22,28 +20,12 @@ from model.files.documents import write_bytes_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
 
-
-class BoardName(StrEnum):
-    """What was printed."""
-
-    chessboard = "chessboard"
-    charuco = "charuco"
-    circles = "circles"
-    tags = "tags"
-
-
-class TagOrder(StrEnum):
-    """How the tags of a grid are numbered."""
-
-    rows = "rows"
-    kalibr = "kalibr"
-
-
-_NEEDED = {
-    BoardName.chessboard: ("square_mm",),
-    BoardName.charuco: ("square_mm", "marker_mm"),
-    BoardName.circles: ("spacing_mm", "diameter_mm"),
-    BoardName.tags: ("tag_mm", "gap_mm"),
+BoardName = Literal["chessboard", "charuco", "circles", "tags"]
+_NEEDED: dict[BoardName, tuple[str, ...]] = {
+    "chessboard": ("square_mm",),
+    "charuco": ("square_mm", "marker_mm"),
+    "circles": ("spacing_mm", "diameter_mm"),
+    "tags": ("tag_mm", "gap_mm"),
 }
 _SIZES = ("square_mm", "marker_mm", "spacing_mm", "diameter_mm", "tag_mm", "gap_mm")
 
@@ -52,7 +34,7 @@ _SIZES = ("square_mm", "marker_mm", "spacing_mm", "diameter_mm", "tag_mm", "gap_
 class BoardOptions:
     """What was said about a board; every field is an option of the verbs that know boards."""
 
-    board: Annotated[BoardName, typer.Option(help="kind of target")] = BoardName.chessboard
+    board: Annotated[BoardName, typer.Option(help="kind of target")] = "chessboard"
     columns: Annotated[
         int | None,
         typer.Option(
@@ -84,7 +66,7 @@ class BoardOptions:
     order: Annotated[
         TagOrder,
         typer.Option(help="numbered from the top left down, or as Kalibr's AprilGrid (tags)"),
-    ] = TagOrder.rows
+    ] = "rows"
 
     def made(self) -> Board:
         """The board.
@@ -100,15 +82,14 @@ class BoardOptions:
             )
         count, sides = (self.columns, self.rows), self._sides()
         match self.board:
-            case BoardName.chessboard:
+            case "chessboard":
                 return Chessboard(*count, sides[0])
-            case BoardName.charuco:
+            case "charuco":
                 return Charuco(*count, sides[0], sides[1], self.dictionary, self.legacy)
-            case BoardName.circles:
+            case "circles":
                 return CircleGrid(*count, sides[0], sides[1], self.asymmetric)
-            case BoardName.tags:
-                order = self.order.value
-                return TagGrid(*count, sides[0], sides[1], self.family, self.first, order)
+            case "tags":
+                return TagGrid(*count, sides[0], sides[1], self.family, self.first, self.order)
 
     def _sides(self) -> list[float]:
         """The sizes of this kind of board, [m]."""
@@ -116,12 +97,12 @@ class BoardOptions:
         sizes: dict[str, float | None] = {name: getattr(self, name) for name in _SIZES}
         if missing := [name for name in needed if sizes[name] is None]:
             raise BadInput(
-                f"--board {self.board.value} needs {_listed(missing)}",
+                f"--board {self.board} needs {_listed(missing)}",
                 next_step="measure over many squares of the print with a ruler",
             )
         given = [name for name, size in sizes.items() if size is not None]
         if others := [name for name in given if name not in needed]:
-            what = f"--board {self.board.value} does not take {_listed(others)}"
+            what = f"--board {self.board} does not take {_listed(others)}"
             raise BadInput(what, next_step="leave it out")
         return [(sizes[name] or 0.0) / 1e3 for name in needed]
 
@@ -133,14 +114,6 @@ def _listed(names: list[str]) -> str:
 # `cdpr calibrate print`: boards and tags on paper.
 
 
-class PaperName(StrEnum):
-    """Sizes of paper."""
-
-    a4 = "a4"
-    a3 = "a3"
-    letter = "letter"
-
-
 @with_option_groups
 def print_(
     output: Annotated[Path, typer.Argument(help="file to write (PDF)", metavar="PDF")],
@@ -149,7 +122,7 @@ def print_(
         Path | None,
         typer.Option("--rig", help="print this rig's tags instead of a board", metavar="RIG"),
     ] = None,
-    paper: Annotated[PaperName, typer.Option(help="paper size")] = PaperName.a4,
+    paper: Annotated[PaperName, typer.Option(help="paper size")] = "a4",
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -182,7 +155,7 @@ def print_(
             "a board needs --columns and --rows",
             next_step="pass them, or --rig RIG for the tags of a rig",
         )
-    made = printout(printed.made() if rig is None else load_rig(rig), paper.value)
+    made = printout(printed.made() if rig is None else load_rig(rig), paper)
     pages, what = made.pages, made.what
     write_bytes_atomic(output, made.pdf())
     step = "print at 100 %, measure the ruler and the squares, glue it to a flat, stiff plate"
@@ -191,7 +164,7 @@ def print_(
             {
                 "file": str(output),
                 "what": what,
-                "paper": paper.value,
+                "paper": paper,
                 "pages": len(pages),
                 "width_mm": pages[0].width_mm,
                 "height_mm": pages[0].height_mm,
@@ -200,5 +173,5 @@ def print_(
         )
     else:
         turned = "upright" if pages[0].width_mm < pages[0].height_mm else "across"
-        on = f"{len(pages)} of {paper.value}, {turned}"
+        on = f"{len(pages)} of {paper}, {turned}"
         show_facts("print", [("what", what), ("pages", on), ("file", str(output)), ("next", step)])

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibration.intrinsics.lens import AUTO
-from calibration.intrinsics.quality import FULL_COVERAGE
+from calibration.intrinsics.lens import LensChoice
 from calibration.pictures import take_pictures
 from calibration.procedures import (
-    CameraOutcome,
     calibrate_camera,
     calibrate_camera_from_corners,
     measure_readout,
@@ -36,20 +33,10 @@ from cdpr.cli.options import (
 )
 from cdpr.cli.output import err
 from executor.cameras.sources import require_camera_source
-from executor.operator_requests import LocalRequests
+from executor.supervision import LocalRequests
 from model.errors import BadInput
 from model.files.output import make_folder
 from model.rig import load_rig
-
-
-class LensChoice(StrEnum):
-    """Models of lenses, and the choice among them."""
-
-    auto = AUTO
-    five = "five"
-    rational = "rational"
-    thin_prism = "thin-prism"
-    fisheye = "fisheye"
 
 
 @with_option_groups
@@ -81,7 +68,7 @@ def camera(
     ] = None,
     lens: Annotated[
         LensChoice, typer.Option(help="its model; auto: what fits held-out pictures best")
-    ] = LensChoice.auto,
+    ] = "auto",
     result: ResultOptions = NOWHERE,
 ) -> None:
     """Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.
@@ -114,10 +101,10 @@ def camera(
             name=name,
             wanted=wanted_mm / 1e3,
             distance=distance_m,
-            lens=lens.value,
+            lens=lens,
             to=to,
         )
-        result.show(made, _facts(made))
+        result.show(made)
         return
     board = printed.made()
     if live is None and (pictures is not None or size_px is not None):
@@ -138,11 +125,11 @@ def camera(
         name=name,
         wanted=wanted_mm / 1e3,
         distance=distance_m,
-        lens=lens.value,
+        lens=lens,
         to=to,
         listener=result.listener,
     )
-    result.show(made, _facts(made))
+    result.show(made)
 
 
 def _take_pictures(
@@ -162,25 +149,6 @@ def _take_pictures(
         )
     if requests.read().stop:
         err.print("capture stopped; the images so far are used")
-
-
-def _facts(made: CameraOutcome) -> list[tuple[str, str]]:
-    """What was found beside the numbers, for people."""
-    result, quality = made.found, made.quality
-    return [
-        ("lens", f"model {result.lens.name}, {len(result.distortion)} coefficients"),
-        ("corners", f"{result.error:.3f} px off (RMS) in {len(result.views)} pictures"),
-        (
-            "boards were",
-            f"{quality.nearest:.3g} to {quality.farthest:.3g} m away; if not, the sizes are wrong",
-        ),
-        ("covered", f"{quality.covered:.0%} of the image; {FULL_COVERAGE:.0%} or more is good"),
-        (
-            "precision",
-            f"{quality.verdict.error * 1e3:.2g} mm at {quality.distance:.2f} m (95 %); two halves"
-            f" of the images differ by {quality.halves * 1e3:.2g} mm",
-        ),
-    ]
 
 
 # `cdpr calibrate readout`: how long a camera takes from its top row to its bottom row.
@@ -231,13 +199,4 @@ def readout(
         to=result.to,
         listener=result.listener,
     )
-    found = made.found
-    fastest = max(found.speeds.values())
-    facts = [
-        (
-            "pictures",
-            f"{len(found.speeds)} used, the platform's speed up to {fastest * 1e3:.0f} mm/s",
-        ),
-        ("edges", f"{found.before:.2f} standard deviations off before, {found.after:.2f} after"),
-    ]
-    result.show(made, facts)
+    result.show(made)

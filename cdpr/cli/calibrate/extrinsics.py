@@ -10,17 +10,9 @@ from typing import Annotated
 import typer
 
 from calibration.extrinsics.camera_pairs import locate_camera_by_another
-from calibration.extrinsics.result import moved_rows
 from calibration.extrinsics.surveyed_tags import Survey
-from calibration.pictures import Pictures, pictures_of
-from calibration.procedures import (
-    USUAL_PICTURES,
-    USUAL_TAG_PICTURES,
-    ExtrinsicsOutcome,
-    locate_camera,
-    locate_tags,
-)
-from calibration.tag_map.result import change_rows
+from calibration.pictures import USUAL_PICTURES, USUAL_TAG_PICTURES, Pictures, pictures_of
+from calibration.procedures import locate_camera, locate_tags
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
     NOWHERE,
@@ -120,7 +112,7 @@ def extrinsics(
             to=result.to,
             listener=result.listener,
         )
-        result.show(made, _facts(made, the_camera))
+        result.show(made)
         return
     made = locate_camera(
         the_rig,
@@ -132,20 +124,11 @@ def extrinsics(
         to=result.to,
         listener=result.listener,
     )
-    result.show(made, _facts(made, the_camera))
+    result.show(made)
 
 
 def _opener(source: str, camera: Camera, pictures: int | None) -> Callable[[], Pictures]:
     return lambda: pictures_of(source, camera, pictures, USUAL_PICTURES)
-
-
-def _facts(made: ExtrinsicsOutcome, camera: Camera) -> list[tuple[str, str]]:
-    found = made.found
-    return [
-        ("by", f"{found.by}, {found.pictures} images"),
-        *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
-        *moved_rows(camera.world_from_camera, found.world_from_camera),
-    ]
 
 
 # `cdpr calibrate tags`: where the tags are on the platform.
@@ -189,15 +172,4 @@ def tags(
         to=result.to,
         listener=result.listener,
     )
-    found = made.found
-    facts = [
-        (
-            "pictures",
-            f"{len(found.errors)} used, reprojection error {found.reprojection:.3f} px RMS",
-        ),
-        *(
-            (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
-            for name, shift, turn, _, count in change_rows(found)
-        ),
-    ]
-    result.show(made, facts)
+    result.show(made)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from calibration.procedures import Calibration, Destination
+from calibration.results import Calibration, Destination
 from cdpr.cli.options import JsonOption, finite
 from cdpr.cli.output import Terminal, show_facts, show_json
 
@@ -51,13 +50,8 @@ class ResultOptions:
         """What shows the progress."""
         return Terminal(quiet=self.as_json)
 
-    def show(self, made: Calibration[Any, Any, Any], facts: Sequence[tuple[str, str]]) -> None:
-        """Shows a calibration that was written, and exits with 3 if it is not good enough.
-
-        Args:
-            made: Written already.
-            facts: More that people want to know.
-        """
+    def show(self, made: Calibration[Any, Any, Any]) -> None:
+        """Shows a calibration that was written, and exits with 3 if it is not good enough."""
         result = made.result
         if self.as_json:
             show_json(result.sealed().model_dump(mode="json"))
@@ -65,7 +59,7 @@ class ResultOptions:
             lines = [("verdict", result.verdict), *(("next", step) for step in result.next_steps)]
             lines += [
                 *result.in_words(),
-                *facts,
+                *made.facts,
                 *(("not used", f"{k} {why}") for k, why in result.unused.items()),
                 *zip(("result", "report"), map(str, made.files), strict=False),
             ]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibration.compare import compare
-from calibration.intrinsics.exchange import FORMATS, write_rig_with_camera
+from calibration.intrinsics.exchange import FORMATS, FormatName, write_rig_with_camera
 from calibration.intrinsics.result import camera_named
-from calibration.load import load_result, write_calibrated_rig
+from calibration.result_files import compare, load_result, write_calibrated_rig
 from cdpr.cli.calibrate.output import CameraOption
 from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import err, show_facts, show_json
@@ -39,18 +37,7 @@ def diff(
     if as_json:
         show_json(found.as_dict())
     else:
-        title = f"{one.kind} {one.name}: from {one.date} to {other.date}"
-        facts = [("verdict", str(found)), ("next", found.next_step)]
-        facts += [
-            (
-                change.name,
-                f"{change.by:+.3g}, within {change.allowed:.2g} by chance"
-                f"{': CHANGED' if change.beyond else ''}",
-            )
-            for change in found.changes
-        ]
-        facts += [(name, "in one result only") for name in found.only_in_one]
-        show_facts(title, facts)
+        show_facts(f"{one.kind} {one.name}: from {one.date} to {other.date}", found.facts())
     if not found.agree:
         raise typer.Exit(3)
 
@@ -93,19 +80,10 @@ def apply(
 # `cdpr calibrate export` and `import`: camera files of OpenCV, ROS, Kalibr and mrcal.
 
 
-class FormatName(StrEnum):
-    """Formats of camera files."""
-
-    opencv = "opencv"
-    ros = "ros"
-    kalibr = "kalibr"
-    mrcal = "mrcal"
-
-
 def export(
     rig: RigArgument,
     output: Annotated[Path, typer.Option("-o", "--output", help="file to write")],
-    to: Annotated[FormatName, typer.Option(help="whose format")] = FormatName.opencv,
+    to: Annotated[FormatName, typer.Option(help="whose format")] = "opencv",
     camera: CameraOption = None,
     calibration: CalibrationOption = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
@@ -123,11 +101,11 @@ def export(
     loaded = calibrated_rig(load_rig(rig), calibration)
     document = camera_named(loaded.document, loaded.camera(camera).name)
     require_new_file(output, force)
-    write_atomic(output, FORMATS[to.value](document))
+    write_atomic(output, FORMATS[to](document))
     if as_json:
-        show_json({"file": str(output), "format": to.value, "camera": document.name})
+        show_json({"file": str(output), "format": to, "camera": document.name})
     else:
-        facts = [("camera", document.name), ("format", to.value), ("file", str(output))]
+        facts = [("camera", document.name), ("format", to), ("file", str(output))]
         show_facts("export", facts)
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from calibration.geometry.pose_selection import measurement_poses
-from calibration.procedures import RigOutcome, calibrate_rig
+from calibration.procedures import calibrate_rig
 from cdpr.cli.calibrate.output import NOWHERE, ResultOptions, WantedOption
 from cdpr.cli.options import (
     CalibrationOption,
@@ -155,8 +155,7 @@ class Deviations:
             "offsets": self.offsets_mm / 1e3,
             "stiffness": self.stiffness_percent / 1e2,
         }
-        fixed = {group.value for group in known}
-        return {group: size for group, size in deviations.items() if group not in fixed}
+        return {group: size for group, size in deviations.items() if group not in known}
 
 
 DRAWING = Deviations()
@@ -248,23 +247,4 @@ def rig(
         to=result.to,
         listener=result.listener,
     )
-    result.show(made, _facts(made))
-
-
-def _facts(made: RigOutcome) -> list[tuple[str, str]]:
-    """What was found beside the numbers, for people."""
-    result, quality = made.found, made.quality
-    what = "positions" if result.held_out.poses else "cables"
-    facts = [
-        (
-            "held out",
-            f"{what} RMS error at held-out samples {quality.held_out * 1e3:.3f} mm;"
-            f" with the rig file {quality.before * 1e3:.3f} mm; {len(result.measured)} samples",
-        ),
-        (
-            "in the workspace",
-            f"within {quality.level * 1e3:.2g} mm, rotated within {quality.turned * 1e3:.2g} mm"
-            " (95 %)",
-        ),
-    ]
-    return facts + [("not identified", line) for line in result.not_identified]
+    result.show(made)

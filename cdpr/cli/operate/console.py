@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -109,9 +106,7 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
         BadInput: The plan cannot be shown, or the address cannot be used.
     """
     try:
-        import uvicorn
-
-        from cdpr.console.server import ConsoleServer
+        from cdpr.console.server import run_server
     except ImportError as error:
         raise HardwareMissing(
             f"the console needs {error.name}",
@@ -121,35 +116,9 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
     shown = Console(files)
     if plan is not None:
         shown.load_plan(plan)
-    with _listening(host, port) as listener:
-        server = ConsoleServer(shown, host=host)
-        at = listener.getsockname()[1]
-        out.print(
-            f"console of {files.rig.name}: http://{host}:{at}/?token={server.token}", soft_wrap=True
-        )
+
+    def show_address(address: str) -> None:
+        out.print(f"console of {files.rig.name}: {address}", soft_wrap=True)
         out.print("Ctrl-C ends the console, not what moves", soft_wrap=True)
-        config = uvicorn.Config(server.app(), log_level="warning", ws_max_size=4096)
-        uvicorn.Server(config).run(sockets=[listener])
 
-
-@contextmanager
-def _listening(host: str, port: int) -> Iterator[socket.socket]:
-    """A socket for the pages.
-
-    Raises:
-        BadInput: The address cannot be used.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((host, port))
-            listener.listen(64)  # before the address is printed
-        except OSError as error:
-            raise BadInput(
-                f"cannot listen on {host}:{port}: {error.strerror or error}",
-                where="--port",
-                why="another program uses the port, or the address is not this machine's",
-                next_step="pass another --port, or 0 for a free one",
-            ) from None
-        yield listener
+    run_server(shown, host, port, show_address)

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.facts import show_forgotten, show_home, show_homing
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CalibrationOption,
@@ -22,7 +21,7 @@ from cdpr.cli.options import (
     rig_on_bus,
     with_option_groups,
 )
-from cdpr.cli.output import Terminal, out, show_json
+from cdpr.cli.output import Terminal, out, show_facts, show_json
 from executor import homing
 from executor.drives import is_simulated, require_own_time
 from executor.homing import (
@@ -151,19 +150,23 @@ def home(
         realtime=not fast,
         need_real_time_rights=not without_real_time,
         listener=Terminal(quiet=as_json),
-        confirm=confirmation(show_homing, asks=asks, as_json=as_json),
+        confirm=confirmation(asks=asks, as_json=as_json),
         supervisor=SignalSupervisor(),
     )
     if as_json:
         file = None if result.file is None else str(result.file)
         show_json({"file": file, **result.reference.model_dump(mode="json")})
     else:
-        show_home(result)
+        show_facts("drives homed; they hold", result.facts())
+        out.print(
+            "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`",
+            soft_wrap=True,
+        )
 
 
 def _use_rig_file_counts(rig: Rig, asks: bool, as_json: bool) -> None:
     """Drops the reference, so that the rig file's counts are the drives' again."""
-    confirm = confirmation(show_forgotten, asks=asks, as_json=as_json)
+    confirm = confirmation(asks=asks, as_json=as_json)
     homing.use_rig_file_counts(rig, confirm=confirm)
     if as_json:
         show_json({"file": None})

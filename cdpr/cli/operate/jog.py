@@ -14,7 +14,6 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
-from cdpr.cli.facts import show_cable, show_jogging
 from cdpr.cli.operate.keys import Keys, speed_by_key
 from cdpr.cli.operate.run import agreement, show, show_files
 from cdpr.cli.operate.supervision import RunSupervisor, SignalSupervisor, confirmation
@@ -221,7 +220,7 @@ def _held(
             speed=speed,
             need_real_time_rights=not without_real_time,
             listener=Terminal(quiet=False),
-            confirm=confirmation(show_jogging, asks=not (is_simulated(rig) or yes), as_json=False),
+            confirm=confirmation(asks=not (is_simulated(rig) or yes), as_json=False),
             supervisor=SignalSupervisor(),
             on_cycle=None if keys is None else keys.take_cycle,
         )
@@ -339,7 +338,7 @@ def _one_cable(
         realtime=not fast,
         need_real_time_rights=not without_real_time,
         listener=Terminal(quiet=as_json),
-        confirm=confirmation(show_cable, asks=not (is_simulated(rig) or yes), as_json=as_json),
+        confirm=confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json),
         supervisor=SignalSupervisor(),
     )
     moved_mm = done.moved * 1000.0

@@ -9,7 +9,7 @@ import sys
 import termios
 import tty
 
-from executor.operator_requests import FASTEST, SLOWEST
+from executor.supervision import FASTEST, SLOWEST
 from model.errors import BadInput
 
 _ONE = re.compile(rb"\x1b[\[O][0-9;]*[A-Za-z~]|.", re.DOTALL)

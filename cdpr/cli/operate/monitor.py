@@ -18,12 +18,20 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from cdpr.cli.facts import camera_line
 from cdpr.cli.operate.keys import Keys, speed_by_key
 from cdpr.cli.output import err, out, show_json
 from cdpr.console.view import RobotNow, RobotView
 from executor.recording.run_folder import RIG, RunFolder
-from executor.remote.client import follow_run, no_run, request_run, stop_runs
+from executor.remote.client import (
+    camera_line,
+    follow_run,
+    next_stop_line,
+    no_run,
+    request_run,
+    status_line,
+    status_text,
+    stop_runs,
+)
 from executor.remote.protocol import make_line
 from model.errors import CdprError
 from model.files.documents import write_atomic
@@ -97,7 +105,7 @@ def monitor(
         if as_json:
             show_json(status)
         else:
-            typer.echo(_plain(status))
+            typer.echo(status_text(status))
         return
     with _foxglove(foxglove) as stream:
         if as_json or not out.is_terminal:
@@ -148,7 +156,7 @@ def _lines(
                 if event not in seen:
                     typer.echo(f"{event['time_s']:9.3f} s  {event['code']}: {event['text']}")
             seen = status["events"]
-            typer.echo(_head(status))
+            typer.echo(status_line(status))
     except KeyboardInterrupt:
         return
     _tell_end(status, as_json)
@@ -248,52 +256,6 @@ def _tell_end(status: dict[str, Any], as_json: bool) -> None:
     raise typer.Exit(_EXIT_CODES.get(state, 1))
 
 
-def _head(status: dict[str, Any]) -> str:
-    """One line: where the run is."""
-    if status["cycle"] is None:
-        return f"{status['state']}  {status['rig']} on {status['bus']}"
-    parts = [
-        f"{status['elapsed_s']:9.3f} s",
-        status["state"],
-        _progress(status),
-        f"{status['feed_percent']:.0f} % of {status['wished']['speed_percent']} %",
-        _lateness(status),
-        f"following error {_number(status['following_error_mm'], '.3f')} mm",
-        f"{status['lost_replies']} lost replies",
-        f"{status['rejected_frames']} rejected, {status['error_frames']} error frames",
-    ]
-    return "  ".join(parts)
-
-
-def _progress(status: dict[str, Any]) -> str:
-    if status["path_mm"] is None:
-        return f"{status['row']:.0f} % done"
-    return f"{status['path_mm']:.1f} of {status['path_length_mm']:.1f} mm"
-
-
-def _lateness(status: dict[str, Any]) -> str:
-    if status["simulated_time"]:
-        return "simulated time"
-    return f"late {status['lateness_ms']:.2f} ms, at most {status['worst_lateness_ms']:.2f} ms"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)
-
-
-def _plain(status: dict[str, Any]) -> str:
-    """Everything as text without a terminal."""
-    drives = [
-        f"  drive {d['node']:<3} {d['state']:<24} {d['position_counts']:>11}"
-        f" ({d['position_counts'] - d['set_counts']:+d}) counts {d['tension_n']:8.2f} N"
-        for d in status["drives"]
-    ]
-    cameras = [f"  camera {camera_line(camera)}" for camera in status["cameras"]]
-    events = [f"  {e['time_s']:9.3f} s  {e['code']}: {e['text']}" for e in status["events"]]
-    first = f"process {status['process']}: {status['rig']} on {status['bus']}, {status['folder']}"
-    return "\n".join([first, _head(status), *drives, *cameras, *events])
-
-
 def _view(
     status: dict[str, Any],
     robot: tuple[RobotView, RobotNow] | None = None,
@@ -309,7 +271,8 @@ def _view(
         events.add_row(f"{event['time_s']:.2f} s", event["code"], Text(event["text"]))
     bar = Table.grid()
     bar.add_row(ProgressBar(total=status["rows"], completed=status["row"] or 0.0, width=60))
-    lines = [] if status["next_stop"] is None else [Text(_ahead(status["next_stop"]))]
+    ahead = next_stop_line(status)
+    lines = [Text(ahead)] if ahead else []
     if robot is not None:
         lines.append(Text(_where(*robot)))
     if status["events"]:
@@ -317,12 +280,8 @@ def _view(
     lines.append(Text(keys, style="dim"))
     cameras = Text("\n".join(f"  camera {camera_line(one)}" for one in status["cameras"]))
     limits = None if robot is None else (robot[0].rig.min_tension, robot[0].rig.max_tension)
-    return Group(title, Text(_head(status)), bar, *lines, _drives(status, limits), cameras, events)
-
-
-def _ahead(stop: dict[str, Any]) -> str:
-    seconds = "" if stop["seconds"] is None else f", {stop['seconds']:.1f} s"
-    return f"next: {stop['name']} in {stop['distance_mm']:.1f} mm{seconds}"
+    head, drives = Text(status_line(status)), _drives(status, limits)
+    return Group(title, head, bar, *lines, drives, cameras, events)
 
 
 def _where(view: RobotView, now: RobotNow) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
-from cdpr.cli.facts import show_missing, show_prepared, show_summary
 from cdpr.cli.operate.supervision import RunSupervisor, confirmation, say
 from cdpr.cli.options import (
     CalibrationOption,
@@ -23,14 +23,17 @@ from cdpr.cli.options import (
     require_unused,
     rig_on_bus,
 )
-from cdpr.cli.output import Terminal, out
+from cdpr.cli.output import Terminal, err, out, show_json
 from drivers.can_bus import IN_PROCESS
 from executor import runner
 from executor.drives import is_simulated
-from executor.runner import MotionProposal, RunResult
+from executor.proposals import MotionProposal
+from executor.runner import RunResult
 from model.errors import BadInput
 from model.plan import load_plan
 from model.rig import Rig
+
+COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
 
 
 def run(
@@ -121,7 +124,7 @@ def agreement(
     supervisor: RunSupervisor, rig: Rig, yes: bool, as_json: bool
 ) -> Callable[[MotionProposal], bool]:
     """A `confirm` callback after whose yes the signals are the run's."""
-    ask = confirmation(show_prepared, asks=not (is_simulated(rig) or yes), as_json=as_json)
+    ask = confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json)
 
     def confirm(proposal: MotionProposal) -> bool:
         agreed = ask(proposal)
@@ -134,7 +137,13 @@ def agreement(
 
 def show(result: RunResult, as_json: bool) -> None:
     """The verdict of a run."""
-    show_summary(result.summary, result.folder, as_json)
+    if as_json:
+        show_json({"run": str(result.folder), **result.summary})
+        return
+    verdict = f"[bold {COLOURS[result.verdict]}]{result.verdict}[/]"
+    out.print(f"{verdict} {escape(result.sentence)}", soft_wrap=True)
+    for line in result.details():
+        out.print(f"  {line}", markup=False, soft_wrap=True)
 
 
 def show_files(result: RunResult, as_json: bool) -> None:
@@ -142,7 +151,8 @@ def show_files(result: RunResult, as_json: bool) -> None:
     if result.report is not None and not as_json:
         line = f"report: {result.report}"
         say(lambda: out.print(line, markup=False, soft_wrap=True), result)
-    show_missing(result)
+    if missing := result.missing_text():
+        err.print(f"error: {missing}", markup=False, soft_wrap=True)
 
 
 def _simulated(rig: Rig, interface: str | None, channel: str | None) -> Rig:

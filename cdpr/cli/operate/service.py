@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
-from shlex import quote
 
-from cdpr.cli.facts import show_release, show_reset, show_status
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CalibrationOption,
@@ -18,9 +15,8 @@ from cdpr.cli.options import (
     WithoutRealTimeOption,
     rig_on_bus,
 )
-from cdpr.cli.output import Terminal, out, show_json
+from cdpr.cli.output import Terminal, out, show_facts, show_json
 from executor import service
-from executor.service import StatusResult
 
 
 def status(
@@ -44,24 +40,11 @@ def status(
     if as_json:
         show_json(result.as_dict())
     else:
-        show_status(the_rig, result, _next_step(rig, result))
+        show_facts("state of the rig", result.facts(rig))
+        for line in result.drive_lines(the_rig.drive_names):
+            out.print(f"  {line}", soft_wrap=True, markup=False)
     if result.missing is not None:
         raise result.missing
-
-
-def _next_step(rig: Path, seen: StatusResult) -> str:
-    """What has to be done before anything can run; nothing where all is well or a run goes on."""
-    if seen.run is not None or seen.being_set_up:
-        return ""
-    steps = []
-    if seen.latched is not None:
-        steps.append(
-            f"find the cause and check the platform, then run cdpr reset {quote(str(rig))}"
-        )
-    if not seen.reference.counts:
-        ways = "--at-home, --pose-mm X Y Z or --camera SOURCE"
-        steps.append(f"cdpr home {quote(str(rig))} with {ways}")
-    return "; then ".join(steps)
 
 
 # `cdpr reset`: the only way out of a latched fault.
@@ -87,7 +70,7 @@ def reset(
     the_rig = rig_on_bus(rig, interface, channel, calibration)
     result = service.reset(
         the_rig,
-        confirm=confirmation(show_reset, asks=not yes, as_json=as_json),
+        confirm=confirmation(asks=not yes, as_json=as_json),
         listener=Terminal(quiet=as_json),
     )
     if as_json:
@@ -127,7 +110,7 @@ def release(
         rig_on_bus(rig, interface, channel, calibration),
         need_real_time_rights=not without_real_time,
         listener=Terminal(quiet=as_json),
-        confirm=confirmation(show_release, asks=not yes, as_json=as_json),
+        confirm=confirmation(asks=not yes, as_json=as_json),
         supervisor=SignalSupervisor(),
     )
     if as_json:

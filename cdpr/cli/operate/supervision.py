@@ -12,43 +12,41 @@ from typing import Any, TypeVar
 
 from rich.console import Console
 
-from cdpr.cli.output import err, out
-from executor.operator_requests import RequestBoard
-from executor.supervision import Supervisor
+from cdpr.cli.output import err, out, show_facts
+from executor.proposals import Proposal
+from executor.supervision import RequestBoard, Supervisor
 from model.errors import BadInput
 
 _T = TypeVar("_T")
-_P = TypeVar("_P")
 
 #: A closed terminal (SIGHUP) must not leave the rig without its loop.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _GIVING_UP = b"\nleaving out what is not written yet; press Ctrl-C again to leave at once\n"
 
 
-def confirmation(
-    show: Callable[[_P, Console], None], *, asks: bool, as_json: bool
-) -> Callable[[_P], bool]:
+def confirmation(*, asks: bool, as_json: bool) -> Callable[[Proposal], bool]:
     """A `confirm` callback: shows what is about to happen, then asks.
 
     Args:
-        show: Shows it, on standard error where a program reads the other.
         asks: There is something to ask; False with ``--yes``.
-        as_json: Standard output is for a program.
+        as_json: Standard output is for a program, so that it is shown on standard error.
     """
 
-    def confirm(proposal: Any) -> bool:
-        show_before(show, proposal, asks=asks, as_json=as_json)
+    def confirm(proposal: Proposal) -> bool:
+        if asks or not as_json:
+            show_proposal(proposal, err if as_json else out)
         return not asks or has_agreed(proposal.question, proposal.otherwise)
 
     return confirm
 
 
-def show_before(
-    show: Callable[[_P, Console], None], proposal: _P, *, asks: bool, as_json: bool
-) -> None:
-    """Shows what is about to happen; arguments as for `confirmation`."""
-    if asks or not as_json:
-        show(proposal, err if as_json else out)
+def show_proposal(proposal: Proposal, on: Console) -> None:
+    """Shows what is about to happen."""
+    facts = proposal.facts()
+    if facts:
+        show_facts(proposal.title, facts, on)
+    else:
+        on.print(proposal.title, soft_wrap=True, markup=False)
 
 
 def has_agreed(question: str, otherwise: str) -> bool:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.errors import BadInput
-from model.statics.dexterity import condition_number, rms_anchor_radius
+from model.statics.wrench_sets import condition_number, rms_anchor_radius
 from tests.model.statics.robots import (
     PAPER_ANCHORS,
     PAPER_LENGTH,

@@ -11,9 +11,8 @@ from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
 from planner.anytime.local_search import Polyline
-from planner.anytime.prepare import problem_of
-from planner.anytime.problem import PathProblem
-from planner.anytime.rounds import advance, handle_of
+from planner.anytime.path import advance, handle_of
+from planner.anytime.problem import PathProblem, problem_of
 from planner.anytime.state import BEST, AnytimeSearch, new_search
 from planner.costs import KinematicCost
 from planner.endpoints import require_usable_ends

@@ -10,10 +10,8 @@ import pytest
 from benchmarks.planner.passages import Passage, passages
 from model.errors import NoSolution
 from model.pose import Pose
-from planner.anytime.path import best_path, optimal_route
-from planner.anytime.prepare import problem_of
-from planner.anytime.problem import PathProblem
-from planner.anytime.rounds import advance, handle_of
+from planner.anytime.path import advance, best_path, handle_of, optimal_route
+from planner.anytime.problem import PathProblem, problem_of
 from planner.anytime.state import new_search
 from planner.check import check_path
 from planner.costs import KinematicCost

@@ -12,8 +12,8 @@ import pytest
 
 from model.pose import Pose
 from model.scene import scene_from_document
+from planner.anytime.path import advance, handle_of
 from planner.anytime.problem import ASK_PROOF, LEAST_MARGIN, NO_MARGIN
-from planner.anytime.rounds import advance, handle_of
 from planner.anytime.state import BEST, KEPT, new_search
 from planner.check import check_path
 from planner.costs import capacity_margins

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from planner import array_cache as stored
+from planner.kernels import jit as stored
 
 KEY = ["rig", {"mass": 0.4}]
 

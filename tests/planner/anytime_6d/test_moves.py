@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from model.pose import Pose, interpolate
+from model.pose import Pose, RotationLimits, interpolate, largest_rotations
 from model.rig import Rig
-from model.rotation_limits import RotationLimits, largest_rotations
 from planner.anytime_6d.moves import (
     matrix_of,
     move_length,

@@ -15,7 +15,7 @@ from model.plan import load_plan, plan_facts, plan_from_document, save_plan
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, load_scene
-from model.statics.dexterity import rms_anchor_radius
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.anytime_6d.path import TurningRoute, turning_route
 from planner.check import check_path, verify
 from planner.costs import KinematicCost

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from model.files.scene_file import SceneDocument
-from model.geometry.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
 from model.kinematics import cables_at
 from model.pose import Array, Pose
 from model.rig import Rig, rig_from_document
 from model.scene import Scene, scene_from_document
+from model.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
 
 KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull", "convex mesh", "mesh")
 

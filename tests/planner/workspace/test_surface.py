@@ -7,10 +7,16 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from planner.workspace.grid import enclosed_volume, zero_surface
+from planner.workspace.grid import zero_surface
 
 AXES = tuple(np.linspace(-1.0, 1.0, n) for n in (33, 41, 29))
 POINTS = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1)
+
+
+def enclosed_volume(triangles):
+    """Volume within a closed surface of triangles, shape (t, 3, 3) (divergence theorem)."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return float(np.einsum("ki,ki->", a, np.cross(b, c)) / 6.0)
 
 
 def ball(radius):

@@ -14,9 +14,9 @@ from model.kinematics import structure_matrix
 from model.pose import Array, Pose
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
-from model.statics.dexterity import rms_anchor_radius
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import LoadArrays, build_load, load_at, margin_at

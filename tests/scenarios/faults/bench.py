@@ -24,11 +24,11 @@ import can
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.factory import make_drive_group
-from executor.operator_requests import LocalRequests
 from executor.recording.recorder import Recorder
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.status import RunStatus
 from executor.state_machine import State
+from executor.supervision import LocalRequests
 from executor.trajectory.prepare import PreparedRun
 from model.files.rig_file import Cia402Document
 from model.rig import Rig, rig_from_document

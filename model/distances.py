@@ -1,24 +1,25 @@
-"""Convex bodies and the distance between two of them: found by FCL, proved by a separating plane.
+"""Exact distances: of straight segments and boxes, many at once, and of two convex bodies.
 
-FCL's distances between convex shapes are right to round-off nearly always, and once in some
-thousand cases wrong by millimetres to the unsafe side. So no distance is taken on trust. The two
-points that FCL names give a direction, and along any direction the gap between the bodies' extents
-(their support functions, in closed form) can be no larger than the distance: a gap as large as
-FCL's distance proves it. Where the proof fails, the distance is computed again by a min-norm-point
-search (Wolfe), which has the same proof as its stopping rule.
+Distances of segments are in closed form. Those of convex bodies are found by FCL and proved by a
+separating plane: FCL's are right to round-off nearly always, and once in some thousand cases wrong
+by millimetres to the unsafe side. So no distance is taken on trust. The two points that FCL names
+give a direction, and along any direction the gap between the bodies' extents (their support
+functions, in closed form) can be no larger than the distance: a gap as large as FCL's distance
+proves it. Where the proof fails, the distance is computed again by a min-norm-point search (Wolfe),
+which has the same proof as its stopping rule.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
 import fcl
 import numpy as np
 
 from model.errors import Fault
-from model.geometry.shapes import (
+from model.pose import Array, Pose
+from model.shapes import (
     Box,
     Capsule,
     ConvexHull,
@@ -28,7 +29,101 @@ from model.geometry.shapes import (
     TriangleMesh,
     shape_points,
 )
-from model.pose import Array, Pose
+
+
+def segment_pair_points(
+    start_a: Array, end_a: Array, start_b: Array, end_b: Array
+) -> tuple[Array, Array]:
+    """The nearest points of pairs of segments, shape (..., 3) each, [m].
+
+    The nearest points are either inside both segments, where the joining line is perpendicular to
+    both, or at an end of one of them; all five cases are tried and the nearest is taken, so that
+    parallel and crossing segments need no tolerance.
+
+    Args:
+        start_a: Shape (..., 3), [m]; the others likewise.
+        end_a: Other end of the first segment.
+        start_b: Start of the second segment.
+        end_b: Other end of the second segment.
+    """
+    along_a, along_b, gap = end_a - start_a, end_b - start_b, start_a - start_b
+    aa, bb = _dot(along_a, along_a), _dot(along_b, along_b)
+    ab, ag, bg = _dot(along_a, along_b), _dot(along_a, gap), _dot(along_b, gap)
+    determinant = aa * bb - ab * ab
+    inner = _clamped_ratio(ab * bg - bb * ag, determinant)
+    zero, one = np.zeros_like(aa), np.ones_like(aa)
+    # Each case: a point of the first segment, and the point of the second nearest to it; then two
+    # ends of the second, and the point of the first nearest to them.
+    a = np.stack([inner, zero, one, _clamped_ratio(-ag, aa), _clamped_ratio(ab - ag, aa)])
+    to_inner, to_start, to_end = (_clamped_ratio(ab * s + bg, bb) for s in (inner, zero, one))
+    b = np.stack([to_inner, to_start, to_end, zero, one])
+    points_a = start_a + a[..., None] * along_a
+    points_b = start_b + b[..., None] * along_b
+    between = points_a - points_b
+    best = np.argmin(_dot(between, between), axis=0)[None, ..., None]
+    return np.take_along_axis(points_a, best, 0)[0], np.take_along_axis(points_b, best, 0)[0]
+
+
+def segment_box_points(start: Array, end: Array, half_size: Array) -> tuple[Array, Array]:
+    """The nearest points of segments and a box about the origin, shape (..., 3) each, [m].
+
+    Along a segment the squared distance to the box is convex and made of parabolas that meet where
+    the segment crosses the planes of the box's faces; each parabola is minimised exactly.
+
+    Args:
+        start: Frame of the box, shape (..., 3), [m].
+        end: Likewise.
+        half_size: Half extents of the box, shape (3,), [m].
+
+    Returns:
+        The points on the segments and in the box; the same point where they touch.
+    """
+    along = end - start
+    safe = np.where(along == 0.0, 1.0, along)
+    crossings = np.concatenate([(half_size - start) / safe, (-half_size - start) / safe], axis=-1)
+    moving = np.concatenate([along, along], axis=-1) != 0.0
+    crossings = np.clip(np.where(moving, crossings, 0.0), 0.0, 1.0)
+    knots = np.sort(np.concatenate([crossings, _ends(start)], axis=-1), axis=-1)
+    low, high = knots[..., :-1], knots[..., 1:]
+    middle = start[..., None, :] + ((low + high) / 2.0)[..., None] * along[..., None, :]
+    face = np.where(np.abs(middle) > half_size, np.sign(middle) * half_size, np.nan)
+    outside = np.isfinite(face)
+    offset = np.where(outside, start[..., None, :] - face, 0.0)
+    slope = np.where(outside, along[..., None, :], 0.0)
+    lowest = np.clip(_ratio(-_dot(offset, slope), _dot(slope, slope), low), low, high)
+    tried = np.concatenate([lowest, _ends(start)], axis=-1)
+    on_segment = start[..., None, :] + tried[..., None] * along[..., None, :]
+    in_box = np.clip(on_segment, -half_size, half_size)
+    between = on_segment - in_box
+    best = np.argmin(_dot(between, between), axis=-1)[..., None, None]
+    return (
+        np.take_along_axis(on_segment, best, -2)[..., 0, :],
+        np.take_along_axis(in_box, best, -2)[..., 0, :],
+    )
+
+
+def _ends(start: Array) -> Array:
+    return np.broadcast_to([0.0, 1.0], (*start.shape[:-1], 2))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    product: Array = np.einsum("...i,...i", a, b)
+    return product
+
+
+def _ratio(numerator: Array, denominator: Array, otherwise: Array) -> Array:
+    divisor = np.where(denominator > 0.0, denominator, 1.0)
+    ratio: Array = np.where(denominator > 0.0, numerator / divisor, otherwise)
+    return ratio
+
+
+def _clamped_ratio(numerator: Array, denominator: Array) -> Array:
+    clamped: Array = np.clip(_ratio(numerator, denominator, np.zeros_like(numerator)), 0.0, 1.0)
+    return clamped
+
+
+# Convex bodies, and the distance of two of them with a separating plane as its proof.
+
 
 #: A distance is proved when the separating plane leaves no more than this of it open, [m].
 PROOF_TOLERANCE = 1e-7
@@ -186,12 +281,6 @@ def _body_of_faces(points: Array, triangles: np.ndarray[Any, Any]) -> ConvexBody
     sides = (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return ConvexBody(points, 0.0, collision, _unit(normals), _unit(sides))
-
-
-@cache
-def _fan(count: int) -> Any:
-    """Triangles over ``count`` points as FCL wants them."""
-    return np.array([[3, 0, i, i + 1] for i in range(1, count - 1)]).ravel()
 
 
 def separation(first: ConvexBody, second: ConvexBody) -> Separation:

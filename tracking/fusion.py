@@ -1,16 +1,22 @@
-"""One pose from what several cameras measured at the same time."""
+"""One pose of the platform from several cameras, and from cameras and drives.
+
+Encoders give the pose every cycle, smoothly, but off by whatever cable lengths are off; a camera
+gives it now and then, where the platform truly is. So their difference is filtered: it changes
+slowly, as geometry errors change along the way. The fused pose is that of the drives, moved by it.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from model.pose import (
     Array,
     Pose,
+    interpolate,
     matrix_from_rotation_vector,
     read_only,
     rotation_vector_from_matrix,
@@ -21,8 +27,8 @@ from tracking.pose_log import LoggedPicture
 #: What lens, place and tags may make a camera's poses err by where that is not stated, and what is
 #: always allowed for, [m] and [rad].
 PLACE = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
-#: Cameras disagree when their poses differ by more (squared, in covariances) than one pair of true
-#: ones in ten thousand does.
+#: Poses that differ by more (squared, in covariances) disagree: of cameras, or of drives and a
+#: camera. One pair of true ones in ten thousand does.
 GATE = 27.9
 
 
@@ -118,9 +124,10 @@ def _apart(name: str, poses: Mapping[str, PoseMeasurement]) -> float:
     return float(np.median(distances)) if len(distances) > 1 else distances[0]
 
 
-def _between(from_: Pose, to: Pose) -> Array:
-    turn = rotation_vector_from_matrix(to.rotation @ from_.rotation.T)
-    return np.concatenate([to.position - from_.position, turn])
+def _between(first: Pose, second: Pose) -> Array:
+    """Shift [m] and turn [rad], world axes, that lead from one pose to the other, shape (6,)."""
+    turn = rotation_vector_from_matrix(second.rotation @ first.rotation.T)
+    return np.concatenate([second.position - first.position, turn])
 
 
 def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
@@ -212,3 +219,121 @@ def _is_nearer_to_the_next(queue: deque[LoggedPicture], time: float) -> bool:
 
 def _time(picture: LoggedPicture) -> float:
     return picture.observation.time
+
+
+# Drives and camera together.
+
+
+#: How fast the difference wanders: 0.3 mm and 0.05° in a second.
+WANDER = np.array([3e-4] * 3 + [np.radians(0.05)] * 3)
+#: What drives are off by from cycle to cycle, [m] and [rad].
+DRIVE_NOISE = np.array([5e-5] * 3 + [np.radians(0.01)] * 3)
+#: After this many outliers in a row it is the difference that is wrong.
+OUTLIERS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A pose that a camera measured.
+
+    Attributes:
+        time: [s].
+        pose: ``world_from_platform``.
+        covariance: Of position [m] and rotation vector [rad], world axes, shape (6, 6).
+    """
+
+    time: float
+    pose: Pose
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fused:
+    """A pose from both.
+
+    Attributes:
+        time: Of the drives' pose, [s].
+        pose: ``world_from_platform``.
+        covariance: As `Measured` has it.
+        age: Time since the last measurement that was used, [s].
+    """
+
+    time: float
+    pose: Pose
+    covariance: Array
+    age: float
+
+
+def fused(
+    times: Sequence[float], by_drives: Sequence[Pose], measured: Sequence[Measured]
+) -> Iterator[Fused]:
+    """Fused poses at the times of the drives, from the first measurement on.
+
+    Measurements are compared with the drives' pose at their own time, between two of their poses.
+
+    Args:
+        times: Of the drives' poses, rising, [s].
+        by_drives: ``world_from_platform`` of forward kinematics.
+        measured: In order of time; those before the drives' first pose are left out.
+    """
+    estimate: _Difference | None = None
+    waiting = [m for m in measured if times and times[0] <= m.time]
+    for number, (time, pose) in enumerate(zip(times, by_drives, strict=True)):
+        while waiting and waiting[0].time <= time:
+            one = waiting.pop(0)
+            there = _at(times, by_drives, number, one.time)
+            estimate = (
+                _Difference.first(one, there) if estimate is None else estimate.after(one, there)
+            )
+        if estimate is not None:
+            yield estimate.applied(pose, time)
+
+
+def _at(times: Sequence[float], poses: Sequence[Pose], number: int, time: float) -> Pose:
+    """The drives' pose at a time between that of ``number`` and the one before."""
+    if number == 0 or times[number] <= times[number - 1]:
+        return poses[number]
+    share = (time - times[number - 1]) / (times[number] - times[number - 1])
+    return interpolate(poses[number - 1], poses[number], share)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Difference:
+    """What leads from the drives' pose to the true one, as far as it is known at a time."""
+
+    time: float
+    mean: Array  # (6,)
+    covariance: Array  # (6, 6)
+    used: float  # time of the last measurement that was no outlier
+    outliers: int
+
+    @classmethod
+    def first(cls, measured: Measured, by_drives: Pose) -> _Difference:
+        covariance = measured.covariance + np.diag(DRIVE_NOISE**2)
+        mean = _between(by_drives, measured.pose)
+        return cls(measured.time, mean, covariance, measured.time, 0)
+
+    def after(self, measured: Measured, by_drives: Pose) -> _Difference:
+        """With a further measurement, unless it is an outlier."""
+        wandered = self._wandered(measured.time)
+        noise = measured.covariance + np.diag(DRIVE_NOISE**2)
+        new = _between(by_drives, measured.pose) - self.mean
+        spread = wandered + noise
+        if float(new @ np.linalg.solve(spread, new)) > GATE:
+            if self.outliers + 1 >= OUTLIERS:
+                return _Difference.first(measured, by_drives)
+            return _Difference(measured.time, self.mean, wandered, self.used, self.outliers + 1)
+        gain = np.linalg.solve(spread, wandered).T
+        covariance = (np.eye(6) - gain) @ wandered
+        covariance = (covariance + covariance.T) / 2.0
+        return _Difference(measured.time, self.mean + gain @ new, covariance, measured.time, 0)
+
+    def applied(self, by_drives: Pose, time: float) -> Fused:
+        """The drives' pose, moved by the difference."""
+        turn = matrix_from_rotation_vector(self.mean[3:])
+        pose = Pose(by_drives.position + self.mean[:3], turn @ by_drives.rotation)
+        covariance = self._wandered(time) + np.diag(DRIVE_NOISE**2)
+        return Fused(time, pose, read_only(covariance), time - self.used)
+
+    def _wandered(self, time: float) -> Array:
+        return np.asarray(self.covariance + np.diag(WANDER**2) * max(0.0, time - self.time))

@@ -1,0 +1,310 @@
+"""What is about to happen to a rig: the question to its operator, and the facts to decide by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+from drivers.can_bus import IN_PROCESS
+from executor.interlock.fault_latch import LatchedFault
+from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
+from model.errors import StoppedByOperator
+from model.pose import Pose
+from model.rig import Camera, Rig
+from model.scene import Scene
+
+if TYPE_CHECKING:
+    from executor.trajectory.prepare import PreparedRun  # loads the planner's check
+
+Facts = list[tuple[str, str]]
+"""Names and values for people."""
+
+
+class Proposal(Protocol):
+    """What is about to happen; a `confirm` callback shows it and answers its question.
+
+    Attributes:
+        question: Asked of the operator.
+        otherwise: What a no leaves, such as ``nothing was moved``.
+    """
+
+    question: ClassVar[str]
+    otherwise: ClassVar[str]
+
+    @property
+    def title(self) -> str:
+        """What is about to happen."""
+        ...
+
+    def facts(self) -> Facts:
+        """With what, and within which limits; none where the title says it all."""
+        ...
+
+
+def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal) -> None:
+    """Asks before anything moves or changes; without a callback the caller has decided.
+
+    Raises:
+        StoppedByOperator: The answer was no.
+    """
+    if confirm is not None and not confirm(proposal):
+        raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionProposal:
+    """A run that is about to move the platform; see `Proposal`.
+
+    Attributes:
+        prepared: The checked run.
+        cameras: Those that measure it, with their sources.
+        clearance_stop: Whether too little measured clearance stops it.
+    """
+
+    question: ClassVar[str] = "Move the platform now?"
+    otherwise: ClassVar[str] = "nothing was moved"
+    title: ClassVar[str] = "ready to run"
+
+    prepared: PreparedRun
+    cameras: Mapping[Camera, str]
+    clearance_stop: bool
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        prepared, scene = self.prepared, self.prepared.scene
+        rig, table = prepared.rig, prepared.checked.table
+        bus = rig.document.bus
+        simulated = ", simulated drives" if bus.interface == IN_PROCESS else ""
+        start, goal = scene.start.position * 1000, scene.goal.position * 1000
+        return [
+            ("rig, scene", f"{rig.name}, {scene.name}"),
+            ("from", f"{start[0]:z.1f}, {start[1]:z.1f}, {start[2]:z.1f} mm"),
+            ("to", f"{goal[0]:z.1f}, {goal[1]:z.1f}, {goal[2]:z.1f} mm"),
+            *scene.stop_facts(),
+            (
+                "motion",
+                f"{prepared.length * 1000:.1f} mm in {prepared.duration:.1f} s,"
+                f" at most {rig.motion.speed * 1000:g} mm/s",
+            ),
+            ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),
+            *self._reference(),
+            ("cameras", self._cameras()),
+            ("clearance stop", self._clearance()),
+            ("bus", f"{bus.interface} {bus.channel}{simulated}"),
+        ]
+
+    def _clearance(self) -> str:
+        """What stops the run when it comes too near to an obstacle, or why nothing does."""
+        scene = self.prepared.scene
+        if not self.clearance_stop:
+            return "off (--no-clearance-stop)"
+        if not self.cameras:
+            return "off (no camera)"
+        if not scene.obstacles:
+            return "off (no obstacles in the scene)"
+        return f"below {scene.obstacle_clearance * 1000:g} mm, measured by the cameras"
+
+    def _cameras(self) -> str:
+        """Which cameras look, and which of the rig file's do not."""
+        names = {camera.name for camera in self.cameras}
+        unused = [one.name for one in self.prepared.rig.cameras if one.name not in names]
+        used = ", ".join(f"{camera.name} ({source})" for camera, source in self.cameras.items())
+        parts = [used] if used else []
+        parts += [f"not used: {', '.join(unused)}"] if unused else []
+        return "; ".join(parts) or "none"
+
+    def _reference(self) -> Facts:
+        """Which reference the drives' counts are read by, where it is not the rig file's own."""
+        interlock = MotionInterlock(self.prepared.rig)
+        reference = interlock.kept_reference()
+        if reference is None:
+            return []
+        return [("reference", f"{reference.made}, {reference.how}; {interlock.file.path}")]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingProposal:
+    """A homing that is about to wind cables in; see `Proposal`.
+
+    Attributes:
+        rig: The robot.
+        target: Pretension, [N].
+        limit: Largest tension, [N].
+        reach: Largest length of a cable that is taken up, [m].
+        speed: Fastest winch, [m/s].
+        fastest: Winding in, which is slower where a drive reports late, [m/s].
+        camera: That measures the pose, and its source; None where the pose is stated.
+    """
+
+    question: ClassVar[str] = "Wind the cables in now?"
+    otherwise: ClassVar[str] = "nothing was moved"
+    title: ClassVar[str] = "ready to pretension"
+
+    rig: Rig
+    target: float
+    limit: float
+    reach: float
+    speed: float
+    fastest: float
+    camera: tuple[Camera, str] | None
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        eye, bus = self.camera, self.rig.document.bus
+        fastest, reach = self.fastest * 1000.0, self.reach * 1000.0
+        measured = f"measured, camera {eye[0].name} ({eye[1]})" if eye else "stated, held by a jig"
+        return [
+            ("rig", self.rig.name),
+            ("pretension", f"{self.target:g} N per cable, at most {self.limit:g} N"),
+            ("winches", f"all together, at most {fastest:.2f} mm/s and {reach:g} mm each"),
+            ("pose", measured),
+            ("bus", f"{bus.interface} {bus.channel}".strip()),
+        ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForgetProposal:
+    """A reference that is about to be given up; see `Proposal`.
+
+    Attributes:
+        interlock: Of the bus, whose reference it is.
+    """
+
+    question: ClassVar[str] = "Do all drive positions match the rig file?"
+    otherwise: ClassVar[str] = "the homing reference was not changed"
+
+    interlock: MotionInterlock
+
+    @property
+    def title(self) -> str:
+        """See `Proposal`."""
+        text = reference_status(self.interlock)
+        return f"the present homing reference, which is discarded: {text}"
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        return []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CableProposal:
+    """One winch that is about to move; see `Proposal`.
+
+    Attributes:
+        rig: The robot.
+        cable: Its number, from 1.
+        length: Paid out, [m]; negative is wound in.
+        limit: Largest tension of any cable, [N].
+        speed: Of the winch, [m/s].
+    """
+
+    question: ClassVar[str] = "Move this cable now?"
+    otherwise: ClassVar[str] = "nothing was moved"
+    title: ClassVar[str] = "ready to move one cable"
+
+    rig: Rig
+    cable: int
+    length: float
+    limit: float
+    speed: float
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        rig, mm, speed = self.rig, self.length * 1000.0, self.speed * 1000.0
+        limit = f"at most {self.limit:g} N in any cable; no taut cable may go slack"
+        return [
+            ("rig", rig.name),
+            ("cable", rig.drive_names[rig.winches[self.cable - 1].node_id]),
+            ("motion", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed:g} mm/s"),
+            ("tension", limit),
+        ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JogProposal:
+    """A session that is about to enable the drives; see `Proposal`.
+
+    Attributes:
+        rig: The robot; its motion has the jog speed.
+        scene: What is in the way.
+        start: Where the platform is, ``world_from_platform``.
+    """
+
+    question: ClassVar[str] = "Enable the drives for jogging now?"
+    otherwise: ClassVar[str] = "nothing was enabled"
+    title: ClassVar[str] = "ready to enable the drives for jogging"
+
+    rig: Rig
+    scene: Scene
+    start: Pose
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        x, y, z = self.start.position * 1000.0
+        fastest = self.rig.motion.speed * 1000
+        return [
+            ("rig", self.rig.name),
+            ("platform", f"at {x:.1f}, {y:.1f}, {z:.1f} mm"),
+            ("obstacles", ", ".join(one.name for one in self.scene.obstacles) or "none"),
+            ("motion", f"at most {fastest:g} mm/s, as long as a control is held"),
+        ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResetProposal:
+    """A fault that is about to be taken off; see `Proposal`.
+
+    Attributes:
+        bus: Interface and channel.
+        latched: What is latched, if anything.
+    """
+
+    question: ClassVar[str] = "Is the cause removed and the platform safe?"
+    otherwise: ClassVar[str] = "nothing was reset"
+
+    bus: str
+    latched: LatchedFault | None
+
+    @property
+    def title(self) -> str:
+        """See `Proposal`."""
+        fault = self.latched
+        cause = f"latched since {fault.since}: {fault.cause}" if fault else "no fault latched"
+        return f"bus {self.bus}: {cause}"
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        return []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReleaseProposal:
+    """Drives that are about to lose their torque; see `Proposal`.
+
+    Attributes:
+        rig: The robot.
+        bus: Interface and channel.
+        braked: Whether brakes hold the drums afterwards.
+        reference: Of the drives' counts, which is given up without brakes.
+    """
+
+    question: ClassVar[str] = "Is the platform supported, so that no cable carries it?"
+    otherwise: ClassVar[str] = "the drives hold as before"
+    title: ClassVar[str] = "ready to release the drives"
+
+    rig: Rig
+    bus: str
+    braked: bool
+    reference: ReferenceStatus
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        held = "the brakes hold the drums" if self.braked else "nothing holds the cables"
+        gone = "discarded: run `cdpr home` before the next motion"
+        return [
+            ("rig", self.rig.name),
+            ("bus", self.bus),
+            ("afterwards", held),
+            ("reference", str(self.reference) if self.braked else gone),
+        ]
