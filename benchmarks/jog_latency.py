@@ -26,8 +26,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from executor.hold_to_run.line import JogProver  # noqa: E402
 from executor.hold_to_run.presses import PressBoard  # noqa: E402
-from executor.hold_to_run.session import JogProver, jog_session  # noqa: E402
+from executor.hold_to_run.session import jog_session  # noqa: E402
 from executor.state_machine import CycleRecord, State  # noqa: E402
 from model.rig import Rig, load_rig  # noqa: E402
 from model.scene import load_scene  # noqa: E402

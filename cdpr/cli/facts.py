@@ -12,7 +12,7 @@ from rich.markup import escape
 from cdpr.cli.output import err, out, show_facts, show_json
 from drivers.can_bus import IN_PROCESS
 from executor.cameras.sources import describe_cameras
-from executor.hold_to_run.session import JogProposal
+from executor.hold_to_run.session import CablesProposal, JogProposal
 from executor.homing import ForgetProposal, HomeResult, HomingProposal
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
@@ -220,6 +220,24 @@ def show_jogging(proposal: JogProposal, on: Console) -> None:
             ("platform", f"at {x:.1f}, {y:.1f}, {z:.1f} mm"),
             ("obstacles", obstacles),
             ("motion", f"at most {rig.motion.speed * 1000:g} mm/s, as long as a control is held"),
+        ],
+        on,
+    )
+
+
+def show_cables(proposal: CablesProposal, on: Console) -> None:
+    """The drives that are about to be enabled for jogs of single cables."""
+    rig = proposal.rig
+    speed = f"at most {rig.motion.speed * 1000:g} mm/s, as long as a control is held"
+    show_facts(
+        "ready to enable the drives for jogs of single cables",
+        [
+            ("rig", rig.name),
+            ("cables", f"{rig.cable_count}, one at a time"),
+            ("motion", speed),
+            ("tension", f"at most {proposal.limit:g} N in any cable; no taut cable may go slack"),
+            ("not checked", "obstacles, workspace and the platform's pose"),
+            ("reference", "stays as it is; a run begins only where drive positions fit a pose"),
         ],
         on,
     )

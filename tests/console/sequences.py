@@ -23,8 +23,9 @@ import numpy as np
 
 from cdpr.console.commands import Held, LetGo, parse_message
 from cdpr.console.session import Console, ConsoleFiles
+from executor.hold_to_run.line import JogProver
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
-from executor.hold_to_run.session import JogProver, jog_session
+from executor.hold_to_run.session import jog_session
 from executor.state_machine import CycleRecord, State
 from model.clearance import ClearanceModel
 from model.errors import StoppedByOperator

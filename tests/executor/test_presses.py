@@ -120,7 +120,7 @@ def test_a_clock_that_jumps_back_holds_nothing(board: PressBoard, time: Time) ->
     assert PressReader(board.memory).read(time.now).press == 0
 
 
-@pytest.mark.parametrize("place", range(22))
+@pytest.mark.parametrize("place", range(32))
 def test_an_entry_that_is_half_written_does_not_count(board: PressBoard, place: int) -> None:
     hold(board, 1, percent=40)
     reader = PressReader(board.memory)
