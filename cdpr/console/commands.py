@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from executor.operator_requests import FASTEST, SLOWEST
-from executor.remote.protocol import STEPS_MM, Number, Share
+from executor.remote.protocol import (
+    Cable,
+    Frame,
+    Number,
+    Sense,
+    Share,
+    require_one_motion,
+    require_step,
+)
 
 #: Longest message, [bytes].
 LONGEST = 4096
@@ -40,7 +47,10 @@ class PlainCommand(_Command):
         "release",
         "run",
         "jog_begin",
+        "cable_begin",
         "jog_end",
+        "service_begin",
+        "service_end",
     ]
 
 
@@ -119,22 +129,22 @@ class IndexCommand(_Command):
 
 
 class Held(_Said):
-    """A jog control is held."""
+    """A jog control is held: of the platform, with a direction, or of one cable, with a sense."""
 
     kind: Literal["held"]
     hold: Number
-    direction: Annotated[list[Share], Field(min_length=3, max_length=3)]
-    frame: Literal["world", "platform"]
+    direction: Annotated[list[Share], Field(min_length=3, max_length=3)] | None = None
+    frame: Frame | None = None
+    cable: Cable | None = None
+    sense: Sense | None = None
     step_mm: float | None
     speed_mm_s: Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
     seq: int
 
     @model_validator(mode="after")
     def _possible(self) -> Held:
-        if math.hypot(*self.direction) < 1e-3:
-            raise ValueError("the direction is zero")
-        if self.step_mm is not None and self.step_mm not in STEPS_MM:
-            raise ValueError("no such step")
+        require_one_motion(self.direction, self.frame, self.cable, self.sense)
+        require_step(self.step_mm)
         return self
 
 

@@ -30,6 +30,8 @@ class PageControl:
         self._next_page, self._last_press = 1, 0
         self.holder: int | None = None
         """The page that has control."""
+        self.is_service = False
+        """That page is in service mode."""
 
     def join(self, host: str) -> int:
         """A page was opened on a computer; its number."""
@@ -42,7 +44,7 @@ class PageControl:
         held = self.let_go(page)
         del self._pages[page]
         if self.holder == page:
-            self.holder = None
+            self._free()
         return held
 
     def take(self, page: int, *, moving: bool, force: bool = False) -> str:
@@ -60,6 +62,7 @@ class PageControl:
                 when = " while the robot moves" if moving and force else ""
                 return f"{holder} has control; it is not taken away{when}"
             self.let_go(self.holder)
+            self._free()
         self.holder = page
         return ""
 
@@ -67,8 +70,24 @@ class PageControl:
         """A page gives its control back; the press that it held ends."""
         held = self.let_go(page)
         if self.holder == page:
-            self.holder = None
+            self._free()
         return held
+
+    def _free(self) -> None:
+        self.holder, self.is_service = None, False
+
+    def set_service(self, page: int, on: bool) -> int | None:
+        """The page that has control enters or leaves service mode; the press that it held ends."""
+        held = self.let_go(page)
+        if self.holder == page:
+            self.is_service = on
+        return held
+
+    def mode(self, page: int) -> str:
+        """What a page may do: ``observe``, ``operate`` or ``service``."""
+        if self.holder != page:
+            return "observe"
+        return "service" if self.is_service else "operate"
 
     def holder_name(self) -> str | None:
         """Who has control."""

@@ -23,9 +23,7 @@ from executor.drives import (
     unreferenced_drives_of,
 )
 from executor.hold_to_run.cables import CableMotion, CableTravel
-from executor.hold_to_run.line import (
-    PieceRing,
-)
+from executor.hold_to_run.line import JogProver, PieceRing
 from executor.hold_to_run.loop import JogMotion
 from executor.hold_to_run.presses import PressBoard
 from executor.interlock.interlock import MotionInterlock
