@@ -72,8 +72,8 @@ def test_nothing_is_possible_outside_service_mode(desk: Visit) -> None:
 
 @pytest.mark.parametrize("homed", [True, False])
 def test_what_it_means_for_the_reference_is_said_before(desk: Visit, homed: bool) -> None:
-    desk.fake.ask(set={"homed": homed, "service": True})
     desk.take_control()
+    desk.fake.ask(set={"homed": homed, "service": True})
     desk.view("service")
     desk.page.locator("#cable-begin").click()
     text = "the reference stays" if homed else "are not homed, and are not by this"
