@@ -114,8 +114,8 @@ function showCable({ cable: jog, tensions_n: tensions, tension_limits_n: [low, h
   write(at("cable-tension"), number ? `Cable ${number}: ${known(tension, 1, "N")}` : "No cable is known yet");
   write(at("cable-range"), `slack below ${known(low / 2, 1, "N")}, limit ${known(limit, 0, "N")}`);
   const sense = (mm) => (Math.abs(mm) < 0.0005 ? "not moved" : `${known(Math.abs(mm), 3, "mm")} ${mm > 0 ? "paid out" : "wound in"}`);
-  const own = jog.cable === number && jog.press_mm !== null ? `By this press ${sense(jog.press_mm)}` : "By this press –";
-  write(at("cable-way"), jog.session_mm && number ? `${own} · since the session began ${sense(jog.session_mm[number - 1])}` : "");
+  const own = jog.cable === number ? `By this press ${sense(jog.press_mm)} · since` : "Since";
+  write(at("cable-way"), jog.ready && number ? `${own} the session began ${sense(jog.session_mm[number - 1])}` : "");
   showPad("cable", jog, jog.ready ? (jog.moving ? `Cable ${jog.cable} is held` : "Ready: hold a button to move the cable") : jog.why_not || "The drives are not enabled");
 }
 

@@ -87,7 +87,7 @@ export class Operate {
     at("take-control").hidden = control.yours;
     at("give-control").hidden = !control.yours;
     const isService = control.mode === "service";
-    write(at("service-text"), isService ? "This page is in service mode: single cables can be jogged." : "For commissioning, by somebody who stands beside the robot.");
+    write(at("service-text"), isService ? "In service mode." : "For commissioning, beside the robot.");
     at("service-begin").hidden = isService;
     at("service-end").hidden = !isService;
     at("latched").hidden = latched === null;
