@@ -101,6 +101,8 @@ class TensionReserve:
     def share(self, tensions: Sequence[float]) -> float:
         """Of its speed at which it goes on, by the tensions [N] now; 0 where it must not."""
         now = np.asarray(tensions, dtype=np.float64)
+        if not np.isfinite(now).all():
+            return 0.0
         if self._before is None:
             self._before = now
         change, range_ = now - self._before, self._ceiling - self._slack
@@ -110,8 +112,7 @@ class TensionReserve:
         slacker = self._is_other & (self._before >= self._slack) & (change < -self._unchanged)
         below = float(np.min(now[slacker] - self._floor, initial=np.inf))
         room = min(above, below) / range_
-        # "Not above", so that a tension that is no number leaves no room.
-        return 0.0 if not room > 0.0 or not np.isfinite(now).all() else min(1.0, max(CREEP, room))
+        return min(1.0, max(CREEP, room)) if room > 0.0 else 0.0
 
 
 def tension_reserve(rig: Rig, limit: float) -> float:

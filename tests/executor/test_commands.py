@@ -326,7 +326,7 @@ def test_any_other_motion_takes_no_jogs(command: str) -> None:
     assert "takes no jogs" in _said(None, command=command, **values[command])["what"]
 
 
-class _Presses:
+class _Noted:
     """Notes what is said of presses; a cable 9 is not there."""
 
     def __init__(self) -> None:
@@ -349,20 +349,20 @@ class _Presses:
         self.said.append("end")
 
 
-def _jog(**values: Any) -> tuple[dict[str, Any], list[Any]]:
-    presses = _Presses()
+def _held(**values: Any) -> tuple[dict[str, Any], list[Any]]:
+    presses = _Noted()
     line = make_line("held", **values)
     return json.loads(answer_to(line, LocalRequests(), STATUS, presses)), presses.said
 
 
 def test_a_held_control_moves_the_platform_or_one_cable():
-    answer, said = _jog(press=1, direction=[0, 0, 2 / 3], frame="platform", step_mm=1.0)
+    answer, said = _held(press=1, direction=[0, 0, 2 / 3], frame="platform", step_mm=1.0)
     assert answer["ok"]
     assert said == [(1, [0, 0, 1], {"in_platform": True, "step": 0.001, "percent": 100})]
-    answer, said = _jog(press=2, cable=3, sense="pay_out", percent=7)
+    answer, said = _held(press=2, cable=3, sense="pay_out", percent=7)
     assert answer["ok"]
     assert said == [(2, 3, {"pays_out": True, "step": None, "percent": 7})]
-    assert _jog(press=2, cable=3, sense="wind_in")[1][0][2]["pays_out"] is False
+    assert _held(press=2, cable=3, sense="wind_in")[1][0][2]["pays_out"] is False
 
 
 @pytest.mark.parametrize(
@@ -382,7 +382,7 @@ def test_a_held_control_moves_the_platform_or_one_cable():
     ],
 )
 def test_a_held_control_that_moves_neither_is_refused(values, part):
-    answer, said = _jog(**{"press": 1, **values})
+    answer, said = _held(**{"press": 1, **values})
     assert answer["ok"] is False
     assert part in answer["what"]
     assert said == [] or values.get("press") == 13

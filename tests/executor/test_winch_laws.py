@@ -242,7 +242,7 @@ def test_winding_in_rests_from_the_reserve_on_whichever_cable_is_tight(cable):
     assert share(one(cable, CEILING - 0.01), out=False) == pytest.approx(0.05)
     middle = (CEILING + SLACK) / 2.0
     assert share(one(cable, middle), out=False) == pytest.approx(0.5, abs=0.01)
-    assert share(one(cable, SLACK), out=False, before=SLACK) == 1.0
+    assert share(SLACK, out=False, before=SLACK) == 1.0
 
 
 def test_paying_out_goes_on_as_long_as_no_other_cable_becomes_tighter():
