@@ -282,7 +282,15 @@ class Sequences:
 
     def _join(self) -> None:
         base = self._random.choice((1, 1_000, 1_700_000_000_000))  # its clock jumped
-        self._pages.append(PageAtHand(self.console.control.join("test"), base))
+        page = PageAtHand(self.console.control.join("test"), base)
+        page.motion = self._motion()
+        self._pages.append(page)
+
+    def _motion(self) -> dict[str, object]:
+        if not self._cables:
+            return {"direction": self._random.choice(DIRECTIONS), "frame": "world"}
+        sense = self._random.choice(("wind_in", "pay_out"))
+        return {"cable": self._random.randint(1, 8), "sense": sense}
 
     # What happens.
 
@@ -291,10 +299,7 @@ class Sequences:
             return
         self.figures.presses += 1
         page.hold += 1
-        page.motion = {"direction": self._random.choice(DIRECTIONS), "frame": "world"}
-        if self._cables:
-            sense = self._random.choice(("wind_in", "pay_out"))
-            page.motion = {"cable": self._random.randint(1, 8), "sense": sense}
+        page.motion = self._motion()
         page.step = self._random.choice((None, None, None, 0.1, 1.0, 10.0))
         page.speed = self._random.choice((1.0, 5.0, 20.0, 900.0))
         page.pressed, page.silent = True, 0
@@ -316,6 +321,8 @@ class Sequences:
 
     def _take(self, page: PageAtHand) -> None:
         self._command(page, "take_control", force=self._random.random() < 0.5)
+        if self._cables and self._random.random() < 0.8:
+            self._change_mode(page, "service_begin")
 
     def _give(self, page: PageAtHand) -> None:
         self._release(page)
@@ -354,10 +361,12 @@ class Sequences:
     def _service(self, page: PageAtHand) -> None:
         """In and out of service mode, which ends what the page holds, and out of it the session."""
         enters = not self._cables or self._random.random() < 0.95
-        is_refused = self._command(page, "service_begin" if enters else "service_end")
-        if not is_refused:
+        self._change_mode(page, "service_begin" if enters else "service_end")
+
+    def _change_mode(self, page: PageAtHand, command: str) -> None:
+        if not self._command(page, command):
             self._release(page)
-            page.is_over |= page.pressed
+            page.is_over |= page.pressed and page.had_control
 
     def _feed(self, page: PageAtHand) -> None:
         self._command(page, "speed", percent=self._random.choice((1, 50, 100)))
@@ -401,7 +410,10 @@ def open_files() -> set[str]:
 def children() -> set[str]:
     """Processes that this one started and that are there still."""
     tasks = Path("/proc/self/task")
-    found = " ".join((task / "children").read_text() for task in tasks.iterdir())
+    found = ""
+    for task in tasks.iterdir():
+        with suppress(OSError):  # a thread that ended meanwhile
+            found += (task / "children").read_text()
     return {f"process {number}" for number in found.split()}
 
 

@@ -93,7 +93,6 @@ HELD = ("--hold-to-run", "--one-cable")
         (("--one-cable",), 2, "--one-cable needs --hold-to-run"),
         ((*HELD, "--keys"), 2, "without --keys"),
         ((*HELD, "--limit-n", "101"), 3, "limit of 101 N"),
-        ((*HELD, "--speed-mm-s", "21"), 2, "20"),
         ((*HELD, *WAY), 2, "no effect here: --by-mm"),
         ((*HELD, "--no-scene"), 2, "no effect here: --no-scene"),
         ((*HELD, "--fast"), 2, "no effect here: --fast"),
