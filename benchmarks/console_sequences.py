@@ -1,6 +1,6 @@
 """Random sequences of what happens at consoles, against a session of jogs in simulated time.
 
-    python benchmarks/console_sequences.py [--count 100000] [--seed 1]
+    python benchmarks/console_sequences.py [--count 100000] [--seed 1] [--cables]
 
 What happens, and how each cycle is judged, is in `tests/console/sequences.py`. Prints what was done
 and what was wrong; exit code 1 if anything was. 100 000 sequences take hours.
@@ -27,10 +27,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cables", action="store_true", help="sessions of single cables")
     options = parser.parse_args()
     with alone():
         began = time.monotonic()
-        figures = sequences(options.count, options.seed)
+        figures = sequences(options.count, options.seed, cables=options.cables)
         seconds = time.monotonic() - began
     print(figures.report())
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

@@ -1,8 +1,10 @@
 """Jogging by hold-to-run in real time over UDP: from a press to the first set-point, and to rest.
 
     python benchmarks/jog_latency.py [--presses 60] [--scene configs/environment_1.yaml]
+    python benchmarks/jog_latency.py --one-cable [--presses 60]
 
-Presses go by turns along both directions of each axis, held for 0.6 s. Measured on the loop's clock
+Presses go by turns along both directions of each axis, held for 0.6 s; or they wind each cable in
+and pay it out again, on the taut platform. Measured on the loop's clock
 are the time from the first word of a press to the first cycle that sends other targets, and from
 the release to the last one, which includes the ramp from 20 mm/s. Not a test: it takes minutes.
 """
@@ -27,14 +29,15 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from executor.hold_to_run.presses import PressBoard  # noqa: E402
-from executor.hold_to_run.session import JogProver, jog_session  # noqa: E402
+from executor.hold_to_run.session import cable_session, jog_session  # noqa: E402
 from executor.state_machine import CycleRecord, State  # noqa: E402
 from model.rig import Rig, load_rig  # noqa: E402
 from model.scene import load_scene  # noqa: E402
 from tests.cli.plans import RIG  # noqa: E402
 
 HELD, PAUSE, SAID = 0.6, 0.9, 0.05
-CHANNEL = "239.74.163.91"
+#: Of this process alone: another one may measure, too.
+CHANNEL = f"239.74.163.91:{20000 + os.getpid() % 20000}"
 
 
 @dataclass
@@ -42,6 +45,7 @@ class Operator:
     """Holds a control by turns, in a thread of its own, and keeps when."""
 
     presses: int
+    one_cable: bool
     spans: list[tuple[float, float]] = field(default_factory=list)
     moved: list[float] = field(default_factory=list)
     lateness: list[float] = field(default_factory=list)
@@ -49,7 +53,7 @@ class Operator:
     _last: tuple[int, ...] = ()
     _thread: threading.Thread | None = None
 
-    def on_cycle(self, record: CycleRecord, board: PressBoard, _: JogProver) -> None:
+    def on_cycle(self, record: CycleRecord, board: PressBoard, _: object) -> None:
         """Begins when the drives are ready; keeps the times of cycles with other targets."""
         if record.state is not State.MOVING:
             return
@@ -64,18 +68,25 @@ class Operator:
     def _hold(self, board: PressBoard) -> None:
         time.sleep(1.0)
         for number in range(1, self.presses + 1):
-            direction = np.zeros(3)
-            direction[(number - 1) // 2 % 3] = 1.0 if number % 2 else -1.0
             began = time.monotonic()
             while time.monotonic() < began + HELD:
-                taken = board.hold(number, direction, in_platform=False, step=None, percent=100)
-                self.silent += not taken
+                self.silent += not self._say(board, number)
                 time.sleep(SAID)
             ended = time.monotonic()
             board.let_go(number)
             self.spans.append((began, ended))
             time.sleep(PAUSE)
         board.end()
+
+    def _say(self, board: PressBoard, number: int) -> bool:
+        """One word of a press: odd ones go forth or wind in, even ones back or pay out."""
+        turn, is_even = (number - 1) // 2, number % 2 == 0
+        if self.one_cable:
+            cable = 1 + turn % 8
+            return board.hold_cable(number, cable, pays_out=is_even, step=None, percent=100)
+        direction = np.zeros(3)
+        direction[turn % 3] = -1.0 if is_even else 1.0
+        return board.hold(number, direction, in_platform=False, step=None, percent=100)
 
 
 @contextmanager
@@ -102,19 +113,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--presses", type=int, default=60)
     parser.add_argument("--scene", type=Path, default=ROOT / "configs" / "environment_1.yaml")
+    parser.add_argument("--one-cable", action="store_true", help="one cable, not the platform")
     options = parser.parse_args()
     rig: Rig = load_rig(RIG).with_bus("udp_multicast", CHANNEL)
-    operator = Operator(options.presses)
+    operator = Operator(options.presses, options.one_cable)
     with tempfile.TemporaryDirectory() as place:
         os.environ["XDG_STATE_HOME"] = place
         os.chdir(place)
         with drives():
-            jog_session(
-                rig,
-                load_scene(options.scene),
-                need_real_time_rights=False,
-                on_cycle=operator.on_cycle,
-            )
+            if options.one_cable:
+                cable_session(rig, need_real_time_rights=False, on_cycle=operator.on_cycle)
+            else:
+                jog_session(
+                    rig,
+                    load_scene(options.scene),
+                    need_real_time_rights=False,
+                    on_cycle=operator.on_cycle,
+                )
     moved = np.array(operator.moved)
     first, rest, lost = [], [], 0
     for began, ended in operator.spans:

@@ -205,14 +205,14 @@ def _happens_by_itself(_load: Load) -> None:
 
 
 def drives_of(
-    document: RigDocument, simulated_start: Pose, load: Load
+    document: RigDocument, simulated_start: Pose, load: Load, listener: Listener = SILENT
 ) -> AbstractContextManager[ReadyDrives]:
     """`open_drives` for a process of its own: takes what can be sent there.
 
     What the drives cannot do is in `ReadyDrives.remarks`, for the listener of the process that
-    asked for them.
+    asked for them; the one given here is for a call in this process.
     """
-    return open_drives(rig_from_document(document), simulated_start, load)
+    return open_drives(rig_from_document(document), simulated_start, load, listener=listener)
 
 
 def unreferenced_drives_of(

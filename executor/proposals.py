@@ -308,3 +308,33 @@ class ReleaseProposal:
             ("afterwards", held),
             ("reference", str(self.reference) if self.braked else gone),
         ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CablesProposal:
+    """A session of single cables that is about to enable the drives; see `Proposal`.
+
+    Attributes:
+        rig: The robot; its motion has the jog speed.
+        limit: Largest tension of any cable, [N].
+    """
+
+    question: ClassVar[str] = "Enable the drives to jog one cable at a time now?"
+    otherwise: ClassVar[str] = "nothing was enabled"
+    title: ClassVar[str] = "ready to enable the drives for jogs of single cables"
+
+    rig: Rig
+    limit: float
+
+    def facts(self) -> Facts:
+        """See `Proposal`."""
+        rig = self.rig
+        speed = f"at most {rig.motion.speed * 1000:g} mm/s, as long as a control is held"
+        return [
+            ("rig", rig.name),
+            ("cables", f"{rig.cable_count}, one at a time"),
+            ("motion", speed),
+            ("tension", f"at most {self.limit:g} N in any cable; no taut cable may go slack"),
+            ("not checked", "obstacles, workspace and the platform's pose"),
+            ("reference", "stays as it is; a run begins only where drive positions fit a pose"),
+        ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -15,8 +15,8 @@ from executor.drives import is_simulated, left_alone, unreferenced_drives_of
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
-from executor.realtime.clock import SimulatedClock
-from executor.realtime.job import Armed, Ended
+from executor.realtime.clock import Clock, SimulatedClock
+from executor.realtime.job import Armed, Ended, MotionTask, ReadyDrives
 from executor.realtime.process import RealTimeProcess, real_time_process
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.run_course import free_folder
@@ -186,29 +186,57 @@ def _supervised(
     return stand
 
 
-@contextmanager
-def _mover(motion: WinchMotion, board: LocalRequests | SharedRequests) -> Iterator[WinchMover]:
-    """In real time the drives are opened and moved in a process of its own."""
-    document, listener = motion.rig.document, motion.listener
-    cycle = document.bus.cycle_ms / 1000.0
-    law = LawMotion(motion.rig.cable_count, cycle, motion.make_law, motion.limit, motion.speed)
-    make_drives = partial(
-        unreferenced_drives_of, document, motion.pose, motion.limit, motion.lost_power
+def _mover(
+    motion: WinchMotion, board: LocalRequests | SharedRequests
+) -> AbstractContextManager[WinchMover]:
+    rig = motion.rig
+    cycle = rig.document.bus.cycle_ms / 1000.0
+    return winch_mover(
+        rig,
+        LawMotion(rig.cable_count, cycle, motion.make_law, motion.limit, motion.speed),
+        partial(unreferenced_drives_of, rig.document, motion.pose, motion.limit, motion.lost_power),
+        board,
+        clock=SimulatedClock(cycle),
+        need_real_time_rights=motion.need_real_time_rights,
+        listener=motion.listener,
     )
+
+
+@contextmanager
+def winch_mover(
+    rig: Rig,
+    task: MotionTask,
+    make_drives: Callable[..., AbstractContextManager[ReadyDrives]],
+    board: LocalRequests | SharedRequests,
+    *,
+    clock: Clock,
+    need_real_time_rights: bool,
+    listener: Listener,
+) -> Iterator[WinchMover]:
+    """What moves winches: in real time the drives are opened and moved in a process of its own.
+
+    Args:
+        rig: The robot and its bus.
+        task: What is done with the drives.
+        make_drives: Opens them; takes a `listener` where it is called in this process.
+        board: Of operator requests.
+        clock: In simulated time.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
+        listener: Receives progress.
+    """
     if isinstance(board, LocalRequests):
         with make_drives(listener=listener) as drives:
-            yield WinchesHere(law, drives, SimulatedClock(cycle), board)
+            yield WinchesHere(task, drives, clock, board)
         return
-    simulated = is_simulated(motion.rig)
+    simulated = is_simulated(rig)
     if simulated:
         ready_for_simulating_process(listener)
-    needed = motion.need_real_time_rights and not simulated
     with real_time_process(
-        law,
+        task,
         make_drives,
         board,
-        need_real_time=needed,
-        look_again=partial(left_alone, document),
+        need_real_time=need_real_time_rights and not simulated,
+        look_again=partial(left_alone, rig.document),
         listener=listener,
     ) as process:
         yield process

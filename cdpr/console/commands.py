@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from executor.remote.protocol import STEPS_MM, Number, Share
+from executor.remote.protocol import (
+    Cable,
+    Frame,
+    Number,
+    Sense,
+    Share,
+    require_one_motion,
+    require_step,
+)
 from executor.supervision import FASTEST, SLOWEST
 
 #: Longest message, [bytes].
@@ -42,7 +49,10 @@ class PlainCommand(_Command):
         "release",
         "run",
         "jog_begin",
+        "cable_begin",
         "jog_end",
+        "service_begin",
+        "service_end",
     ]
 
 
@@ -121,22 +131,22 @@ class IndexCommand(_Command):
 
 
 class Held(_Said):
-    """A jog control is held."""
+    """A jog control is held: of the platform, with a direction, or of one cable, with a sense."""
 
     kind: Literal["held"]
     hold: Number
-    direction: Annotated[list[Share], Field(min_length=3, max_length=3)]
-    frame: Literal["world", "platform"]
+    direction: Annotated[list[Share], Field(min_length=3, max_length=3)] | None = None
+    frame: Frame | None = None
+    cable: Cable | None = None
+    sense: Sense | None = None
     step_mm: float | None
     speed_mm_s: Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
     seq: int
 
     @model_validator(mode="after")
     def _possible(self) -> Held:
-        if math.hypot(*self.direction) < 1e-3:
-            raise ValueError("the direction is zero")
-        if self.step_mm is not None and self.step_mm not in STEPS_MM:
-            raise ValueError("no such step")
+        require_one_motion(self.direction, self.frame, self.cable, self.sense)
+        require_step(self.step_mm)
         return self
 
 
@@ -212,6 +222,8 @@ class PageControl:
         self._next_page, self._last_press = 1, 0
         self.holder: int | None = None
         """The page that has control."""
+        self.is_service = False
+        """That page is in service mode."""
 
     def join(self, host: str) -> int:
         """A page was opened on a computer; its number."""
@@ -224,7 +236,7 @@ class PageControl:
         held = self.let_go(page)
         del self._pages[page]
         if self.holder == page:
-            self.holder = None
+            self._free()
         return held
 
     def take(self, page: int, *, moving: bool, force: bool = False) -> str:
@@ -242,6 +254,7 @@ class PageControl:
                 when = " while the robot moves" if moving and force else ""
                 return f"{holder} has control; it is not taken away{when}"
             self.let_go(self.holder)
+            self._free()
         self.holder = page
         return ""
 
@@ -249,8 +262,24 @@ class PageControl:
         """A page gives its control back; the press that it held ends."""
         held = self.let_go(page)
         if self.holder == page:
-            self.holder = None
+            self._free()
         return held
+
+    def _free(self) -> None:
+        self.holder, self.is_service = None, False
+
+    def set_service(self, page: int, on: bool) -> int | None:
+        """The page that has control enters or leaves service mode; the press that it held ends."""
+        held = self.let_go(page)
+        if self.holder == page:
+            self.is_service = on
+        return held
+
+    def mode(self, page: int) -> str:
+        """What a page may do: ``observe``, ``operate`` or ``service``."""
+        if self.holder != page:
+            return "observe"
+        return "service" if self.is_service else "operate"
 
     def holder_name(self) -> str | None:
         """Who has control."""

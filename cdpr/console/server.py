@@ -227,7 +227,11 @@ class ConsoleServer:
                     await self._news.wait()
                 seen = self._seq
             control = self._console.control
-            own = {"yours": control.holder == number, "held_by": control.holder_name()}
+            own = {
+                "yours": control.holder == number,
+                "held_by": control.holder_name(),
+                "mode": control.mode(number),
+            }
             state = {**self._state, "seq": seen, "control": own}
             try:
                 await asyncio.wait_for(page.send_json(state), PATIENCE)

@@ -31,7 +31,14 @@ from cdpr.console.commands import (
 )
 from cdpr.console.preview import preview
 from cdpr.console.started import StartedVerb, file_here
-from cdpr.console.state import Kept, jog_state, kept_state, measured_state, outcome_state
+from cdpr.console.state import (
+    Kept,
+    cable_state,
+    jog_state,
+    kept_state,
+    measured_state,
+    outcome_state,
+)
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
 from cdpr.console.watch import CameraPictures, RunWatch
@@ -162,7 +169,7 @@ class Console:
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
             "platform": None if robot is None else pose_data(rig, robot.pose, "drives"),
-            "tensions_n": None if robot is None else [round(t, 2) for t in robot.tensions],
+            "tensions_n": _tensions(status, robot),
             "tension_limits_n": [rig.min_tension, rig.max_tension],
             "clearance_mm": near and nearest_data(near, self.view.required_clearance),
             "measured": measured_state(status, age),
@@ -170,6 +177,7 @@ class Console:
             "preview": None if self.preview is None else self.preview["name"],
             "compared": None if self.compared is None else self.compared["name"],
             "jog": jog_state(status),
+            "cable": cable_state(status),
             "poses": self.poses.told(),
         }
 
@@ -268,6 +276,8 @@ class Console:
         return ""
 
     def _plain(self, command: str) -> str:
+        if command in ("service_begin", "service_end"):
+            return self._service(on=command == "service_begin")
         said = {"hold": "hold", "resume": "resume", "jog_end": "end"}
         if command in said:
             return self.watch.say(said[command])
@@ -277,6 +287,7 @@ class Console:
             "release": self._release,
             "run": self._run,
             "jog_begin": self._jog_begin,
+            "cable_begin": self._cable_begin,
         }
         return verbs[command]()
 
@@ -304,6 +315,25 @@ class Console:
         around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
         speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
         return self._start("jog", [str(self.files.rig_file), "--hold-to-run", *speed, *around])
+
+    def _cable_begin(self) -> str:
+        if not self.control.is_service:
+            return "enter service mode first"
+        speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
+        rig = str(self.files.rig_file)
+        return self._start("jog", [rig, "--hold-to-run", "--one-cable", *speed])
+
+    def _service(self, *, on: bool) -> str:
+        """Enters or leaves service mode; single cables are jogged in it alone."""
+        status = self.watch.last.status
+        jogs_cables = status is not None and "cable_jog" in status
+        if on and status is not None and not jogs_cables:
+            return "the robot moves; wait, or stop it"
+        page = self.control.holder
+        with self._control_lock:
+            press = None if page is None else self.control.set_service(page, on)
+        self._end_press(press)
+        return self.watch.say("end") if jogs_cables and not on else ""
 
     def _start(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
         if self.watch.last.status is not None:
@@ -364,23 +394,21 @@ class Console:
         """A page's jog control is held; what may not move does not."""
         motion = 0 if self.files.read_only else self.watch.number
         with self._control_lock:
+            if message.cable is not None and not self.control.is_service:
+                motion = 0
             press = self.control.hold(page, message.hold, motion)
         if press is None:
             return
-        most = 1e3 * self.view.rig.motion.speed
-        jog = (self.watch.last.status or {}).get("jog")
-        if jog is not None:
-            most = float(jog["speed_mm_s"])
+        status = self.watch.last.status or {}
+        jog = status.get("jog") or status.get("cable_jog")
+        most = 1e3 * self.view.rig.motion.speed if jog is None else float(jog["speed_mm_s"])
         percent = min(max(round(100.0 * message.speed_mm_s / most), 1), 100)
-        length = math.hypot(*message.direction)
-        self.watch.say(
-            "held",
-            press=press,
-            direction=[v / length for v in message.direction],
-            frame=message.frame,
-            step_mm=message.step_mm,
-            percent=percent,
-        )
+        what: dict[str, Any] = {"cable": message.cable, "sense": message.sense}
+        if message.direction is not None:
+            length = math.hypot(*message.direction)
+            direction = [v / length for v in message.direction]
+            what = {"direction": direction, "frame": message.frame}
+        self.watch.say("held", press=press, step_mm=message.step_mm, percent=percent, **what)
 
     def let_go(self, page: int, message: LetGo) -> None:
         """A page's jog control is no longer held."""
@@ -397,6 +425,14 @@ class Console:
     def _end_press(self, press: int | None) -> None:
         if press is not None:
             self.watch.say("let_go", press=press)
+
+
+def _tensions(status: dict[str, Any] | None, robot: RobotNow | None) -> list[float] | None:
+    """Of what moves, also where its cables fit no pose; or as the robot was seen last, [N]."""
+    drives = [] if status is None else status["drives"]
+    if drives:
+        return [drive["tension_n"] for drive in drives]
+    return None if robot is None else [round(t, 2) for t in robot.tensions]
 
 
 def _milliseconds() -> int:

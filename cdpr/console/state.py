@@ -60,9 +60,10 @@ def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:
     """
     jog = None if status is None else status.get("jog")
     if status is None or jog is None:
+        cables = status is not None and "cable_jog" in status
         return {
             "ready": False,
-            "why_not": "the drives are not enabled for jogging",
+            "why_not": _CABLES if cables else "the drives are not enabled for jogging",
             "moving": False,
             "limit": None,
             "speed_mm_s": 1e3 * FASTEST,
@@ -76,6 +77,41 @@ def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:
         "limit": limit,
         "speed_mm_s": jog["speed_mm_s"],
     }
+
+
+def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:
+    """Whether single cables can be jogged, which one was, and how far.
+
+    Args:
+        status: As for `jog_state`.
+    """
+    jog = None if status is None else status.get("cable_jog")
+    if status is None or jog is None:
+        platform = status is not None and "jog" in status
+        return {
+            "ready": False,
+            "why_not": _PLATFORM if platform else "the drives are not enabled for single cables",
+            "moving": False,
+            "cable": None,
+            "press_mm": None,
+            "session_mm": None,
+            "limit": None,
+            "limit_n": None,
+            "speed_mm_s": 1e3 * FASTEST,
+        }
+    ready = status["state"] == "moving"
+    told = {name: jog[name] for name in ("cable", "press_mm", "session_mm", "limit", "limit_n")}
+    return {
+        **told,
+        "ready": ready,
+        "why_not": None if ready else f"the drives are {status['state']}",
+        "moving": bool(status["feed_percent"]),
+        "speed_mm_s": jog["speed_mm_s"],
+    }
+
+
+_CABLES = "single cables are jogged: end that first"
+_PLATFORM = "the platform is jogged: end that first"
 
 
 def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] | None:

@@ -6,6 +6,7 @@ than could overstretch it before its tension is seen. No law pays cable out to c
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -62,6 +63,64 @@ class TensionHeadroom:
             for cable, tension in enumerate(tensions, start=1)
             if not tension <= self._limit
         ]
+
+
+#: Of what lies between slack and the limit a held control leaves this share unused, at least as
+#: much as a drive's whole counts may raise a tension, and at most half, [N].
+RESERVE, RESERVE_COUNTS, MOST_RESERVE = 0.1, 2.0, 0.5
+#: Another cable that was taut is let become no slacker than this share of the least tension.
+LEAST_SHARE = 0.75
+#: By less than this share of the reserve a tension may change without having changed.
+UNCHANGED = 0.25
+
+
+class TensionReserve:
+    """Brings a jog of one cable to rest before a tension is at its limit: that is no fault.
+
+    Winding in ends where any cable comes near the limit. Paying out slackens the cable itself, so
+    that only others count, and only those that become tighter: else nothing could slacken a
+    platform that is too taut. Either ends before another cable that was taut goes slack.
+    """
+
+    def __init__(self, rig: Rig, cable: int, *, limit: float, pays_out: bool) -> None:
+        """Nothing moves yet.
+
+        Args:
+            rig: The robot.
+            cable: Which, from 0.
+            limit: Tension that no cable may have, [N].
+            pays_out: The cable is paid out, otherwise wound in.
+        """
+        reserve = tension_reserve(rig, limit)
+        self._slack, self._floor = rig.min_tension / 2.0, LEAST_SHARE * rig.min_tension
+        self._ceiling, self._unchanged = limit - reserve, UNCHANGED * reserve
+        self._is_other = np.arange(rig.cable_count) != cable
+        self._pays_out = pays_out
+        self._before: Array | None = None
+
+    def share(self, tensions: Sequence[float]) -> float:
+        """Of its speed at which it goes on, by the tensions [N] now; 0 where it must not."""
+        now = np.asarray(tensions, dtype=np.float64)
+        if not np.isfinite(now).all():
+            return 0.0
+        if self._before is None:
+            self._before = now
+        change, range_ = now - self._before, self._ceiling - self._slack
+        tighter = self._is_other & (change > self._unchanged)
+        counts = tighter if self._pays_out else np.full(len(now), True)
+        above = float(np.min(self._ceiling - now[counts], initial=np.inf))
+        slacker = self._is_other & (self._before >= self._slack) & (change < -self._unchanged)
+        below = float(np.min(now[slacker] - self._floor, initial=np.inf))
+        room = min(above, below) / range_
+        return min(1.0, max(CREEP, room)) if room > 0.0 else 0.0
+
+
+def tension_reserve(rig: Rig, limit: float) -> float:
+    """How far below a limit [N] of the tension a jog of one cable comes to rest, [N]."""
+    room = limit - rig.min_tension / 2.0
+    per_metre = np.abs([winch.counts_per_metre for winch in rig.winches])
+    count = RESERVE_COUNTS * float(np.max(_stiffness(rig) / per_metre))
+    return min(max(RESERVE * room, count), MOST_RESERVE * room)
 
 
 #: A cable that was taut stays so while its tension is above this share of what was asked for.
@@ -176,32 +235,37 @@ class PretensionLaw:
         return Alarm(StopReaction.PATH_STOP, "not_taut", text, cable + 1)
 
 
-class CableStep:
-    """Moves one winch by a length of cable, smoothly, while all others stand."""
+class OneCableLaw(ABC):
+    """Moves one winch while all others stand: what is common to a step and a held jog.
+
+    A cable that is taut is moved as carefully as it would be wound in. Other cables that were taut
+    must not go slack meanwhile; those that hung slack before may go on so.
+    """
 
     def __init__(
-        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float
-    ) -> None:
+        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float,
+        reserve: TensionReserve | None = None,
+    ) -> None:  # fmt: skip
         """Nothing moves yet.
 
         Args:
             rig: The robot.
             begin: Positions of the drives, [counts].
             cable: Which, from 0.
-            way: Cable to pay out, [m]; negative to wind in.
+            way: Cable to pay out at most, [m]; negative to wind in.
             limit: Tension that no cable may have, [N].
             speed: At most so fast, [m/s].
+            reserve: Where it comes to rest before the limit; None where that is a fault.
         """
         self._begin = tuple(begin)
-        speed = float(_fastest(rig, speed)[cable])
+        self._speed = float(_fastest(rig, speed)[cable])
         self._cable, self._counts = cable, way * rig.winches[cable].counts_per_metre
         self._least = rig.min_tension / 2.0
-        self._room = TensionHeadroom(self._least, limit)
-        self._duration = max(1.0, PEAK * abs(way) / (speed * _cycle(rig)))
-        # A cable that is taut is moved as carefully as it would be wound in.
+        self._room, self._reserve = TensionHeadroom(self._least, limit), reserve
         careful = wind_in_speed(rig, self._least, limit, speed)[cable]
-        self._pace_if_taut = float(careful) / speed
-        self._time = 0.0
+        self._pace_if_taut = float(careful) / self._speed
+        # A cable that goes slack is moved faster again, but not with a jerk.
+        self._share, self._rise = 1.0, rig.motion.acceleration / rig.motion.speed * _cycle(rig)
         self._was_taut: list[bool] | None = None
         self._slack = [0] * rig.cable_count
 
@@ -213,20 +277,26 @@ class CableStep:
     @property
     def done(self) -> bool:
         """The winch is where it was to go."""
-        return self._time >= self._duration
+        return self.progress >= 1.0
 
     @property
+    @abstractmethod
     def progress(self) -> float:
-        """Share of the time that it takes."""
-        return min(1.0, self._time / self._duration)
+        """See `WinchLaw`."""
+
+    @abstractmethod
+    def _advance(self, pace: float) -> float:
+        """Goes on by a share of a cycle; the share of the way that is done then."""
 
     def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Alarm, ...]]:
         """See `WinchLaw`."""
         taut = tensions[self._cable] >= self._least
-        pace *= (self._pace_if_taut if taut else 1.0) * self._room.share(tensions)
-        self._time = min(self._time + pace, self._duration)
-        smooth = smooth_step(self._time / self._duration)
-        return self._at(smooth), (*self._room.used_up(tensions), *self._made_slack(tensions))
+        share = (self._pace_if_taut if taut else 1.0) * self._room.share(tensions)
+        if self._reserve is not None:
+            share *= self._reserve.share(tensions)
+        self._share = min(share, self._share + self._rise)
+        targets = self._at(self._advance(pace * self._share))
+        return targets, (*self._room.used_up(tensions), *self._made_slack(tensions))
 
     def _at(self, share: float) -> Targets:
         targets = list(self._begin)
@@ -234,7 +304,7 @@ class CableStep:
         return tuple(targets)
 
     def _made_slack(self, tensions: Sequence[float]) -> list[Alarm]:
-        """Other cables that were taut and are slack; one that hung slack before may go on so."""
+        """Other cables that were taut and are slack."""
         if self._was_taut is None:
             self._was_taut = [tension >= self._least for tension in tensions]
         found = []
@@ -250,14 +320,72 @@ class CableStep:
         return found
 
 
+class CableStep(OneCableLaw):
+    """Moves one winch by a length of cable, smoothly, from rest to rest."""
+
+    def __init__(
+        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float,
+        reserve: TensionReserve | None = None,
+    ) -> None:  # fmt: skip
+        """Nothing moves yet; arguments as for `OneCableLaw`."""
+        super().__init__(
+            rig, begin, cable=cable, way=way, limit=limit, speed=speed, reserve=reserve
+        )
+        self._duration = max(1.0, PEAK * abs(way) / (self._speed * _cycle(rig)))
+        self._time = 0.0
+
+    @property
+    def progress(self) -> float:
+        """Share of the time that it takes."""
+        return self._time / self._duration
+
+    def _advance(self, pace: float) -> float:
+        self._time = min(self._time + pace, self._duration)
+        return smooth_step(self._time / self._duration)
+
+
+class CableFeed(OneCableLaw):
+    """Moves one winch at an even speed up to a longest way; its feed speeds up and slows down."""
+
+    def __init__(
+        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float,
+        reserve: TensionReserve | None = None,
+    ) -> None:  # fmt: skip
+        """Nothing moves yet; arguments as for `OneCableLaw`."""
+        super().__init__(
+            rig, begin, cable=cable, way=way, limit=limit, speed=speed, reserve=reserve
+        )
+        self._cycles = abs(way) / (self._speed * _cycle(rig))
+        self._passed = 0.0
+
+    @property
+    def progress(self) -> float:
+        """Share of the longest way."""
+        return self._passed / self._cycles if self._cycles else 1.0
+
+    @property
+    def cycles_left(self) -> float:
+        """To the end of the longest way, at its speed."""
+        return self._cycles - self._passed
+
+    def _advance(self, pace: float) -> float:
+        self._passed = min(self._passed + pace, self._cycles)
+        return self.progress
+
+
 def wind_in_speed(rig: Rig, target: float, limit: float, speed: float) -> Array:
     """How fast each cable may be wound in while its tension is looked at, shape (m,), [m/s].
 
     Never faster than its winch; cables are taken to be as stiff as they are at home.
     """
-    lengths = cable_lengths(rig, rig.home) + [winch.drum_to_outlet for winch in rig.winches]
-    careful = SHARE_OF_ROOM * (limit - target) / (rig.cable_stiffness / lengths) / _cycle(rig)
+    careful = SHARE_OF_ROOM * (limit - target) / _stiffness(rig) / _cycle(rig)
     return np.minimum(_fastest(rig, speed), careful)
+
+
+def _stiffness(rig: Rig) -> Array:
+    """Of each cable at home, shape (m,), [N/m]."""
+    lengths = cable_lengths(rig, rig.home) + [winch.drum_to_outlet for winch in rig.winches]
+    return rig.cable_stiffness / lengths
 
 
 def _fastest(rig: Rig, speed: float) -> Array:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.stopping_distance import require_stopping_room
+from executor.hold_to_run.presses import PlatformPress, PressBoard
 from executor.realtime.shared_memory import Ring, SharedMemory
+from executor.state_machine import CycleRecord, State
 from executor.trajectory.path import Path, line
 from executor.trajectory.setpoints import (
     CheckedTrajectory,
@@ -19,7 +21,7 @@ from executor.trajectory.setpoints import (
     fingerprint,
 )
 from executor.trajectory.time_scaling import TimeLaw, s_curve, time_law
-from model.errors import Refused
+from model.errors import CdprError, Refused
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
@@ -172,3 +174,88 @@ class PieceRing:
             press, first, from_rest, digest = _HEAD.unpack_from(content)
             rows = np.frombuffer(content, dtype=np.int32, offset=_HEAD.size)
             yield Piece(press, first, from_rest, rows.reshape(-1, self._cables), digest.decode())
+
+
+# Who keeps the line proved ahead of the platform, in the supervisor.
+
+
+#: Rows are proved ahead for so long beyond the way to rest, [s].
+AHEAD = 0.4
+#: Cycles after the end of a press until what the loop reports is certainly not of it any more.
+CERTAIN = 2.0
+
+
+class JogProver:
+    """Keeps what is proved ahead of the platform as long as a press is held."""
+
+    def __init__(
+        self, rig: Rig, scene: Scene, start: Pose, board: PressBoard, send: Callable[[Piece], None]
+    ) -> None:
+        """The platform is at rest at the start, ``world_from_platform``."""
+        self._rig, self._scene, self._board, self._send = rig, scene, board, send
+        self._cycle = rig.document.bus.cycle_ms / 1000.0
+        motion = rig.motion
+        to_rest = motion.speed / motion.acceleration + motion.acceleration / motion.jerk
+        self._wanted_rows = (AHEAD + to_rest) / self._cycle
+        self._line = JogLine(rig, scene, start, np.zeros(3))
+        self._press, self._size, self._narrows, self._is_whole = 0, FIRST_ROWS, False, True
+        self._row = 0.0
+        self.limit = ""
+        """Why the line ends where it does; empty while it may go on."""
+
+    @property
+    def pose(self) -> Pose:
+        """Where the platform was sent last, ``world_from_platform``."""
+        return self._line.pose(self._row)
+
+    @property
+    def room(self) -> float:
+        """How far the platform may still go on this line, [m]."""
+        return self._line.travelled(self._line.rows - 1) - self._line.travelled(self._row)
+
+    def take_cycle(self, record: CycleRecord) -> None:
+        """A cycle is over; proves at most one piece."""
+        if record.state is not State.MOVING:
+            return
+        press = self._board.held()
+        if not isinstance(press, PlatformPress):
+            press = None
+        if press is None or press.number == self._press:
+            self._row = record.index
+        if press is None:
+            return
+        if press.number != self._press:
+            rests = record.rate == 0.0 or record.index >= self._line.rows - 1
+            # What this cycle did was decided up to a cycle before it began.
+            if rests and record.at - press.free_since > CERTAIN * self._cycle:
+                self._row = record.index
+                self._begin(press)
+        elif not self._is_whole and self._line.rows - 1 - record.index < self._wanted_rows:
+            self._prove(press)
+
+    def _begin(self, press: PlatformPress) -> None:
+        start = self.pose
+        rotation = start.rotation if press.in_platform else np.eye(3)
+        self._line = JogLine(self._rig, self._scene, start, rotation @ press.direction)
+        self._press, self._row, self.limit = press.number, 0.0, ""
+        self._size, self._narrows, self._is_whole = FIRST_ROWS, False, False
+        self._prove(press)
+
+    def _prove(self, press: PlatformPress) -> None:
+        """Proves the next piece; half of one that is refused, until not one row is left."""
+        first = self._line.rows - 1
+        try:
+            if press.step is None:
+                checked = self._line.go_on(self._size)
+            else:
+                checked = self._line.step(press.step)
+        except CdprError as error:
+            self.limit = self.limit or error.what
+            self._size, self._narrows = self._size // 2, True
+            self._is_whole = press.step is not None or self._size == 0
+            return
+        self._is_whole = press.step is not None
+        if not self._narrows:
+            self._size = MOST_ROWS
+        rows = checked.table.setpoints
+        self._send(Piece(press.number, first, self._is_whole, rows, checked.hash))

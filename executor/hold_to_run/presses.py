@@ -20,7 +20,7 @@ from model.pose import Array
 #: A press of which nothing is heard for so long has ended, [s].
 TIMEOUT = 0.150
 
-_ENTRY, _CHECK = struct.Struct("<QdB?"), struct.Struct("<I")
+_ENTRY, _CHECK = struct.Struct("<QdB?B?d"), struct.Struct("<I")
 _SIZE = _ENTRY.size + _CHECK.size
 
 
@@ -56,11 +56,17 @@ class PressState:
         press: Number of the press that is held; 0 for none.
         share: Of the jog speed, from 0.01 to 1.
         ends: The session is to end.
+        cable: That the press moves, from 1; 0 where it moves the platform.
+        pays_out: The cable is paid out, otherwise wound in.
+        step: Length of cable after which the jog ends by itself, [m]; None as long as it is held.
     """
 
     press: int = 0
     share: float = 1.0
     ends: bool = False
+    cable: int = 0
+    pays_out: bool = False
+    step: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,29 +75,52 @@ class Press:
 
     Attributes:
         number: From 1, rising.
-        direction: Unit vector, shape (3,).
-        in_platform: It is given in the platform frame, otherwise in the world frame.
         step: Length after which the jog ends by itself, [m]; None as long as it is held.
         free_since: From when on no earlier press was held, [s].
     """
 
     number: int
-    direction: Array
-    in_platform: bool
     step: float | None
     free_since: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlatformPress(Press):
+    """Moves the platform straight.
+
+    Attributes:
+        direction: Unit vector, shape (3,).
+        in_platform: It is given in the platform frame, otherwise in the world frame.
+    """
+
+    direction: Array
+    in_platform: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CablePress(Press):
+    """Moves one winch alone.
+
+    Attributes:
+        cable: Which, from 1.
+        pays_out: Otherwise it winds in.
+    """
+
+    cable: int
+    pays_out: bool
 
 
 class PressBoard:
     """The supervisor's side: takes in what is said of presses, from any thread."""
 
-    def __init__(self, now: Callable[[], float]) -> None:
+    def __init__(self, now: Callable[[], float], cables: int = 0) -> None:
         """Nothing is held.
 
         Args:
             now: The clock of the loop, [s].
+            cables: How many there are to move, one at a time; 0 where the platform is moved.
         """
-        self.memory = SharedMemory.create(_SIZE)
+        self.memory, self._cables = SharedMemory.create(_SIZE), cables
         self._now, self._rule, self._lock = now, PressRule(), threading.Lock()
         self._press: Press | None = None
         self._heard, self._percent, self._ends = math.nan, 100, False
@@ -103,15 +132,53 @@ class PressBoard:
     def hold(
         self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
     ) -> bool:
-        """A control is held; False when that press is over, or ends with it.
+        """A control that moves the platform is held; False when that press is over.
 
         Args:
             number: Of the press.
             direction: Unit vector, shape (3,); counts at the begin of a press.
-            in_platform: See `Press`, as the next one.
+            in_platform: See `PlatformPress`, as the next one.
             step: [m].
             percent: Of the jog speed, from 1 to 100.
+
+        Raises:
+            ValueError: The session moves one cable at a time.
         """
+        if self._cables:
+            raise ValueError("this session moves one cable at a time: name cable and sense")
+        return self._hold(
+            number,
+            percent,
+            lambda free_since: PlatformPress(number, step, free_since, direction, in_platform),
+        )
+
+    def hold_cable(
+        self, number: int, cable: int, *, pays_out: bool, step: float | None, percent: int
+    ) -> bool:
+        """A control that moves one winch is held; False when that press is over.
+
+        Args:
+            number: Of the press.
+            cable: Which, from 1; counts at the begin of a press, as the next two.
+            pays_out: See `CablePress`.
+            step: Length of cable, [m].
+            percent: Of the jog speed, from 1 to 100.
+
+        Raises:
+            ValueError: There is no such cable, or the session moves the platform.
+        """
+        if not self._cables:
+            raise ValueError("this session moves the platform: name a direction")
+        if not 1 <= cable <= self._cables:
+            raise ValueError(f"there is no cable {cable}: name one from 1 to {self._cables}")
+        return self._hold(
+            number,
+            percent,
+            lambda free_since: CablePress(number, step, free_since, cable, pays_out),
+        )
+
+    def _hold(self, number: int, percent: int, begin: Callable[[float], Press]) -> bool:
+        """The press goes on, or begins where it is a new one; False when it is over."""
         with self._lock:
             now = self._now()
             known = self._press is not None and self._press.number == number
@@ -121,7 +188,7 @@ class PressBoard:
                 return False
             if not known:
                 self._end_press(now)
-                self._press = Press(number, direction, in_platform, step, self._free_since)
+                self._press = begin(self._free_since)
             self._heard, self._percent, self.last_heard = now, percent, now
             self._write()
             return True
@@ -162,8 +229,13 @@ class PressBoard:
         self._heard = math.nan
 
     def _write(self) -> None:
-        number = 0 if self._press is None else self._press.number
-        entry = _ENTRY.pack(number, self._heard, self._percent, self._ends)
+        press = self._press
+        number = 0 if press is None else press.number
+        step = math.nan if press is None or press.step is None else press.step
+        cable, pays_out = 0, False
+        if isinstance(press, CablePress):
+            cable, pays_out = press.cable, press.pays_out
+        entry = _ENTRY.pack(number, self._heard, self._percent, self._ends, cable, pays_out, step)
         self.memory.view[:_SIZE] = entry + _CHECK.pack(zlib.crc32(entry))
 
 
@@ -173,7 +245,7 @@ class PressReader:
     def __init__(self, memory: SharedMemory) -> None:
         """Reads what `PressBoard` writes."""
         self._memory, self._rule = memory, PressRule()
-        self._entry = _ENTRY.pack(0, math.nan, 100, False)
+        self._entry = _ENTRY.pack(0, math.nan, 100, False, 0, False, math.nan)
 
     def read(self, now: float) -> PressState:
         """What is held now, on the loop's clock [s]; of a half-written entry, what was before."""
@@ -181,7 +253,8 @@ class PressReader:
         entry, check = content[: _ENTRY.size], content[_ENTRY.size :]
         if check == _CHECK.pack(zlib.crc32(entry)):
             self._entry = entry
-        number, heard, percent, ends = _ENTRY.unpack(self._entry)
+        number, heard, percent, ends, cable, pays_out, step = _ENTRY.unpack(self._entry)
         held = number > 0 and self._rule.held(number, heard, now)
         share = min(max(percent, 1), 100) / 100.0
-        return PressState(number if held else 0, share, ends)
+        length = None if math.isnan(step) else step
+        return PressState(number if held else 0, share, ends, cable, pays_out, length)

@@ -7,39 +7,37 @@ keys and no screen.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar, Protocol
 
 import numpy as np
 
-from executor.control.winch_loop import WinchesHere, WinchMover
 from executor.control.winch_motion import WinchesStand, WinchRecord, move_winches, recording
-from executor.drives import drives_of, is_simulated, left_alone, open_drives, require_own_time
-from executor.hold_to_run.line import (
-    FIRST_ROWS,
-    MOST_ROWS,
-    JogLine,
-    Piece,
-    PieceRing,
+from executor.drives import (
+    drives_of,
+    is_simulated,
+    require_own_time,
+    unreferenced_drives_of,
 )
+from executor.hold_to_run.cables import CableMotion, CableTravel
+from executor.hold_to_run.line import JogProver, PieceRing
 from executor.hold_to_run.loop import JogMotion
-from executor.hold_to_run.presses import Press, PressBoard
+from executor.hold_to_run.presses import PressBoard
 from executor.interlock.interlock import MotionInterlock
-from executor.jogging import FASTEST, measured_pose, with_speed
-from executor.kernels import ready_for_simulating_process
-from executor.proposals import JogProposal, require_confirmed
+from executor.jogging import FASTEST, LONGEST_MM, measured_pose, with_speed
+from executor.proposals import CablesProposal, JogProposal, require_confirmed
 from executor.realtime.clock import SimulatedClock
-from executor.realtime.process import real_time_process
+from executor.realtime.job import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
 from executor.recording.run_course import free_folder
 from executor.remote.command_socket import advertised, serving
-from executor.remote.status import JogStatus
-from executor.state_machine import CycleRecord, LoopEvent, State
-from executor.supervision import LocalRequests, Supervisor
-from executor.winch_runs import with_board
-from model.errors import CdprError
+from executor.remote.status import CableStatus, JogStatus, SessionStatus
+from executor.state_machine import CycleRecord, LoopEvent
+from executor.supervision import LocalRequests, RequestBoard, Supervisor
+from executor.winch_runs import limit_of, winch_mover, with_board
 from model.kinematics import cable_lengths
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -48,86 +46,8 @@ from model.scene import Load, Scene, nothing_in_the_way
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
-#: Rows are proved ahead for so long beyond the way to rest, [s].
-AHEAD = 0.4
-#: Cycles after the end of a press until what the loop reports is certainly not of it any more.
-CERTAIN = 2.0
 #: A session in which nothing is held for so long ends by itself, [s]: cables relax.
 IDLE = 300.0
-
-
-class JogProver:
-    """Keeps what is proved ahead of the platform as long as a press is held."""
-
-    def __init__(
-        self, rig: Rig, scene: Scene, start: Pose, board: PressBoard, send: Callable[[Piece], None]
-    ) -> None:
-        """The platform is at rest at the start, ``world_from_platform``."""
-        self._rig, self._scene, self._board, self._send = rig, scene, board, send
-        self._cycle = rig.document.bus.cycle_ms / 1000.0
-        motion = rig.motion
-        to_rest = motion.speed / motion.acceleration + motion.acceleration / motion.jerk
-        self._wanted_rows = (AHEAD + to_rest) / self._cycle
-        self._line = JogLine(rig, scene, start, np.zeros(3))
-        self._press, self._size, self._narrows, self._is_whole = 0, FIRST_ROWS, False, True
-        self._row = 0.0
-        self.limit = ""
-        """Why the line ends where it does; empty while it may go on."""
-
-    @property
-    def pose(self) -> Pose:
-        """Where the platform was sent last, ``world_from_platform``."""
-        return self._line.pose(self._row)
-
-    @property
-    def room(self) -> float:
-        """How far the platform may still go on this line, [m]."""
-        return self._line.travelled(self._line.rows - 1) - self._line.travelled(self._row)
-
-    def take_cycle(self, record: CycleRecord) -> None:
-        """A cycle is over; proves at most one piece."""
-        if record.state is not State.MOVING:
-            return
-        press = self._board.held()
-        if press is None or press.number == self._press:
-            self._row = record.index
-        if press is None:
-            return
-        if press.number != self._press:
-            rests = record.rate == 0.0 or record.index >= self._line.rows - 1
-            # What this cycle did was decided up to a cycle before it began.
-            if rests and record.at - press.free_since > CERTAIN * self._cycle:
-                self._row = record.index
-                self._begin(press)
-        elif not self._is_whole and self._line.rows - 1 - record.index < self._wanted_rows:
-            self._prove(press)
-
-    def _begin(self, press: Press) -> None:
-        start = self.pose
-        rotation = start.rotation if press.in_platform else np.eye(3)
-        self._line = JogLine(self._rig, self._scene, start, rotation @ press.direction)
-        self._press, self._row, self.limit = press.number, 0.0, ""
-        self._size, self._narrows, self._is_whole = FIRST_ROWS, False, False
-        self._prove(press)
-
-    def _prove(self, press: Press) -> None:
-        """Proves the next piece; half of one that is refused, until not one row is left."""
-        first = self._line.rows - 1
-        try:
-            if press.step is None:
-                checked = self._line.go_on(self._size)
-            else:
-                checked = self._line.step(press.step)
-        except CdprError as error:
-            self.limit = self.limit or error.what
-            self._size, self._narrows = self._size // 2, True
-            self._is_whole = press.step is not None or self._size == 0
-            return
-        self._is_whole = press.step is not None
-        if not self._narrows:
-            self._size = MOST_ROWS
-        rows = checked.table.setpoints
-        self._send(Piece(press.number, first, self._is_whole, rows, checked.hash))
 
 
 def jog_session(
@@ -175,8 +95,184 @@ def jog_session(
     around = (nothing_in_the_way(slow) if scene is None else scene).changed(stops=())
     start = ready.home if is_simulated(ready) else measured_pose(ready, around)
     require_confirmed(confirm, JogProposal(ready, around, start))
-    session = _Session(ready, around, start, realtime, need_real_time_rights, listener, on_cycle)
+    session = _Session(
+        ready,
+        _PlatformJogs(ready, around, start, on_cycle),
+        realtime,
+        need_real_time_rights,
+        listener,
+    )
     with_board(ready, supervisor or Supervisor(), session.run, realtime=realtime)
+
+
+def cable_session(
+    rig: Rig,
+    *,
+    limit: float | None = None,
+    speed: float = FASTEST,
+    realtime: bool = True,
+    need_real_time_rights: bool = True,
+    listener: Listener = SILENT,
+    confirm: Callable[[CablesProposal], bool] | None = None,
+    supervisor: Supervisor | None = None,
+    on_cycle: Callable[[CycleRecord, PressBoard, CableTravel], None] | None = None,
+) -> None:
+    """Enables the drives where they are, homed or not, and moves one winch while a control is held.
+
+    As `executor.jogging.jog_cable`, but for its length: the winch slows down when the control is
+    let go, near the limit of the tension, where it comes to rest, and after 50 mm of a press. A
+    press is held, and the session ends, as for `jog_session`. What the homing reference was before
+    it stays; where the drive positions fit no pose afterwards, no run begins.
+
+    Args:
+        rig: The robot and its bus.
+        limit: No cable may carry more, [N]; None for 60 % of the rig's range.
+        speed: Of a winch at most, [m/s].
+        realtime: As for `executor.runner.run`, as all up to the supervisor.
+        need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
+        listener: Receives what happens.
+        confirm: Called once, before anything is enabled; False cancels it.
+        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        on_cycle: Called after every cycle, with the board of presses and how far cables moved, by
+            a program that holds controls itself.
+
+    Raises:
+        CdprError: As for `executor.jogging.jog_cable`; a fault is latched.
+        StoppedByOperator: It was cancelled, or stopped; the drives hold.
+    """
+    slow = with_speed(rig, speed)
+    require_own_time(slow, realtime)
+    limit = limit_of(slow, limit)
+    MotionInterlock(slow).require_free()
+    require_confirmed(confirm, CablesProposal(slow, limit))
+    session = _Session(
+        slow,
+        _CableJogs(slow, limit, on_cycle),
+        realtime,
+        need_real_time_rights,
+        listener,
+    )
+    with_board(slow, supervisor or Supervisor(), session.run, realtime=realtime)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """What one kind of session puts into it.
+
+    Attributes:
+        task: Of the process that moves the drives.
+        make_drives: See `winch_mover`.
+        status: What is reported.
+        take_cycle: Called after every cycle, before the status hears of it.
+        on_cycle: Called after that.
+    """
+
+    task: MotionTask
+    make_drives: Callable[..., AbstractContextManager[ReadyDrives]]
+    status: SessionStatus
+    take_cycle: Callable[[CycleRecord], None]
+    on_cycle: Callable[[CycleRecord], None]
+
+
+class _Kind(Protocol):
+    """What is moved in a session."""
+
+    @property
+    def folder(self) -> str:
+        """Of its record, below ``runs``."""
+        ...
+
+    @property
+    def cables(self) -> int:
+        """See `PressBoard`."""
+        ...
+
+    def parts(
+        self, board: RequestBoard, presses: PressBoard, stack: ExitStack, *, realtime: bool
+    ) -> _Parts:
+        """Makes them; what must be closed is left to the stack."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PlatformJogs:
+    """The platform, straight, along what is proved."""
+
+    folder: ClassVar[str] = "jog-session"
+    cables: ClassVar[int] = 0
+
+    rig: Rig
+    scene: Scene
+    start: Pose
+    on_cycle: Callable[[CycleRecord, PressBoard, JogProver], None] | None
+
+    def parts(
+        self, board: RequestBoard, presses: PressBoard, stack: ExitStack, *, realtime: bool
+    ) -> _Parts:
+        """See `_Kind`."""
+        rig, load = self.rig, self.scene.load
+        memory = SharedMemory.create(PieceRing.size(rig.cable_count))
+        stack.callback(memory.close)
+        send = PieceRing(memory, rig.cable_count).put
+        prover = JogProver(rig, self.scene, self.start, presses, send)
+        task = JogMotion(
+            rig=rig.document,
+            cables=rig.cable_count,
+            cycle=_cycle(rig),
+            begin=_counts_at(rig, self.start, load),
+            presses=presses.memory,
+            pieces=memory,
+            reference=MotionInterlock(rig).require_ready(),
+        )
+        on_cycle = self.on_cycle or _nothing
+        return _Parts(
+            task,
+            partial(drives_of, rig.document, self.start, load),
+            JogStatus(rig, board, prover, simulated_time=not realtime),
+            prover.take_cycle,
+            lambda record: on_cycle(record, presses, prover),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CableJogs:
+    """One cable at a time."""
+
+    folder: ClassVar[str] = "jog-cables"
+
+    rig: Rig
+    limit: float
+    on_cycle: Callable[[CycleRecord, PressBoard, CableTravel], None] | None
+
+    @property
+    def cables(self) -> int:
+        """See `PressBoard`."""
+        return self.rig.cable_count
+
+    def parts(
+        self, board: RequestBoard, presses: PressBoard, stack: ExitStack, *, realtime: bool
+    ) -> _Parts:
+        """See `_Kind`."""
+        rig, limit, longest = self.rig, self.limit, LONGEST_MM / 1000.0
+        travel = CableTravel(rig, limit, longest)
+        speed = rig.motion.speed
+        task = CableMotion(rig.cable_count, _cycle(rig), limit, speed, longest, presses.memory)
+        on_cycle = self.on_cycle or _nothing
+        return _Parts(
+            task,
+            partial(unreferenced_drives_of, rig.document, rig.home, limit, None),
+            CableStatus(rig, board, travel, simulated_time=not realtime),
+            lambda record: travel.take_cycle(record, presses.held()),
+            lambda record: on_cycle(record, presses, travel),
+        )
+
+
+def _nothing(_record: CycleRecord, _presses: PressBoard, _moved: object) -> None:
+    """Nobody looks on."""
+
+
+def _cycle(rig: Rig) -> float:
+    return rig.document.bus.cycle_ms / 1000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,37 +280,43 @@ class _Session:
     """One session and how it is to be done."""
 
     rig: Rig
-    scene: Scene
-    start: Pose
+    kind: _Kind
     realtime: bool
     need_real_time_rights: bool
     listener: Listener
-    on_cycle: Callable[[CycleRecord, PressBoard, JogProver], None] | None
 
     def run(self, board: LocalRequests | SharedRequests) -> WinchesStand:
         """Moves until it ends; the command socket takes what is said of presses."""
         rig, interlock = self.rig, MotionInterlock(self.rig)
-        clock = SimulatedClock(rig.document.bus.cycle_ms / 1000.0)
+        clock = SimulatedClock(_cycle(rig))
+        now = time.monotonic if self.realtime else lambda: clock.now
         with ExitStack() as stack:
-            presses = PressBoard(time.monotonic if self.realtime else lambda: clock.now)
+            presses = PressBoard(now, self.kind.cables)
             stack.callback(presses.close)
-            memory = SharedMemory.create(PieceRing.size(rig.cable_count))
-            stack.callback(memory.close)
-            send = PieceRing(memory, rig.cable_count).put
-            prover = JogProver(rig, self.scene, self.start, presses, send)
-            status = JogStatus(rig, board, prover, simulated_time=not self.realtime)
+            parts = self.kind.parts(board, presses, stack, realtime=self.realtime)
+            status = parts.status
             listeners = stack.enter_context(advertised())
             stack.enter_context(serving(listeners, board, status, presses))
-            mover = stack.enter_context(self._mover(board, presses, memory, clock))
+            mover = stack.enter_context(
+                winch_mover(
+                    rig,
+                    parts.task,
+                    parts.make_drives,
+                    board,
+                    clock=clock,
+                    need_real_time_rights=self.need_real_time_rights,
+                    listener=self.listener,
+                )
+            )
             kept = stack.enter_context(
-                nullcontext() if is_simulated(rig) else recording(free_folder("jog-session"))
+                nullcontext() if is_simulated(rig) else recording(free_folder(self.kind.folder))
             )
             status.folder = None if kept is None else kept.folder
             stand = move_winches(
                 mover,
                 rig,
                 interlock,
-                _Sink(self, prover, presses, status, kept),
+                _Sink(parts, presses, kept, self.listener),
                 record=kept.folder if kept is not None else interlock.file.path,
                 rehome=False,
                 at_rest=lambda _stand, _true_pose: None,
@@ -222,66 +324,29 @@ class _Session:
             status.take_end(stand.state, stand.cause)
         return stand
 
-    @contextmanager
-    def _mover(
-        self,
-        board: LocalRequests | SharedRequests,
-        presses: PressBoard,
-        pieces: SharedMemory,
-        clock: SimulatedClock,
-    ) -> Iterator[WinchMover]:
-        """In real time the drives are opened and moved in a process of its own."""
-        rig, listener = self.rig, self.listener
-        motion = JogMotion(
-            rig=rig.document,
-            cables=rig.cable_count,
-            cycle=rig.document.bus.cycle_ms / 1000.0,
-            begin=_counts_at(rig, self.start, self.scene.load),
-            presses=presses.memory,
-            pieces=pieces,
-            reference=MotionInterlock(rig).require_ready(),
-        )
-        if isinstance(board, LocalRequests):
-            with open_drives(rig, self.start, self.scene.load, listener=listener) as drives:
-                yield WinchesHere(motion, drives, clock, board)
-            return
-        if is_simulated(rig):
-            ready_for_simulating_process(listener)
-        with real_time_process(
-            motion,
-            partial(drives_of, rig.document, self.start, self.scene.load),
-            board,
-            need_real_time=self.need_real_time_rights and not is_simulated(rig),
-            look_again=partial(left_alone, rig.document),
-            listener=listener,
-        ) as process:
-            yield process
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sink:
-    """Forwards what happens to the prover, the status and the record."""
+    """Forwards what happens to the parts of the session and the record."""
 
-    session: _Session
-    prover: JogProver
+    parts: _Parts
     presses: PressBoard
-    status: JogStatus
     kept: WinchRecord | None
+    listener: Listener
 
     def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
-        self.prover.take_cycle(record)
-        self.status.take_cycle(record)
+        self.parts.take_cycle(record)
+        self.parts.status.take_cycle(record)
         if record.at - self.presses.last_heard > IDLE:
             self.presses.end()
-        if self.session.on_cycle is not None:
-            self.session.on_cycle(record, self.presses, self.prover)
+        self.parts.on_cycle(record)
         if self.kept is not None:
             self.kept.take_cycle(record)
 
     def take_event(self, event: LoopEvent) -> None:
-        self.status.take_event(event)
+        self.parts.status.take_event(event)
         if event.code not in ("moving", "traceback"):
-            self.session.listener.note(f"{event.code}: {event.text}")
+            self.listener.note(f"{event.code}: {event.text}")
         if self.kept is not None:  # last: what a full disk does not take is told all the same
             self.kept.take_event(event)
 

@@ -2,16 +2,18 @@
 
 The question names a ``command``: ``status``, ``stop``, ``hold``, ``resume``, or ``speed`` with
 ``percent`` (1 to 100). A session of jogs also takes ``held`` with ``press`` (a number, rising),
-``direction`` (x, y, z; normed by who takes it), ``frame`` (``world`` or ``platform``), ``step_mm``
-(one of `STEPS_MM`, or null as long as it is held) and ``percent`` of the jog speed; ``let_go`` with
-``press``; and ``end``. The answer has ``ok``; when it is true ``status`` (see
-`executor.remote.status`), otherwise ``what``, a sentence.
+``step_mm`` (one of `STEPS_MM`, or null as long as it is held), ``percent`` of the jog speed, and
+what is moved: the platform by ``direction`` (x, y, z; normed by who takes it) in a ``frame``
+(``world`` or ``platform``), or one cable by ``cable`` (its number, from 1) and ``sense``
+(``wind_in`` or ``pay_out``); ``let_go`` with ``press``; and ``end``. The answer has ``ok``; when
+it is true ``status`` (see `executor.remote.status`), otherwise ``what``, a sentence.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
@@ -44,23 +46,54 @@ Share = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 STEPS_MM = (0.1, 1.0, 10.0)
 
 
+Frame = Literal["world", "platform"]
+Cable = Annotated[int, Field(ge=1, le=255)]
+Sense = Literal["wind_in", "pay_out"]
+
+
 class HeldCommand(_Question):
-    """A jog control is held."""
+    """A jog control is held: of the platform, with a direction, or of one cable, with a sense."""
 
     command: Literal["held"]
     press: Number
-    direction: Annotated[list[Share], Field(min_length=3, max_length=3)]
-    frame: Literal["world", "platform"] = "world"
+    direction: Annotated[list[Share], Field(min_length=3, max_length=3)] | None = None
+    frame: Frame | None = None
+    cable: Cable | None = None
+    sense: Sense | None = None
     step_mm: float | None = None
     percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)] = FASTEST
 
     @model_validator(mode="after")
-    def _somewhere(self) -> HeldCommand:
-        if math.hypot(*self.direction) < 1e-3:
-            raise ValueError("the direction is zero")
-        if self.step_mm is not None and self.step_mm not in STEPS_MM:
-            raise ValueError(f"step_mm is none of {', '.join(map(str, STEPS_MM))}")
+    def _one_motion(self) -> HeldCommand:
+        require_one_motion(self.direction, self.frame, self.cable, self.sense)
+        require_step(self.step_mm)
         return self
+
+
+def require_one_motion(
+    direction: Sequence[float] | None, frame: str | None, cable: int | None, sense: str | None
+) -> None:
+    """A held control moves either the platform or one cable.
+
+    Raises:
+        ValueError: It is neither, or both, or the direction is zero.
+    """
+    if direction is None and None not in (cable, sense) and frame is None:
+        return
+    if direction is None or (cable, sense) != (None, None):
+        raise ValueError("a held control has either a direction, or a cable and its sense")
+    if math.hypot(*direction) < 1e-3:
+        raise ValueError("the direction is zero")
+
+
+def require_step(step_mm: float | None) -> None:
+    """A jog ends after one of `STEPS_MM`, or goes on as long as it is held.
+
+    Raises:
+        ValueError: There is no such step.
+    """
+    if step_mm is not None and step_mm not in STEPS_MM:
+        raise ValueError(f"step_mm is none of {', '.join(map(str, STEPS_MM))}")
 
 
 class LetGoCommand(_Question):
@@ -87,7 +120,13 @@ class Presses(Protocol):
     def hold(
         self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
     ) -> bool:
-        """A control is held; False when that press is over."""
+        """A control that moves the platform is held; False when that press is over."""
+        ...
+
+    def hold_cable(
+        self, number: int, cable: int, *, pays_out: bool, step: float | None, percent: int
+    ) -> bool:
+        """A control that moves one cable is held; False when that press is over."""
         ...
 
     def let_go(self, number: int) -> None:
@@ -183,13 +222,26 @@ def _jog(command: JogCommand, presses: Presses | None) -> None:
     elif isinstance(command, LetGoCommand):
         presses.let_go(command.press)
     else:
-        direction = np.array(command.direction, dtype=np.float64)
-        taken = presses.hold(
-            command.press,
-            direction / np.linalg.norm(direction),
-            in_platform=command.frame == "platform",
-            step=None if command.step_mm is None else command.step_mm / 1000.0,
-            percent=command.percent,
-        )
-        if not taken:
+        try:
+            is_taken = _hold(command, presses)
+        except ValueError as error:
+            raise NotACommand(str(error)) from None
+        if not is_taken:
             raise NotACommand(f"press {command.press} is over")
+
+
+def _hold(command: HeldCommand, presses: Presses) -> bool:
+    step = None if command.step_mm is None else command.step_mm / 1000.0
+    if command.cable is not None:
+        pays_out = command.sense == "pay_out"
+        return presses.hold_cable(
+            command.press, command.cable, pays_out=pays_out, step=step, percent=command.percent
+        )
+    direction = np.array(command.direction, dtype=np.float64)
+    return presses.hold(
+        command.press,
+        direction / np.linalg.norm(direction),
+        in_platform=command.frame == "platform",
+        step=step,
+        percent=command.percent,
+    )

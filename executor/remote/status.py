@@ -20,7 +20,10 @@ it did not end well. Winches that move without a path (`cdpr home`, `cdpr jog --
 ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a percentage. A session of jogs
 has ``jog`` {``speed_mm_s`` (at most), ``position_mm``, ``quaternion`` (where the platform was
 sent), ``room_mm`` (to the end of what is proved), ``limit`` (why there is no more, or nothing)},
-and neither rows nor a path.
+and neither rows nor a path; one of single cables has ``cable_jog`` {``speed_mm_s`` (at most),
+``limit_n`` (of every tension), ``cable`` (that moved last, or nothing), ``press_mm`` (that its
+newest press paid out; negative was wound in), ``session_mm`` (the same of each cable since the
+session began), ``limit`` (why the cable goes no further, or nothing)}.
 """
 
 from __future__ import annotations
@@ -303,6 +306,17 @@ class WinchStatus(MotionStatus):
         ]
 
 
+class SessionStatus(WinchStatus):
+    """Of a session of jogs."""
+
+    def _place(self) -> dict[str, Any]:
+        return {"row": None, "rows": None, **_NO_PATH, **self._jogged()}
+
+    @abstractmethod
+    def _jogged(self) -> dict[str, Any]:
+        """What is moved, and how far."""
+
+
 class JogPlace(Protocol):
     """Where a session of jogs is."""
 
@@ -322,8 +336,8 @@ class JogPlace(Protocol):
         ...
 
 
-class JogStatus(WinchStatus):
-    """Of a session of jogs."""
+class JogStatus(SessionStatus):
+    """Of a session that jogs the platform."""
 
     def __init__(
         self, rig: Rig, board: RequestBoard, place: JogPlace, *, simulated_time: bool
@@ -332,7 +346,7 @@ class JogStatus(WinchStatus):
         super().__init__(rig, board, simulated_time=simulated_time)
         self._jog = place
 
-    def _place(self) -> dict[str, Any]:
+    def _jogged(self) -> dict[str, Any]:
         pose = self._jog.pose
         jog = {
             "speed_mm_s": round(self._rig.motion.speed * 1e3, 3),
@@ -341,4 +355,56 @@ class JogStatus(WinchStatus):
             "room_mm": round(self._jog.room * 1e3, 2),
             "limit": self._jog.limit or None,
         }
-        return {"row": None, "rows": None, **_NO_PATH, "jog": jog}
+        return {"jog": jog}
+
+
+class CablePlace(Protocol):
+    """How far cables were jogged, one at a time."""
+
+    @property
+    def tension_limit(self) -> float:
+        """That no cable may have, [N]."""
+        ...
+
+    @property
+    def cable(self) -> int:
+        """That moved last, from 1; 0 for none."""
+        ...
+
+    @property
+    def by_press(self) -> float:
+        """What the newest press paid out, [m]."""
+        ...
+
+    @property
+    def by_session(self) -> list[float]:
+        """What was paid out of each cable, [m]."""
+        ...
+
+    @property
+    def limit(self) -> str:
+        """Why the cable goes on more slowly, or no further; empty while it may go on."""
+        ...
+
+
+class CableStatus(SessionStatus):
+    """Of a session that jogs one cable at a time."""
+
+    def __init__(
+        self, rig: Rig, board: RequestBoard, place: CablePlace, *, simulated_time: bool
+    ) -> None:
+        """A session that is being prepared."""
+        super().__init__(rig, board, simulated_time=simulated_time)
+        self._moved = place
+
+    def _jogged(self) -> dict[str, Any]:
+        moved = self._moved
+        jog = {
+            "speed_mm_s": round(self._rig.motion.speed * 1e3, 3),
+            "limit_n": round(moved.tension_limit, 3),
+            "cable": moved.cable or None,
+            "press_mm": round(moved.by_press * 1e3, 3),
+            "session_mm": [round(length * 1e3, 3) for length in moved.by_session],
+            "limit": moved.limit or None,
+        }
+        return {"cable_jog": jog}

@@ -20,8 +20,9 @@ from cdpr.cli.operate import monitor
 from cdpr.cli.operate.jog import JogKeys
 from cdpr.cli.operate.keys import NAMES, Keys, names_of
 from cdpr.cli.operate.supervision import SignalSupervisor
+from executor.hold_to_run.line import JogProver
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
-from executor.hold_to_run.session import JogProver, jog_session
+from executor.hold_to_run.session import jog_session
 from executor.remote import client
 from executor.remote.client import StopResult, follow_run
 from executor.remote.command_socket import Reached, advertised, serving

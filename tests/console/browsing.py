@@ -28,7 +28,7 @@ ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-VIEWS = ("live", "operate", "jog", "teach", "events")
+VIEWS = ("live", "operate", "jog", "teach", "events", "service")
 AUDITS = (Path(__file__).parent / "audits.js").read_text(encoding="utf-8")
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
 
@@ -113,6 +113,16 @@ class Visit:
         self.view("jog")
         self.page.locator("#jog-begin").click()
         expect(self.page.locator("#jog-state")).to_contain_text("Ready")
+
+    def ready_to_jog_cables(self) -> None:
+        self.take_control()
+        self.view("service")
+        self.page.locator("#service-begin").click()
+        self.page.locator(".confirm").click()
+        expect(self.page.locator("#lamp-control")).to_have_text("Service mode")
+        self.page.locator("#cable-begin").click()
+        self.page.locator(".confirm").click()
+        expect(self.page.locator("#cable-state")).to_contain_text("Ready")
 
     def hold(self, name: str = "+x") -> int:
         """Presses a jog button by mouse; the number of the press.

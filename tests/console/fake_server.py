@@ -146,7 +146,9 @@ class Fake:
         self.wished = {"stop": False, "hold": False, "speed_percent": 100}
         self.moving: str | None = None  # state of the motion
         self.began = time.monotonic()
-        self.jog_ready = False
+        self.jog_ready = self.cable_ready = self.service = False
+        self.cables_mm = [0.0] * 8
+        self.press_mm = 0.0
         self.position = on_circle(0.0)
         self.held: dict[str, Any] | None = None
         self.held_at, self.spent = 0.0, -1
@@ -178,7 +180,12 @@ class Fake:
                 self._end(stopped=self.wished["stop"])
         if self.held and time.monotonic() - self.held_at > 0.15:
             self.spent, self.held = max(self.spent, self.held["hold"]), None
-        if self.held:
+        if self.held and self.cable_ready:
+            sign = 1.0 if self.held["sense"] == "pay_out" else -1.0
+            way = sign * self.held["speed_mm_s"] * PERIOD_S
+            self.cables_mm[self.held["cable"] - 1] += way
+            self.press_mm += way
+        elif self.held:
             step = np.array(self.held["direction"]) * self.held["speed_mm_s"] * PERIOD_S / 1e3
             self.position = np.clip(self.position + step, RIG.workspace_lower, RIG.workspace_upper)
 
@@ -213,13 +220,13 @@ class Fake:
         jog = {
             "ready": self.jog_ready,
             "why_not": None,
-            "moving": self.held is not None,
+            "moving": self.jog_ready and self.held is not None,
             "limit": None,
         }
         if self.held and near < 60.0:
             jog["limit"] = f"stops in {near - 10.0:.0f} mm: clearance to obstacle_1"
         busy = None
-        if self.moving or self.jog_ready:
+        if self.moving or self.jog_ready or self.cable_ready:
             verb = "run" if self.moving else "jog"
             busy = {
                 "verb": verb,
@@ -232,7 +239,11 @@ class Fake:
             "rig": RIG.name,
             "bus": "udp_multicast 239.74.163.2",
             "simulated": True,
-            "control": {"yours": reader is self.in_control, "held_by": name},
+            "control": {
+                "yours": reader is self.in_control,
+                "held_by": name,
+                "mode": self._mode(reader),
+            },
             "latched": self.latched,
             "reference": {
                 "counts": self.homed,
@@ -265,8 +276,28 @@ class Fake:
             "preview": self.plan,
             "compared": self.compared,
             "jog": {**jog, "speed_mm_s": 20.0},
+            "cable": self._cable(),
             "poses": self.poses,
             **self.over,
+        }
+
+    def _mode(self, reader: WebSocket) -> str:
+        if reader is not self.in_control:
+            return "observe"
+        return "service" if self.service else "operate"
+
+    def _cable(self) -> dict[str, Any]:
+        held = self.held if self.cable_ready else None
+        return {
+            "ready": self.cable_ready,
+            "why_not": None if self.cable_ready else "the drives are not enabled",
+            "moving": held is not None,
+            "cable": held and held["cable"],
+            "press_mm": round(self.press_mm, 3),
+            "session_mm": [round(mm, 3) for mm in self.cables_mm],
+            "limit": None,
+            "limit_n": 62.0 if self.cable_ready else None,
+            "speed_mm_s": 20.0,
         }
 
     def _next_stop(self) -> dict[str, Any] | None:
@@ -347,7 +378,10 @@ class Fake:
         """What a page asks for; whether it was done, and what to answer."""
         self.received.append(message)
         kind = message["kind"]
-        if kind == "held" and self.jog_ready and message["hold"] > self.spent:
+        ready = self.cable_ready if "cable" in message else self.jog_ready
+        if kind == "held" and ready and message["hold"] > self.spent:
+            if self.held is None:
+                self.press_mm = 0.0
             self.held, self.held_at = message, time.monotonic()
         if kind == "let_go":
             self.spent, self.held = max(self.spent, message["hold"]), None
@@ -369,13 +403,18 @@ class Fake:
         self.held = None
         if self.moving:
             self.wished = {**self.wished, "stop": True}
-        active = self.moving is not None or self.jog_ready
+        active = self.moving is not None or self.jog_ready or self.cable_ready
         return active, "" if active else "nothing moves"
 
     def _obey(self, message: dict[str, Any]) -> tuple[bool, str]:
         command, index = message["command"], message.get("index", 0)
         if command == "give_control":
-            self.in_control = None
+            self.in_control, self.service = None, False
+        elif command in ("service_begin", "service_end"):
+            self.service = command == "service_begin"
+            self.cable_ready &= self.service
+        elif command == "cable_begin":
+            self.cable_ready = True
         elif command == "run":
             self.moving, self.share, self.began, self.events = "moving", 0.0, time.monotonic(), []
             self.wished, self.outcome = {"stop": False, "hold": False, "speed_percent": 100}, None
@@ -385,7 +424,7 @@ class Fake:
         elif command == "speed":
             self.wished = {**self.wished, "speed_percent": message["percent"]}
         elif command in ("jog_begin", "jog_end"):
-            self.jog_ready = command == "jog_begin"
+            self.jog_ready, self.cable_ready = command == "jog_begin", False
         elif command == "reset":
             self.latched = None
         elif command in ("home", "release"):

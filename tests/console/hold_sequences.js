@@ -11,7 +11,7 @@ Gives what was wrong, as texts, and how many messages were sent: `(Hold, rounds,
   const one = (list) => list[Math.floor(random() * list.length)];
   const wrong = [], over = new Set(), letGo = new Map(), sources = ["pointer 1", "key ArrowUp", "gamepad"];
   let now = 0, act = null, due = Infinity, open = true, refusal = null;
-  let press = null, newest = 0, last = 0, held = 0, ended = 0; // press: {source, number} by what the page was told
+  let said = "", press = null, newest = 0, last = 0, held = 0, ended = 0; // press: {source, number} by what the page was told
 
   const clock = {
     now: () => now,
@@ -33,18 +33,21 @@ Gives what was wrong, as texts, and how many messages were sent: `(Hold, rounds,
     if (!press || !press.pressed) wrong.push(`held ${message.hold} though nothing is pressed`);
     if (refusal) wrong.push(`held although ${refusal}`);
     if (message.hold === newest && now - last > 150) wrong.push(`held after ${now - last} ms of silence`);
-    if (Math.abs(Math.hypot(...message.direction) - 1) > 1e-9) wrong.push("the direction is not of length 1");
+    if (message.cable ? message.direction || !message.sense : Math.abs(Math.hypot(...message.direction) - 1) > 1e-9) wrong.push("neither a direction of length 1 nor a cable");
+    const motion = JSON.stringify([message.cable, message.sense, message.direction]);
+    if (message.hold === newest && motion !== said) wrong.push(`the motion of ${message.hold} changed`);
+    said = motion;
     [newest, last] = [message.hold, now];
     return open;
   };
   const hold = new Hold({
-    send, clock, whyNot: () => refusal, settings: () => ({ frame: "world", step_mm: null, speed_mm_s: 5 }),
+    send, clock, whyNot: () => refusal, settings: (motion) => ({ ...(motion.direction && { frame: "world" }), step_mm: null, speed_mm_s: 5 }),
     changed: (begun) => (press = begun ? { source: begun.source, pressed: true } : null),
   });
   const moves = [
-    () => hold.press(one(sources), [random() - 0.5, random() - 0.5, random() + 0.1]),
-    () => hold.press(one(sources), [1, 0, 0], random()),
-    () => hold.steer(one(sources), [0, random() + 0.1, 0], random()),
+    () => hold.press(one(sources), { direction: [random() - 0.5, random() - 0.5, random() + 0.1] }),
+    () => hold.press(one(sources), { cable: one([1, 5]), sense: one(["wind_in", "pay_out"]) }, random()),
+    () => hold.steer(one(sources), one([{ direction: [0, random() + 0.1, 0] }, { cable: 1, sense: "wind_in" }]), random()),
     () => {
       const source = one(sources);
       if (press?.source === source) press.pressed = false;

@@ -3,7 +3,8 @@
 The console is the real one, with its command socket; so is the session of jogs, with drives that
 are simulated in this process. Pages hold and let go, two at once, take control and lose it, are cut
 off, reloaded with a clock that jumped, send again what is over, change what they do, and STOP. What
-the pages truly held is kept apart; every cycle is judged by it.
+the pages truly held is kept apart; every cycle is judged by it. A session moves the platform, or
+one cable at a time, which only pages in service mode may.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ import numpy as np
 from cdpr.console.commands import Held, LetGo, parse_message
 from cdpr.console.session import Console, ConsoleFiles
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
-from executor.hold_to_run.session import JogProver, jog_session
+from executor.hold_to_run.session import cable_session, jog_session
 from executor.state_machine import CycleRecord, State
+from executor.winch_runs import limit_of
 from model.clearance import ClearanceModel
-from model.errors import StoppedByOperator
-from model.pose import Pose
-from model.rig import load_rig
+from model.errors import Fault, StoppedByOperator
+from model.pose import Array, Pose
+from model.rig import Rig, load_rig, rig_from_document
 from model.scene import load_scene
 from tests.cli.plans import RIG
 
@@ -47,7 +49,7 @@ class PageAtHand:
 
     number: int
     hold: int
-    direction: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0])
+    motion: dict[str, object] = field(default_factory=dict)
     step: float | None = None
     speed: float = 20.0
     pressed: bool = False
@@ -59,8 +61,7 @@ class PageAtHand:
     def word(self, hold: int | None = None) -> str:
         """What it says as long as it holds."""
         said = {"kind": "held", "hold": self.hold if hold is None else hold, "seq": 1}
-        how = {"direction": self.direction, "frame": "world", "step_mm": self.step}
-        return json.dumps(said | how | {"speed_mm_s": self.speed})
+        return json.dumps(said | self.motion | {"step_mm": self.step, "speed_mm_s": self.speed})
 
 
 @dataclass
@@ -88,15 +89,17 @@ class Figures:
 class Judge:
     """Holds every cycle against what was truly held."""
 
-    def __init__(self, figures: Figures) -> None:
+    def __init__(self, figures: Figures, rig: Rig) -> None:
         self._figures = figures
         self._last: CycleRecord | None = None
         self._ahead = 0.0
-        self._rig = load_rig(RIG)
+        self._rig = rig
         self._model = ClearanceModel(self._rig, load_scene(SCENE))
         self._required = load_scene(SCENE).obstacle_clearance
         self.heard = float("-inf")
         """When a press was truly held last, [s]."""
+        self.heard_of: dict[tuple[int, bool], float] | None = None
+        """The same of each cable, from 1, and whether it was paid out; None of the platform."""
         cycle = self._rig.document.bus.cycle_ms / 1000.0
         # The anchor of a cable moves with the platform; nothing is wound in faster than it moves.
         self._step = [
@@ -106,6 +109,8 @@ class Judge:
     def begin(self) -> None:
         """A new session; the drives stand."""
         self._last, self.heard = None, float("-inf")
+        if self.heard_of is not None:
+            self.heard_of = {}
 
     def release(self, now: float) -> None:
         """What was held is not any more: as if it had been silent for long enough."""
@@ -124,6 +129,7 @@ class Judge:
             self._figures.moving_cycles += 1
             if since > TIMEOUT + RAMP + late:
                 self._say(record, f"moves though nothing was held for {since:.3f} s")
+            self._judge_cables(record, ahead, late)
             if np.any(np.abs(ahead) > self._step):
                 self._say(record, f"a set-point is {np.abs(ahead).max()} counts ahead")
         # With limited jerk it still speeds up for a moment, and less and less.
@@ -133,16 +139,29 @@ class Judge:
         if record.state is State.LATCHED:
             self._say(record, "latched")
 
+    def _judge_cables(self, record: CycleRecord, ahead: Array, late: float) -> None:
+        """Only the cable moves that was held, in its sense, and no tension is beyond the limit."""
+        if self.heard_of is None:
+            return
+        for cable in np.flatnonzero(ahead):
+            pays_out = bool(ahead[cable] * self._rig.winches[cable].counts_per_metre > 0.0)
+            since = record.at - self.heard_of.get((int(cable) + 1, pays_out), float("-inf"))
+            if since > TIMEOUT + RAMP + late:
+                sense = "paid out" if pays_out else "wound in"
+                self._say(record, f"cable {cable + 1} is {sense}, held {since:.3f} s ago")
+        most = float(np.max(self._rig.tensions_by(record.torques)))
+        if most > limit_of(self._rig, None):
+            self._say(record, f"a cable carries {most:.1f} N")
+
     def look_around(self, console: Console) -> None:
         """Where the platform is keeps what the scene asks for."""
         jog = (console.watch.last.status or {}).get("jog")
-        if jog is None:
-            return
-        position = np.array(jog["position_mm"]) / 1000.0
-        pose = Pose(position, self._rig.home.rotation)
-        near = self._model.smallest(pose)
-        if near is not None and near.distance < self._required - 1e-4:
-            self._figures.wrong.append(f"only {1e3 * near.distance:.2f} mm at {position}")
+        if jog is not None:
+            position = np.array(jog["position_mm"]) / 1000.0
+            pose = Pose(position, self._rig.home.rotation)
+            near = self._model.smallest(pose)
+            if near is not None and near.distance < self._required - 1e-4:
+                self._figures.wrong.append(f"only {1e3 * near.distance:.2f} mm at {position}")
         for event in (console.watch.last.status or {}).get("events", []):
             if event["code"] in ("gate_denied", "traceback", "broken"):
                 self._figures.wrong.append(f"{event['code']}: {event['text']}")
@@ -156,15 +175,17 @@ class Judge:
 class Sequences:
     """Pages at one console, and the sessions that it jogs."""
 
-    def __init__(self, seed: int) -> None:
-        self._random = random.Random(seed)
-        rig = load_rig(RIG)
+    def __init__(self, seed: int, *, cables: bool = False) -> None:
+        self._random, self._cables = random.Random(seed), cables
+        rig = with_soft_cables(load_rig(RIG)) if cables else load_rig(RIG)
         files = ConsoleFiles(RIG, rig, (), (), (), SCENE, True, False)
         self.console = Console(files)
         self._started: list[str] = []
         self.console.verbs.start = self._start  # type: ignore[method-assign]
         self.figures = Figures()
-        self._judge = Judge(self.figures)
+        self._judge = Judge(self.figures, rig)
+        if cables:
+            self._judge.heard_of = {}
         self._pages: list[PageAtHand] = []
         self._goal = self._left = self._cycle = 0
         self._now = 0.0
@@ -176,12 +197,13 @@ class Sequences:
             self.figures.sessions += 1
             self._judge.begin()
             try:
-                jog_session(
-                    self.console.rig, load_scene(SCENE), speed=0.020, realtime=False,
-                    on_cycle=self._on_cycle,
-                )  # fmt: skip
+                self._session()
             except StoppedByOperator:
                 self.figures.did["session stopped"] += 1
+            except Fault as error:  # the platform moves with the cable that is paid out
+                self.figures.did["session ended by slack"] += 1
+                if not (self._cables and "went slack" in error.what):
+                    self.figures.wrong.append(error.what)
             for page in self._pages:
                 page.pressed = False
         for page in self._pages:
@@ -189,10 +211,18 @@ class Sequences:
         self.console.close()
         return self.figures
 
+    def _session(self) -> None:
+        rig, on_cycle = self.console.rig, self._on_cycle
+        if self._cables:
+            cable_session(rig, speed=0.020, realtime=False, on_cycle=on_cycle)
+        else:
+            scene = load_scene(SCENE)
+            jog_session(rig, scene, speed=0.020, realtime=False, on_cycle=on_cycle)
+
     def _start(self, verb: str, _arguments: object) -> None:
         self._started.append(verb)
 
-    def _on_cycle(self, record: CycleRecord, board: PressBoard, _: JogProver) -> None:
+    def _on_cycle(self, record: CycleRecord, board: PressBoard, _: object) -> None:
         self._judge.judge(record)
         self._cycle, self._now = self._cycle + 1, record.at
         if record.state is not State.MOVING:
@@ -214,10 +244,16 @@ class Sequences:
                 self._hold(page)
 
     def _hold(self, page: PageAtHand) -> None:
-        if self.console.control.holder != page.number:
-            page.is_over |= page.had_control  # who lost control has to press again
+        control = self.console.control
+        mine = control.holder == page.number
+        if not mine or (self._cables and not control.is_service):
+            page.is_over |= page.had_control or mine  # who lost control has to press again
         elif not page.is_over:
             page.had_control, self._judge.heard = True, self._now
+            if self._judge.heard_of is not None:
+                cable, sense = page.motion["cable"], page.motion["sense"]
+                assert isinstance(cable, int)
+                self._judge.heard_of[cable, sense == "pay_out"] = self._now
         self._held(page, page.word())
 
     def _held(self, page: PageAtHand, text: str) -> None:
@@ -246,7 +282,15 @@ class Sequences:
 
     def _join(self) -> None:
         base = self._random.choice((1, 1_000, 1_700_000_000_000))  # its clock jumped
-        self._pages.append(PageAtHand(self.console.control.join("test"), base))
+        page = PageAtHand(self.console.control.join("test"), base)
+        page.motion = self._motion()
+        self._pages.append(page)
+
+    def _motion(self) -> dict[str, object]:
+        if not self._cables:
+            return {"direction": self._random.choice(DIRECTIONS), "frame": "world"}
+        sense = self._random.choice(("wind_in", "pay_out"))
+        return {"cable": self._random.randint(1, 8), "sense": sense}
 
     # What happens.
 
@@ -255,7 +299,7 @@ class Sequences:
             return
         self.figures.presses += 1
         page.hold += 1
-        page.direction = self._random.choice(DIRECTIONS)
+        page.motion = self._motion()
         page.step = self._random.choice((None, None, None, 0.1, 1.0, 10.0))
         page.speed = self._random.choice((1.0, 5.0, 20.0, 900.0))
         page.pressed, page.silent = True, 0
@@ -277,6 +321,8 @@ class Sequences:
 
     def _take(self, page: PageAtHand) -> None:
         self._command(page, "take_control", force=self._random.random() < 0.5)
+        if self._cables and self._random.random() < 0.8:
+            self._change_mode(page, "service_begin")
 
     def _give(self, page: PageAtHand) -> None:
         self._release(page)
@@ -306,10 +352,21 @@ class Sequences:
 
     def _mode(self, page: PageAtHand) -> None:
         """What else a page may want; nothing of it is done while the session is there."""
-        command = self._random.choice(("home", "reset", "release", "run", "jog_begin", "resume"))
+        verbs = ("home", "reset", "release", "run", "jog_begin", "cable_begin", "resume")
+        command = self._random.choice(verbs)
         self._command(page, command)
         if self._started:
             self.figures.wrong.append(f"{self._started.pop()} was started during a session")
+
+    def _service(self, page: PageAtHand) -> None:
+        """In and out of service mode, which ends what the page holds, and out of it the session."""
+        enters = not self._cables or self._random.random() < 0.95
+        self._change_mode(page, "service_begin" if enters else "service_end")
+
+    def _change_mode(self, page: PageAtHand, command: str) -> None:
+        if not self._command(page, command):
+            self._release(page)
+            page.is_over |= page.pressed and page.had_control
 
     def _feed(self, page: PageAtHand) -> None:
         self._command(page, "speed", percent=self._random.choice((1, 50, 100)))
@@ -332,6 +389,7 @@ _WEIGHTED: list[tuple[Act, float]] = [
     (Sequences._held_up, 1.5),
     (Sequences._replay, 2.0),
     (Sequences._mode, 1.0),
+    (Sequences._service, 1.0),
     (Sequences._feed, 0.5),
     (Sequences._stop, 0.01),
     (Sequences._end, 0.01),
@@ -352,7 +410,10 @@ def open_files() -> set[str]:
 def children() -> set[str]:
     """Processes that this one started and that are there still."""
     tasks = Path("/proc/self/task")
-    found = " ".join((task / "children").read_text() for task in tasks.iterdir())
+    found = ""
+    for task in tasks.iterdir():
+        with suppress(OSError):  # a thread that ended meanwhile
+            found += (task / "children").read_text()
     return {f"process {number}" for number in found.split()}
 
 
@@ -362,12 +423,19 @@ def held() -> set[str]:
     return threads | open_files() | children()
 
 
-def sequences(count: int, seed: int) -> Figures:
+def with_soft_cables(rig: Rig) -> Rig:
+    """On which one cable moves by more than steel stretches."""
+    cables = rig.document.cables
+    soft = cables.model_copy(update={"stiffness_n": 0.002 * cables.stiffness_n})
+    return rig_from_document(rig.document.model_copy(update={"cables": soft}))
+
+
+def sequences(count: int, seed: int, *, cables: bool = False) -> Figures:
     """So many sequences; threads, sockets and processes that are left count as wrong."""
     before, interval = held(), sys.getswitchinterval()
     sys.setswitchinterval(1e-4)  # the session and its socket's thread take turns all the time
     try:
-        figures = Sequences(seed).run(count)
+        figures = Sequences(seed, cables=cables).run(count)
     finally:
         sys.setswitchinterval(interval)
     if left := held() - before:

@@ -18,7 +18,7 @@ def state_of(**changes: Any) -> dict[str, Any]:
     """A state at rest, with control, homed, and with a plan."""
     return {
         "read_only": False,
-        "control": {"yours": True, "held_by": "A"},
+        "control": {"yours": True, "held_by": "A", "mode": "operate"},
         "latched": None,
         "reference": {"counts": True, "why_not": None},
         "busy": None,
@@ -26,6 +26,7 @@ def state_of(**changes: Any) -> dict[str, Any]:
         "platform": {},
         "preview": "1",
         "jog": {"ready": False, "why_not": None, "moving": False},
+        "cable": {"ready": False, "why_not": None, "moving": False},
         "poses": [{}, {}],
         **changes,
     }
@@ -39,8 +40,10 @@ def moving(state: str, **wished: Any) -> dict[str, Any]:
 
 
 RUN = {"verb": "run", "text": ""}
-REST = {"home", "release", "load_plan", "compare", "plan", "plan_poses", "run", "jog_begin"}
-ALWAYS = {"stop", "jog_setting"}
+PLANS = {"load_plan", "compare", "plan", "plan_poses"}
+REST = {"home", "release", "run", "jog_begin", "service_begin"} | PLANS
+ALWAYS = {"stop", "jog_setting", "cable_setting"}
+SERVICE = {"yours": True, "held_by": "A", "mode": "service"}
 TAUGHT = {"teach", "teach_at", "edit_pose", "give_control"}
 #: Name, situation, and the buttons that are possible in it; all others are not.
 TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
@@ -101,6 +104,37 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
             "motion": moving("moving"),
         },
         ALWAYS | TAUGHT | {"jog", "jog_end"},
+    ),
+    (
+        "service mode",
+        {"control": SERVICE, "reference": {"counts": False, "why_not": "x"}},
+        (ALWAYS | TAUGHT | REST | {"service_end", "cable_begin"})
+        - {"service_begin", "run", "jog_begin"},
+    ),
+    (
+        "service mode, latched",
+        {"control": SERVICE, "latched": "slack"},
+        (ALWAYS | TAUGHT | REST | {"reset", "service_end"})
+        - {"service_begin", "home", "run", "jog_begin"},
+    ),
+    (
+        "cables are jogged",
+        {
+            "control": SERVICE,
+            "busy": {"verb": "jog", "text": ""},
+            "cable": {"ready": True, "why_not": None},
+            "motion": moving("moving"),
+        },
+        ALWAYS | TAUGHT | {"service_end", "cable", "jog_end"},
+    ),
+    (
+        "cables are jogged by a page that is not in service mode",
+        {
+            "busy": {"verb": "jog", "text": ""},
+            "cable": {"ready": True, "why_not": None},
+            "motion": moving("moving"),
+        },
+        ALWAYS | TAUGHT | {"service_begin", "jog_end"},
     ),
     ("jogging begins", {"busy": {"verb": "jog", "text": ""}}, ALWAYS | TAUGHT | {"jog_end"}),
     ("position not known", {"platform": None}, (ALWAYS | TAUGHT | REST) - {"teach", "teach_at"}),

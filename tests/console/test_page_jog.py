@@ -27,7 +27,7 @@ def hidden(found: Visit) -> None:
     )
 
 
-BUTTON = "document.querySelector('[data-jog=\"+x\"]')"
+BUTTON = "document.querySelector('[data-jog].held')"
 ENDS: dict[str, Callable[[Visit], Any]] = {
     "pointer up": lambda found: found.page.mouse.up(),
     "pointer cancelled": end_by_event(

@@ -21,9 +21,9 @@ def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_nothing_moves_unless_a_page_in_control_holds(seed: int) -> None:
-    figures = sequences(60, seed)
+@pytest.mark.parametrize(("seed", "cables"), [(1, False), (2, False), (1, True), (2, True)])
+def test_nothing_moves_unless_a_page_in_control_holds(seed: int, cables: bool) -> None:
+    figures = sequences(60, seed, cables=cables)
     assert figures.wrong == []
     assert figures.sequences >= 60
     assert figures.presses > 20

@@ -288,6 +288,80 @@ def test_a_held_control_is_passed_on_for_who_has_control_only(served: Served) ->
         assert served.said[-1] == ("let_go", {"press": holds[0]})
 
 
+def held_cable(hold: int, **changes: object) -> str:
+    word = {"kind": "held", "hold": hold, "cable": 3, "sense": "wind_in", "step_mm": None}
+    return json.dumps(word | {"speed_mm_s": 5.0, "seq": 1} | changes)
+
+
+def test_a_cable_is_moved_by_a_page_in_service_mode_only(served: Served) -> None:
+    with served.page() as page:
+        command(page, "take_control")
+        assert state(page)["control"]["mode"] == "operate"
+        assert "service mode" in command(page, "cable_begin")["what"]
+        assert command(page, "service_begin")["ok"]
+        assert state(page)["control"]["mode"] == "service"
+        assert command(page, "cable_begin")["ok"]
+        ((verb, arguments),) = served.started
+        assert verb == "jog"
+        assert {"--hold-to-run", "--one-cable", "--yes"} <= set(arguments)
+        with served.something_moves():
+            page.send(held_cable(1))
+            command(page, "stop")
+            ((name, values),) = served.said
+            assert name == "held"
+            assert (values["cable"], values["sense"], values["step_mm"]) == (3, "wind_in", None)
+            assert "direction" not in values
+            assert command(page, "service_end")["ok"]
+            assert served.said[-1] == ("let_go", {"press": values["press"]})
+            page.send(held_cable(1))
+            page.send(held_cable(2))
+            command(page, "stop")
+            assert [name for name, _ in served.said] == ["held", "let_go"]
+            command(page, "service_begin")
+            page.send(held_cable(2))
+            command(page, "stop")
+            assert [name for name, _ in served.said].count("held") == 1, "it was over at once"
+
+
+def test_service_mode_ends_with_control(served: Served) -> None:
+    with served.page() as first, served.page() as second:
+        command(first, "take_control")
+        command(first, "service_begin")
+        assert not command(second, "service_begin")["ok"]
+        assert command(second, "take_control", force=True)["ok"]
+        assert "service mode" in command(second, "cable_begin")["what"]
+        command(second, "service_begin")
+        command(second, "give_control")
+        command(second, "take_control")
+        assert "service mode" in command(second, "cable_begin")["what"]
+    assert served.started == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"cable": 0},
+        {"cable": -1},
+        {"cable": 1.5},
+        {"cable": None},
+        {"cable": 256},
+        {"sense": "out"},
+        {"sense": None},
+        {"frame": "world"},
+        {"direction": [0.0, 0.0, 1.0]},
+        {"step_mm": 2.0},
+    ],
+)
+def test_what_names_no_cable_and_sense_moves_nothing(
+    served: Served, changes: dict[str, object]
+) -> None:
+    with served.something_moves(), served.page() as page:
+        command(page, "take_control")
+        command(page, "service_begin")
+        assert told(page, held_cable(1, **changes))["ok"] is False
+        assert served.said == []
+
+
 def test_what_a_page_held_ends_when_the_page_is_gone(served: Served) -> None:
     with served.something_moves(), served.page() as first:
         command(first, "take_control")

@@ -330,3 +330,65 @@ def test_a_press_that_is_none_is_refused(wrong: dict[str, Any]) -> None:
 def test_any_other_motion_takes_no_jogs(command: str) -> None:
     values = {"held": {"press": 1, "direction": [1, 0, 0]}, "let_go": {"press": 1}, "end": {}}
     assert "takes no jogs" in _said(None, command=command, **values[command])["what"]
+
+
+class _Noted:
+    """Notes what is said of presses; a cable 9 is not there."""
+
+    def __init__(self) -> None:
+        self.said: list[Any] = []
+
+    def hold(self, number: int, direction: Any, **how: Any) -> bool:
+        self.said.append((number, direction.tolist(), how))
+        return True
+
+    def hold_cable(self, number: int, cable: int, **how: Any) -> bool:
+        if cable == 9:
+            raise ValueError("there is no cable 9")
+        self.said.append((number, cable, how))
+        return number != 13
+
+    def let_go(self, number: int) -> None:
+        self.said.append(number)
+
+    def end(self) -> None:
+        self.said.append("end")
+
+
+def _held(**values: Any) -> tuple[dict[str, Any], list[Any]]:
+    presses = _Noted()
+    line = make_line("held", **values)
+    return json.loads(answer_to(line, LocalRequests(), STATUS, presses)), presses.said
+
+
+def test_a_held_control_moves_the_platform_or_one_cable():
+    answer, said = _held(press=1, direction=[0, 0, 2 / 3], frame="platform", step_mm=1.0)
+    assert answer["ok"]
+    assert said == [(1, [0, 0, 1], {"in_platform": True, "step": 0.001, "percent": 100})]
+    answer, said = _held(press=2, cable=3, sense="pay_out", percent=7)
+    assert answer["ok"]
+    assert said == [(2, 3, {"pays_out": True, "step": None, "percent": 7})]
+    assert _held(press=2, cable=3, sense="wind_in")[1][0][2]["pays_out"] is False
+
+
+@pytest.mark.parametrize(
+    ("values", "part"),
+    [
+        ({}, "either a direction, or a cable and its sense"),
+        ({"cable": 3}, "either"),
+        ({"sense": "wind_in"}, "either"),
+        ({"cable": 3, "sense": "wind_in", "direction": [0, 0, 1]}, "either"),
+        ({"cable": 3, "sense": "wind_in", "frame": "world"}, "either"),
+        ({"direction": [0, 0, 0]}, "direction is zero"),
+        ({"cable": 0, "sense": "wind_in"}, "greater than"),
+        ({"cable": 3, "sense": "in"}, "wind_in"),
+        ({"cable": 3, "sense": "wind_in", "step_mm": 3.0}, "step_mm"),
+        ({"cable": 9, "sense": "wind_in"}, "there is no cable 9"),
+        ({"press": 13, "cable": 3, "sense": "wind_in"}, "press 13 is over"),
+    ],
+)
+def test_a_held_control_that_moves_neither_is_refused(values, part):
+    answer, said = _held(**{"press": 1, **values})
+    assert answer["ok"] is False
+    assert part in answer["what"]
+    assert said == [] or values.get("press") == 13

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from executor.hold_to_run import session as sessions
-from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, Piece, PieceRing
+from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, JogProver, Piece, PieceRing
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
-from executor.hold_to_run.session import JogProver, jog_session
+from executor.hold_to_run.session import jog_session
 from executor.jogging import with_speed
 from executor.realtime.shared_memory import SharedMemory
 from executor.remote.protocol import STEPS_MM

@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.hold_to_run.presses import TIMEOUT, PressBoard, PressReader, PressRule
+from executor.hold_to_run.presses import (
+    TIMEOUT,
+    CablePress,
+    PlatformPress,
+    PressBoard,
+    PressReader,
+    PressRule,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 NUMBERS = st.integers(1, 6)
@@ -99,7 +106,7 @@ def test_what_a_press_asked_for_first_stays(board: PressBoard) -> None:
     hold(board, 1)
     board.hold(1, -UP, in_platform=True, step=0.001, percent=50)
     press = board.held()
-    assert press is not None
+    assert isinstance(press, PlatformPress)
     assert (press.direction == UP).all()
     assert (press.in_platform, press.step) == (False, None)
     assert PressReader(board.memory).read(10.0).share == 0.5, "but its speed may change"
@@ -120,7 +127,7 @@ def test_a_clock_that_jumps_back_holds_nothing(board: PressBoard, time: Time) ->
     assert PressReader(board.memory).read(time.now).press == 0
 
 
-@pytest.mark.parametrize("place", range(22))
+@pytest.mark.parametrize("place", range(32))
 def test_an_entry_that_is_half_written_does_not_count(board: PressBoard, place: int) -> None:
     hold(board, 1, percent=40)
     reader = PressReader(board.memory)
@@ -156,3 +163,48 @@ def test_a_press_knows_since_when_no_earlier_one_was_held(board: PressBoard, tim
     heard = time.now
     time.now += 3.0
     assert free_since(4) == pytest.approx(heard + TIMEOUT), "it fell silent"
+
+
+@pytest.fixture
+def cables(time: Time) -> PressBoard:
+    return PressBoard(time, cables=8)
+
+
+@pytest.mark.parametrize("step", [None, 0.001])
+@pytest.mark.parametrize("out", [True, False])
+def test_the_loop_reads_cable_sense_and_step(
+    cables: PressBoard, time: Time, out: bool, step: float | None
+) -> None:
+    assert cables.hold_cable(4, 8, pays_out=out, step=step, percent=30)
+    told = PressReader(cables.memory).read(time.now)
+    assert (told.press, told.cable, told.pays_out, told.step) == (4, 8, out, step)
+    assert told.share == 0.3
+
+
+def test_a_press_keeps_its_cable(cables: PressBoard, time: Time) -> None:
+    """What is said later under the same number changes neither cable nor sense nor length."""
+    cables.hold_cable(4, 3, pays_out=False, step=None, percent=100)
+    assert cables.hold_cable(4, 5, pays_out=True, step=0.001, percent=50)
+    told = PressReader(cables.memory).read(time.now)
+    assert (told.cable, told.pays_out, told.step, told.share) == (3, False, None, 0.5)
+    press = cables.held()
+    assert isinstance(press, CablePress)
+    assert (press.cable, press.pays_out) == (3, False)
+
+
+@pytest.mark.parametrize("cable", [0, 9, -1])
+def test_a_cable_that_is_not_there_is_not_held(cables: PressBoard, cable: int) -> None:
+    with pytest.raises(ValueError, match=f"no cable {cable}"):
+        cables.hold_cable(1, cable, pays_out=False, step=None, percent=100)
+    assert cables.held() is None
+
+
+def test_a_session_moves_either_cables_or_the_platform(
+    board: PressBoard, cables: PressBoard
+) -> None:
+    with pytest.raises(ValueError, match="moves the platform"):
+        board.hold_cable(1, 1, pays_out=False, step=None, percent=100)
+    with pytest.raises(ValueError, match="one cable at a time"):
+        hold(cables, 1)
+    assert board.held() is None
+    assert cables.held() is None

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.control.winch_laws import CableStep, PretensionLaw, wind_in_speed
+from executor.control.winch_laws import (
+    LEAST_SHARE,
+    CableFeed,
+    CableStep,
+    PretensionLaw,
+    TensionReserve,
+    tension_reserve,
+    wind_in_speed,
+)
 from executor.safety.monitor import StopReaction
 from model.rig import load_rig
 from tests.cli.plans import HALL, RIG
@@ -158,3 +166,113 @@ def test_only_a_cable_that_was_taut_may_not_go_slack(was):
         codes.append([finding.code for finding in found])
     assert codes[:4] == [[]] * 4
     assert codes[4] == (["went_slack"] if was else [])
+
+
+# A jog of one cable that is held: `CableFeed`, and where it comes to rest.
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rig=st.sampled_from(RIGS),
+    way=st.floats(-0.05, 0.05),
+    speed=st.floats(1e-3, 0.02),
+    paces=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=80),
+    seed=st.integers(0, 10**6),
+)
+def test_a_held_cable_goes_one_way_and_no_farther_than_its_reach(rig, way, speed, paces, seed):
+    random = np.random.default_rng(seed)
+    law = CableFeed(rig, [7] * 8, cable=2, way=way, limit=60.0, speed=speed)
+    counts = rig.winches[2].counts_per_metre
+    begin, end = law.reach
+    assert begin == (7,) * 8
+    assert end[2] == 7 + round(way * counts)
+    before, left = 7, law.cycles_left
+    for pace in paces:
+        targets, _ = law.next(pace, random.uniform(0.0, 80.0, 8).tolist())
+        assert (np.delete(targets, 2) == 7).all(), "the others stand"
+        ahead = targets[2] - before
+        assert ahead * np.sign(way * counts) >= 0
+        assert abs(ahead) <= abs(counts) * speed * 0.01 * pace + 1
+        assert abs(targets[2] - 7) <= abs(end[2] - 7)
+        assert law.cycles_left <= left
+        before, left = targets[2], law.cycles_left
+    while not law.done:
+        law.next(1.0, [0.0] * 8)
+    assert law.next(1.0, [0.0] * 8)[0] == end
+
+
+def test_a_way_of_nothing_is_done_at_once():
+    law = CableFeed(RIGS[0], [0] * 8, cable=2, way=0.0, limit=60.0, speed=0.02)
+    assert law.done
+    assert law.next(1.0, [0.0] * 8) == ((0,) * 8, ())
+
+
+def test_a_cable_that_goes_slack_speeds_up_without_a_jerk():
+    rig = RIGS[0]
+    law = CableFeed(rig, [0] * 8, cable=2, way=0.05, limit=60.0, speed=0.02)
+    places = [0]
+    for tension in [20.0] * 20 + [0.0] * 60:
+        targets, _ = law.next(1.0, [20.0, 20.0, tension] + [20.0] * 5)
+        places.append(abs(targets[2]))
+    steps = np.diff(places) / abs(per_metre(rig)[2])
+    most = rig.motion.acceleration / rig.motion.speed * 0.01 * 0.02 * 0.01
+    assert np.diff(steps).max() <= most + 2.0 / abs(per_metre(rig)[2])
+    assert steps[-1] > 5.0 * steps[10]
+
+
+SLACK, FLOOR = RIGS[0].min_tension / 2.0, LEAST_SHARE * RIGS[0].min_tension
+LIMIT = 62.0
+CEILING = LIMIT - tension_reserve(RIGS[0], LIMIT)
+
+
+def share(now, *, out, before=20.0):
+    """Of cable 3 (index 2): from tensions `before` of all to `now`, a number or a list."""
+    reserve = TensionReserve(RIGS[0], 2, limit=LIMIT, pays_out=out)
+    reserve.share(before if isinstance(before, list) else [before] * 8)
+    return reserve.share(now if isinstance(now, list) else [now] * 8)
+
+
+def one(cable, tension, others=20.0):
+    return [others] * cable + [tension] + [others] * (7 - cable)
+
+
+@pytest.mark.parametrize("cable", [2, 6])
+def test_winding_in_rests_from_the_reserve_on_whichever_cable_is_tight(cable):
+    assert share(one(cable, CEILING + 0.01), out=False) == 0.0
+    assert share(one(cable, CEILING - 0.01), out=False) == pytest.approx(0.05)
+    middle = (CEILING + SLACK) / 2.0
+    assert share(one(cable, middle), out=False) == pytest.approx(0.5, abs=0.01)
+    assert share(SLACK, out=False, before=SLACK) == 1.0
+
+
+def test_paying_out_goes_on_as_long_as_no_other_cable_becomes_tighter():
+    assert share(one(2, LIMIT + 30.0), out=True) == 1.0, "its own tension falls by it"
+    assert share(CEILING + 3.0, out=True, before=CEILING + 3.0) == 1.0
+    assert share(one(6, CEILING + 0.01), out=True) == 0.0
+    assert 0.0 < share(one(6, CEILING - 1.0), out=True) < 0.1
+    noise = 0.2 * tension_reserve(RIGS[0], LIMIT)
+    assert share(CEILING + 3.0 + noise, out=True, before=CEILING + 3.0) == 1.0
+
+
+@pytest.mark.parametrize("out", [True, False])
+def test_it_rests_before_another_cable_that_was_taut_is_slack(out):
+    assert share(one(6, FLOOR - 0.01), out=out) == 0.0
+    assert 0.0 < share(one(6, FLOOR + 0.5), out=out) < 0.1
+    assert share(one(2, FLOOR - 0.01), out=out) > 0.2, "its own may go slack"
+    hung = one(6, SLACK - 0.5)
+    assert share(one(6, 0.0), out=out, before=hung) > 0.2, "what hung slack may go on so"
+
+
+@pytest.mark.parametrize("out", [True, False])
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
+def test_a_tension_that_is_no_number_leaves_no_room(out, wrong):
+    for cable in (2, 6):
+        assert share(one(cable, wrong), out=out) == 0.0
+        assert share(20.0, out=out, before=one(cable, wrong)) >= 0.0
+
+
+@given(limit=st.floats(5.1, 100.0), rig=st.sampled_from(RIGS))
+def test_the_reserve_is_some_of_the_room_and_never_all(limit, rig):
+    room = limit - rig.min_tension / 2.0
+    if room > 0.0:
+        assert 0.1 * room - 1e-9 <= tension_reserve(rig, limit) <= 0.5 * room + 1e-9

@@ -39,7 +39,7 @@ class Operator:
     """Somebody at the page, without a page."""
 
     def __init__(self, page: ClientConnection) -> None:
-        self._page, self._press = page, 0
+        self._page, self._press, self._words = page, 0, 0
         self.state: dict[str, Any] = {}
 
     def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
@@ -92,6 +92,20 @@ class Operator:
         word = {"kind": "held", "hold": self._press, "direction": direction, "frame": "world"}
         word |= {"step_mm": None, "speed_mm_s": 20.0, "seq": 1}
         self._page.send(json.dumps(word))
+
+    def winds_in(self, cable: int, state: dict[str, Any]) -> float:
+        """Goes on holding; anew where the press ended. What it has paid out by then, [mm]."""
+        jog = state["cable"]
+        self._words += 1
+        if self._words % 40 == 1:
+            self._press += 1
+        word = {"kind": "held", "hold": self._press, "cable": cable, "sense": "wind_in"}
+        self._page.send(json.dumps(word | {"step_mm": None, "speed_mm_s": 2.0, "seq": 1}))
+        return float(jog["press_mm"]) if jog["cable"] == cable else 0.0
+
+    def let_go(self) -> None:
+        """The press ends."""
+        self._page.send(json.dumps({"kind": "let_go", "hold": self._press}))
 
     def moves(self, direction: list[float], state: dict[str, Any]) -> bool:
         """Goes on holding; whether the platform has begun to move."""
@@ -236,6 +250,47 @@ def find_any() -> bool:
     """Whether a motion is under way; each look waits for the answer of the system."""
     with find_runs() as runs:
         return bool(runs)
+
+
+def test_one_cable_moves_in_service_mode_as_long_as_a_page_holds_it(
+    on_a_day: Callable[[Day], None],
+) -> None:
+    on_a_day(one_cable)
+
+
+def one_cable(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
+    with console(slow_rig, bus) as (process, address), operator(address) as me:
+        reference = me.until(lambda state: state["platform"])["reference"]
+        assert "service mode" in me.command("cable_begin")["what"]
+        assert me.command("service_begin")["ok"]
+        assert me.command("cable_begin")["ok"]
+        me.until(lambda state: state["cable"]["ready"])
+        me.until(lambda state: me.winds_in(3, state) < -0.002)
+        me.let_go()
+        me.until(lambda state: not state["cable"]["moving"])
+        assert me.state["cable"]["cable"] == 3
+        assert me.state["cable"]["session_mm"][2] == me.state["cable"]["press_mm"]
+        assert me.command("jog_end")["ok"]
+        ended = me.until(lambda state: state["busy"] is None)["outcome"]
+        assert ended["ok"], ended["text"]
+        assert me.state["reference"] == reference, "single cables change nothing of it"
+
+        assert me.command("cable_begin")["ok"]
+        me.until(lambda state: state["cable"]["ready"])
+        me.until(lambda state: me.winds_in(5, state) < 0.0)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert stop_runs().stopped
+        while find_any():
+            pass
+    for name, cable in (("jog-cables", 3), ("jog-cables-2", 5)):
+        rows = (place / "runs" / name / "winches.csv").read_text().splitlines()[1:]
+        moving = [row.split(",") for row in rows if row.split(",")[2] in ("moving", "stopping")]
+        targets = [[int(v) for v in row[3:11]] for row in moving]
+        moved = {k for row in targets for k in range(8) if row[k] != targets[0][k]}
+        assert moved == {cable - 1}, name
+        last = [row.split(",")[3:11] for row in rows[-10:]]
+        assert all(target == last[0] for target in last)
 
 
 def test_a_stop_that_nobody_needs_says_so(on_a_day: Callable[[Day], None]) -> None:

@@ -84,6 +84,27 @@ def test_what_is_not_clearly_meant_moves_no_cable(
     one_message(call("jog", RIG, *options, "--fast"), code, part)
 
 
+HELD = ("--hold-to-run", "--one-cable")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "part"),
+    [
+        (("--one-cable",), 2, "--one-cable needs --hold-to-run"),
+        ((*HELD, "--keys"), 2, "without --keys"),
+        ((*HELD, "--limit-n", "101"), 3, "limit of 101 N"),
+        ((*HELD, *WAY), 2, "no effect here: --by-mm"),
+        ((*HELD, "--no-scene"), 2, "no effect here: --no-scene"),
+        ((*HELD, "--fast"), 2, "no effect here: --fast"),
+        (("--hold-to-run", "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),
+    ],
+)
+def test_what_is_not_clearly_meant_enables_no_drive(
+    options: tuple[str, ...], code: int, part: str
+) -> None:
+    one_message(call("jog", RIG, *options), code, part)
+
+
 def test_a_jog_into_an_obstacle_is_denied(tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(

@@ -33,8 +33,9 @@ from cdpr.cli.options import (
 from cdpr.cli.output import Terminal, err, out, show_json
 from executor import jogging
 from executor.drives import is_simulated, require_own_time
+from executor.hold_to_run.line import JogProver
 from executor.hold_to_run.presses import PressBoard
-from executor.hold_to_run.session import JogProver, jog_session
+from executor.hold_to_run.session import cable_session, jog_session
 from executor.jogging import FASTEST, SPEED
 from executor.state_machine import CycleRecord, State
 from model.errors import BadInput
@@ -97,6 +98,13 @@ class HeldOptions:
             "--keys", help="as --hold-to-run, by keys: arrows for x and y, page up and down for z"
         ),
     ] = False
+    one_cable: Annotated[
+        bool,
+        typer.Option(
+            "--one-cable",
+            help="with --hold-to-run: controls wind one cable in or pay it out, homed or not",
+        ),
+    ] = False
 
 
 #: Keys that hold a jog, and where to.
@@ -126,7 +134,10 @@ def jog(
     ] = None,
     held: HeldOptions = NOT_HELD,
     limit_n: Annotated[
-        float | None, typer.Option(help="with --cable: tension limit of any cable (default: 60 %)")
+        float | None,
+        typer.Option(
+            help="with --cable or --one-cable: tension limit of any cable (default: 60 %)"
+        ),
     ] = None,
     speed_mm_s: Annotated[
         float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
@@ -146,6 +157,7 @@ def jog(
     winch alone is moved: for commissioning, with cables that carry no load. With --hold-to-run the
     drives stay enabled, and the platform moves as long as a control is held, over the command
     socket; `cdpr console` has such controls. With --keys it moves as long as a key is held here.
+    With --hold-to-run --one-cable controls move one winch at a time instead of the platform.
 
     [dim]Examples:[/dim]
 
@@ -163,6 +175,9 @@ def jog(
             "a single cable is moved without a path, and obstacles are not checked",
         )
         _one_cable(the_rig, cable, mm, limit_n, speed, fast, yes, without_real_time, as_json)
+        return
+    if held.one_cable:
+        _held_cables(the_rig, path, held, limit_n, speed, fast, yes, without_real_time, as_json)
         return
     require_unused(
         "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
@@ -224,6 +239,38 @@ def _held(
             supervisor=SignalSupervisor(),
             on_cycle=None if keys is None else keys.take_cycle,
         )
+    out.print("the session is over; the drives hold")
+
+
+def _held_cables(
+    rig: Rig,
+    path: PathOptions,
+    held: HeldOptions,
+    limit_n: float | None,
+    speed: float,
+    fast: bool,
+    yes: bool,
+    without_real_time: bool,
+    as_json: bool,
+) -> None:
+    if not held.hold_to_run or held.keys:
+        raise BadInput(
+            "--one-cable needs --hold-to-run, without --keys",
+            where="cdpr jog",
+            why="single cables are jogged by controls that are held, as of `cdpr console`",
+            next_step="pass --hold-to-run --one-cable, or --cable N --mm X for a fixed length",
+        )
+    unused = {**path.given(), "--json": as_json, "--fast": fast}
+    require_unused("cdpr jog", unused, "controls move one cable at a time, without a path")
+    cable_session(
+        rig,
+        limit=limit_n,
+        speed=speed,
+        need_real_time_rights=not without_real_time,
+        listener=Terminal(quiet=False),
+        confirm=confirmation(asks=not (is_simulated(rig) or yes), as_json=False),
+        supervisor=SignalSupervisor(),
+    )
     out.print("the session is over; the drives hold")
 
 

@@ -9,7 +9,7 @@ const ACTIVE = ["preparing", ...MOVING];
 const VERBS = { run: "A run is under way", home: "Homing is under way", reset: "A reset is under way", release: "The drives are being released", plan: "A plan is being made", jog: "Jogging is enabled: end it first" };
 
 export const isActive = (motion) => motion !== null && ACTIVE.includes(motion.state);
-const isJogging = ({ busy, jog }) => jog.ready || busy?.verb === "jog";
+const isJogging = ({ busy, jog, cable }) => jog.ready || cable.ready || busy?.verb === "jog";
 
 /** Each is a reason why not, or null. Order in `BUTTONS` is the order in which reasons are given. */
 const REQUIREMENTS = {
@@ -23,7 +23,7 @@ const REQUIREMENTS = {
   homed: ({ state: { reference } }) => (reference.counts ? null : reference.why_not || "The drives are not homed"),
   idle: ({ state }) => {
     if (state.busy) return VERBS[state.busy.verb] ?? "Something is under way";
-    if (state.jog.ready) return VERBS.jog;
+    if (state.jog.ready || state.cable.ready) return VERBS.jog;
     return isActive(state.motion) ? "The platform is in motion" : null;
   },
   moves: ({ state: { motion } }) => (motion && MOVING.includes(motion.state) ? null : "Nothing is moving"),
@@ -35,6 +35,10 @@ const REQUIREMENTS = {
   proved: ({ preview }) => (preview === undefined || !preview ? "The plan is being read" : preview.passed ? null : "The plan did not pass its check"),
   jogging: ({ state }) => (isJogging(state) ? null : "Jogging is not enabled"),
   jog_ready: ({ state: { jog } }) => (jog.ready ? null : jog.why_not || "Enable the drives for jogging first"),
+  cable_ready: ({ state: { cable } }) => (cable.ready ? null : cable.why_not || "Enable the drives for single cables first"),
+  service: ({ state: { control } }) => (control.mode === "service" ? null : "Enter service mode first"),
+  not_service: ({ state: { control } }) => (control.mode === "service" ? "This page is in service mode" : null),
+  idle_but_cables: (situation) => (situation.state.cable.ready ? null : REQUIREMENTS.idle(situation)),
   located: ({ state }) => (state.platform ? null : "The platform’s position is not known"),
   poses: ({ state }) => (state.poses.length ? null : "No pose is taught yet"),
   two_poses: ({ state }) => (state.poses.length > 1 ? null : "Teach two poses first"),
@@ -62,6 +66,11 @@ export const BUTTONS = {
   jog_end: [...OPERATOR, "jogging"],
   jog: [...OPERATOR, "unlatched", "jog_ready"],
   jog_setting: ["fresh", "writable"],
+  service_begin: [...OPERATOR, "not_service", "idle_but_cables"],
+  service_end: [...OPERATOR, "service"],
+  cable_begin: [...OPERATOR, "service", "idle", "unlatched"],
+  cable: [...OPERATOR, "service", "unlatched", "cable_ready"],
+  cable_setting: ["fresh", "writable"],
   teach: [...OPERATOR, "located"],
   teach_at: [...OPERATOR, "located"],
   edit_pose: [...OPERATOR, "poses"],

@@ -1,74 +1,138 @@
-/* The jog panel: buttons, keys and a gamepad, each of which holds the one press of hold.js. */
+/* The jog panels, of the platform and of one cable: buttons, keys and a gamepad hold the one press of hold.js. */
 
-import { at, chosen, known, mark, write } from "./elements.js";
+import { at, chosen, known, make, mark, write } from "./elements.js";
 import { Hold } from "./hold.js";
 import { whyNot } from "./buttons.js";
 
-const KEYS = { ArrowRight: "+x", ArrowLeft: "-x", ArrowUp: "+y", ArrowDown: "-y", PageUp: "+z", PageDown: "-z" };
 /** Axes of the standard gamepad: left stick x and y, right stick up and down; a stick counts beyond the dead zone. */
 const DEAD_ZONE = 0.25, POLL_MS = 50, SHOULDERS = [4, 5];
 
-function vectorOf(name) {
-  const sign = name[0] === "+" ? 1 : -1;
-  return ["x", "y", "z"].map((axis) => (axis === name[1] ? sign : 0));
+function beyond(v) {
+  return Math.abs(v) < DEAD_ZONE ? 0 : v;
 }
 
+function stepOf(group) {
+  const step = chosen(group);
+  return step === "null" ? null : Number(step);
+}
+
+/** What differs between both panels, by the name of the panel and of its buttons. */
+const PADS = {
+  jog: {
+    keys: { ArrowRight: "+x", ArrowLeft: "-x", ArrowUp: "+y", ArrowDown: "-y", PageUp: "+z", PageDown: "-z" },
+    motion: (name) => ({ direction: ["x", "y", "z"].map((axis) => (axis === name[1] ? (name[0] === "+" ? 1 : -1) : 0)) }),
+    settings: () => ({ frame: chosen("jog-frame") }),
+    stick: ([x, y, , up]) => {
+      const direction = [x, -y, -up].map(beyond);
+      return { share: Math.hypot(...direction), motion: { direction } };
+    },
+  },
+  cable: {
+    keys: { ArrowUp: "wind_in", PageUp: "wind_in", ArrowDown: "pay_out", PageDown: "pay_out" },
+    motion: (name) => ({ cable: Number(chosen("cable")), sense: name }),
+    settings: () => ({}),
+    stick: ([, left, , right]) => {
+      const v = beyond(Math.abs(left) > Math.abs(right) ? left : right);
+      return { share: Math.abs(v), motion: PADS.cable.motion(v < 0 ? "wind_in" : "pay_out") };
+    },
+  },
+};
+const motionOf = (button) => PADS[button.closest("#jog-pad") ? "jog" : "cable"].motion(button.dataset.jog);
+const PANELS = { jog: "jog", cable: "service" }; // views
+const panelOf = (motion) => (motion.direction ? "jog" : "cable");
+
 /**
- * Binds the panel. `situation()` as in buttons.js; `command(name)` sends one. The answer has `end(why)`, to be called
+ * Binds both panels. `situation()` as in buttons.js; `command(name)` sends one. The answer has `end(why)`, to be called
  * when the page changes under the operator's hands, and `show(state)`.
  */
 export function bindJog(connection, situation, command) {
-  const pad = at("jog-pad"), said = at("jog-said");
   const hold = new Hold({
     send: (message) => connection.send(message),
-    whyNot: () => (document.hasFocus() && !document.hidden ? whyNot("jog", situation()) : "this page does not have the focus"),
-    settings: () => ({
-      frame: chosen("jog-frame"),
-      step_mm: chosen("jog-step") === "null" ? null : Number(chosen("jog-step")),
-      speed_mm_s: Number(at("jog-speed").value),
-    }),
+    whyNot: (motion) => (document.hasFocus() && !document.hidden ? whyNot(panelOf(motion), situation()) : "this page does not have the focus"),
+    settings: (motion) => {
+      const panel = panelOf(motion);
+      return { ...PADS[panel].settings(), step_mm: stepOf(`${panel}-step`), speed_mm_s: Number(at(`${panel}-speed`).value) };
+    },
     changed: (press, why) => {
-      for (const button of pad.querySelectorAll("[data-jog]"))
-        button.classList.toggle("held", press !== null && !String(press.source).startsWith("gamepad") && vectorOf(button.dataset.jog).join() === press.direction.join());
-      write(said, press ? "Held" : why === "released" ? "Released" : `Ended: ${why}`);
+      const isOn = press !== null && !press.source.startsWith("gamepad"), held = isOn && JSON.stringify(press.motion);
+      for (const button of document.querySelectorAll("[data-jog]")) button.classList.toggle("held", isOn && JSON.stringify(motionOf(button)) === held);
+      const text = press ? "Held" : why === "released" ? "Released" : `Ended: ${why}`;
+      for (const panel of Object.keys(PADS)) write(at(`${panel}-said`), text);
     },
   });
 
-  bindPointers(pad, hold);
-  bindKeys(pad, hold);
+  for (const panel of Object.keys(PADS)) {
+    const pad = at(`${panel}-pad`), begin = `${panel}_begin`;
+    bindKeys(pad, hold, PADS[panel]);
+    bindGamepad(panel, hold, PADS[panel]);
+    at(`${panel}-speed`).addEventListener("input", () => showSpeed(panel));
+    if (panel === "jog") at("jog-begin").addEventListener("click", () => command(begin));
+    at(`${panel}-end`).addEventListener("click", () => {
+      hold.end("jogging ended");
+      command("jog_end");
+    });
+    showSpeed(panel);
+  }
+  bindPointers(hold);
   bindEnds(hold);
-  bindGamepad(hold);
-  at("jog-speed").addEventListener("input", showSpeed);
-  at("jog-begin").addEventListener("click", () => command("jog_begin"));
-  at("jog-end").addEventListener("click", () => {
-    hold.end("jogging ended");
-    command("jog_end");
-  });
+  at("cables").addEventListener("change", () => hold.end("another cable was chosen"));
   for (const event of ["stale", "closed"]) connection.addEventListener(event, () => hold.end("data are too old"));
-  showSpeed();
 
   return {
     end: (why) => hold.end(why),
-    show: ({ jog, platform, clearance_mm: clearance }) => {
-      const here = ["x", "y", "z"].map((axis, k) => `${axis}\u00a0${known(platform?.position_mm[k], 1)}`).join("  ");
-      write(at("jog-here"), `${here}\u00a0mm · clearance ${known(clearance?.now, 0, "mm")}`);
-      pad.classList.toggle("ready", jog.ready);
-      const text = jog.ready ? (jog.moving ? "Moving" : "Ready: hold a button to move") : jog.why_not || "The drives are not enabled for jogging";
-      write(at("jog-state"), text);
-      if (jog.speed_mm_s) mark(at("jog-speed"), "max", String(jog.speed_mm_s)); // the fastest that it may be
-      showSpeed();
-      write(at("jog-limit"), jog.limit ?? "");
-      at("jog-limit").hidden = !jog.limit;
+    show: (state) => {
+      showPlatform(state);
+      showCable(state);
     },
   };
 }
 
-function showSpeed() {
-  write(at("jog-speed-shown"), known(Number(at("jog-speed").value), 0, "mm/s"));
-  mark(at("jog-speed"), "aria-valuetext", `${at("jog-speed").value} millimetres per second`);
+function showPad(panel, jog, text) {
+  at(`${panel}-pad`).classList.toggle("ready", jog.ready);
+  write(at(`${panel}-state`), text);
+  if (jog.speed_mm_s) mark(at(`${panel}-speed`), "max", String(jog.speed_mm_s)); // the fastest that it may be
+  showSpeed(panel);
+  write(at(`${panel}-limit`), jog.limit ?? "");
+  at(`${panel}-limit`).hidden = !jog.limit;
 }
 
-function bindPointers(pad, hold) {
+function showPlatform({ jog, platform, clearance_mm: clearance }) {
+  const here = ["x", "y", "z"].map((axis, k) => `${axis}\u00a0${known(platform?.position_mm[k], 1)}`).join("  ");
+  write(at("jog-here"), `${here}\u00a0mm · clearance ${known(clearance?.now, 0, "mm")}`);
+  showPad("jog", jog, jog.ready ? (jog.moving ? "Moving" : "Ready: hold a button to move") : jog.why_not || "The drives are not enabled for jogging");
+}
+
+function showCable({ cable: jog, tensions_n: tensions, tension_limits_n: [low, high] }) {
+  const list = at("cables"), count = tensions?.length ?? 0;
+  if (count && list.querySelectorAll("input").length !== count) makeCables(list, count);
+  const number = Number(chosen("cable")), tension = tensions?.[number - 1] ?? null, limit = jog.limit_n ?? high, full = 1.1 * limit;
+  const track = at("cable-track");
+  track.style.setProperty("--low", `${(100 * low) / 2 / full}%`);
+  track.style.setProperty("--high", `${(100 * limit) / full}%`);
+  at("cable-bar").style.width = `${tension === null ? 0 : Math.min(100, Math.max(0, (100 * tension) / full))}%`;
+  at("cable-bar").style.background = tension === null ? "" : globalThis.tensionColour((tension - low / 2) / (limit - low / 2));
+  write(at("cable-tension"), number ? `Cable ${number}: ${known(tension, 1, "N")}` : "No cable is known yet");
+  write(at("cable-range"), `slack below ${known(low / 2, 1, "N")}, limit ${known(limit, 0, "N")}`);
+  const sense = (mm) => (Math.abs(mm) < 0.0005 ? "not moved" : `${known(Math.abs(mm), 3, "mm")} ${mm > 0 ? "paid out" : "wound in"}`);
+  const own = jog.cable === number ? `By this press ${sense(jog.press_mm)} · since` : "Since";
+  write(at("cable-way"), jog.ready && number ? `${own} the session began ${sense(jog.session_mm[number - 1])}` : "");
+  showPad("cable", jog, jog.ready ? (jog.moving ? `Cable ${jog.cable} is held` : "Ready: hold a button to move the cable") : jog.why_not || "The drives are not enabled");
+}
+
+/** Numbered as in the scene; the first is chosen. */
+function makeCables(list, count) {
+  const choices = Array.from({ length: count }, (_, k) =>
+    make("label", {}, make("input", { type: "radio", name: "cable", value: String(k + 1), "data-button": "cable_setting", checked: k === 0, "aria-label": `Cable ${k + 1}` }), make("span", {}, String(k + 1))));
+  list.replaceChildren(list.querySelector("legend"), ...choices);
+}
+
+function showSpeed(panel) {
+  const slider = at(`${panel}-speed`);
+  write(at(`${panel}-speed-shown`), known(Number(slider.value), 0, "mm/s"));
+  mark(slider, "aria-valuetext", `${slider.value} millimetres per second`);
+}
+
+function bindPointers(hold) {
   const down = new Set(); // pointers that are down anywhere on the page
   let refused = null; // the pointer that ended a press must not begin the next
   window.addEventListener("pointerdown", (event) => {
@@ -83,11 +147,11 @@ function bindPointers(pad, hold) {
   window.addEventListener("pointermove", (event) => {
     if (hold.source === `pointer ${event.pointerId}` && event.buttons !== 1) hold.end("another button of the mouse");
   }, { capture: true });
-  for (const button of pad.querySelectorAll("[data-jog]")) {
+  for (const button of document.querySelectorAll("[data-jog]")) {
     button.addEventListener("pointerdown", (event) => {
       if (event.button !== 0 || down.size > 1 || refused === event.pointerId || button.getAttribute("aria-disabled")) return;
       button.setPointerCapture(event.pointerId);
-      hold.press(`pointer ${event.pointerId}`, vectorOf(button.dataset.jog));
+      hold.press(`pointer ${event.pointerId}`, motionOf(button));
     });
     button.addEventListener("lostpointercapture", (event) => hold.release(`pointer ${event.pointerId}`));
     // A long touch is a press, not the menu of the browser.
@@ -96,14 +160,14 @@ function bindPointers(pad, hold) {
 }
 
 /** Arrows and page keys while the pad has the focus; Enter presses the button that has it. */
-function bindKeys(pad, hold) {
+function bindKeys(pad, hold, { keys, motion }) {
   pad.addEventListener("keydown", (event) => {
-    const name = event.key === "Enter" ? event.target.dataset.jog : KEYS[event.key];
+    const name = event.key === "Enter" ? event.target.dataset.jog : keys[event.key];
     if (name) event.preventDefault();
     if (event.repeat) return;
     if (hold.source !== null) return hold.end("a second key");
     if (!name || event.ctrlKey || event.altKey || event.metaKey || event.shiftKey) return;
-    hold.press(`key ${event.code}`, vectorOf(name));
+    hold.press(`key ${event.code}`, motion(name));
   });
   window.addEventListener("keyup", (event) => hold.release(`key ${event.code}`), { capture: true });
   pad.addEventListener("focusout", (event) => {
@@ -116,14 +180,14 @@ function bindEnds(hold) {
   window.addEventListener("pagehide", () => hold.end("the page was left"));
   document.addEventListener("visibilitychange", () => document.hidden && hold.end("the page is hidden"));
   window.addEventListener("contextmenu", (event) => {
-    if (hold.source !== null || (event.target instanceof Element && event.target.closest("#jog-pad"))) event.preventDefault();
+    if (hold.source !== null || (event.target instanceof Element && event.target.closest("#jog-pad, #cable-pad"))) event.preventDefault();
     hold.end("a menu was opened");
   }, { capture: true });
 }
 
 /** A shoulder button held and a stick away from its centre, in that order: a stick alone moves nothing. */
-function bindGamepad(hold) {
-  const box = at("jog-gamepad"), text = at("jog-gamepad-state");
+function bindGamepad(panel, hold, { stick }) {
+  const box = at(`${panel}-gamepad`), text = at(`${panel}-gamepad-state`), source = `gamepad ${panel}`;
   let centred = false; // since the last press: a stick that is still held after its press ended must not begin another
 
   function poll() {
@@ -131,26 +195,25 @@ function bindGamepad(hold) {
     write(text, !box.checked ? "" : pad ? "Connected: hold a shoulder button and move a stick" : "No gamepad found: press one of its buttons");
     if (!pad) {
       centred = false;
-      return hold.release("gamepad");
+      return hold.release(source);
     }
-    const [x, y, , up] = pad.axes, direction = [x, -y, -up].map((v) => (Math.abs(v) < DEAD_ZONE ? 0 : v));
-    const share = Math.min(1, Math.hypot(...direction));
+    const { share, motion } = stick(pad.axes);
     const enabled = SHOULDERS.some((k) => pad.buttons[k]?.pressed);
     if (share === 0 || !enabled) {
       centred = share === 0;
-      return hold.release("gamepad");
+      return hold.release(source);
     }
-    if (hold.source === "gamepad") hold.steer("gamepad", direction, share);
-    else if (centred && at("panel-jog").checkVisibility()) {
+    if (hold.source === source) hold.steer(source, motion, Math.min(1, share));
+    else if (centred && at(`panel-${PANELS[panel]}`).checkVisibility()) {
       centred = false;
-      hold.press("gamepad", direction, share);
+      hold.press(source, motion, Math.min(1, share));
     }
   }
 
   setInterval(poll, POLL_MS);
   window.addEventListener("gamepaddisconnected", () => {
     centred = false;
-    hold.release("gamepad");
+    hold.release(source);
   });
   box.addEventListener("change", () => hold.end("the gamepad was switched"));
 }

@@ -6,10 +6,11 @@ import { at, duration, known, make, mark, write } from "./elements.js";
 /** Lamps: what is shown, and whether that is good (pass), bad (fail), worth a look (stop) or neither (quiet). */
 const LAMPS = {
   control: ({ control, read_only: readOnly }) =>
-    readOnly ? ["Read-only", "quiet"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
-  drives: ({ motion, jog }) => {
+    readOnly ? ["Read-only", "quiet"] : control.mode === "service" ? ["Service mode", "stop"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
+  drives: ({ motion, jog, cable }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
-    if (!drives.length) return [jog.ready ? "Drives on" : "Drives not heard", jog.ready ? "stop" : "quiet"];
+    const ready = jog.ready || cable.ready;
+    if (!drives.length) return [ready ? "Drives on" : "Drives not heard", ready ? "stop" : "quiet"];
     return [`${on} of ${drives.length} drives on`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
   },
   homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
@@ -22,8 +23,9 @@ const STATES = {
 };
 
 /** What moves, in a few words. */
-export function motionText({ motion, busy, jog, latched }) {
+export function motionText({ motion, busy, jog, cable, latched }) {
   if (jog.ready) return jog.moving ? "Jogging" : "Ready to jog";
+  if (cable.ready) return cable.moving ? `Jogging cable ${cable.cable}` : "Ready to jog a cable";
   if (motion) {
     const share = motion.path_length_mm ? ` · ${Math.round((100 * motion.path_mm) / motion.path_length_mm)} %` : "";
     return (STATES[motion.state] ?? motion.state) + (isActive(motion) ? share : "");

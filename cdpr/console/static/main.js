@@ -42,12 +42,12 @@ const stopBar = bindStop(connection, () => {
   jog.end("STOP");
 }, () => {
   const { state, stale } = situation();
-  return !stale && !state.jog.ready && !isActive(state.motion);
+  return !stale && !state.jog.ready && !state.cable.ready && !isActive(state.motion);
 });
 const live = new Live(), curves = new Curves(), events = new Events(), pictures = new Pictures(), teach = new Teach(page), pick = new Pick(page), operate = new Operate(page);
 const jog = bindJog(connection, situation, command);
 
-// Views: beside the live view on a wide screen, one of five on a narrow one.
+// Views: beside the live view on a wide screen, one of six on a narrow one.
 const tabs = [...document.querySelectorAll("[role=tab]")];
 const wide = matchMedia("(min-width: 900px)");
 

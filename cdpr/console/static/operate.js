@@ -45,6 +45,9 @@ export class Operate {
       await page.command("speed", { percent: Number(at("speed").value) });
       this.#sliding = false;
     });
+    at("service-begin").addEventListener("click", () => this.#service());
+    at("service-end").addEventListener("click", () => page.command("service_end"));
+    at("cable-begin").addEventListener("click", () => this.#cables());
     at("home").addEventListener("click", () => this.#home());
     at("reset").addEventListener("click", () => this.#reset());
     at("release").addEventListener("click", () => this.#release());
@@ -83,6 +86,10 @@ export class Operate {
     write(at("control-text"), state.read_only ? "This console is read-only: you see everything, and STOP works." : control.yours ? "You have control." : control.held_by ? `${control.held_by} has control. You see everything, and STOP works.` : "Control is free. Take it to command the robot.");
     at("take-control").hidden = control.yours;
     at("give-control").hidden = !control.yours;
+    const isService = control.mode === "service";
+    write(at("service-text"), isService ? "In service mode." : "For commissioning, beside the robot.");
+    at("service-begin").hidden = isService;
+    at("service-end").hidden = !isService;
     at("latched").hidden = latched === null;
     write(at("latched-cause"), latched ?? "");
     this.#motion(state);
@@ -105,7 +112,7 @@ export class Operate {
     if (along !== null) {
       at("progress").value = along;
       write(at("progress-text"), `${known(motion.path_mm, 0)} of ${known(motion.path_length_mm, 0, "mm")} · ${duration(motion.elapsed_s)} · feed ${known(motion.feed_percent, 0)} %`);
-    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.jog.moving ? "" : "Nothing is moving.");
+    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.jog.moving || state.cable.moving ? "" : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
     if (asked !== undefined && !this.#sliding) {
@@ -217,6 +224,23 @@ export class Operate {
     if (holder === null) return this.#page.command("take_control");
     const lines = [`${holder} has control, and loses it at once. Speak to who is there first.`, "It is not taken away while the robot moves."];
     if (await this.#confirmed("take_control", { title: "Take control away?", lines, confirm: "Take control" })) this.#page.command("take_control", { force: true });
+  }
+
+  async #service() {
+    const lines = ["In service mode single winches can be moved. Obstacles, workspace and the platform’s pose are not checked then.", "Only enter it where you see the robot. It ends with your control of it."];
+    if (await this.#confirmed("service_begin", { title: "Enter service mode?", lines, confirm: "Enter service mode" })) this.#page.command("service_begin");
+  }
+
+  async #cables() {
+    const { reference } = this.#page.situation().state;
+    const lines = [
+      "The drives are enabled where they are. One winch moves as long as you hold a button, a key or a stick.",
+      "Checked are tensions and speed alone: no obstacle, no workspace, no pose. The platform may move, tilt or drop.",
+      make("p", { class: "cause" }, make("b", {}, "Homing: "), reference.counts
+        ? "the reference stays, as the drives go on counting. No run begins while their positions fit no pose; then wind back, or home again."
+        : "the drives are not homed, and are not by this. Home them afterwards."),
+    ];
+    if (await this.#confirmed("cable_begin", { title: "Enable the drives for single cables?", lines, confirm: "Enable the drives" })) this.#page.command("cable_begin");
   }
 
   async #home() {
