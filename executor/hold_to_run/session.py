@@ -268,7 +268,7 @@ class _CableJogs:
 
 
 def _nothing(_record: CycleRecord, _presses: PressBoard, _moved: object) -> None:
-    """Nobody looks on."""
+    """No program looks on."""
 
 
 def _cycle(rig: Rig) -> float:
