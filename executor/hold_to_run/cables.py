@@ -292,12 +292,10 @@ class CableTravel:
         if not most <= self._near:
             text = f"cable {tightest + 1} carries {most:.1f} N"
             return f"{text}, near the limit of {self.tension_limit:g} N"
-        taut = [k for k, t in enumerate(self._tensions) if t >= self._rig.min_tension / 2.0]
-        for cable in taut:
-            if self._tensions[cable] < LEAST_SHARE * self._rig.min_tension and self.by_press:
-                return (
-                    f"cable {cable + 1} carries {self._tensions[cable]:.1f} N and is nearly slack"
-                )
+        slack, least = self._rig.min_tension / 2.0, LEAST_SHARE * self._rig.min_tension
+        for cable, tension in enumerate(self._tensions, start=1):
+            if slack <= tension < least and cable != self.cable and self.by_press:
+                return f"cable {cable} carries {tension:.1f} N: it is nearly slack"
         if abs(self.by_press) > 0.9 * self._longest:
             return f"a press moves a cable by {1e3 * self._longest:g} mm at most"
         return ""

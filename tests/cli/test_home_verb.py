@@ -61,6 +61,10 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990")
     assert call("home", RIG, "--at-home", *bus, answers="n\n").code == 130
     assert call("jog", RIG, "--cable", "1", "--mm", "1", *bus, answers="n\n").code == 130
+    held = call("jog", RIG, "--hold-to-run", "--one-cable", *bus, answers="n\n")
+    assert held.code == 130
+    assert "nothing was enabled" in held.said
+    assert "stays as it is; a run begins only where drive positions fit a pose" in held.said
     assert not list(tmp_path.rglob("*.json"))
 
 

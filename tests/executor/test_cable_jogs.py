@@ -16,7 +16,7 @@ from executor.control import winch_laws
 from executor.control.winch_laws import tension_reserve
 from executor.hold_to_run import session as sessions
 from executor.hold_to_run.cables import CableLimits, CableTravel
-from executor.hold_to_run.presses import TIMEOUT, PressBoard, PressState
+from executor.hold_to_run.presses import TIMEOUT, CablePress, PressBoard, PressState
 from executor.hold_to_run.session import cable_session
 from executor.jogging import with_speed
 from executor.remote.protocol import STEPS_MM
@@ -327,3 +327,35 @@ def test_the_status_says_which_cable_and_how_far() -> None:
     assert jog["press_mm"] == pytest.approx(1.0, abs=0.01)
     assert jog["session_mm"] == pytest.approx([0, 0, jog["press_mm"], 0, 0, 0, 0, 0])
     assert jog["limit_n"] == pytest.approx(62.0)
+
+
+def cycle(targets: list[int], tension: list[float], index: float, rate: float) -> CycleRecord:
+    """One record of a session that moves."""
+    per_newton = 1000.0 / 100.0  # rated torque pulls 100 N
+    torques = tuple(int(v) for v in np.rint(per_newton * np.array(tension)))
+    zero = (0,) * 8
+    return CycleRecord(
+        cycle=1, at=1.0, state=State.MOVING, index=index, rate=rate, targets=tuple(targets),
+        actual=zero, torques=torques, words=zero, missing=0, rejected=0, error_frames=0,
+        following_error=0.0, lateness=0.0,
+    )  # fmt: skip
+
+
+def test_what_keeps_a_cable_from_going_on_is_said() -> None:
+    travel = CableTravel(rig(), 62.0, 0.050)
+    assert (travel.cable, travel.limit, travel.by_session) == (0, "", [0.0] * 8)
+    easy, tight, slack = [20.0] * 8, [20.0] * 8, [20.0] * 8
+    tight[5], slack[6] = 55.0, 3.0
+    press = CablePress(1, None, 0.0, 3, False)
+    travel.take_cycle(cycle([0] * 8, easy, 0.0, 0.0), press)
+    assert (travel.cable, travel.limit) == (3, ""), "it is held, and has not moved yet"
+    travel.take_cycle(cycle([0, 0, 0, 0, 7, 0, 0, 0], easy, 0.1, 1.0), None)
+    assert (travel.cable, travel.by_press) == (5, 0.0001)
+    for tension, index, text in (
+        (easy, 0.1, ""),
+        (tight, 0.1, "cable 6 carries 55.0 N, near the limit of 62 N"),
+        (slack, 0.1, "cable 7 carries 3.0 N: it is nearly slack"),
+        (easy, -49.0, "a press moves a cable by 50 mm at most"),
+    ):
+        travel.take_cycle(cycle([0, 0, 0, 0, 7, 0, 0, 0], tension, index, 0.0), None)
+        assert travel.limit == text
