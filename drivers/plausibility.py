@@ -131,7 +131,8 @@ def position_limits(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[int, int
         raise BadInput(
             f"positions from {low} to {high} counts exceed the drive's 32-bit range",
             where=f"rig {rig.name}: winches[{drive}]",
-            next_step="choose home_counts nearer to 0, or fewer counts per metre of cable",
+            next_step="choose home_counts nearer to 0, or fewer counts per metre of cable; where"
+            " `cdpr home` says this, set the drive's position near 0 with its maker's tool",
         )
     return low, high
 

@@ -150,7 +150,7 @@ def with_board(
         raise Fault(
             stand.cause,
             where="winches",
-            why="the motion was stopped, all drives together; they hold",
+            why="the motion was stopped, all drives together; `cdpr status RIG` shows which hold",
             next_step="find the cause; simulated drives start fresh"
             if is_simulated(rig)
             else "find the cause and look at the platform, then `cdpr reset RIG`",

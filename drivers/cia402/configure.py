@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,33 +12,35 @@ from drivers.can_errors import (
     SETTING_UP,
     all_of_them,
     answers_twice,
-    in_fault,
-    keeps_another,
-    moved_by_another,
 )
 from drivers.cia402.error_codes import abort_text
-from drivers.cia402.object_dictionary import (
+from drivers.cia402.expected_objects import (
     BEFORE,
-    HEARTBEAT_CONSUMERS,
     MODE_DISPLAY,
-    PDO_IDENTIFIER,
-    PDO_INVALID,
-    UNUSED_PDOS,
-    USED_PDOS,
-    Expectation,
-    Setting,
+    count_heartbeats,
     expected_by,
-    heartbeat_consumers,
     identifiers,
     identity,
+    number_text,
+    require_absent,
+    require_expected,
+    require_idle,
+    require_there,
+    wrong_value,
+)
+from drivers.cia402.object_dictionary import (
+    PDO_IDENTIFIER,
+    PDO_INVALID,
+    Setting,
+    heartbeat_consumers,
     left_out,
     settings_for,
+    stated_absent,
 )
 from drivers.cia402.pdo import NmtCommand
-from drivers.cia402.profile import profile_of
+from drivers.cia402.profile import STANDARD_PDOS, profile_of, unused_pdos, used_pdos
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork, silent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
-from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import OnRestarted, Pump
 from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import ProfileDocument
@@ -118,11 +119,13 @@ def configure_drives(
     entries: list[int] = []
     for drive, node in enumerate(nodes):
         for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
-            wrong.note(_expect, network, node, expected)
-        wrong.note(_check_idle, network, node, to_reset)
+            wrong.note(require_expected, network, node, expected)
+        wrong.note(require_idle, network, node, to_reset)
         for setting in settings[drive]:
-            wrong.note(_require_there, network, node, setting)
-        wrong.note(_count_heartbeats, network, node, profile, entries)
+            wrong.note(require_there, network, node, setting)
+        for setting in stated_absent(rig, drive, winch_map, max_tension):
+            wrong.note(require_absent, network, node, setting)
+        wrong.note(count_heartbeats, network, node, profile, entries)
     wrong.refuse()
     _refuse_duplicates(network)
     on_restarted(
@@ -131,12 +134,11 @@ def configure_drives(
     absent: dict[str, list[int]] = {}
     for drive, node in enumerate(nodes):
         network.command(NmtCommand.PRE_OPERATIONAL, node)
-        wrong.note(_switch_off_used, network, node)
-        for remark in _write_all(network, node, settings[drive], wrong):
-            absent.setdefault(remark, []).append(node)
+        wrong.note(_switch_off_used, network, node, profile)
+        refused: list[str] = []  # before another PDO gets the identifier that this one has
+        wrong.note(_switch_off_unused, network, node, profile, refused)
+        refused += _write_all(network, node, settings[drive], wrong)
         _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), wrong)
-        refused: list[str] = []
-        wrong.note(_switch_off_unused, network, node, refused)
         for remark in refused:
             absent.setdefault(remark, []).append(node)
     wrong.refuse()  # a mode that was not taken is not waited for
@@ -258,34 +260,6 @@ def require_answers(network: SetupNetwork, nodes: Sequence[int]) -> None:
         )
 
 
-def _expect(network: SetupNetwork, node: int, expected: Expectation) -> None:
-    try:
-        data = network.client(node).read(expected.index, expected.sub, expected.name)
-    except Refused as error:
-        if expected.optional and error.values.get("abort_code") not in (None, *NOT_NOW):
-            return
-        raise
-    value = int.from_bytes(data, "little")
-    if value & expected.mask != expected.expected:
-        found, wanted = f"{value:X}h", f"{expected.expected:X}h"
-        raise _wrong(node, str(expected), found, wanted, expected.why)
-
-
-def _require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
-    """Missing objects are all reported before any is written; other errors show then.
-
-    Raises:
-        Refused: A drive does not have an object that it needs.
-    """
-    if setting.optional or setting.transient:
-        return
-    try:
-        network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
-    except Refused as error:
-        if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
-            raise
-
-
 def _await_mode(network: SetupNetwork, node: int) -> None:
     """The mode that was written shows within `MODE_WAIT`; drives need not follow at once."""
     deadline = network.clock() + MODE_WAIT
@@ -294,21 +268,7 @@ def _await_mode(network: SetupNetwork, node: int) -> None:
         if int.from_bytes(data, "little") == MODE_DISPLAY.expected or network.clock() >= deadline:
             break
         network.wait(MODE_WAIT / MODE_ASKED)
-    _expect(network, node, MODE_DISPLAY)
-
-
-_STATUS_WORD = "object 6041h:00 status word"
-
-
-def _check_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
-    """A drive that is enabled belongs to somebody; one that holds in quick stop may be taken."""
-    data = network.client(node).read(0x6041, 0, "status word", 2)
-    state = state_of(int.from_bytes(data, "little"))
-    if state in FAULTED and not to_reset:
-        why = "it stopped itself; see its display or maker's tool for the cause"
-        raise in_fault(node, "", _STATUS_WORD, why)
-    if state is DriveState.OPERATION_ENABLED:
-        raise moved_by_another(node, "enabled already", _STATUS_WORD)
+    require_expected(network, node, MODE_DISPLAY)
 
 
 def _write_all(
@@ -356,8 +316,8 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         return
     kept = client.read(setting.index, setting.sub, setting.name, setting.size)
     if not setting.is_kept(kept):
-        found = _number(kept, setting.form)
-        raise _wrong(node, str(setting), found, str(setting.value), setting.why)
+        found = number_text(kept, setting.form)
+        raise wrong_value(node, str(setting), found, str(setting.value), setting.why)
 
 
 def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
@@ -369,47 +329,44 @@ def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
     return setting.is_kept(kept)
 
 
-def _count_heartbeats(
-    network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
-) -> None:
-    """How many entries of 1016h the drive has, as far as the profile uses them."""
-    name, needed = "consumer heartbeat entries", profile.watches_heartbeats
-    client = network.client(node)
-    read = client.read if needed else client.read_if_there
-    data = read(HEARTBEAT_CONSUMERS, 0, name, 1) if profile.has(HEARTBEAT_CONSUMERS, 1) else None
-    count, most = int.from_bytes(data or b"", "little"), profile.heartbeat_entries
-    if count < 1 and needed:
-        raise _wrong(node, f"1016h:00 {name}", "0", "1 or more", "watch the master")
-    entries.append(count if most is None else min(count, most))
-
-
-def _switch_off_used(network: SetupNetwork, node: int) -> None:
+def _switch_off_used(network: SetupNetwork, node: int, profile: ProfileDocument) -> None:
     """The identifier of a PDO may change only while it is off. Source: CiA 301, 7.5.2.35."""
-    for index in USED_PDOS:
+    for index in used_pdos(profile):
         data = network.client(node).read(index, 1, "PDO identifier")
         value = int.from_bytes(data, "little")
         if not value & PDO_INVALID:
             _switch_off(network, node, index, value)
 
 
-def _switch_off_unused(network: SetupNetwork, node: int, remarks: list[str]) -> None:
-    """Process data that is not used would only fill the bus; drives need not have it."""
-    for index in UNUSED_PDOS:
-        try:
-            data = network.client(node).read(index, 1, "PDO identifier")
-        except Refused as error:
-            code = error.values.get("abort_code")
-            if code is None or code in NOT_NOW:
-                raise
-            if code not in OBJECT_DOES_NOT_EXIST:
-                remarks.append(
-                    f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"
-                    " if it has this PDO, it stays as it is"
-                )
-            continue
-        value = int.from_bytes(data, "little")
-        if not value & PDO_INVALID:
-            _switch_off(network, node, index, value)
+def _switch_off_unused(
+    network: SetupNetwork, node: int, profile: ProfileDocument, remarks: list[str]
+) -> None:
+    """Process data that is not used fills the bus, or takes frames for others; it may be absent."""
+    for indices in unused_pdos(profile):
+        for index in indices:
+            value = _identifier_if_there(network, node, index, remarks)
+            if value is None and (index & 0x1FF) >= STANDARD_PDOS:
+                break
+            if value is not None and not value & PDO_INVALID:
+                _switch_off(network, node, index, value)
+
+
+def _identifier_if_there(
+    network: SetupNetwork, node: int, index: int, remarks: list[str]
+) -> int | None:
+    """Identifier of a PDO (sub-index 1); None where it cannot be read, which may be a remark."""
+    try:
+        return int.from_bytes(network.client(node).read(index, 1, "PDO identifier"), "little")
+    except Refused as error:
+        code = error.values.get("abort_code")
+        if code is None or code in NOT_NOW:
+            raise
+        if code not in OBJECT_DOES_NOT_EXIST:
+            remarks.append(
+                f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"
+                " if it has this PDO, it stays as it is"
+            )
+        return None
 
 
 def _switch_off(network: SetupNetwork, node: int, index: int, value: int) -> None:
@@ -418,13 +375,3 @@ def _switch_off(network: SetupNetwork, node: int, index: int, value: int) -> Non
         mask=PDO_IDENTIFIER,
     )
     _write(network, node, off, [])
-
-
-def _number(data: bytes, form: str) -> str:
-    if len(data) != struct.calcsize(form):
-        return f"{len(data)} bytes ({data.hex()})"
-    return str(struct.unpack(form, data)[0])
-
-
-def _wrong(node: int, place: str, found: str, wanted: str, why: str) -> Refused:
-    return keeps_another(node, f"object {place}", found, wanted, why, "the drive's manual")

@@ -32,6 +32,7 @@ from drivers.cia402.state_machine import (
     ControlWord,
     DriveState,
     Goal,
+    late_drives,
     next_words,
 )
 from drivers.cyclic_group import CyclicBus, CyclicGroup
@@ -282,8 +283,8 @@ class Cia402Group(CyclicGroup):
         """Heartbeat first and SYNC last: what is still watched is still sent."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused("enabled drives must monitor this program", where="drive group")
-        jobs = zip(self._nodes, map(monitoring_off, self._heartbeats), strict=True)
-        self._unwatching = SdoJobs(dict(jobs), self._again_after)
+        off = (monitoring_off(count, self._profile.rpdo) for count in self._heartbeats)
+        self._unwatching = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
         self._modes = None
         self._watch.on_answer = self._unwatching.take
 
@@ -385,10 +386,8 @@ class Cia402Group(CyclicGroup):
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
 
     def _late(self, wanted: tuple[DriveState, ...]) -> list[tuple[int, str]]:
-        seconds = f"{self._patience * self._cycle_s:g} s (enable_timeout_ms of its profile)"
-        names, way = self._rig.drive_names, f"on the way to {wanted[-1].value} after {seconds}"
-        states = zip(self._nodes, self._watch.states, strict=True)
-        return [(n, f"{names[n]} is in {s.value} {way}") for n, s in states if s not in wanted]
+        words, seconds = self._watch.status_words, self._patience * self._cycle_s
+        return late_drives(self._rig.drive_names, words, wanted, seconds)
 
     def _status(self) -> CycleStatus:
         watch = self._watch

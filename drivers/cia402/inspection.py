@@ -12,26 +12,34 @@ import numpy as np
 
 from drivers.cia402.configure import is_still_set_up, require_answers
 from drivers.cia402.error_codes import abort_text
-from drivers.cia402.object_dictionary import (
+from drivers.cia402.expected_objects import (
     BEFORE,
-    HEARTBEAT_CONSUMERS,
     MODE_DISPLAY,
-    UNUSED_PDOS,
     Expectation,
-    Setting,
     expected_by,
     identifiers,
     identity,
-    settings_for,
 )
-from drivers.cia402.profile import load_profile, profile_names, profile_of
+from drivers.cia402.object_dictionary import (
+    HEARTBEAT_CONSUMERS,
+    Setting,
+    settings_for,
+    stated_absent,
+)
+from drivers.cia402.profile import (
+    STANDARD_PDOS,
+    load_profile,
+    profile_names,
+    profile_of,
+    unused_pdos,
+)
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
-from drivers.cia402.state_machine import FAULTED, DriveState, state_of
+from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
 from drivers.plausibility import winding_signs
 from model.errors import CdprError, Refused
-from model.files.drive_profile_file import ProfileDocument, object_name
+from model.files.drive_profile_file import NEEDED, OBJECTS, ProfileDocument, object_name
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -160,8 +168,12 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         look.at_heartbeats(profile, rig.cable_count)
         for setting in _last_of_each(settings_for(rig, drive, winch_map, None)):
             look.at_setting(setting, _needed(setting))
-        for index in UNUSED_PDOS:
-            look.at_unused(index)
+        for setting in stated_absent(rig, drive, winch_map):
+            look.at_absent(setting)
+        for indices in unused_pdos(profile):
+            for index in indices:
+                if not look.at_unused(index) and (index & 0x1FF) >= STANDARD_PDOS:
+                    break
     answered = tuple(node for node in all_nodes if node not in silent)
     return Examined(answered, tuple(silent), tuple(rows.values()))
 
@@ -171,9 +183,15 @@ def _last_of_each(settings: Iterable[Setting]) -> list[Setting]:
     return list({(s.index, s.sub): s for s in settings if not s.transient}.values())
 
 
+def _number(setting: Setting, value: int) -> str:
+    """Objects and identifiers of process data in hexadecimal digits, as manuals print them."""
+    is_entry = 0x1400 <= setting.index < 0x1C00 and setting.size == 4
+    return f"{value:08X}h" if is_entry else str(value)
+
+
 def _needed(setting: Setting) -> str:
     if setting.per_mille_of is None:
-        return f"{setting.value}, written at set-up"
+        return f"{_number(setting, setting.value)}, written at set-up"
     return f"{setting.value} per mille of {object_name(*setting.per_mille_of)}, written at set-up"
 
 
@@ -204,13 +222,16 @@ class _Look:
         data = self._read(0x6041, 0, row, optional=False)
         if data is None:
             return
-        state = state_of(int.from_bytes(data, "little"))
+        word = int.from_bytes(data, "little")
+        state = state_of(word)
         if state in FAULTED:
             row.note(
                 self._node, state.value, "wrong", "remove the cause, then run `cdpr reset RIG`"
             )
         elif state is DriveState.OPERATION_ENABLED:
             row.note(self._node, state.value, "remark", "another program moves it; end it first")
+        elif shown := without_power(word):
+            row.note(self._node, state.value, "remark", f"before a motion: {' and '.join(shown)}")
         else:
             row.note(self._node, state.value)
 
@@ -259,7 +280,7 @@ class _Look:
             text = f"{len(data)} bytes, not {setting.size}"
             row.note(self._node, text, "wrong", "compare with the drive's manual")
         else:
-            row.note(self._node, str(struct.unpack(setting.form, data)[0]))
+            row.note(self._node, _number(setting, struct.unpack(setting.form, data)[0]))
         if setting.per_mille_of is not None:
             rated = self._row(*setting.per_mille_of, "rated value of the limit", "more than 0")
             found = self._read(*setting.per_mille_of, rated, optional=False)
@@ -268,13 +289,26 @@ class _Look:
                 change = "" if value else "enter the motor data with the maker's tool"
                 rated.note(self._node, str(value), "ok" if value else "wrong", change)
 
-    def at_unused(self, index: int) -> None:
-        """A PDO that is switched off at set-up where it is there."""
+    def at_absent(self, setting: Setting) -> None:
+        """An object that the profile calls absent; where it is there, its value counts."""
+        needed = f"absent by the profile, or {_number(setting, setting.value)}"
+        row = self._row(setting.index, setting.sub, str(setting), needed)
+        row.meaning = setting.why
+        data = self._read(setting.index, setting.sub, row, optional=True, size=setting.size)
+        if data is not None:
+            text = _number(setting, int.from_bytes(data, "little"))
+            good = setting.is_kept(data)
+            change = "" if good else "take it out of `absent` in the drive profile"
+            row.note(self._node, text, "ok" if good else "wrong", change)
+
+    def at_unused(self, index: int) -> bool:
+        """A PDO that is switched off at set-up where it is there, which is returned."""
         row = self._row(index, 1, "PDO identifier", "none required: switched off where it is there")
         row.meaning = "other process data would only fill the bus"
         data = self._read(index, 1, row, optional=True)
         if data is not None:
             row.note(self._node, f"{int.from_bytes(data, 'little'):X}h")
+        return data is not None
 
     def _row(self, index: int, sub: int, name: str, needed: str) -> ObjectRow:
         text = name if name.startswith(f"{index:04X}h") else f"{object_name(index, sub)} {name}"
@@ -320,13 +354,25 @@ def _how_to_set(expected: Expectation) -> str:
     return "set it with the maker's tool and store it"
 
 
+_BESIDE = {
+    "1006h:00": ", with monitoring: heartbeat",
+    "1016h:01": "; the SYNC time-out alone then stops the drive",
+    "6072h:00": ", with torque_limit",
+    "60C2h:01": ", where the drive needs no interpolation time",
+    "60C2h:02": ", where the drive needs no interpolation time",
+}
+"""What else a profile says in which an object is absent."""
+
+
 def _how_without(index: int, sub: int) -> str:
     """Of an object that is needed and not there."""
-    name = object_name(index, sub)
-    fitting = [each for each in profile_names() if name in load_profile(each).absent]
-    if fitting:
-        return f"name the drives in the rig file: drives.profile: {' or '.join(fitting)}"
-    return "use another drive or firmware: see its manual"
+    name = "1016h:01" if index == HEARTBEAT_CONSUMERS else object_name(index, sub)
+    if name not in OBJECTS or name in NEEDED:
+        return "use another drive or firmware: no profile makes up for it"
+    own = f"name it as absent in a drive profile of your own{_BESIDE.get(name, '')}"
+    there = [each for each in profile_names() if name in load_profile(each).absent]
+    of_ours = "".join(f"; {load_profile(each).name} have drives.profile: {each}" for each in there)
+    return own + of_ours
 
 
 # Looks at CiA 402 drives without changing anything: questions by SDO, and nothing else.

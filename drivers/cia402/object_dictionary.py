@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 
 from drivers.can_load import heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.pdo import MASTER_NODE, RPDO1_BASE, TPDO1_BASE
-from drivers.cia402.profile import profile_of
+from drivers.cia402.profile import profile_of, used_pdos
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.plausibility import position_limits
 from model.errors import BadInput
 from model.files.drive_profile_file import ProfileDocument, Range, object_key
-from model.files.rig_file import Cia402Document
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -96,78 +95,6 @@ class Setting:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-@dataclass(frozen=True, slots=True)
-class Expectation:
-    """One object to read: ``value & mask`` must be ``expected``; optional ones may be absent."""
-
-    index: int
-    sub: int
-    mask: int
-    expected: int
-    name: str
-    why: str
-    optional: bool = False
-
-    def __str__(self) -> str:
-        """Index, sub-index and name."""
-        return f"{self.index:04X}h:{self.sub:02X} {self.name}"
-
-
-#: What a drive must be before anything is written to it.
-BEFORE = (
-    Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
-    Expectation(
-        *(0x6502, 0, 0x80, 0x80, "supported drive modes"),
-        "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
-    ),
-)
-
-
-def identifiers(node: int) -> tuple[Expectation, ...]:
-    """On what identifiers a drive hears SYNC and sends its emergencies; CiA 301, 7.5.2."""
-    sync, emergency = (
-        "SYNC goes out as 80h, without a counter",
-        "emergencies are heard as 80h + node",
-    )
-    return (
-        Expectation(0x1005, 0, 0x7FF, 0x80, "COB-ID SYNC", sync, optional=True),
-        Expectation(0x1014, 0, 0x800007FF, 0x80 + node, "COB-ID EMCY", emergency, optional=True),
-        Expectation(0x1019, 0, 0xFF, 0, "synchronous counter overflow", sync, optional=True),
-    )
-
-
-def identity(rig: Rig) -> tuple[Expectation, ...]:
-    """Whose drives they must be, where the rig file says so (1018h)."""
-    drives = rig.document.drives
-    if not isinstance(drives, Cia402Document):
-        return ()
-    named = ((1, drives.vendor_id, "vendor id"), (2, drives.product_code, "product code"))
-    why = "the rig file requires this drive"
-    return tuple(
-        Expectation(0x1018, sub, 0xFFFFFFFF, value, name, why)
-        for sub, value, name in named
-        if value is not None
-    )
-
-
-MODE_DISPLAY = Expectation(
-    0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode must be active"
-)
-"""What it must show after the set-up, or once enabled (`ProfileDocument`)."""
-
-
-def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
-    """What drives of a profile must hold that the program does not write, such as units."""
-    return tuple(
-        Expectation(*object_key(each.object), 0xFFFFFFFF, each.value, each.name, each.why)
-        for each in profile.expect
-    )
-
-
-#: Communication parameters of process data that are not used; switched off where they exist.
-USED_PDOS = (0x1400, 0x1800)
-UNUSED_PDOS = (0x1401, 0x1402, 0x1403, 0x1801, 0x1802, 0x1803)
-
 HEARTBEAT_CONSUMERS = 0x1016
 
 
@@ -185,22 +112,50 @@ def settings_for(
     Raises:
         BadInput: A value of the rig does not fit its object.
     """
-    cycle, profile = rig.document.bus.cycle_ms / 1000.0, profile_of(rig)
+    profile = profile_of(rig)
+    settings = _all_settings(rig, drive, winch_map, max_tension, profile)
+    return tuple(_within(each, profile) for each in settings if profile.has(each.index, each.sub))
+
+
+def stated_absent(
+    rig: Rig, drive: int, winch_map: WinchMap, max_tension: float | None = None
+) -> tuple[Setting, ...]:
+    """What is not written because the drive's profile says that the object is absent.
+
+    In a drive that has it all the same, another program's value would count.
+
+    Args:
+        rig: The robot.
+        drive: Place of its winch in the rig file, from 0.
+        winch_map: The rig's lengths and counts.
+        max_tension: As for `settings_for`.
+
+    Raises:
+        BadInput: A value of the rig does not fit its object.
+    """
+    profile = profile_of(rig)
+    watched = Setting(HEARTBEAT_CONSUMERS, 1, "<I", 0, "consumer heartbeat time", "none is watched")
+    settings = (*_all_settings(rig, drive, winch_map, max_tension, profile), watched)
+    return tuple(each for each in settings if not profile.has(each.index, each.sub))
+
+
+def _all_settings(
+    rig: Rig, drive: int, winch_map: WinchMap, max_tension: float | None, profile: ProfileDocument
+) -> tuple[Setting, ...]:
+    cycle = rig.document.bus.cycle_ms / 1000.0
     tension = rig.max_tension if max_tension is None else max_tension
-    settings = (
-        *_process_data(rig.winches[drive].node_id),
-        *_supervision(cycle, profile.monitoring == "sync"),
+    return (
+        *_process_data(rig.winches[drive].node_id, profile),
+        *_supervision(cycle, profile.monitoring == "sync", _produced_ms(cycle, profile)),
         *_mode(cycle, profile),
         *_reactions(rig, drive, cycle, profile),
         *_limits(rig, drive, winch_map, tension, profile),
     )
-    there = (setting for setting in settings if profile.has(setting.index, setting.sub))
-    return tuple(_within(setting, profile) for setting in there)
 
 
 def left_out(profile: ProfileDocument) -> tuple[str, ...]:
     """What is missed in drives of a profile, one remark for each optional object without work."""
-    all_optional = (*_process_data(1), *_supervision(0.01), *_options())
+    all_optional = (*_process_data(1, profile), *_supervision(0.01, True, 30), *_options())
     return tuple(
         f"there is no {setting}: {setting.instead}"
         for setting in all_optional
@@ -247,14 +202,16 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
         return tuple(
             Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why) for sub in range(1, entries + 1)
         )
-    time_ms = math.ceil(1000 * heartbeat_timeout(rig.document.bus.cycle_ms / 1000.0))
+    cycle = rig.document.bus.cycle_ms / 1000.0
+    time_ms = math.ceil(1000 * heartbeat_timeout(cycle))
+    peers_ms = max(time_ms, math.ceil(3.2 * _produced_ms(cycle, profile_of(rig))))
     peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
     return tuple(
         Setting(
             HEARTBEAT_CONSUMERS,
             sub,
             "<I",
-            node << 16 | time_ms,
+            node << 16 | (time_ms if node == MASTER_NODE else peers_ms),
             "consumer heartbeat time",
             "stop when the master is lost" if node == MASTER_NODE else "stop when a peer is lost",
         )
@@ -290,28 +247,35 @@ def interpolation_time(
     )
 
 
-def _process_data(node: int) -> tuple[Setting, ...]:
+def _process_data(node: int, profile: ProfileDocument) -> tuple[Setting, ...]:
+    """The two PDOs in use, whatever their numbers, on the identifiers of RPDO1 and TPDO1."""
     received = (0x60400010, 0x607A0020)
     sent = (0x60410010, 0x60640020, 0x60770010)
+    (rpdo, tpdo), (taken, replies) = (
+        used_pdos(profile),
+        (f"RPDO{profile.rpdo}", f"TPDO{profile.tpdo}"),
+    )
     return (
-        *_mapped(0x1400, 0x1600, RPDO1_BASE + node, received),
+        *_mapped(rpdo, RPDO1_BASE + node, received),
         # Off: a drive that stops by itself because frames to it alone were lost would be enabled
         # again by the next one (transition 16 acts by level), before its reply shows that.
         Setting(
             *(
-                0x1400,
+                rpdo,
                 5,
                 "<H",
                 0,
-                "RPDO1 deadline",
+                f"{taken} deadline",
                 "the program detects lost set-points and stops",
             ),
             optional=True,
         ),
-        _switched_on(0x1400, RPDO1_BASE + node, "RPDO1 identifier"),
-        *_mapped(0x1800, 0x1A00, PDO_NO_RTR | TPDO1_BASE + node, sent),
-        Setting(*(0x1800, 3, "<H", 0, "TPDO1 inhibit time", "no reply is delayed"), optional=True),
-        _switched_on(0x1800, PDO_NO_RTR | TPDO1_BASE + node, "TPDO1 identifier"),
+        _switched_on(rpdo, RPDO1_BASE + node, f"{taken} identifier"),
+        *_mapped(tpdo, PDO_NO_RTR | TPDO1_BASE + node, sent),
+        Setting(
+            *(tpdo, 3, "<H", 0, f"{replies} inhibit time", "no reply is delayed"), optional=True
+        ),
+        _switched_on(tpdo, PDO_NO_RTR | TPDO1_BASE + node, f"{replies} identifier"),
     )
 
 
@@ -319,11 +283,9 @@ def _switched_on(parameters: int, identifier: int, name: str) -> Setting:
     return Setting(parameters, 1, "<I", identifier, name, "switched on", mask=PDO_IDENTIFIER)
 
 
-def _mapped(
-    parameters: int, mapping: int, identifier: int, objects: tuple[int, ...]
-) -> tuple[Setting, ...]:
+def _mapped(parameters: int, identifier: int, objects: tuple[int, ...]) -> tuple[Setting, ...]:
     """Off, no objects, the objects, their number, at each SYNC. Source: CiA 301, 7.5.2.36."""
-    off = PDO_INVALID | identifier
+    off, mapping = PDO_INVALID | identifier, parameters + 0x200
     return (
         Setting(parameters, 1, "<I", off, "PDO identifier", "off while it is mapped", True),
         Setting(mapping, 0, "<B", 0, "PDO mapping", "off while it is mapped", True),
@@ -336,10 +298,9 @@ def _mapped(
     )
 
 
-def _supervision(cycle: float, sync: bool = True) -> tuple[Setting, ...]:
+def _supervision(cycle: float, sync: bool, produced_ms: int) -> tuple[Setting, ...]:
     period_us = round(1e6 * cycle) if sync else 0
     why = "the cycle of the rig" if sync else "a missed SYNC would take the torque off"
-    produced_ms = round(1000 * cycle * heartbeat_cycles(cycle))
     return (
         Setting(0x1006, 0, "<I", period_us, "communication cycle period", why),
         Setting(
@@ -356,6 +317,15 @@ def _supervision(cycle: float, sync: bool = True) -> tuple[Setting, ...]:
             instead="a drive may leave NMT operational, which is a fault",
         ),
     )
+
+
+def _produced_ms(cycle: float, profile: ProfileDocument) -> int:
+    """Period of a drive's own heartbeat, [ms]: the master's, or the shortest that it takes.
+
+    Only other drives wait for it; the master has a reply every cycle.
+    """
+    shortest = profile.range_of(0x1017, 0)
+    return max(round(1000 * cycle * heartbeat_cycles(cycle)), shortest.low if shortest else 0)
 
 
 def _mode(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
@@ -389,7 +359,9 @@ def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument
     """Deceleration by which a drive at its top speed stands within a cycle, in the drive's unit."""
     winch = rig.winches[drive]
     ramp = winch.max_speed / cycle * abs(winch.counts_per_metre)
-    return ramp * 60.0 / winch.counts_per_turn if profile.acceleration_unit == "rpm/s" else ramp
+    turns = ramp / winch.counts_per_turn
+    in_unit = {"counts/s^2": ramp, "rpm/s": 60.0 * turns, "rev/s^2": turns}
+    return in_unit[profile.acceleration_unit] / profile.acceleration_step
 
 
 def _options() -> tuple[Setting, ...]:

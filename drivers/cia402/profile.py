@@ -17,6 +17,12 @@ from model.rig import Rig
 
 FOLDER = Path(__file__).parent / "profiles"
 
+MOST_PDOS = 512
+"""Of each kind. Source: CiA 301, 7.5.2.35 to 7.5.2.38."""
+
+STANDARD_PDOS = 4
+"""Of each kind, each of which a drive may have without the one before."""
+
 
 def profile_names() -> tuple[str, ...]:
     """The profiles that cdpr brings along."""
@@ -54,3 +60,21 @@ def profile_of(rig: Rig) -> ProfileDocument:
     """
     drives = rig.document.drives
     return load_profile(drives.profile if isinstance(drives, Cia402Document) else "cia402")
+
+
+def used_pdos(profile: ProfileDocument) -> tuple[int, int]:
+    """Communication parameters of the process data that are used: of the RPDO, of the TPDO."""
+    return 0x13FF + profile.rpdo, 0x17FF + profile.tpdo
+
+
+def unused_pdos(profile: ProfileDocument) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Those that are switched off where they exist: RPDOs, and TPDOs.
+
+    All of 1 to 4. Beyond these a drive numbers its PDOs without a gap, so that the first one that
+    is absent ends the search.
+    """
+    kinds = zip((0x1400, 0x1800), used_pdos(profile), strict=True)
+    received, sent = (
+        tuple(i for i in range(at, at + MOST_PDOS) if i != used) for at, used in kinds
+    )
+    return received, sent

@@ -76,17 +76,18 @@ def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float
     return sum(jobs) * cycle / REQUESTS_A_CYCLE + max(jobs) * answer
 
 
-def monitoring_off(heartbeats: int) -> tuple[SdoRequest, ...]:
+def monitoring_off(heartbeats: int, rpdo: int = 1) -> tuple[SdoRequest, ...]:
     """What ends all monitoring by a drive: heartbeats, set-points, and SYNC last.
 
     Those of its peers, too: one that fell silent after the end would take the torque off all.
 
     Args:
         heartbeats: Entries of 1016h that set-up wrote, the master's first.
+        rpdo: Number of the RPDO that takes the set-points.
     """
     return (
         *(SdoRequest(0x1016, sub, bytes(4)) for sub in range(1, heartbeats + 1)),
-        SdoRequest(0x1400, 5, bytes(2)),
+        SdoRequest(0x13FF + rpdo, 5, bytes(2)),
         SdoRequest(0x1006, 0, bytes(4)),
     )
 

@@ -6,7 +6,7 @@ Pure: goal and states go in, the next words come out. Every word has bit 1 set, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum, IntEnum, auto
 
 # The CiA 402 state machine as tables: status word to state, and the control words sent.
@@ -83,6 +83,58 @@ _STATES = tuple(_decoded(low_bits) for low_bits in range(0x80))
 def state_of(status_word: int) -> DriveState:
     """The state a status word (6041h) reports; a code the standard has not is NOT_READY."""
     return _STATES[status_word & 0x7F]
+
+
+VOLTAGE_ENABLED, REMOTE = 1 << 4, 1 << 9
+"""Bits of the status word. Source: CiA 402-2, object 6041h."""
+
+_NO_VOLTAGE = (
+    "its bit 4 (voltage enabled) is 0: mains power is off, or safe torque off (STO) is active"
+)
+_LOCAL = "its bit 9 (remote) is 0: its maker's tool, panel or enable input has control"
+_INTERLOCKED = "check mains power, safe torque off (STO) and its enable input"
+_STAYS_STOPPED = (
+    "it does not take 0Fh there (transition 16), so that only a loss of power ends its quick stop:"
+    " support the platform first"
+)
+
+
+def late_drives(
+    names: Mapping[int, str],
+    status_words: Sequence[int],
+    wanted: Sequence[DriveState],
+    seconds: float,
+) -> list[tuple[int, str]]:
+    """Drives that did not come to a state in time, by node, and why they may not have.
+
+    Args:
+        names: By node id.
+        status_words: Of each of them, as last reported.
+        wanted: States that count; the last one is where they were sent.
+        seconds: That they had, [s].
+    """
+    way = f"on the way to {wanted[-1].value} after {seconds:g} s (enable_timeout_ms of its profile)"
+    return [
+        (node, f"{name} is in {state_of(word).value} {way}{_obstacle(word)}")
+        for (node, name), word in zip(names.items(), status_words, strict=True)
+        if state_of(word) not in wanted
+    ]
+
+
+def _obstacle(status_word: int) -> str:
+    """What in its status word says why a drive stays where it is."""
+    state = state_of(status_word)
+    if state is DriveState.QUICK_STOP_ACTIVE:
+        return f"; {_STAYS_STOPPED}"
+    if state not in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON):
+        return ""
+    return f"; {' and '.join(without_power(status_word)) or _INTERLOCKED}"
+
+
+def without_power(status_word: int) -> list[str]:
+    """What in its status word keeps a drive at rest from being enabled; nothing if it may be."""
+    shown = [_LOCAL] if not status_word & REMOTE else []
+    return shown + ([_NO_VOLTAGE] if not status_word & VOLTAGE_ENABLED else [])
 
 
 class Goal(Enum):

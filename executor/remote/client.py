@@ -337,7 +337,7 @@ def status_line(status: Mapping[str, Any]) -> str:
 
 def _progress(status: Mapping[str, Any]) -> str:
     if status["path_mm"] is None:
-        return f"{status['row']:.0f} % done"
+        return "no path" if status["row"] is None else f"{status['row']:.0f} % done"
     return f"{status['path_mm']:.1f} of {status['path_length_mm']:.1f} mm"
 
 

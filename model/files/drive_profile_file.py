@@ -20,8 +20,8 @@ OBJECTS: Mapping[str, str] = {
     "1016h:01": "consumer heartbeat time",
     "1017h:00": "producer heartbeat time",
     "1029h:01": "communication error behaviour",
-    "1400h:05": "RPDO1 deadline",
-    "1800h:03": "TPDO1 inhibit time",
+    **{f"{0x1400 + pdo:04X}h:05": f"RPDO{pdo + 1} deadline" for pdo in range(4)},
+    **{f"{0x1800 + pdo:04X}h:03": f"TPDO{pdo + 1} inhibit time" for pdo in range(4)},
     "6007h:00": "abort connection option code",
     "605Ah:00": "quick stop option code",
     "605Ch:00": "disable operation option code",
@@ -123,6 +123,14 @@ class ProfileDocument(Document):
     heartbeat_entries: Annotated[int, Field(ge=1, le=127)] | None = Field(
         default=None, description="entries of 1016h; left out, as many as the drive says"
     )
+    rpdo: Annotated[int, Field(ge=1, le=4)] = Field(
+        default=1,
+        description="number of the RPDO that takes set-points: one whose mapping can be written;"
+        " all others are switched off",
+    )
+    tpdo: Annotated[int, Field(ge=1, le=4)] = Field(
+        default=1, description="number of the TPDO that sends the replies, as rpdo"
+    )
     monitoring: Literal["sync", "heartbeat"] = Field(
         default="sync",
         description="what stops a drive whose master is gone; heartbeat: it has no 1006h, or must"
@@ -138,8 +146,11 @@ class ProfileDocument(Document):
         description="what a drive does whose heartbeat producer is lost; fault: it takes its torque"
         " off whatever 6007h says, so it is given no heartbeat to monitor",
     )
-    acceleration_unit: Literal["counts/s^2", "rpm/s"] = Field(
-        default="counts/s^2", description="of 6085h; rpm is of the motor shaft"
+    acceleration_unit: Literal["counts/s^2", "rpm/s", "rev/s^2"] = Field(
+        default="counts/s^2", description="of 6085h; revolutions are of the motor shaft"
+    )
+    acceleration_step: Annotated[float, Field(gt=0.0, le=1e6)] = Field(
+        default=1.0, description="acceleration, in this unit, that 6085h = 1 stands for"
     )
     torque_limit: TorqueLimit | None = Field(
         default=None, description="left out, 6072h limits the torque"

@@ -100,6 +100,12 @@ def test_a_run_that_is_prepared_or_in_simulated_time_is_shown_too(shown: Any) ->
 
 
 @pytest.mark.parametrize("shown", [live, status_text])
+def test_a_session_of_jogs_has_no_progress_to_show(shown: Any) -> None:
+    nothing = dict.fromkeys(("row", "rows", "path_mm", "path_length_mm", "next_stop"))
+    assert shown(status(**nothing))
+
+
+@pytest.mark.parametrize("shown", [live, status_text])
 def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> None:
     rig = load_rig(RIG)
     told = WinchStatus(rig, LocalRequests(), simulated_time=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from drivers.cia402 import configure
 from drivers.cia402 import inspection as examine
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.inspection import Examined, examine_drives
-from drivers.cia402.object_dictionary import UNUSED_PDOS, settings_for
-from drivers.cia402.profile import load_profile, profile_names
+from drivers.cia402.object_dictionary import heartbeat_consumers, settings_for
+from drivers.cia402.profile import load_profile, profile_names, unused_pdos
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork
+from drivers.cia402.sdo_jobs import monitoring_off
 from drivers.factory import make_drive_group
 from drivers.stopping_distance import lost_master, require_stopping_room
 from model.errors import BadInput, CdprError, InvalidFile, Refused
@@ -25,6 +27,7 @@ from model.rig import Rig, rig_from_document
 from model.winches import WinchMap
 from tests.drivers.sdo_server import ScriptedBus, ScriptedDrive, downloads, eds_of
 
+UNUSED_PDOS = [i for kind in unused_pdos(load_profile("cia402")) for i in kind if i % 0x200 < 4]
 MAKERS = ("akd", "elmo-gold", "epos4", "nanotec-c5e")
 
 
@@ -404,6 +407,137 @@ def test_a_profile_of_the_lab_is_used(tmp_path: Path, rig: Rig) -> None:
         (s.index, s.sub) for s in settings_for(with_profile(rig, str(path)), 0, WinchMap(rig))
     }
     assert (0x1400, 5) not in written
+
+
+def lab_profile(tmp_path: Path, lines: str) -> str:
+    path = tmp_path / "lab.yaml"
+    path.write_text(f"name: Ours\nsources: [our bench]\n{lines}\n")
+    return str(path)
+
+
+def test_process_data_can_be_others_than_the_first(rig: Rig, tmp_path: Path) -> None:
+    """PDO mappings of some makes are fixed but for one; the first ones are switched off before."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        for base in (0x1400, 0x1600, 0x1800, 0x1A00):
+            of_first = {key: od for key, od in drive.objects.items() if key[0] == base}
+            for (_, sub), od in of_first.items():
+                for number in (1, 2, 3):
+                    drive.objects[base + number, sub] = od
+                    drive.values[base + number, sub] = 0
+        drive.values[0x1400, 1] = 0x200 + drive.node
+    set_up(with_profile(rig, lab_profile(tmp_path, "rpdo: 4\ntpdo: 3")), bus)
+    for node, drive in bus.drives.items():
+        values = drive.values
+        assert values[0x1403, 1] == 0x200 + node
+        assert values[0x1802, 1] & 0x3FFFFFFF == 0x180 + node
+        assert [values[0x1603, sub] for sub in range(3)] == [2, 0x60400010, 0x607A0020]
+        assert values[0x1A02, 0] == 3
+        off = (0x1400, 0x1401, 0x1402, 0x1800, 0x1801, 0x1803)
+        assert all(values[index, 1] & 1 << 31 for index in off)
+    written = [struct.unpack_from("<HB", m.data, 1) for m in downloads(bus)]
+    assert not [key for key in written if key[0] in (0x1600, 0x1A00)]
+    of_one = [
+        struct.unpack_from("<HB", m.data, 1) for m in downloads(bus) if m.arbitration_id == 0x601
+    ]
+    switched_on = len(of_one) - 1 - of_one[::-1].index((0x1403, 1))
+    assert of_one.index((0x1400, 1)) < switched_on, "no identifier is there twice"
+
+
+def test_the_deadline_of_the_pdo_in_use_is_the_one_that_ends() -> None:
+    keys = [(job.index, job.sub) for job in monitoring_off(1, rpdo=4)]
+    assert keys == [(0x1016, 1), (0x1403, 5), (0x1006, 0)]
+
+
+def test_process_data_beyond_the_fourth_is_switched_off(rig: Rig) -> None:
+    """A fifth RPDO on another drive's identifier would take that drive's set-points."""
+    bus = eight_of("cia402")
+    for index, identifier in ((0x1404, 0x205), (0x1405, 0x206), (0x1804, 0x1C3)):
+        bus.drives[3].objects[index, 1] = bus.drives[3].objects[0x1400, 1]
+        bus.drives[3].values[index, 1] = identifier
+    assert {row.object[:8] for row in examined(rig, bus).rows} >= {"1405h:01", "1804h:01"}
+    assert set_up(rig, bus) == ()
+    for index in (0x1404, 0x1405, 0x1804):
+        assert bus.drives[3].values[index, 1] & 1 << 31
+
+
+@pytest.mark.parametrize("held", [0, 20_000])
+def test_an_object_that_the_profile_denies_must_not_hold_another_value(
+    rig: Rig, tmp_path: Path, held: int
+) -> None:
+    """What an earlier program wrote there would count unseen."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x1006, 0] = 0
+    bus.drives[5].values[0x1006, 0] = held
+    lines = 'absent: ["1006h:00"]\nmonitoring: heartbeat'
+    theirs = with_profile(rig, lab_profile(tmp_path, lines))
+    (row,) = (row for row in examined(theirs, bus).rows if row.object.startswith("1006h"))
+    assert row.verdict == ("wrong" if held else "ok")
+    if not held:
+        set_up(theirs, bus)
+        return
+    with pytest.raises(Refused, match="its profile says that it is absent") as caught:
+        set_up(theirs, bus)
+    assert caught.value.values["node"] == 5
+    assert not downloads(bus)
+
+
+@pytest.mark.parametrize(
+    ("lines", "counts_per_s2"),
+    [
+        ("acceleration_unit: counts/s^2", 1.0),
+        ("acceleration_unit: counts/s^2\nacceleration_step: 10", 10.0),
+        ("acceleration_unit: rev/s^2", 131_072.0),
+        ("acceleration_unit: rpm/s", 131_072.0 / 60.0),
+        ("acceleration_unit: rpm/s\nacceleration_step: 0.1", 13_107.2 / 60.0),
+    ],
+)
+def test_the_ramp_of_a_quick_stop_is_in_the_unit_of_the_make(
+    rig: Rig, tmp_path: Path, lines: str, counts_per_s2: float
+) -> None:
+    theirs = with_profile(rig, lab_profile(tmp_path, lines))
+    found = {s.index: s.value for s in settings_for(theirs, 0, WinchMap(theirs))}[0x6085]
+    needed = rig.winches[0].max_speed / 0.01 * abs(rig.winches[0].counts_per_metre)
+    assert found == math.ceil(needed / counts_per_s2)
+
+
+def test_a_drive_with_a_slow_heartbeat_is_waited_for_by_its_peers_alone(
+    rig: Rig, tmp_path: Path
+) -> None:
+    lines = 'ranges: {"1017h:00": {low: 100, high: 65535}}'
+    theirs = with_profile(rig, lab_profile(tmp_path, lines))
+    found = {s.index: s.value for s in settings_for(theirs, 0, WinchMap(theirs))}
+    assert found[0x1017] == 100
+    assert [s.value & 0xFFFF for s in heartbeat_consumers(theirs, 0, 3)] == [100, 320, 320]
+
+
+def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
+    """Not another maker's profile, which would write objects of that maker."""
+    bus = eight_of("cia402")
+    for key in ((0x1006, 0), (0x6066, 0), (0x6007, 0)):
+        bus.drives[2].aborts[key] = 0x06020000
+    change = {row.object[:8]: row.change for row in examined(rig, bus).rows}
+    assert change["6066h:00"] == "name it as absent in a drive profile of your own"
+    assert change["1006h:00"].startswith("name it as absent in a drive profile of your own, with")
+    assert "monitoring: heartbeat" in change["1006h:00"]
+    assert "no profile" in change["6007h:00"]
+
+
+def test_doctor_prints_mappings_as_manuals_do(rig: Rig) -> None:
+    (row,) = (row for row in examined(rig, eight_of("cia402")).rows if row.object[:8] == "1600h:02")
+    assert row.needed == "607A0020h, written at set-up"
+
+
+@pytest.mark.parametrize(("word", "said"), [(0x0240, "voltage enabled"), (0x0050, "remote")])
+def test_doctor_says_what_keeps_a_drive_from_being_enabled(rig: Rig, word: int, said: str) -> None:
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x6041, 0] = 0x0250
+    bus.drives[4].values[0x6041, 0] = word
+    (row,) = (row for row in examined(rig, bus).rows if row.object.startswith("6041h"))
+    assert row.verdict == "remark"
+    assert said in row.change
 
 
 def test_every_profile_names_its_sources() -> None:

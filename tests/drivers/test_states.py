@@ -6,7 +6,14 @@ import re
 
 import pytest
 
-from drivers.cia402.state_machine import FAULTED, TORQUE_ON, ControlWord, DriveState, state_of
+from drivers.cia402.state_machine import (
+    FAULTED,
+    TORQUE_ON,
+    ControlWord,
+    DriveState,
+    late_drives,
+    state_of,
+)
 
 # Bits 6..0 as the standard prints them; x is any.
 STANDARD = {
@@ -69,3 +76,23 @@ def test_which_states_hold_a_cable_and_which_are_a_fault() -> None:
 
 def test_no_control_word_is_disable_voltage() -> None:
     assert all(word & 0x02 for word in ControlWord)
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        (0x0240, "voltage enabled"),
+        (0x0221, "voltage enabled"),
+        (0x0050, "remote"),
+        (0x0250, "enable input"),
+        (0x0217, "transition 16"),
+        (0x0233, ""),
+    ],
+)
+def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said: str) -> None:
+    wanted = (DriveState.OPERATION_ENABLED,)
+    (found,) = late_drives({4: "cable 1", 5: "cable 2"}, (word, 0x0237), wanted, 1.0)
+    assert found[0] == 4
+    assert found[1].startswith(f"cable 1 is in {state_of(word).value} on the way to operation")
+    assert said in found[1]
+    assert (";" in found[1]) == bool(said)
