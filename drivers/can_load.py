@@ -24,6 +24,9 @@ HEARTBEAT_PERIOD = 0.03
 HEARTBEAT_TIMEOUT = 0.1
 """Without the heartbeat of master or peer for so long a drive stops itself, [s]."""
 
+HEARTBEATS_WAITED = 3.2
+"""Periods after which a heartbeat is missed; two may be lost."""
+
 _SET_POINT_BYTES = 6
 _REPLY_BYTES = 8
 _ODRIVE_BYTES = 8
@@ -54,7 +57,7 @@ def heartbeat_cycles(cycle: float) -> int:
 
 def heartbeat_timeout(cycle: float) -> float:
     """When a heartbeat is missed, [s]; more than three of its periods, ``cycle`` in [s]."""
-    return max(HEARTBEAT_TIMEOUT, 3.2 * cycle * heartbeat_cycles(cycle))
+    return max(HEARTBEAT_TIMEOUT, HEARTBEATS_WAITED * cycle * heartbeat_cycles(cycle))
 
 
 def bus_load(drives: int, cycle: float, bitrate: int) -> float:

@@ -36,7 +36,7 @@ def lost_master(rig: Rig) -> LostMaster:
     Raises:
         BadInput: There is no such profile, or its file is wrong.
     """
-    cycle = rig.document.bus.cycle_ms / 1000.0
+    cycle = rig.cycle
     drives = rig.document.drives
     if isinstance(drives, Cia402Document):
         noticed_by, notice, ramp = _cia402_times(rig)
@@ -52,7 +52,7 @@ def _cia402_times(rig: Rig) -> tuple[str, float, float]:
     from drivers.cia402.object_dictionary import quick_stop_ramp
     from drivers.cia402.profile import profile_of
 
-    cycle, profile = rig.document.bus.cycle_ms / 1000.0, profile_of(rig)
+    cycle, profile = rig.cycle, profile_of(rig)
     steepest = profile.range_of(0x6085, 0)
     wanted = max(quick_stop_ramp(rig, i, cycle, profile) for i in range(rig.cable_count))
     ramp = cycle if steepest is None else cycle * max(1.0, wanted / max(1, steepest.high))

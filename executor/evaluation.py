@@ -167,7 +167,7 @@ def _context_of(
         simulated=simulated,
         fast=course.fast,
         started=course.started,
-        duration=_duration(cycles, rig.document.bus.cycle_ms / 1000.0),
+        duration=_duration(cycles, rig.cycle),
         final_state=course.final_state,
         events=tuple(events),
         versions=versions(),

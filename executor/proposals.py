@@ -187,6 +187,15 @@ class ForgetProposal:
         return []
 
 
+def _tension_fact(limit: float) -> tuple[str, str]:
+    return "tension", f"at most {limit:g} N in any cable; no taut cable may go slack"
+
+
+def _held_fact(rig: Rig) -> tuple[str, str]:
+    speed = rig.motion.speed * 1000.0
+    return "motion", f"at most {speed:g} mm/s, as long as a control is held"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CableProposal:
     """One winch that is about to move; see `Proposal`.
@@ -212,12 +221,11 @@ class CableProposal:
     def facts(self) -> Facts:
         """See `Proposal`."""
         rig, mm, speed = self.rig, self.length * 1000.0, self.speed * 1000.0
-        limit = f"at most {self.limit:g} N in any cable; no taut cable may go slack"
         return [
             ("rig", rig.name),
             ("cable", rig.drive_names[rig.winches[self.cable - 1].node_id]),
             ("motion", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed:g} mm/s"),
-            ("tension", limit),
+            _tension_fact(self.limit),
         ]
 
 
@@ -242,12 +250,11 @@ class JogProposal:
     def facts(self) -> Facts:
         """See `Proposal`."""
         x, y, z = self.start.position * 1000.0
-        fastest = self.rig.motion.speed * 1000
         return [
             ("rig", self.rig.name),
             ("platform", f"at {x:.1f}, {y:.1f}, {z:.1f} mm"),
             ("obstacles", ", ".join(one.name for one in self.scene.obstacles) or "none"),
-            ("motion", f"at most {fastest:g} mm/s, as long as a control is held"),
+            _held_fact(self.rig),
         ]
 
 
@@ -329,12 +336,11 @@ class CablesProposal:
     def facts(self) -> Facts:
         """See `Proposal`."""
         rig = self.rig
-        speed = f"at most {rig.motion.speed * 1000:g} mm/s, as long as a control is held"
         return [
             ("rig", rig.name),
             ("cables", f"{rig.cable_count}, one at a time"),
-            ("motion", speed),
-            ("tension", f"at most {self.limit:g} N in any cable; no taut cable may go slack"),
+            _held_fact(rig),
+            _tension_fact(self.limit),
             ("not checked", "obstacles, workspace and the platform's pose"),
             ("reference", "stays as it is; a run begins only where drive positions fit a pose"),
         ]

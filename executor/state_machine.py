@@ -197,11 +197,21 @@ def shared_causes(findings: Sequence[Alarm], names: Sequence[str]) -> tuple[Alar
         if finding.code not in _SHARED or len(same) == 1:
             told.append(finding)
         elif finding is same[0]:
-            who = [names[f.drive - 1] for f in same]
-            which = f"all {len(names)} drives" if len(who) == len(names) else ", ".join(who)
-            cause = ": bus or supply" if len(who) == len(names) else ""
+            which, cause = together([names[f.drive - 1] for f in same], len(names))
             told.append(replace(finding, text=f"{which} {rest}{cause}", drive=0))
     return tuple(told)
+
+
+def together(who: Sequence[str], drives: int) -> tuple[str, str]:
+    """Drives that fail in the same way at once, named in a sentence, and the cause to end it with.
+
+    Args:
+        who: Their names.
+        drives: How many the rig has.
+    """
+    if len(who) == drives:
+        return f"all {drives} drives", ": bus or supply"
+    return ", ".join(who), ""
 
 
 def _without_name(finding: Alarm, names: Sequence[str]) -> str:

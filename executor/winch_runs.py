@@ -190,13 +190,12 @@ def _mover(
     motion: WinchMotion, board: LocalRequests | SharedRequests
 ) -> AbstractContextManager[WinchMover]:
     rig = motion.rig
-    cycle = rig.document.bus.cycle_ms / 1000.0
     return winch_mover(
         rig,
-        LawMotion(rig.cable_count, cycle, motion.make_law, motion.limit, motion.speed),
+        LawMotion(rig.cable_count, rig.cycle, motion.make_law, motion.limit, motion.speed),
         partial(unreferenced_drives_of, rig.document, motion.pose, motion.limit, motion.lost_power),
         board,
-        clock=SimulatedClock(cycle),
+        clock=SimulatedClock(rig.cycle),
         need_real_time_rights=motion.need_real_time_rights,
         listener=motion.listener,
     )

@@ -161,6 +161,11 @@ class Rig:
         return self.document.name
 
     @property
+    def cycle(self) -> float:
+        """Period of the bus and of the set-points, [s]."""
+        return self.document.bus.cycle_ms / 1000.0
+
+    @property
     def cable_count(self) -> int:
         """Number of cables m."""
         return len(self.outlets)

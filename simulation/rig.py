@@ -246,7 +246,7 @@ class SimulatedRig(ABC, Generic[Drive]):
             Fault: The bus did not take the drives' first frames.
         """
         self._rig, self._bus = rig, bus
-        self._cycle = rig.document.bus.cycle_ms / 1000.0
+        self._cycle = rig.cycle
         self.plant = Plant(rig_as_built(rig), start_pose, load, stiffness_as_built(rig))
         self.cycles = 0
         per_newton = self._torque_per_newton()

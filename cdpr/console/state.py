@@ -58,25 +58,12 @@ def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:
     Args:
         status: Of what moves, see `executor.remote.status`; None where nothing does.
     """
+    why_not = "the drives are not enabled for jogging"
+    if status is not None and "cable_jog" in status:
+        why_not = "single cables are jogged: end that first"
     jog = None if status is None else status.get("jog")
-    if status is None or jog is None:
-        cables = status is not None and "cable_jog" in status
-        return {
-            "ready": False,
-            "why_not": _CABLES if cables else "the drives are not enabled for jogging",
-            "moving": False,
-            "limit": None,
-            "speed_mm_s": 1e3 * FASTEST,
-        }
-    ready = status["state"] == "moving"
-    limit = jog["limit"] and f"stops in {jog['room_mm']:.1f} mm: {jog['limit']}"
-    return {
-        "ready": ready,
-        "why_not": None if ready else f"the drives are {status['state']}",
-        "moving": bool(status["feed_percent"]),
-        "limit": limit,
-        "speed_mm_s": jog["speed_mm_s"],
-    }
+    limit = jog and jog["limit"] and f"stops in {jog['room_mm']:.1f} mm: {jog['limit']}"
+    return {**_session_state(status, jog, why_not), "limit": limit}
 
 
 def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:
@@ -85,33 +72,28 @@ def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:
     Args:
         status: As for `jog_state`.
     """
+    why_not = "the drives are not enabled for single cables"
+    if status is not None and "jog" in status:
+        why_not = "the platform is jogged: end that first"
     jog = None if status is None else status.get("cable_jog")
+    names = ("cable", "press_mm", "session_mm", "limit", "limit_n")
+    shown = {name: jog[name] if jog else None for name in names}
+    return {**_session_state(status, jog, why_not), **shown}
+
+
+def _session_state(
+    status: dict[str, Any] | None, jog: dict[str, Any] | None, why_not: str
+) -> dict[str, Any]:
+    """Of a session of jogs, or why there is none."""
     if status is None or jog is None:
-        platform = status is not None and "jog" in status
-        return {
-            "ready": False,
-            "why_not": _PLATFORM if platform else "the drives are not enabled for single cables",
-            "moving": False,
-            "cable": None,
-            "press_mm": None,
-            "session_mm": None,
-            "limit": None,
-            "limit_n": None,
-            "speed_mm_s": 1e3 * FASTEST,
-        }
+        return {"ready": False, "why_not": why_not, "moving": False, "speed_mm_s": 1e3 * FASTEST}
     ready = status["state"] == "moving"
-    told = {name: jog[name] for name in ("cable", "press_mm", "session_mm", "limit", "limit_n")}
     return {
-        **told,
         "ready": ready,
         "why_not": None if ready else f"the drives are {status['state']}",
         "moving": bool(status["feed_percent"]),
         "speed_mm_s": jog["speed_mm_s"],
     }
-
-
-_CABLES = "single cables are jogged: end that first"
-_PLATFORM = "the platform is jogged: end that first"
 
 
 def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] | None:

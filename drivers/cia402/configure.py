@@ -38,7 +38,7 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.pdo import NmtCommand
-from drivers.cia402.profile import STANDARD_PDOS, profile_of, unused_pdos, used_pdos
+from drivers.cia402.profile import for_unused_pdos, profile_of, used_pdos
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork, silent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import OnRestarted, Pump
@@ -342,13 +342,14 @@ def _switch_off_unused(
     network: SetupNetwork, node: int, profile: ProfileDocument, remarks: list[str]
 ) -> None:
     """Process data that is not used fills the bus, or takes frames for others; it may be absent."""
-    for indices in unused_pdos(profile):
-        for index in indices:
-            value = _identifier_if_there(network, node, index, remarks)
-            if value is None and (index & 0x1FF) >= STANDARD_PDOS:
-                break
-            if value is not None and not value & PDO_INVALID:
-                _switch_off(network, node, index, value)
+
+    def is_there(index: int) -> bool:
+        value = _identifier_if_there(network, node, index, remarks)
+        if value is not None and not value & PDO_INVALID:
+            _switch_off(network, node, index, value)
+        return value is not None
+
+    for_unused_pdos(profile, is_there)
 
 
 def _identifier_if_there(

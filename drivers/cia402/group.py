@@ -74,7 +74,7 @@ class Cia402Group(CyclicGroup):
         super().__init__(rig, bus, pump)
         check_bus_load(rig)
         self._signs = winding_signs(rig)
-        cycle = rig.document.bus.cycle_ms / 1000.0
+        cycle = rig.cycle
         self._cycle_s, self._profile = cycle, profile_of(rig)
         self._answer_time = self._profile.sdo_timeout_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)

@@ -27,11 +27,10 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.profile import (
-    STANDARD_PDOS,
+    for_unused_pdos,
     load_profile,
     profile_names,
     profile_of,
-    unused_pdos,
 )
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
@@ -170,10 +169,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
             look.at_setting(setting, _needed(setting))
         for setting in stated_absent(rig, drive, winch_map):
             look.at_absent(setting)
-        for indices in unused_pdos(profile):
-            for index in indices:
-                if not look.at_unused(index) and (index & 0x1FF) >= STANDARD_PDOS:
-                    break
+        for_unused_pdos(profile, look.at_unused)
     answered = tuple(node for node in all_nodes if node not in silent)
     return Examined(answered, tuple(silent), tuple(rows.values()))
 

@@ -6,7 +6,7 @@ import math
 import struct
 from dataclasses import dataclass, replace
 
-from drivers.can_load import heartbeat_cycles, heartbeat_timeout
+from drivers.can_load import HEARTBEATS_WAITED, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.pdo import MASTER_NODE, RPDO1_BASE, TPDO1_BASE
 from drivers.cia402.profile import profile_of, used_pdos
 from drivers.cia402.sdo_jobs import CSP_MODE
@@ -142,7 +142,7 @@ def stated_absent(
 def _all_settings(
     rig: Rig, drive: int, winch_map: WinchMap, max_tension: float | None, profile: ProfileDocument
 ) -> tuple[Setting, ...]:
-    cycle = rig.document.bus.cycle_ms / 1000.0
+    cycle = rig.cycle
     tension = rig.max_tension if max_tension is None else max_tension
     return (
         *_process_data(rig.winches[drive].node_id, profile),
@@ -202,9 +202,9 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
         return tuple(
             Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why) for sub in range(1, entries + 1)
         )
-    cycle = rig.document.bus.cycle_ms / 1000.0
+    cycle = rig.cycle
     time_ms = math.ceil(1000 * heartbeat_timeout(cycle))
-    peers_ms = max(time_ms, math.ceil(3.2 * _produced_ms(cycle, profile_of(rig))))
+    peers_ms = max(time_ms, math.ceil(HEARTBEATS_WAITED * _produced_ms(cycle, profile_of(rig))))
     peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
     return tuple(
         Setting(
@@ -251,23 +251,15 @@ def _process_data(node: int, profile: ProfileDocument) -> tuple[Setting, ...]:
     """The two PDOs in use, whatever their numbers, on the identifiers of RPDO1 and TPDO1."""
     received = (0x60400010, 0x607A0020)
     sent = (0x60410010, 0x60640020, 0x60770010)
-    (rpdo, tpdo), (taken, replies) = (
-        used_pdos(profile),
-        (f"RPDO{profile.rpdo}", f"TPDO{profile.tpdo}"),
-    )
+    rpdo, tpdo = used_pdos(profile)
+    taken, replies = f"RPDO{profile.rpdo}", f"TPDO{profile.tpdo}"
     return (
         *_mapped(rpdo, RPDO1_BASE + node, received),
         # Off: a drive that stops by itself because frames to it alone were lost would be enabled
         # again by the next one (transition 16 acts by level), before its reply shows that.
         Setting(
-            *(
-                rpdo,
-                5,
-                "<H",
-                0,
-                f"{taken} deadline",
-                "the program detects lost set-points and stops",
-            ),
+            *(rpdo, 5, "<H", 0, f"{taken} deadline"),
+            "the program detects lost set-points and stops",
             optional=True,
         ),
         _switched_on(rpdo, RPDO1_BASE + node, f"{taken} identifier"),

@@ -6,6 +6,7 @@ A profile is a YAML file (`model.files.drive_profile_file`), one of ours in
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -62,19 +63,44 @@ def profile_of(rig: Rig) -> ProfileDocument:
     return load_profile(drives.profile if isinstance(drives, Cia402Document) else "cia402")
 
 
+def rpdo_parameters(number: int) -> int:
+    """Index of the communication parameters of an RPDO, by its number from 1. CiA 301, 7.5.2.35."""
+    return 0x1400 + number - 1
+
+
+def tpdo_parameters(number: int) -> int:
+    """The same of a TPDO. Source: CiA 301, 7.5.2.37."""
+    return 0x1800 + number - 1
+
+
+_FIRST_PDOS = rpdo_parameters(1), tpdo_parameters(1)
+
+
 def used_pdos(profile: ProfileDocument) -> tuple[int, int]:
     """Communication parameters of the process data that are used: of the RPDO, of the TPDO."""
-    return 0x13FF + profile.rpdo, 0x17FF + profile.tpdo
+    return rpdo_parameters(profile.rpdo), tpdo_parameters(profile.tpdo)
 
 
 def unused_pdos(profile: ProfileDocument) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Those that are switched off where they exist: RPDOs, and TPDOs.
-
-    All of 1 to 4. Beyond these a drive numbers its PDOs without a gap, so that the first one that
-    is absent ends the search.
-    """
-    kinds = zip((0x1400, 0x1800), used_pdos(profile), strict=True)
+    """Those that are switched off where they exist: RPDOs, and TPDOs."""
+    kinds = zip(_FIRST_PDOS, used_pdos(profile), strict=True)
     received, sent = (
         tuple(i for i in range(at, at + MOST_PDOS) if i != used) for at, used in kinds
     )
     return received, sent
+
+
+def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -> None:
+    """Goes through the unused PDOs of a drive as far as it may have them.
+
+    All of 1 to 4. Beyond these a drive numbers its PDOs without a gap, so that the first one that
+    is absent ends the search.
+
+    Args:
+        profile: Of the drive.
+        is_there: Called with the communication parameters of each; whether the drive has it.
+    """
+    for indices, first in zip(unused_pdos(profile), _FIRST_PDOS, strict=True):
+        for index in indices:
+            if not is_there(index) and index >= first + STANDARD_PDOS:
+                break

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from drivers.cia402.pdo import SDO_REQUEST_BASE
+from drivers.cia402.profile import rpdo_parameters
 
 REQUESTS_A_CYCLE = 1
 """SDO requests beside a cycle: as much as fits on a bus that others fill to nine tenths."""
@@ -87,7 +88,7 @@ def monitoring_off(heartbeats: int, rpdo: int = 1) -> tuple[SdoRequest, ...]:
     """
     return (
         *(SdoRequest(0x1016, sub, bytes(4)) for sub in range(1, heartbeats + 1)),
-        SdoRequest(0x13FF + rpdo, 5, bytes(2)),
+        SdoRequest(rpdo_parameters(rpdo), 5, bytes(2)),
         SdoRequest(0x1006, 0, bytes(4)),
     )
 

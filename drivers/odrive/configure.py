@@ -19,6 +19,7 @@ from drivers.can_errors import (
     keeps_another,
     moved_by_another,
 )
+from drivers.can_load import HEARTBEATS_WAITED
 from drivers.drive_group import Pump
 from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
 from drivers.odrive.messages import (
@@ -144,9 +145,6 @@ class SetupLink:
         while (left := deadline - time.monotonic()) > 0.0:
             yield left
 
-
-HEARTBEATS_WAITED = 3.2
-"""Periods after which a heartbeat is missed; two may be lost."""
 
 SPEED_RESERVE = 1.5
 TORQUE_RESERVE = 1.2

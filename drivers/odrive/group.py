@@ -81,7 +81,7 @@ class OdriveGroup(CyclicGroup):
         self._document = document
         self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
         self._frames = OdriveFrames(rig, self._layouts)
-        cycle = rig.document.bus.cycle_ms / 1000.0
+        cycle = rig.cycle
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
         self._settling = max(1, round(SETTLING / cycle))
         self._max_tension = rig.max_tension if max_tension is None else max_tension
@@ -375,9 +375,7 @@ def read_axes(
     nodes = [winch.node_id for winch in rig.winches]
     own = EchoFilter(commanding_ids(layouts, nodes), echoes_own_frames=echoes_own_frames(bus))
     cyclic = CyclicBus(bus, own, foreign_master_message)
-    watch = OdriveWatch(
-        rig, document, layouts, largest_steps(rig, rig.document.bus.cycle_ms / 1000.0)
-    )
+    watch = OdriveWatch(rig, document, layouts, largest_steps(rig, rig.cycle))
     cyclic.forget_waiting()
     for _ in range(ATTEMPTS):
         watch.begin_cycle()

@@ -302,7 +302,7 @@ class OdriveFrames:
         """Takes nodes, counts and cycle from the rig."""
         self._nodes = tuple(winch.node_id for winch in rig.winches)
         self._per_turn = tuple(winch.counts_per_turn for winch in rig.winches)
-        self._cycle = rig.document.bus.cycle_ms / 1000.0
+        self._cycle = rig.cycle
         self._layouts = layouts
 
     def set_points(self, targets: Sequence[int], before: Sequence[int]) -> list[can.Message]:

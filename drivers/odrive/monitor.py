@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from drivers.odrive.configure import HEARTBEATS_WAITED
+from drivers.can_load import HEARTBEATS_WAITED
 from drivers.odrive.messages import AxisState, Layout, Layouts, can_id, error_text, status_word
 from drivers.plausibility import ReplyCheck
 from model.files.rig_file import OdriveDocument

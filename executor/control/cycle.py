@@ -72,7 +72,7 @@ class Cycle:
 
     def allow(self, setpoints: NDArray[np.int32]) -> None:
         """The gate lets the range of other set-points through from now on, shape (n, m)."""
-        self._limits = gate_limits(self._rig, setpoints, self._rig.document.bus.cycle_ms / 1000.0)
+        self._limits = gate_limits(self._rig, setpoints, self._rig.cycle)
 
     def largest_way(self, first: Array, second: Array) -> float:
         """The longest cable between two sets of drive positions, [m]."""

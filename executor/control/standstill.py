@@ -50,7 +50,7 @@ class Standstill(ABC):
         self._wishes, self._on_cycle = wishes, on_cycle
         self._silence = ReplyTimeout(rig)
         self._cycles = 0
-        self._longest = round(WITHIN_S / (rig.document.bus.cycle_ms / 1000.0))
+        self._longest = round(WITHIN_S / rig.cycle)
         self.cause, self.error = "", None
         self.holding = True
 
@@ -63,7 +63,7 @@ class Standstill(ABC):
             Refused: They are not to be worked on so; nothing was changed.
             HardwareMissing: A drive does not answer.
         """
-        require_capabilities(self._group.capabilities, self._rig.document.bus.cycle_ms / 1000.0)
+        require_capabilities(self._group.capabilities, self._rig.cycle)
         self._master.read_positions()
         require(self.stands_at)
 
@@ -265,7 +265,7 @@ class StandstillMotion:
     @classmethod
     def of(cls, kind: type[Release] | type[FaultReset], rig: Rig) -> StandstillMotion:
         """A procedure on the drives of a rig."""
-        return cls(kind, rig.cable_count, rig.document.bus.cycle_ms / 1000.0)
+        return cls(kind, rig.cable_count, rig.cycle)
 
     def loop(
         self,

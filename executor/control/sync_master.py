@@ -20,6 +20,7 @@ from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
 from drivers.factory import drive_states
 from executor.realtime.clock import Clock
 from executor.safety.monitor import MISSING_CYCLES, USUAL_TIMEOUT, SyncAge
+from executor.state_machine import together
 from model.errors import CdprError, Fault, HardwareMissing
 from model.rig import Rig
 
@@ -57,9 +58,7 @@ class ReplyTimeout:
             name for name, n in zip(self._names, self._cycles, strict=True) if n >= MISSING_CYCLES
         ]
         if gone:
-            every = len(gone) == len(self._cycles)
-            which = f"all {len(gone)} drives" if every else ", ".join(gone)
-            cause = ": bus or supply" if every else ""
+            which, cause = together(gone, len(self._cycles))
             what = f"{which} stopped answering {doing}{cause}"
             raise HardwareMissing(what, where=where, why=why, next_step=next_step)
 
@@ -86,7 +85,7 @@ class SyncMaster:
         timeout = group.capabilities.sync_timeout
         self.rule = SyncAge(USUAL_TIMEOUT if timeout is None else timeout)
         self.status: CycleStatus | None = None
-        self._rig, self._cycle = rig, rig.document.bus.cycle_ms / 1000.0
+        self._rig, self._cycle = rig, rig.cycle
         self._synced: float | None = None
         self._overdue = 0.0
         self._enabled_after: float | None = None  # SYNC before one that enables, [s] of the clock

@@ -6,9 +6,8 @@ than could overstretch it before its tension is seen. No law pays cable out to c
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -187,7 +186,7 @@ class PretensionLaw:
         self._target, self._reach = target, reach
         self._room = TensionHeadroom(target, limit)
         self._per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
-        self._step = wind_in_speed(rig, target, limit, speed) * _cycle(rig)
+        self._step = wind_in_speed(rig, target, limit, speed) * rig.cycle
         self._wound = np.zeros(rig.cable_count)
         self._taut = np.zeros(rig.cable_count, dtype=bool)
         self._cycles = 0
@@ -235,12 +234,19 @@ class PretensionLaw:
         return Alarm(StopReaction.PATH_STOP, "not_taut", text, cable + 1)
 
 
-class OneCableLaw(ABC):
+class OneCableLaw:
     """Moves one winch while all others stand: what is common to a step and a held jog.
 
     A cable that is taut is moved as carefully as it would be wound in. Other cables that were taut
     must not go slack meanwhile; those that hung slack before may go on so.
+
+    Attributes:
+        stretch: How much longer it takes than at an even speed.
+        shortest: It takes no less, [cycles].
     """
+
+    stretch: ClassVar[float] = 1.0
+    shortest: ClassVar[float] = 0.0
 
     def __init__(
         self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float,
@@ -265,7 +271,9 @@ class OneCableLaw(ABC):
         careful = wind_in_speed(rig, self._least, limit, speed)[cable]
         self._pace_if_taut = float(careful) / self._speed
         # A cable that goes slack is moved faster again, but not with a jerk.
-        self._share, self._rise = 1.0, rig.motion.acceleration / rig.motion.speed * _cycle(rig)
+        self._share, self._rise = 1.0, rig.motion.acceleration / rig.motion.speed * rig.cycle
+        at_speed = self.stretch * abs(way) / (self._speed * rig.cycle)
+        self._duration, self._passed = max(self.shortest, at_speed), 0.0
         self._was_taut: list[bool] | None = None
         self._slack = [0] * rig.cable_count
 
@@ -280,13 +288,13 @@ class OneCableLaw(ABC):
         return self.progress >= 1.0
 
     @property
-    @abstractmethod
     def progress(self) -> float:
-        """See `WinchLaw`."""
+        """Share of the time that it takes."""
+        return self._passed / self._duration if self._duration else 1.0
 
-    @abstractmethod
-    def _advance(self, pace: float) -> float:
-        """Goes on by a share of a cycle; the share of the way that is done then."""
+    def _share_of_way(self) -> float:
+        """Share of the way that is done by now."""
+        return self.progress
 
     def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Alarm, ...]]:
         """See `WinchLaw`."""
@@ -295,7 +303,8 @@ class OneCableLaw(ABC):
         if self._reserve is not None:
             share *= self._reserve.share(tensions)
         self._share = min(share, self._share + self._rise)
-        targets = self._at(self._advance(pace * self._share))
+        self._passed = min(self._passed + pace * self._share, self._duration)
+        targets = self._at(self._share_of_way())
         return targets, (*self._room.used_up(tensions), *self._made_slack(tensions))
 
     def _at(self, share: float) -> Targets:
@@ -323,54 +332,19 @@ class OneCableLaw(ABC):
 class CableStep(OneCableLaw):
     """Moves one winch by a length of cable, smoothly, from rest to rest."""
 
-    def __init__(
-        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float,
-        reserve: TensionReserve | None = None,
-    ) -> None:  # fmt: skip
-        """Nothing moves yet; arguments as for `OneCableLaw`."""
-        super().__init__(
-            rig, begin, cable=cable, way=way, limit=limit, speed=speed, reserve=reserve
-        )
-        self._duration = max(1.0, PEAK * abs(way) / (self._speed * _cycle(rig)))
-        self._time = 0.0
+    stretch, shortest = PEAK, 1.0
 
-    @property
-    def progress(self) -> float:
-        """Share of the time that it takes."""
-        return self._time / self._duration
-
-    def _advance(self, pace: float) -> float:
-        self._time = min(self._time + pace, self._duration)
-        return smooth_step(self._time / self._duration)
+    def _share_of_way(self) -> float:
+        return smooth_step(self.progress)
 
 
 class CableFeed(OneCableLaw):
     """Moves one winch at an even speed up to a longest way; its feed speeds up and slows down."""
 
-    def __init__(
-        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float,
-        reserve: TensionReserve | None = None,
-    ) -> None:  # fmt: skip
-        """Nothing moves yet; arguments as for `OneCableLaw`."""
-        super().__init__(
-            rig, begin, cable=cable, way=way, limit=limit, speed=speed, reserve=reserve
-        )
-        self._cycles = abs(way) / (self._speed * _cycle(rig))
-        self._passed = 0.0
-
-    @property
-    def progress(self) -> float:
-        """Share of the longest way."""
-        return self._passed / self._cycles if self._cycles else 1.0
-
     @property
     def cycles_left(self) -> float:
         """To the end of the longest way, at its speed."""
-        return self._cycles - self._passed
-
-    def _advance(self, pace: float) -> float:
-        self._passed = min(self._passed + pace, self._cycles)
-        return self.progress
+        return self._duration - self._passed
 
 
 def wind_in_speed(rig: Rig, target: float, limit: float, speed: float) -> Array:
@@ -378,7 +352,7 @@ def wind_in_speed(rig: Rig, target: float, limit: float, speed: float) -> Array:
 
     Never faster than its winch; cables are taken to be as stiff as they are at home.
     """
-    careful = SHARE_OF_ROOM * (limit - target) / _stiffness(rig) / _cycle(rig)
+    careful = SHARE_OF_ROOM * (limit - target) / _stiffness(rig) / rig.cycle
     return np.minimum(_fastest(rig, speed), careful)
 
 
@@ -391,7 +365,3 @@ def _stiffness(rig: Rig) -> Array:
 def _fastest(rig: Rig, speed: float) -> Array:
     """The speed that is wished for, where the winch has it, shape (m,), [m/s]."""
     return np.minimum(speed, [winch.max_speed for winch in rig.winches])
-
-
-def _cycle(rig: Rig) -> float:
-    return rig.document.bus.cycle_ms / 1000.0

@@ -49,7 +49,7 @@ class WinchLoop(Loop):
         on_event: Callable[[LoopEvent], None],
     ) -> None:
         """Prepares the motion; arguments as for `Loop`, with a law in place of a course."""
-        cycle = rig.document.bus.cycle_ms / 1000.0
+        cycle = rig.cycle
         reach = np.array(law.reach, dtype=np.int32)
         course = CheckedSetpoints(rig, cycle, reach, fingerprint(cycle, reach))
         super().__init__(course, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)

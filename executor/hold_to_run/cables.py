@@ -106,7 +106,7 @@ class CableLoop(Loop):
             on_cycle: See `Loop`.
             on_event: See `Loop`.
         """
-        cycle = rig.document.bus.cycle_ms / 1000.0
+        cycle = rig.cycle
         here = np.array([begin], dtype=np.int32)
         course = CheckedSetpoints(rig, cycle, here, fingerprint(cycle, here))
         super().__init__(course, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)

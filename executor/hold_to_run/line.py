@@ -47,7 +47,7 @@ class JogLine:
         """
         self._rig, self._scene, self._start = rig, scene, start
         self._direction = direction
-        self._cycle = rig.document.bus.cycle_ms / 1000.0
+        self._cycle = rig.cycle
         self._spacing = rig.motion.speed * self._cycle
         self._weight = rms_anchor_radius(rig.anchors)
         self._travelled: Array = np.zeros(1)
@@ -193,7 +193,7 @@ class JogProver:
     ) -> None:
         """The platform is at rest at the start, ``world_from_platform``."""
         self._rig, self._scene, self._board, self._send = rig, scene, board, send
-        self._cycle = rig.document.bus.cycle_ms / 1000.0
+        self._cycle = rig.cycle
         motion = rig.motion
         to_rest = motion.speed / motion.acceleration + motion.acceleration / motion.jerk
         self._wanted_rows = (AHEAD + to_rest) / self._cycle

@@ -218,7 +218,7 @@ class _PlatformJogs:
         task = JogMotion(
             rig=rig.document,
             cables=rig.cable_count,
-            cycle=_cycle(rig),
+            cycle=rig.cycle,
             begin=_counts_at(rig, self.start, load),
             presses=presses.memory,
             pieces=memory,
@@ -256,7 +256,7 @@ class _CableJogs:
         rig, limit, longest = self.rig, self.limit, LONGEST_MM / 1000.0
         travel = CableTravel(rig, limit, longest)
         speed = rig.motion.speed
-        task = CableMotion(rig.cable_count, _cycle(rig), limit, speed, longest, presses.memory)
+        task = CableMotion(rig.cable_count, rig.cycle, limit, speed, longest, presses.memory)
         on_cycle = self.on_cycle or _nothing
         return _Parts(
             task,
@@ -269,10 +269,6 @@ class _CableJogs:
 
 def _nothing(_record: CycleRecord, _presses: PressBoard, _moved: object) -> None:
     """No program looks on."""
-
-
-def _cycle(rig: Rig) -> float:
-    return rig.document.bus.cycle_ms / 1000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,7 +284,7 @@ class _Session:
     def run(self, board: LocalRequests | SharedRequests) -> WinchesStand:
         """Moves until it ends; the command socket takes what is said of presses."""
         rig, interlock = self.rig, MotionInterlock(self.rig)
-        clock = SimulatedClock(_cycle(rig))
+        clock = SimulatedClock(rig.cycle)
         now = time.monotonic if self.realtime else lambda: clock.now
         with ExitStack() as stack:
             presses = PressBoard(now, self.kind.cables)

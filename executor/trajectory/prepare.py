@@ -69,7 +69,7 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
     for waypoints in parted(plan.waypoints, plan.stops, len(plan.scene.stops)):
         path = rounded(waypoints, rig.motion.blend_tolerance, weight, is_allowed)
         legs.append((path, time_law(path, rig.motion)))
-    cycle = rig.document.bus.cycle_ms / 1000.0
+    cycle = rig.cycle
     table = build_table(rig, plan.scene, legs, cycle)
     checked = check_table(rig, plan.scene, table)
     require_stopping_room(rig, checked.report.proved_obstacle_clearance)

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.console.browsing import SIZES, Fake, Visit, visit
-from tests.console.test_page_jog import ENDS, GAMEPAD
+from tests.console.test_page_jog import ENDS, GAMEPAD, ends_for_good
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -30,15 +30,7 @@ OF_CABLES: dict[str, Callable[[Visit], Any]] = {
 @pytest.mark.parametrize("end", OF_CABLES)
 def test_a_held_cable_ends_for_good(desk: Visit, end: str) -> None:
     desk.ready_to_jog_cables()
-    number = desk.hold("wind_in")
-    OF_CABLES[end](desk)
-    desk.fake.wait(desk.page, lambda f: any(m["kind"] == "let_go" for m in f["received"]))
-    desk.fake.ask(silent=False)
-    found = [
-        m for m in desk.fake.let_pass(desk.page)["received"] if m["kind"] in ("held", "let_go")
-    ]
-    assert found[-1] == {"kind": "let_go", "hold": number}
-    assert [m["kind"] for m in found].count("let_go") == 1
+    ends_for_good(desk, desk.hold("wind_in"), OF_CABLES[end])
 
 
 def test_what_a_held_message_says(desk: Visit) -> None:

@@ -66,12 +66,9 @@ ENDS: dict[str, Callable[[Visit], Any]] = {
 }
 
 
-@pytest.mark.parametrize("end", ENDS)
-def test_a_held_jog_ends_for_good(desk: Visit, end: str) -> None:
+def ends_for_good(desk: Visit, number: int, end: Callable[[Visit], Any]) -> None:
     """One `let_go` with its number, and not one `held` after it, though the mouse stays down."""
-    desk.ready_to_jog()
-    number = desk.hold()
-    ENDS[end](desk)
+    end(desk)
     desk.fake.wait(desk.page, lambda f: any(m["kind"] == "let_go" for m in f["received"]))
     desk.fake.ask(silent=False)
     found = [
@@ -79,6 +76,12 @@ def test_a_held_jog_ends_for_good(desk: Visit, end: str) -> None:
     ]
     assert found[-1] == {"kind": "let_go", "hold": number}
     assert [m["kind"] for m in found].count("let_go") == 1
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_held_jog_ends_for_good(desk: Visit, end: str) -> None:
+    desk.ready_to_jog()
+    ends_for_good(desk, desk.hold(), ENDS[end])
 
 
 def test_what_a_held_message_says(desk: Visit) -> None:

@@ -19,6 +19,7 @@ function stepOf(group) {
 /** What differs between both panels, by the name of the panel and of its buttons. */
 const PADS = {
   jog: {
+    view: "jog",
     keys: { ArrowRight: "+x", ArrowLeft: "-x", ArrowUp: "+y", ArrowDown: "-y", PageUp: "+z", PageDown: "-z" },
     motion: (name) => ({ direction: ["x", "y", "z"].map((axis) => (axis === name[1] ? (name[0] === "+" ? 1 : -1) : 0)) }),
     settings: () => ({ frame: chosen("jog-frame") }),
@@ -28,6 +29,7 @@ const PADS = {
     },
   },
   cable: {
+    view: "service",
     keys: { ArrowUp: "wind_in", PageUp: "wind_in", ArrowDown: "pay_out", PageDown: "pay_out" },
     motion: (name) => ({ cable: Number(chosen("cable")), sense: name }),
     settings: () => ({}),
@@ -38,7 +40,6 @@ const PADS = {
   },
 };
 const motionOf = (button) => PADS[button.closest("#jog-pad") ? "jog" : "cable"].motion(button.dataset.jog);
-const PANELS = { jog: "jog", cable: "service" }; // views
 const panelOf = (motion) => (motion.direction ? "jog" : "cable");
 
 /**
@@ -62,17 +63,16 @@ export function bindJog(connection, situation, command) {
   });
 
   for (const panel of Object.keys(PADS)) {
-    const pad = at(`${panel}-pad`), begin = `${panel}_begin`;
-    bindKeys(pad, hold, PADS[panel]);
+    bindKeys(at(`${panel}-pad`), hold, PADS[panel]);
     bindGamepad(panel, hold, PADS[panel]);
     at(`${panel}-speed`).addEventListener("input", () => showSpeed(panel));
-    if (panel === "jog") at("jog-begin").addEventListener("click", () => command(begin));
     at(`${panel}-end`).addEventListener("click", () => {
       hold.end("jogging ended");
       command("jog_end");
     });
     showSpeed(panel);
   }
+  at("jog-begin").addEventListener("click", () => command("jog_begin"));
   bindPointers(hold);
   bindEnds(hold);
   at("cables").addEventListener("change", () => hold.end("another cable was chosen"));
@@ -186,7 +186,7 @@ function bindEnds(hold) {
 }
 
 /** A shoulder button held and a stick away from its centre, in that order: a stick alone moves nothing. */
-function bindGamepad(panel, hold, { stick }) {
+function bindGamepad(panel, hold, { view, stick }) {
   const box = at(`${panel}-gamepad`), text = at(`${panel}-gamepad-state`), source = `gamepad ${panel}`;
   let centred = false; // since the last press: a stick that is still held after its press ended must not begin another
 
@@ -204,7 +204,7 @@ function bindGamepad(panel, hold, { stick }) {
       return hold.release(source);
     }
     if (hold.source === source) hold.steer(source, motion, Math.min(1, share));
-    else if (centred && at(`panel-${PANELS[panel]}`).checkVisibility()) {
+    else if (centred && at(`panel-${view}`).checkVisibility()) {
       centred = false;
       hold.press(source, motion, Math.min(1, share));
     }
