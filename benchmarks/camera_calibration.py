@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from calibration.intrinsics.calibrate import fit_camera
 from calibration.intrinsics.lens import LENSES
 from calibration.intrinsics.quality import judge_camera
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard
 from tests.calibration.board_pictures import (
     DISTORTION,
     MATRIX,

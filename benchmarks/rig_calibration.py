@@ -2,13 +2,16 @@
 
     python benchmarks/rig_calibration.py [--count 60] [-o FOLDER]
     python benchmarks/rig_calibration.py --plants 12
+    python benchmarks/rig_calibration.py --sensors 60
 
 With the program itself, on configs/gachon_8_6_rehearsal.yaml: plans where to measure, runs it with
 the synthetic camera, calibrates, and runs environment 3 before and after. Then, with the truth that
 only the simulation knows: how far off places are that were never measured, and what is told of the
 rig when the platform is never turned. Measured faster than the rig file says (50 mm/s, 4 images
 a second), which changes nothing at rest. With --plants only: how often the 95 % intervals hold the
-truth of so many other rigs, when the rig file tells the right stiffness and wrong ones.
+truth of so many other rigs, when the rig file tells the right stiffness and wrong ones, and when
+cables differ. With --sensors only: the same of rigs over pulleys, whose cables differ by 20 %, with
+swivel angles and an IMU beside lengths and poses, and how wide the intervals of the geometry are.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from calibration.geometry.calibrate import fit_rig
-from calibration.geometry.model import DEFAULT_DEVIATIONS
+from calibration.geometry.identifiability import identified, uncertainty_of_rig
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig
 from calibration.result_files import load_result
 from model.kinematics import poses_near
@@ -41,9 +45,12 @@ from tests.calibration.rig_places import (
     share_inside,
     true_numbers,
 )
+from tests.calibration.synthetic_rig import LENGTH_NOISE, built_rig, measured, only
 
 ROOT = Path(__file__).parents[1]
 RIG = ROOT / "configs/gachon_8_6_rehearsal.yaml"
+HALL = ROOT / "configs/hall_10_6.yaml"
+SENSOR_OF = {"swivel_zeros": "swivels", "imu_mounting": "verticals"}
 ENVIRONMENT = ROOT / "configs/environment_3.yaml"
 FREE = """schema_version: 1
 name: measuring
@@ -164,7 +171,7 @@ def coverage(plants: int, count: int) -> None:
         for seed in range(plants):
             built = built_otherwise(rig, seed)
             data = places(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
-            drawn = drawn_with(built, share * rig.cable_stiffness)
+            drawn = drawn_with(built, share * rig.document.cables.stiffness_n)
             result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, 1e-4)
             verdict = judge_rig(result, 1e-3, math.radians(5.0)).verdict
             inside.append(share_inside(result.intervals, true_numbers(built)))
@@ -177,15 +184,94 @@ def coverage(plants: int, count: int) -> None:
         )
 
 
+def cables_that_differ(plants: int, count: int) -> None:
+    """One stiffness for all cables, and one for each, of cables that differ."""
+    rig = load_rig(RIG)
+    each = {"cable_stiffness" if g == "stiffness" else g: d for g, d in DEFAULT_DEVIATIONS.items()}
+    for spread in (0.1, 0.2, 0.3):
+        for name, deviations in (("one stiffness", DEFAULT_DEVIATIONS), ("of each", each)):
+            inside, good = [], 0
+            for seed in range(plants):
+                shares = np.exp(spread * np.random.default_rng(seed).standard_normal(8))
+                stiffness = rig.document.cables.stiffness_n * shares
+                built = built_otherwise(rig, seed, stiffness.tolist())
+                data = places(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
+                result = fit_rig(built, data, deviations, 1e-4)
+                true = true_numbers(built)
+                del true["stiffness_n"]
+                if name == "of each":
+                    true |= {f"stiffness_{i}_n": float(s) for i, s in enumerate(stiffness, start=1)}
+                inside.append(share_inside(result.intervals, true))
+                good += judge_rig(result, 1e-3, math.radians(5.0)).verdict.good
+            show(
+                f"cables differ by {spread:.0%}, {name}, {plants} plants",
+                f"{np.mean(inside):.1%} inside, worst plant {min(inside):.1%}; {good} good",
+            )
+
+
+KINDS: dict[str, tuple[str, ...]] = {
+    "lengths": (),
+    "lengths, swivels": ("swivels",),
+    "lengths, IMU": ("verticals",),
+    "lengths, swivels, IMU": ("swivels", "verticals"),
+}
+
+
+def sensors(plants: int, count: int) -> None:
+    """Coverage by group, and the geometry's intervals beside those without a sensor."""
+    rig, degree = load_rig(HALL), math.radians(1.0)
+    for poses in (True, False):
+        shares: dict[tuple[str, str], list[float]] = {}
+        wider: dict[str, list[np.ndarray]] = {}
+        for seed in range(plants):
+            built = built_rig(rig, seed)
+            data = measured(built, count, 1000 + seed)
+            alone: dict[str, float] = {}
+            for kind, which in KINDS.items():
+                sought = {g: d for g, d in DEFAULT_DEVIATIONS.items() if g != "stiffness"}
+                sought |= {"cable_stiffness": 0.2, "imu_mounting": degree}
+                sought = {
+                    g: d
+                    for g, d in sought.items()
+                    if SENSOR_OF.get(g) is None or SENSOR_OF[g] in which
+                }
+                parameters = Parameters.of(rig, sought)
+                part = only(data if poses else data.without_poses(), *which)
+                fit, observability = identified(parameters, part, LENGTH_NOISE)
+                found = uncertainty_of_rig(parameters, part, fit, observability)
+                off = np.abs(fit.values - built.values(parameters.groups)) < found.half_widths
+                for group, where in parameters.slices().items():
+                    shares.setdefault((kind, group), []).append(float(np.mean(off[where])))
+                widths = dict(zip(parameters.names, found.half_widths.tolist(), strict=True))
+                alone = alone or widths
+                ratios = np.array([widths[name] / alone[name] for name in alone])
+                wider.setdefault(kind, []).append(ratios)
+        for kind in KINDS:
+            held = [f"{g} {np.mean(s):.1%}" for (k, g), s in shares.items() if k == kind]
+            name = f"{kind}{', poses' if poses else ''}, {plants} plants"
+            show(f"{name}: inside", ", ".join(held))
+            ratios = np.array(wider[kind])
+            show(
+                f"{name}: geometry's intervals, share of those without",
+                f"mean {ratios.mean():.3f}, largest of a number's means"
+                f" {ratios.mean(axis=0).max():.3f}, largest {ratios.max():.3f}",
+            )
+
+
 def main() -> None:
     """Prints a line a figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("-o", "--output", type=Path, help="keep the files in this new folder")
     parser.add_argument("--plants", type=int, help="only how often intervals hold the truth")
+    parser.add_argument("--sensors", type=int, help="only further sensors, with so many rigs")
     options = parser.parse_args()
+    if options.sensors is not None:
+        sensors(options.sensors, options.count)
+        return
     if options.plants is not None:
         coverage(options.plants, options.count)
+        cables_that_differ(options.plants, options.count)
         return
     if options.output is not None:
         options.output.mkdir(parents=True)

@@ -1,12 +1,13 @@
 """How exactly the platform's pose is tracked, beside plain OpenCV and pyapriltags.
 
-    python benchmarks/tag_tracking.py [--frames 1000] [--peer-every 5]
+    python benchmarks/tag_tracking.py [--frames 1000] [--peer-every 5] [--heights 720 1080]
 
 The ready rig's cube (96 mm tags on 130 mm faces) flies a smooth curve with turns of up to 10°,
 about 1.6 m before the camera, which sees three faces, at 1280 x 720 and at 1920 x 1080 px. Peers
 get every fifth of the same images: their corners of all platform tags go through
 `cv2.solvePnP` (SQPnP, then Levenberg-Marquardt). NEES is the squared error in units of the stated
-covariance; its mean is 6 when that covariance is exact.
+covariance; its mean is 6 when that covariance is exact. A picture of a bare wall, in which there is
+nothing to find, is timed beside plain OpenCV. A height of 2598 px makes 12 megapixels.
 """
 
 from __future__ import annotations
@@ -29,15 +30,17 @@ from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector
 from model.rig import Camera, Rig, load_rig
 from model.scene import Scene, load_scene
 from simulation.camera.camera import Optics, SyntheticCamera
-from tracking.detection.tags import tag_corners
+from tracking.detection.tags import dictionary, tag_corners
 from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: A pose turned farther from the truth than this is a flip, [rad].
 FLIP = np.radians(5.0)
-#: Targets of position [m] and rotation [rad], RMS, by image height.
+#: Targets of position [m] and rotation [rad], RMS, from an image height on.
 TARGETS = {720: (0.8e-3, np.radians(0.1)), 1080: (0.3e-3, np.radians(0.03))}
+#: Pictures of a bare wall.
+WALLS = 15
 
 
 @dataclass
@@ -164,7 +167,28 @@ def fly(
                 start = time.process_time()
                 there = peer(image)
                 scores[name].add(there, truth, time.process_time() - start)
-    return report(camera, mine, scores, states, faces)
+    good = report(camera, mine, scores, states, faces)
+    look_at_a_wall(rig, camera, optics.noise)
+    return good
+
+
+def look_at_a_wall(rig: Rig, camera: Camera, noise: float) -> None:
+    """Prints the CPU time of a picture with nothing in it, beside OpenCV's detector as it comes."""
+    grey = np.random.default_rng(0).normal(120.0, noise, (camera.height, camera.width))
+    wall = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    tracker, peer = Tracker(rig, camera), cv2.aruco.ArucoDetector(dictionary(rig.tag_family))
+    took: tuple[list[float], list[float]] = ([], [])
+    for number in range(WALLS):
+        start = time.process_time()
+        tracker.observe(wall, number / 20.0)
+        between = time.process_time()
+        peer.detectMarkers(wall)
+        took[0].append(between - start)
+        took[1].append(time.process_time() - between)
+    ours, theirs = (float(np.median(each)) for each in took)
+    print(
+        f"nothing in it: {ours * 1e3:.1f} ms CPU, {ours / theirs:.2f} of cv2's {theirs * 1e3:.1f}"
+    )
 
 
 def report(
@@ -186,7 +210,7 @@ def report(
     print(f"NEES {mean:.2f} (exact: 6, 99 % band {low:.2f} to {high:.2f}); ", end="")
     print(f"{beyond:.1%} of poses beyond the 99 % ellipsoid")
     place, turn = mine.rms
-    limit_place, limit_turn = TARGETS[camera.height]
+    limit_place, limit_turn = TARGETS[max(h for h in TARGETS if h <= camera.height)]
     flips = sum(np.linalg.norm(e[3:]) > FLIP for e in mine.errors)
     return place <= limit_place and turn <= limit_turn and not flips and not mine.missed
 

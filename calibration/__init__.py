@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from calibration.result_files import load_result
     from calibration.results import Calibration, ResultDocument
     from calibration.tag_map.result import TagsResult
-    from calibration.targets.chessboards import Charuco, Chessboard
-    from calibration.targets.circle_grid import CircleGrid
-    from calibration.targets.tag_grid import TagGrid
+    from calibration.targets.boards import Charuco, Chessboard
+    from calibration.targets.grids import CircleGrid, TagGrid
 
 __all__ = [
     "Calibration",
@@ -45,8 +44,7 @@ if not TYPE_CHECKING:
             "calibration.procedures": "Calibration",
             "calibration.results": "ResultDocument",
             "calibration.tag_map.result": "TagsResult",
-            "calibration.targets.chessboards": "Charuco Chessboard",
-            "calibration.targets.circle_grid": "CircleGrid",
-            "calibration.targets.tag_grid": "TagGrid",
+            "calibration.targets.boards": "Charuco Chessboard",
+            "calibration.targets.grids": "CircleGrid TagGrid",
         },
     )

@@ -20,7 +20,7 @@ from calibration.extrinsics.result import (
 )
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.geometry.calibrate import RigCalibration, fit_rig
-from calibration.geometry.model import DEFAULT_DEVIATIONS
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS
 from calibration.geometry.quality import RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
@@ -61,7 +61,7 @@ from calibration.tag_map.result import (
     tags_page,
     tags_result,
 )
-from calibration.targets.board import Board, read_corners
+from calibration.targets.boards import Board, read_corners
 from executor.kernels import ready_to_measure
 from model.errors import BadInput, Fault, Refused
 from model.kinematics import NoCable
@@ -77,35 +77,35 @@ RigOutcome = Calibration[RigResult, RigCalibration, RigQuality]
 
 
 def calibrate_camera(
-    pictures: Pictures | Path,
+    folder: Pictures | str | Path,
     board: Board,
     *,
     name: str = "camera",
     wanted: float = 1e-3,
     distance: float | None = None,
     lens: str = AUTO,
-    to: Destination | None = None,
+    output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> CameraOutcome:
-    """Finds a camera's matrix and lens distortion.
+    """Finds a camera's matrix and lens distortion from images of a board.
 
     Args:
-        pictures: Of the board, or the folder that they are in.
-        board: What they show.
+        folder: Of the images, all of one size; or the images.
+        board: What they show: `Chessboard`, `Charuco`, `CircleGrid` or `TagGrid`.
         name: Of the camera in the rig file.
         wanted: What is good enough, 95 %, [m].
         distance: From which the camera measures, [m]; that of the boards when left out.
-        lens: ``five`` coefficients, ``rational``, ``thin-prism`` or ``fisheye``; the one that fits
-            held-out pictures best when left out.
-        to: Where the result is written; nowhere when left out.
+        lens: ``five`` coefficients, ``rational``, ``thin-prism`` or ``fisheye``; ``auto`` takes the
+            one that fits held-out images best.
+        output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives how far it is.
 
     Raises:
         BadInput: Images of different sizes, or too few that show the board.
     """
     require_file_name(name, "--name")
-    source = pictures if isinstance(pictures, Pictures) else pictures_in(pictures)
-    to = to or Destination()
+    source = folder if isinstance(folder, Pictures) else pictures_in(Path(folder))
+    to = Destination.of(output)
     to.require_free("camera", name)
     with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused, lens)
@@ -120,7 +120,7 @@ def calibrate_camera_from_corners(
     wanted: float = 1e-3,
     distance: float | None = None,
     lens: str = AUTO,
-    to: Destination | None = None,
+    output: Destination | str | Path | None = None,
 ) -> CameraOutcome:
     """Finds a camera's matrix and lens distortion from corners that another program detected.
 
@@ -131,13 +131,13 @@ def calibrate_camera_from_corners(
         wanted: What is good enough, 95 %, [m].
         distance: From which the camera measures, [m].
         lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
-        to: For the result.
+        output: Folder for the result.
 
     Raises:
         BadInput: The file cannot be read, or as of `fit_corners`.
     """
     require_file_name(name, "--name")
-    to = to or Destination()
+    to = Destination.of(output)
     to.require_free("camera", name)
     found = fit_corners(read_corners(corners), size, lens, str(corners))
     return _judged_camera(found, name, wanted, distance, to)
@@ -154,85 +154,91 @@ def _judged_camera(
 
 def locate_camera(
     rig: Rig,
-    camera: Camera,
-    pictures: PicturesFrom,
+    source: PicturesFrom,
     *,
-    poses: Mapping[str, Pose] | Path | None = None,
+    camera: str | None = None,
+    poses: Mapping[str, Pose] | str | Path | None = None,
     survey: Survey | None = None,
     wanted: float = 1e-3,
-    to: Destination | None = None,
+    output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> ExtrinsicsOutcome:
     """Finds where a camera is, by surveyed tags on the frame or by the rig's own motion.
 
     Args:
         rig: The robot, with its tags.
-        camera: Its matrix and distortion hold.
-        pictures: Taken while the camera does not move.
+        source: A folder of images, a video file, or the index or address of a live
+            camera; taken while the camera does not move.
+        camera: Which of the rig's cameras took them; the first when left out. Its matrix and
+            distortion hold.
         poses: The platform's by image, or a CSV file of them, or a run folder: go by the rig's
             motion. Left out, by the tags on the frame.
         survey: How well the frame tags were surveyed; each corner to 0.5 mm when left out.
         wanted: What is good enough in the work space, 95 %, [m].
-        to: Where the result is written; nowhere when left out.
+        output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives how far it is.
 
     Raises:
         BadInput: There are no tags, or too few images that show them.
     """
-    require_file_name(camera.name, "cameras")
-    known = poses_by_picture(poses, camera.name) if isinstance(poses, Path) else poses
+    taken_by = rig.camera(camera)
+    require_file_name(taken_by.name, "cameras")
+    known = poses_by_picture(Path(poses), taken_by.name) if isinstance(poses, str | Path) else poses
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags
-    source, to = opened_pictures(pictures, camera, USUAL_PICTURES), to or Destination()
-    to.require_free("extrinsics", camera.name)
+    pictures, to = opened_pictures(source, taken_by, USUAL_PICTURES), Destination.of(output)
+    to.require_free("extrinsics", taken_by.name)
     ready_to_measure(listener)
-    with source.reported("detecting tags", listener) as images:
-        sights = sights_of(images, rig, camera, [tag.id for tag in tags], source.unused)
+    with pictures.reported("detecting tags", listener) as images:
+        sights = sights_of(images, rig, taken_by, [tag.id for tag in tags], pictures.unused)
     if known is None:
-        found = locate_by_frame_tags(rig, camera, sights, survey or Survey(0.5e-3, None))
+        found = locate_by_frame_tags(rig, taken_by, sights, survey or Survey(0.5e-3, None))
     else:
-        found = locate_by_motion(rig, camera, sights, known)
+        found = locate_by_motion(rig, taken_by, sights, known)
     verdict = judge_extrinsics(found, wanted)
     result = extrinsics_result(found, verdict, rig.document, to.on)
-    page = extrinsics_page(found, result, verdict, camera.world_from_camera)
-    facts = place_facts(found, camera.world_from_camera)
+    page = extrinsics_page(found, result, verdict, taken_by.world_from_camera)
+    facts = place_facts(found, taken_by.world_from_camera)
     return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
 
 
 def locate_tags(
     rig: Rig,
-    camera: Camera,
-    pictures: PicturesFrom,
+    source: PicturesFrom,
     *,
+    camera: str | None = None,
     fixed_tag: int | None = None,
     wanted: float = 0.2e-3,
-    to: Destination | None = None,
+    output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> TagsOutcome:
     """Finds where the tags are on the platform, from images that show two or more at once.
 
     Args:
         rig: The robot, with its tags.
-        camera: Its matrix and distortion hold.
-        pictures: Taken from anywhere.
+        source: A folder of images, a video file, or the index or address of a live
+            camera; taken from anywhere.
+        camera: Which of the rig's cameras took them; the first when left out. Its matrix and
+            distortion hold.
         fixed_tag: Is as in the rig file; all fit it best when left out.
         wanted: What is good enough for corners of tags, 95 %, [m].
-        to: Where the result is written; nowhere when left out.
+        output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives how far it is.
 
     Raises:
         BadInput: There are no tags, or too few images that show them.
     """
+    taken_by = rig.camera(camera)
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
-    source, to = opened_pictures(pictures, camera, USUAL_TAG_PICTURES), to or Destination()
+    pictures, to = opened_pictures(source, taken_by, USUAL_TAG_PICTURES), Destination.of(output)
     to.require_free("tags", rig.name)
     ready_to_measure(listener)
-    with source.reported("detecting tags", listener) as images:
+    with pictures.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
-        sights = sights_of(images, rig, camera, numbers, source.unused)
-    found = measure_layout(rig, camera, sights, fixed_tag)
+        sights = sights_of(images, rig, taken_by, numbers, pictures.unused)
+    found = measure_layout(rig, taken_by, sights, fixed_tag)
     verdict = judge_layout(found, wanted)
     result = tags_result(found, verdict, rig.document, to.on)
     page = tags_page(found, result, verdict)
@@ -247,7 +253,7 @@ def measure_readout(
     rate: float | None = None,
     speed: float | None = None,
     wanted: float = 0.1e-3,
-    to: Destination | None = None,
+    output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> ReadoutOutcome:
     """Finds how long a camera takes from its top row to its bottom row (rolling shutter).
@@ -259,7 +265,7 @@ def measure_readout(
         rate: Images a second of a folder; the camera's when left out.
         speed: Of the platform, for which the error is stated, [m/s]; the rig's when left out.
         wanted: What is good enough, 95 %, [m].
-        to: Where the result is written; nowhere when left out.
+        output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives how far it is.
 
     Raises:
@@ -267,7 +273,7 @@ def measure_readout(
     """
     require_file_name(camera.name, "cameras")
     require_tags(rig, None)
-    pictures, to = timed_pictures(source, camera, rate), to or Destination()
+    pictures, to = timed_pictures(source, camera, rate), Destination.of(output)
     to.require_free("readout", camera.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
@@ -284,18 +290,20 @@ def measure_readout(
 
 def calibrate_rig(
     rig: Rig,
-    data: Sequence[Path],
+    data: Sequence[str | Path],
     *,
     deviations: Mapping[str, float] = DEFAULT_DEVIATIONS,
     length_deviation: float = 0.1e-3,
     pose_deviations: tuple[float, float] = (0.1e-3, radians(0.02)),
     without_poses: bool = False,
     reflector: Sequence[float] = (0.0, 0.0, 0.0),
+    swivel_deviation: float = radians(0.1),
+    imu_deviation: float = radians(0.1),
     tilt: float = radians(5.0),
     wanted: float = 1e-3,
     name: str = "rig",
     rig_file: Path | None = None,
-    to: Destination | None = None,
+    output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> RigOutcome:
     """Finds outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
@@ -304,31 +312,36 @@ def calibrate_rig(
         rig: As in its file.
         data: Run folders, and CSV files (docs/data-formats.md).
         deviations: How far off the rig file may be by group of numbers, one standard deviation;
-            groups left out are taken as known.
+            groups left out are taken as known. ``cable_stiffness`` in place of ``stiffness`` finds
+            that of each cable, and ``imu_mounting`` that of an IMU.
         length_deviation: Of a cable's length from the encoders, [m].
         pose_deviations: Of poses, added to that of their file, [m] and [rad].
         without_poses: Drive positions alone, as without a camera.
         reflector: The point of positions without rotations, platform frame, [m].
+        swivel_deviation: Of measured swivel angles, [rad].
+        imu_deviation: Of the vertical by an IMU about any axis, [rad].
         tilt: How far the platform will be rotated, [rad].
         wanted: What is good enough, 95 %, [m].
         name: Of the result.
         rig_file: Named in messages.
-        to: Where the result is written; nowhere when left out.
+        output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives how far it is.
 
     Raises:
         BadInput: Data cannot be read, are too few, or do not fit the rig file.
     """
     require_file_name(name, "--name")
-    counted, measured = rig_measurements(rig, data)
+    counted, measured = rig_measurements(rig, [Path(path) for path in data])
     length, turn = pose_deviations
     measured = replace(
         measured.with_doubt(np.array([length] * 3 + [turn] * 3)),
         reflector=read_only(reflector),
+        swivel_deviation=swivel_deviation,
+        imu_deviation=imu_deviation,
     )
     if without_poses:
         measured = measured.without_poses()
-    to = to or Destination()
+    to = Destination.of(output)
     to.require_free("rig", name)
     with listener.waiting("fitting"):
         try:

@@ -18,7 +18,6 @@ from calibration.statistics import Interval
 from calibration.tag_map.result import TagsResult
 from model.errors import BadInput
 from model.files.documents import load_yaml, read_yaml, write_atomic
-from model.progress import SILENT, Listener
 from model.rig import Rig
 
 KINDS: dict[str, type[ResultDocument]] = {
@@ -60,26 +59,6 @@ def _kind_of(path: Path) -> type[ResultDocument]:
             next_step="pass a file calibration_*.yaml written by `cdpr calibrate`",
         )
     return KINDS[kind]
-
-
-def with_calibrations(rig: Rig, files: Sequence[Path], listener: Listener = SILENT) -> Rig:
-    """The rig with the results of files in place of its file's numbers, in memory only.
-
-    The verdict of each result that is not good enough is reported: it may be used all the same.
-
-    Raises:
-        BadInput: A file cannot be used, or is not about this rig.
-    """
-    if not files:
-        return rig
-    results = [load_result(file) for file in files]
-    better = rig.with_calibration(*results)
-    for result in results:
-        if not result.good_enough:
-            listener.remark(
-                f"calibration {result.kind} {result.name}, {result.date}: {result.verdict}"
-            )
-    return better
 
 
 def write_calibrated_rig(path: Path, rig: Rig, results: Sequence[ResultDocument]) -> Rig:

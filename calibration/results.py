@@ -358,6 +358,13 @@ class Destination:
     replace: bool = False
     on: date = field(default_factory=lambda: datetime.now(UTC).date())
 
+    @classmethod
+    def of(cls, output: Destination | str | Path | None) -> Destination:
+        """A destination as it is; of a folder, what a result there replaces is refused."""
+        if isinstance(output, Destination):
+            return output
+        return cls(None if output is None else Path(output))
+
     def require_free(self, kind: str, name: str) -> None:
         """Makes the folder before the work, so that no work is lost.
 

@@ -12,18 +12,15 @@ from model.lazy import lazy_names
 
 if TYPE_CHECKING:
     from calibration.geometry.pose_selection import measurement_poses
-    from calibration.targets.chessboards import Chessboard
-    from cdpr.measurement import (
+    from calibration.procedures import (
         calibrate_camera,
         calibrate_rig,
-        load_calibration,
         locate_camera,
         locate_tags,
-        open_camera,
-        track,
     )
-    from cdpr.operation import report, stop
-    from cdpr.planning import check, plan, workspace_map
+    from calibration.targets.boards import Chessboard
+    from cdpr.measurement import load_calibration, open_camera, track
+    from cdpr.operation import check, plan, report, stop, workspace_map
     from executor.homing import home
     from executor.jogging import jog
     from executor.run_result import RunResult, load_run
@@ -94,13 +91,10 @@ if not TYPE_CHECKING:
         __name__,
         {
             "calibration.geometry.pose_selection": "measurement_poses",
-            "calibration.targets.chessboards": "Chessboard",
-            "cdpr.measurement": (
-                "calibrate_camera calibrate_rig load_calibration locate_camera "
-                "locate_tags open_camera track"
-            ),
-            "cdpr.operation": "report stop",
-            "cdpr.planning": "check plan workspace_map",
+            "calibration.procedures": "calibrate_camera calibrate_rig locate_camera locate_tags",
+            "calibration.targets.boards": "Chessboard",
+            "cdpr.measurement": "load_calibration open_camera track",
+            "cdpr.operation": "check plan report stop workspace_map",
             "executor.homing": "home",
             "executor.jogging": "jog",
             "executor.run_result": "RunResult load_run",

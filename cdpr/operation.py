@@ -1,13 +1,144 @@
-"""Runs that are under way or over: what `cdpr stop`, `hold`, `resume`, `speed` and `report` do."""
+"""Plans and runs: what `cdpr plan`, `check`, `workspace`, `stop`, `hold` … `report` do."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from executor.evaluation import rewrite_report
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
+from model.plan import Plan, plan_from_document, require_same_rig
+from model.pose import Array, Pose
+from model.progress import SILENT, Listener
+from model.rig import Rig
+from model.scene import Scene
+from planner.check import verify
+from planner.check_report import CheckReport
+from planner.planning import plan_path
+from planner.settings import Objective, PlannerName, PlanningOptions, settings_from_options
+from planner.workspace.compute import Maps, map_workspace, workspace_grids
+from planner.workspace.maps import Question
+
+
+def plan(
+    rig: Rig,
+    scene: Scene,
+    *,
+    planner: PlannerName = "optimal",
+    cost: Objective | None = None,
+    weights: Mapping[str, float] | None = None,
+    budget: float | None = None,
+    rounds: int | Sequence[int] | None = None,
+    seed: int = 0,
+    longest: float | None = None,
+    free_rotation: bool = False,
+    start: Pose | None = None,
+    goal: Pose | None = None,
+    clearance: float | None = None,
+    max_iterations: int | None = None,
+    listener: Listener = SILENT,
+) -> Plan:
+    """Plans a path from the scene's start through its stops to its goal.
+
+    Args:
+        rig: The robot.
+        scene: Obstacles, clearances, load, start, stops and goal.
+        planner: ``optimal``, or those of the paper: ``adaptive`` and ``goal-bias``.
+        cost: What to optimise: ``length`` (default), ``kinematic``, ``clearance``, ``capacity``.
+        weights: Instead of a cost: weights of a sum of them, by name.
+        budget: How long paths are sought and improved, [s]; 0.05 when left out, 0.5 with
+            `free_rotation`. How far a budget goes depends on the computer.
+        rounds: Instead of a budget: rounds for all legs between stops, or for each. The same rounds
+            and seed give the same path.
+        seed: Of the random numbers.
+        longest: The best path that is no longer, [m].
+        free_rotation: The platform may rotate, within the scene's limits.
+        start: Instead of the scene's, ``world_from_platform``.
+        goal: Instead of the scene's, ``world_from_platform``.
+        clearance: To obstacles, instead of the scene's, [m].
+        max_iterations: The paper's planners: samples after which the search ends.
+        listener: Receives the progress of a long search.
+
+    Returns:
+        The plan, which passed the check of `cdpr.check`.
+
+    Raises:
+        BadInput: Start, goal or a stop cannot be used, or arguments contradict each other.
+        NoSolution: There is no path, or the search ended at its limit.
+    """
+    of_legs = [rounds] if isinstance(rounds, int) else list(rounds or ())
+    settings = settings_from_options(
+        PlanningOptions(
+            planner=planner,
+            seed=seed,
+            cost=cost,
+            weight=weights or (),
+            budget_ms=None if budget is None else budget * 1000.0,
+            rounds=of_legs,
+            longest_mm=None if longest is None else longest * 1000.0,
+            free_rotation=free_rotation,
+            max_iterations=max_iterations,
+        )
+    )
+    scene = scene.changed(start=start, goal=goal, clearance=clearance)
+    each = of_legs if len(of_legs) > 1 else ()
+    return plan_from_document(plan_path(rig, scene, settings, listener, rounds=each))
+
+
+def check(plan: Plan, rig: Rig | None = None) -> CheckReport:
+    """Proves a plan by an independent route: distances at dense poses, bounds proved between them.
+
+    Args:
+        plan: The plan, with the scene it carries.
+        rig: The robot as it is now; the plan's own when left out.
+
+    Returns:
+        The figures of the path; `proved_` ones hold everywhere on it.
+
+    Raises:
+        BadInput: The plan was made for another rig.
+        PlanRejected: With every violation, what by how much and where.
+    """
+    the_rig = plan.rig if rig is None else rig
+    require_same_rig(plan, the_rig, f"plan for {plan.rig.name} in {plan.scene.name}")
+    return verify(plan, the_rig).report
+
+
+def workspace_map(
+    rig: Rig,
+    scene: Scene | None = None,
+    *,
+    slices: Sequence[tuple[Literal["x", "y", "z"], float]] = (),
+    volume: bool | None = None,
+    step: float | None = None,
+    rotation: Array | None = None,
+    workers: int | None = None,
+    listener: Listener = SILENT,
+) -> list[Maps]:
+    """Where the robot can hold its load, and how well, over planes and volumes.
+
+    Args:
+        rig: The robot.
+        scene: Its obstacles and load; the robot alone when left out.
+        slices: Axis and position [m] of planes; the level one through home when left out.
+        volume: Map the whole workspace too; left out, if there are no slices.
+        step: Distance of points, [m]; a fiftieth of the longest side when left out.
+        rotation: Of the platform, shape (3, 3); that of the start, or of home, when left out.
+        workers: Processes; one a core when left out.
+        listener: Receives the progress.
+
+    Returns:
+        For each plane or volume its grid, and arrays of values by name.
+
+    Raises:
+        BadInput: A plane is outside the workspace, or there are too many points.
+    """
+    planes = [("xyz".index(axis), position) for axis, position in slices]
+    grids = workspace_grids(rig, planes, volume=volume, step=step)
+    question = Question.about(rig, scene, rotation)
+    return map_workspace(question, grids, workers=workers, listener=listener)
 
 
 def stop() -> list[int]:

@@ -9,9 +9,11 @@ from typing import Protocol
 
 import can
 
-from drivers.can_bus import EchoFilter, bus_name, lost_frames, take, transmit
+from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, lost_frames, take, transmit
 from drivers.can_errors import SETTING_UP, BusFault, ErrorFrames, ForeignMaster, ReceiveOverflow
+from drivers.can_load import check_bus_load
 from drivers.drive_group import WHOLE_BUS, CycleStatus, GroupState, Pump
+from drivers.plausibility import largest_steps
 from model.errors import Refused
 from model.rig import Rig
 
@@ -43,17 +45,21 @@ class CyclicBus:
     """
 
     def __init__(
-        self, bus: can.BusABC, own: EchoFilter, foreign_master_message: Callable[[int], str]
+        self,
+        bus: can.BusABC,
+        commanding: frozenset[int],
+        foreign_master_message: Callable[[int], str],
     ) -> None:
         """Takes an open bus.
 
         Args:
             bus: The caller's.
-            own: Filters own frames from another master's.
+            commanding: Identifiers that only a master sends.
             foreign_master_message: What another master does that sends a frame of an identifier.
         """
         self._bus, self._where = bus, bus_name(bus)
-        self._own, self._foreign_master_message = own, foreign_master_message
+        self._own = EchoFilter(commanding, echoes_own_frames=echoes_own_frames(bus))
+        self._foreign_master_message = foreign_master_message
         self._errors = ErrorFrames(self._where)
         self._lost = lost_frames(bus)
         self._found: list[BusFault] = []
@@ -179,8 +185,10 @@ class CyclicGroup(ABC):
 
     def __init__(self, rig: Rig, bus: can.BusABC, pump: Pump | None) -> None:
         """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
+        check_bus_load(rig)
         self._rig, self._bus, self._pump = rig, bus, pump
         self._nodes = tuple(winch.node_id for winch in rig.winches)
+        self._max_steps = largest_steps(rig, rig.cycle)
         self._state = GroupState.OFFLINE
         self._faults: list[tuple[int, str]] = []
 

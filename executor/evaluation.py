@@ -20,10 +20,8 @@ from executor.recording.clearance import (
     source_of,
     tension_noise,
 )
-from executor.recording.cycle_table import CycleTable
 from executor.recording.mcap import write_mcap
-from executor.recording.pose_table import OK, PoseTable, fused_table, no_poses
-from executor.recording.run_course import CameraRecord, RunCourse, versions
+from executor.recording.record_files import CameraRecord, RunCourse, versions
 from executor.recording.run_folder import (
     CLEARANCE,
     COURSE,
@@ -40,6 +38,7 @@ from executor.recording.run_folder import (
     RunFolder,
 )
 from executor.recording.summary import RunContext, summarize
+from executor.recording.tables import OK, CycleTable, PoseTable, fused_table, no_poses
 from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
 from executor.state_machine import SIMULATED, State

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from executor.cameras.client import static_pose
 from executor.cameras.open import look_at_rest
 from executor.cameras.sources import choose_one_camera, require_simulated_pictures
-from executor.cameras.static_pose import static_pose
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
 from executor.control.winch_motion import WinchesStand
 from executor.drives import is_simulated, require_own_time

@@ -16,7 +16,7 @@ from executor.control.winch_laws import CableStep
 from executor.drives import current_pose, is_simulated, look_at, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import CableProposal, MotionProposal, require_confirmed
-from executor.recording.run_course import free_folder
+from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.runner import RunOptions, RunResult, prepare_plan, run_prepared
 from executor.supervision import Supervisor

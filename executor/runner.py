@@ -23,10 +23,10 @@ from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_for_simulating_process
 from executor.proposals import MotionProposal, require_confirmed
-from executor.realtime.clock import SimulatedClock
+from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
+from executor.recording.record_files import RunCourse, dated_folder
 from executor.recording.recorder import Recorder
-from executor.recording.run_course import RunCourse, dated_folder
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
 from executor.remote.command_socket import advertised, serving
 from executor.remote.status import RunStatus

@@ -28,9 +28,16 @@ from planner.check import verify
 from simulation.camera.camera import Film
 from simulation.factory import make_synthetic_camera
 from tracking.measurement import PoseMeasurement
-from tracking.overlay import drawn_over
 from tracking.pose_log import LoggedPicture, write_pose_log
-from tracking.track import FrameRate, Picture, TogetherCount, TrackCount, track, track_together
+from tracking.track import (
+    FrameRate,
+    Picture,
+    TogetherCount,
+    TrackCount,
+    drawn_over,
+    track,
+    track_together,
+)
 from tracking.tracker import Tracker
 
 #: A live camera that shows no tag for this number of images is given up.

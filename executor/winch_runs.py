@@ -15,11 +15,11 @@ from executor.drives import is_simulated, left_alone, unreferenced_drives_of
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
-from executor.realtime.clock import Clock, SimulatedClock
 from executor.realtime.job import Armed, Ended, MotionTask, ReadyDrives
 from executor.realtime.process import RealTimeProcess, real_time_process
+from executor.realtime.scheduling import Clock, SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
-from executor.recording.run_course import free_folder
+from executor.recording.record_files import free_folder
 from executor.remote.command_socket import advertised, serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State

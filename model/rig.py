@@ -127,6 +127,7 @@ class Rig:
             file does not say.
         outlet_error: How far off outlets are along any axis, 95 %, [m]; None as above.
         anchor_error: As `outlet_error`, of anchors.
+        cable_stiffness: Axial, E·A of each cable, shape (m,), [N].
     """
 
     document: RigDocument
@@ -141,7 +142,7 @@ class Rig:
     workspace_lower: Array
     workspace_upper: Array
     cable_radius: float
-    cable_stiffness: float
+    cable_stiffness: Array
     min_tension: float
     max_tension: float
     winches: tuple[Winch, ...]
@@ -340,7 +341,9 @@ def rig_from_document(document: RigDocument) -> Rig:
         workspace_lower=read_only(millimetres(document.workspace.lower_mm)),
         workspace_upper=read_only(millimetres(document.workspace.upper_mm)),
         cable_radius=document.cables.radius_mm / 1000.0,
-        cable_stiffness=document.cables.stiffness_n,
+        cable_stiffness=read_only(
+            [w.cable_stiffness_n or document.cables.stiffness_n for w in document.winches]
+        ),
         min_tension=document.cables.min_tension_n,
         max_tension=document.cables.max_tension_n,
         winches=tuple(_winch(w) for w in document.winches),

@@ -24,12 +24,12 @@ class WinchMap:
 
         Args:
             rig: The robot.
-            stiffness: E·A of each cable where they differ, shape (m,), [N].
+            stiffness: E·A of each cable, shape (m,), [N]; the rig file's when left out.
 
         Raises:
             TensionInfeasible: The rig cannot hold its platform at home.
         """
-        self.stiffness = rig.cable_stiffness if stiffness is None else stiffness
+        self.stiffness: Array = rig.cable_stiffness if stiffness is None else stiffness
         self.behind_outlet = read_only([w.drum_to_outlet for w in rig.winches])
         self.counts_per_metre = read_only([w.counts_per_metre for w in rig.winches])
         self.home_counts = read_only([w.home_counts for w in rig.winches])

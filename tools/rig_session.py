@@ -19,7 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from calibration.geometry.model import DEFAULT_DEVIATIONS, Parameters
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.pose_selection import Wish, chosen_poses
 from model.files.scene_file import SceneDocument
 from model.kinematics import cables_at

@@ -9,7 +9,6 @@ import numpy as np
 from model.errors import BadInput
 from model.pose import Array, Pose, interpolate
 from model.rig import Camera, Rig
-from tracking.camera_check import CameraCheck, refuse_moved_camera
 from tracking.camera_model import Image, require_image_format
 from tracking.detection.detector import (
     Detection,
@@ -21,6 +20,7 @@ from tracking.detection.detector import (
 from tracking.estimator import PlatformEstimator, TrackerSettings
 from tracking.measurement import NoPose, Observation, PoseMeasurement, predicted
 from tracking.rolling_shutter import RecentMotion
+from tracking.shared_errors import CameraCheck, refuse_moved_camera
 
 # Where the platform should be seen, by the positions of its drives.
 #
@@ -192,12 +192,16 @@ class Tracker:
         return found if self._goes_on(found, last) else None
 
     def _search(self, image: Image, time: float) -> Observation:
-        """The pose by a search of the whole image, once more thoroughly when it finds none."""
-        found = self._searched(image, time, thorough=False)
-        return self._searched(image, time, thorough=True) if isinstance(found, NoPose) else found
+        """The pose by a search of the whole image, more thorough when that finds none."""
+        plain = self._detector.detect_all(image)
+        found = self._judged(image, time, plain)
+        if isinstance(found, NoPose):
+            thorough = self._detector.look_again(image, plain)
+            if len(thorough) > len(plain):
+                return self._judged(image, time, thorough)
+        return found
 
-    def _searched(self, image: Image, time: float, thorough: bool) -> Observation:
-        detections = self._detector.detect_all(image, thorough=thorough)
+    def _judged(self, image: Image, time: float, detections: Sequence[Detection]) -> Observation:
         self._check_camera(image, detections)
         return self._sight.measured(image, time, detections, None, "found")
 

@@ -27,10 +27,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from calibration.targets.board import Board, Seen
-from calibration.targets.chessboards import Charuco, Chessboard
-from calibration.targets.circle_grid import CircleGrid
-from calibration.targets.tag_grid import TagGrid
+from calibration.targets.boards import Board, Charuco, Chessboard, Seen
+from calibration.targets.grids import CircleGrid, TagGrid
 from tracking.camera_model import Image
 from tracking.detection.tags import dictionary, upright_corners
 

@@ -28,8 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from calibration.intrinsics.lens import LENSES, LensFit, LensModel, choose_lens, error_of, fit_lens
-from calibration.targets.board import Seen
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard, Seen
 
 ROOT = Path(__file__).parents[2]
 Views = Mapping[str, Seen]

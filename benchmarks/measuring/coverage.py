@@ -32,7 +32,7 @@ from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
 from calibration.intrinsics.quality import judge_camera
 from calibration.tag_map.observations import TagSights
-from calibration.targets.board import Seen
+from calibration.targets.boards import Seen
 from model.clearance import ClearanceModel
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, Tag, load_rig

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,9 +31,8 @@ from calibration.procedures import ExtrinsicsOutcome
 from calibration.results import Calibration, Destination, Issue, data_hash
 from calibration.tag_map.bundle_adjustment import require_tags
 from calibration.tag_map.observations import TagSights, platform_pose, sights_of
-from calibration.targets.board import Board, Seen
-from calibration.targets.chessboards import Charuco
-from calibration.targets.tag_grid import TagGrid
+from calibration.targets.boards import Board, Charuco, Seen
+from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
 from model.cameras import SURE
 from model.errors import BadInput
@@ -230,7 +230,7 @@ def locate_camera_by_another(
     *,
     board: Board | None = None,
     wanted: float = 1e-3,
-    to: Destination | None = None,
+    output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> ExtrinsicsOutcome:
     """Finds where a camera is, by what another camera sees at the same time.
@@ -242,7 +242,7 @@ def locate_camera_by_another(
         sources: Images of this and of the other camera; those of a moment have the same name.
         board: What both see; the tags of the platform when left out.
         wanted: What is good enough in the work space, 95 %, [m].
-        to: Where the result is written; nowhere when left out.
+        output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives how far it is.
 
     Raises:
@@ -257,7 +257,7 @@ def locate_camera_by_another(
         require_tags(rig, None)
     else:
         require_oriented(board)
-    to = to or Destination()
+    to = Destination.of(output)
     to.require_free("extrinsics", camera.name)
     ready_to_measure(listener)
     seen: list[dict[str, BodyLook]] = []

@@ -21,11 +21,11 @@ from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
-from tracking.camera_check import change_of_inverse
 from tracking.camera_model import ideal_slopes, project_undistorted
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, moved, solve_pnp
+from tracking.shared_errors import change_of_inverse
 
 # How far off the surveyed places of tags may be, and what that does to their pixels.
 

@@ -18,7 +18,8 @@ from calibration.geometry.identifiability import (
     uncertainty_of_rig,
 )
 from calibration.geometry.measurements import RigMeasurements
-from calibration.geometry.model import Parameters, RigGeometry, RigModel, rig_with
+from calibration.geometry.model import RigModel
+from calibration.geometry.parameters import Parameters, RigGeometry, rig_with
 from calibration.statistics import Interval
 from model.errors import BadInput
 from model.kinematics import cables_to, poses_near
@@ -44,30 +45,36 @@ def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> Rig
         fit: Of all of them, robust.
         fewest: Nothing is left out where fewer places than that would remain.
     """
-    cables = fit.residuals / fit.deviations
-    misfits = _misfits(cables, fit.pose_misfits, measured)
+    residuals, m = fit.residuals / fit.deviations, fit.cables.shape[1]
+    misfits = _misfits(fit, residuals, measured)
     usual = float(np.median(misfits))
     bad = misfits > max(FAR_OFF * usual, OFF)
     if not bad.any() or len(measured) - int(bad.sum()) < fewest:
         return measured
     unused = dict(measured.unused)
     for k in np.flatnonzero(bad):
-        worst = int(np.argmax(np.abs(cables[k])))
-        by_pose = fit.pose_misfits[k] > abs(cables[k, worst])
-        what = "pose" if by_pose else f"cable {worst + 1}"
-        apart = (measured.measured_points(fit.positions, fit.rotations) - measured.positions)[k]
-        off = float(np.linalg.norm(apart)) if by_pose else float(abs(fit.residuals[k, worst]))
+        worst = int(np.argmax(np.abs(residuals[k])))
+        off = float(abs(fit.residuals[k, worst]))
+        if fit.pose_misfits[k] > abs(residuals[k, worst]):
+            points = measured.measured_points(fit.positions, fit.rotations)
+            apart = float(np.linalg.norm(points[k] - measured.positions[k]))
+            what = f"pose is {apart * 1e3:.3g} mm"
+        elif worst < m:
+            what = f"cable {worst + 1} is {off * 1e3:.3g} mm"
+        else:
+            what = f"{fit.sensors[worst - m]} is {math.degrees(off):.3g}°"
+        times = misfits[k] / usual
         unused[measured.names[k]] = (
-            f"contradicts the others: {what} is {off * 1e3:.3g} mm off,"
-            f" {misfits[k] / usual:.3g} times the usual error"
+            f"contradicts the others: {what} off, {times:.3g} times the usual error"
         )
     return replace(measured, unused=unused).part(~bad)
 
 
-def _misfits(cables: Array, poses: Array, measured: RigMeasurements) -> Array:
+def _misfits(fit: RigFit, residuals: Array, measured: RigMeasurements) -> Array:
     """How far off places are, RMS in standard deviations, shape (n,)."""
-    freedom = np.maximum(cables.shape[1] - measured.unmeasured, 1)
-    misfits: Array = np.sqrt((np.sum(cables**2, axis=1) + poses**2) / freedom)
+    freedom = np.maximum(np.isfinite(fit.deviations).sum(axis=1) - measured.unmeasured, 1)
+    squares = np.sum(residuals**2, axis=1) + fit.pose_misfits**2
+    misfits: Array = np.sqrt(squares / freedom)
     return misfits
 
 
@@ -132,6 +139,11 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
 
 FEWEST_PLACES = 10
 """Fewer say too little to be fitted at all."""
+UNKNOWN_SHARE = 0.5
+"""A number is unknown when this share of its square lies among the unknown directions."""
+DEGREE = math.degrees(1.0)
+MOST_APART = math.radians(45.0)
+"""An IMU's vertical farther from the pose's is in other axes, [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +186,26 @@ class RigCalibration:
     @cached_property
     def not_identified(self) -> list[str]:
         """What the data do not determine, in words."""
-        return sentences(self.observability, self.parameters)
+        return sentences(self.observability, self.parameters) + self._missing_tensions()
+
+    def _missing_tensions(self) -> list[str]:
+        """What measurements would determine the stiffness of each cable, where it is unknown."""
+        place = self.parameters.slices().get("cable_stiffness")
+        if place is None:
+            return []
+        tensions = self.measured.tensions
+        untold = int((~np.isfinite(tensions)).any(axis=1).sum())
+        if untold:
+            return [
+                f"for the stiffness of each cable, tensions are missing at {untold} poses: use run"
+                " folders, or the columns tension_1_n …"
+            ]
+        unknown = np.sum(self.observability.unknown[place] ** 2, axis=1) > UNKNOWN_SHARE
+        return [
+            f"for the stiffness of cable {i + 1}, tensions that differ more are missing: they are"
+            f" {tensions[:, i].min():.3g} to {tensions[:, i].max():.3g} N"
+            for i in np.flatnonzero(unknown)
+        ]
 
     @cached_property
     def intervals(self) -> dict[str, Interval]:
@@ -189,14 +220,19 @@ class RigCalibration:
             "drum_scale": (drums * (1.0 + geometry.drum_scale), "_mm_per_rev", drums),
             "offsets": (geometry.offsets * 1e3, "_mm", np.full(m, 1e3)),
         }
+        tables["swivel_zeros"] = (np.degrees(geometry.swivel_zeros), "_deg", np.full(m, DEGREE))
+        tables["imu_mounting"] = (np.degrees(geometry.imu_mounting), "_deg", np.full(3, DEGREE))
         half_widths = self.uncertainty.half_widths
         for group, place in self.parameters.slices().items():
-            if group == "stiffness":
-                found["stiffness_n"] = self._stiffness()
+            names = self.parameters.names[place]
+            if group in ("stiffness", "cable_stiffness"):
+                one = [geometry.stiffness.mean()] if group == "stiffness" else geometry.stiffness
+                rows = zip(names, one, np.exp(half_widths[place]), strict=True)
+                # Its logarithm is as uncertain to both sides, itself is not.
+                found |= {f"{n}_n": Interval.between(s / w, s * w) for n, s, w in rows}
                 continue
             values, unit, scale = tables[group]
-            widths = half_widths[place] * scale
-            rows = zip(self.parameters.names[place], values, widths, strict=True)
+            rows = zip(names, values, half_widths[place] * scale, strict=True)
             found |= {f"{n}{unit}": Interval(float(v), float(w)) for n, v, w in rows}
         return found
 
@@ -210,12 +246,6 @@ class RigCalibration:
         if place is None:
             return None
         return float(np.sqrt(np.mean(self.uncertainty.half_widths[place] ** 2)))
-
-    def _stiffness(self) -> Interval:
-        """Of the cables, [N]: its logarithm is as uncertain to both sides, itself is not."""
-        width = float(self.uncertainty.half_widths[self.parameters.slices()["stiffness"]][0])
-        stiffness = self.geometry.stiffness
-        return Interval.between(stiffness * math.exp(-width), stiffness * math.exp(width))
 
     def position_error(self, positions: Array, rotations: Array) -> Array:
         """How far off the platform may be from its commanded pose, 95 %.
@@ -274,7 +304,10 @@ def fit_rig(
             next_step="measure at more poses: `cdpr calibrate poses` plans them",
         )
     _require_within(rig, measured)
-    parameters = Parameters.of(rig, deviations)
+    _require_sensors(rig, measured, deviations)
+    swivels = np.isfinite(measured.swivels).any()
+    sought = {g: d for g, d in deviations.items() if swivels or g != "swivel_zeros"}
+    parameters = Parameters.of(rig, sought)
     if not len(parameters):
         raise BadInput(
             "there is nothing to calibrate",
@@ -315,6 +348,40 @@ def _require_within(rig: Rig, measured: RigMeasurements) -> None:
             where=measured.names[k],
             why="a wrong unit or frame, or a false pose",
             next_step="check units and axes of x_mm, y_mm, z_mm, or leave out the line",
+        )
+
+
+def _require_sensors(rig: Rig, measured: RigMeasurements, deviations: Mapping[str, float]) -> None:
+    """Sensors measure what the rig has, and an IMU's axes are about the platform's.
+
+    Raises:
+        BadInput: They do not.
+    """
+    if np.isfinite(measured.swivels).any() and not rig.pulley_radius:
+        raise BadInput(
+            "swivel angles were measured, and the rig file has no pulleys",
+            where="calibrate rig",
+            next_step="add `pulleys` to the rig file, or leave out the columns swivel_1_deg …",
+        )
+    known = np.isfinite(measured.verticals).all(axis=1)
+    if "imu_mounting" in deviations and not known.any():
+        raise BadInput(
+            "the mounting of an IMU is to be found, and no data have its columns",
+            where="calibrate rig",
+            next_step="add the columns accel_x_m_s2, accel_y_m_s2, accel_z_m_s2, or leave out"
+            " --imu-mounting-deg",
+        )
+    upwards = measured.first_rotations(rig)[:, 2]
+    apart = np.arccos(np.clip(np.sum(upwards * measured.verticals, axis=1), -1.0, 1.0))
+    wrong = np.flatnonzero(apart > MOST_APART)
+    if len(wrong):
+        k = int(wrong[0])
+        raise BadInput(
+            f"the IMU's vertical is {math.degrees(apart[k]):.0f}° from that of the pose",
+            where=measured.names[k],
+            why="its axes are not the platform's, or it reads gravity downward",
+            next_step="give accelerations in the platform's axes; at rest, an accelerometer reads"
+            " +9.81 m/s² along an axis that points up",
         )
 
 

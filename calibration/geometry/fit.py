@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.geometry.measurements import RigMeasurements
-from calibration.geometry.model import Parameters, RigModel
+from calibration.geometry.model import RigModel
+from calibration.geometry.parameters import Parameters
 from calibration.statistics import huber, share_of
 from model.errors import Fault
 from model.kinematics import ForwardSolution, NoCable, forward_kinematics
@@ -80,8 +81,8 @@ MOST_DAMPING = 1e9
 """No smaller step is tried: what it would gain is below round-off."""
 START_TOLERANCE = 1e-5
 """Poses to begin with need be no nearer, [m] and [rad]."""
-CABLE_BEND, POSE_BEND = 3.0, 4.0
-"""Where residuals of cables and of poses begin to count less than their square."""
+RESIDUAL_BEND, POSE_BEND = 3.0, 4.0
+"""Where residuals of cables and sensors, and of poses, begin to count less than their square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +93,12 @@ class RigFit:
         values: Of the unknowns, shape (p,), [m] or share.
         positions: World frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
-        residuals: Of cable lengths, shape (n, m), [m].
-        deviations: How far off each length was taken to be, shape (n, m), [m].
-        weights: How much of each residual's square counts, shape (n, m); less than 1 where it is
+        sensors: What was measured beside the m cable lengths at each place, k − m texts.
+        residuals: Of cable lengths, then of the sensors, shape (n, k), [m], [rad]; 0 where nothing
+            was measured.
+        deviations: How far off each was taken to be, shape (n, k), [m], [rad]; infinite where
+            nothing was measured.
+        weights: How much of each residual's square counts, shape (n, k); less than 1 where it is
             far off.
         pose_misfits: Of the poses from the measured ones, in standard deviations, shape (n,); 0
             where there is none.
@@ -106,12 +110,25 @@ class RigFit:
     values: Array
     positions: Array
     rotations: Array
+    sensors: tuple[str, ...]
     residuals: Array
     deviations: Array
     weights: Array
     pose_misfits: Array
     informations: Array
     scores: Array
+
+    @property
+    def cables(self) -> Array:
+        """Residuals of the cable lengths alone, shape (n, m), [m]."""
+        return self.residuals[:, : self.residuals.shape[1] - len(self.sensors)]
+
+    @property
+    def sensor_rms(self) -> Array:
+        """RMS of each sensor's residuals where it measured, shape (k − m,), [rad]."""
+        m = self.cables.shape[1]
+        known = np.maximum(np.isfinite(self.deviations[:, m:]).sum(axis=0), 1)
+        return np.asarray(np.sqrt(np.sum(self.residuals[:, m:] ** 2, axis=0) / known))
 
     @property
     def information(self) -> Array:
@@ -138,7 +155,7 @@ class RigFitter:
         """
         self._parameters, self._measured = parameters, measured
         self._model = RigModel(parameters, measured)
-        self._deviations = self._model.length_deviations(length_deviation)
+        self._deviations = self._model.deviations(length_deviation)
         self._posed, self._turned = measured.posed, measured.turned
 
     def fit(self, basis: Array | None = None) -> RigFit:
@@ -215,16 +232,16 @@ class RigFitter:
             residuals = self._model.residuals(values, positions, rotations)
         except NoCable:
             return float("inf")
-        cables = np.abs(residuals) / self._deviations
+        distances = np.abs(residuals) / self._deviations
         weights = self._measured.pose_information(rotations)
         poses = self._distances(self._pose_errors(positions, rotations), weights)
-        return float(z @ z + huber(cables, CABLE_BEND).sum() + huber(poses, POSE_BEND).sum())
+        return float(z @ z + huber(distances, RESIDUAL_BEND).sum() + huber(poses, POSE_BEND).sum())
 
     def _system(
         self, values: Array, z: Array, spread: Array, positions: Array, rotations: Array
     ) -> NormalEquations:
         line = self._model.linearised(values, positions, rotations)
-        weights = self._cable_share(line.residuals) / self._deviations**2
+        weights = self._share(line.residuals) / self._deviations**2
         errors = self._pose_errors(positions, rotations)
         informations = self._measured.pose_information(rotations)
         share = share_of(self._distances(errors, informations), POSE_BEND)
@@ -241,9 +258,9 @@ class RigFitter:
             + np.einsum("nij,nj->ni", pose_weights, errors),
         )
 
-    def _cable_share(self, residuals: Array) -> Array:
-        """How much of each cable's square counts, shape (n, m)."""
-        return share_of(np.abs(residuals) / self._deviations, CABLE_BEND)
+    def _share(self, residuals: Array) -> Array:
+        """How much of each residual's square counts, shape (n, k)."""
+        return share_of(np.abs(residuals) / self._deviations, RESIDUAL_BEND)
 
     def _result(self, values: Array, positions: Array, rotations: Array) -> RigFit:
         spread = np.diag(self._parameters.deviations)
@@ -254,9 +271,10 @@ class RigFitter:
             values,
             positions,
             rotations,
+            tuple(name for sensor in self._model.sensors for name in sensor.names),
             residuals,
             read_only(self._deviations),
-            self._cable_share(residuals),
+            self._share(residuals),
             self._distances(
                 self._pose_errors(positions, rotations), self._measured.pose_information(rotations)
             ),

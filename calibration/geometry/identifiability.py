@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from calibration.geometry.fit import RigFit, RigFitter
 from calibration.geometry.measurements import RigMeasurements
-from calibration.geometry.model import AXES, Parameters
+from calibration.geometry.parameters import AXES, Parameters
 from calibration.statistics import CONFIDENCE
 from model.pose import Array, read_only, skew
 
@@ -131,6 +131,10 @@ def _named(parameters: Parameters) -> list[_Named]:
         found.append(_Named("the size of the whole rig", "", grown))
     if "stiffness" in places:
         found.append(_Named("the stiffness of the cables", "", scaled(stiffness=np.ones(1))))
+    if "cable_stiffness" in places:
+        for cable, own in enumerate(np.eye(m), start=1):
+            what = "the stiffness of one cable"
+            found.append(_Named(what, f"cable {cable}", scaled(cable_stiffness=own)))
     for number, name in enumerate(parameters.names):
         alone = zero.copy()
         alone[number] = 1.0
@@ -237,7 +241,7 @@ def uncertainty_of_rig(
     scores = fit.scores @ known
     whole = informations.sum(axis=0) + np.eye(known.shape[1])
     squares = float(np.sum(fit.weights * (fit.residuals / fit.deviations) ** 2))
-    freedom = fit.residuals.size - known.shape[1] - int(measured.unmeasured.sum())
+    freedom = int(np.isfinite(fit.deviations).sum() - measured.unmeasured.sum()) - known.shape[1]
     scatter = max(1.0, squares / max(freedom, 1))
     count = len(measured)
     without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from math import radians
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +16,7 @@ from calibration.results import data_hash
 from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, matrix_from_quaternion, read_only, skew
 from model.rig import Rig
-from model.statics.gravity import PRETENSION_SHARE, working_tensions
+from model.statics.gravity import PRETENSION_SHARE, STANDARD_GRAVITY, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 
 SHORTEST_REST = 0.4
@@ -23,6 +25,11 @@ SETTLING = 0.2
 """What comes sooner after they stopped does not count, [s]."""
 
 _ARRAYS = ("counts", "tensions", "positions", "rotations", "covariances")
+_SENSORS = ("swivels", "verticals")
+
+
+def _nothing() -> Array:
+    return np.empty((0, 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +47,12 @@ class RigMeasurements:
         unused: Why others were left out, by name.
         reflector: The point of the platform whose positions were measured where rotations are not
             known, platform frame, shape (3,), [m]; else it is the origin.
+        swivels: Swivel angles of the pulleys about their feed directions, right-handed, 0 with the
+            rig file's platform at home, shape (n, m), [rad]; NaN where they were not measured.
+        verticals: Upward unit vectors in the axes of an IMU on the platform, by what its
+            accelerometers read at rest, shape (n, 3); NaN where they were not measured.
+        swivel_deviation: Of each swivel angle, [rad].
+        imu_deviation: Of a vertical's direction about any axis, [rad].
     """
 
     names: tuple[str, ...]
@@ -50,6 +63,16 @@ class RigMeasurements:
     covariances: Array
     unused: Mapping[str, str] = field(default_factory=dict)
     reflector: Array = field(default_factory=lambda: np.zeros(3))
+    swivels: Array = field(default_factory=_nothing)
+    verticals: Array = field(default_factory=_nothing)
+    swivel_deviation: float = radians(0.1)
+    imu_deviation: float = radians(0.1)
+
+    def __post_init__(self) -> None:
+        """Sensors that were left out measured nothing."""
+        for key, shape in (("swivels", self.counts.shape), ("verticals", (len(self), 3))):
+            if not getattr(self, key).size:
+                object.__setattr__(self, key, read_only(np.full(shape, np.nan)))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -102,17 +125,17 @@ class RigMeasurements:
     @property
     def data_hash(self) -> str:
         """Hash of all numbers."""
-        numbers = (self.counts, self.tensions, self.positions, self.rotations)
+        sensors = (a for a in (self.swivels, self.verticals) if np.isfinite(a).any())
+        numbers = (self.counts, self.tensions, self.positions, self.rotations, *sensors)
         return data_hash(np.round(values, 12).tobytes() for values in numbers)
 
     def part(self, chosen: NDArray[np.bool_]) -> RigMeasurements:
         """Some of the places."""
-        return RigMeasurements(
-            names=tuple(n for n, yes in zip(self.names, chosen.tolist(), strict=True) if yes),
-            unused=self.unused,
-            reflector=self.reflector,
-            **{key: read_only(getattr(self, key)[chosen]) for key in _ARRAYS},
-        )
+        arrays: dict[str, Any] = {
+            key: read_only(getattr(self, key)[chosen]) for key in _ARRAYS + _SENSORS
+        }
+        names = tuple(n for n, yes in zip(self.names, chosen.tolist(), strict=True) if yes)
+        return replace(self, names=names, **arrays)
 
     def with_doubt(self, deviations: Array) -> RigMeasurements:
         """The same, poses less certain: errors that all images of a place have in common.
@@ -131,15 +154,16 @@ class RigMeasurements:
 
 def joined(parts: Sequence[RigMeasurements]) -> RigMeasurements:
     """Several sources as one; a sample that repeats an earlier one is listed as unused."""
-    arrays = {
-        key: read_only(np.concatenate([getattr(part, key) for part in parts])) for key in _ARRAYS
+    arrays: dict[str, Any] = {
+        key: read_only(np.concatenate([getattr(part, key) for part in parts]))
+        for key in _ARRAYS + _SENSORS
     }
     names = tuple(name for part in parts for name in part.names)
     unused = {name: why for part in parts for name, why in part.unused.items()}
     first: dict[bytes, str] = {}
     new = np.ones(len(names), dtype=bool)
     for k, name in enumerate(names):
-        numbers = b"".join(arrays[key][k].tobytes() for key in _ARRAYS[:-1])
+        numbers = b"".join(arrays[key][k].tobytes() for key in _ARRAYS[:-1] + _SENSORS)
         earlier = first.setdefault(numbers, name)
         if earlier is not name:
             new[k] = False
@@ -194,7 +218,7 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
         rows.append((*means, *_mean_pose(run, pictures)))
     m = run.counts.shape[1]
     shapes = ((-1, m), (-1, m), (-1, 3), (-1, 3, 3), (-1, 6, 6))
-    arrays = {
+    arrays: dict[str, Any] = {
         key: read_only(np.array([row[i] for row in rows]).reshape(shape))
         for i, (key, shape) in enumerate(zip(_ARRAYS, shapes, strict=True))
     }
@@ -262,6 +286,9 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
         deviations[:, : len(stated)] = table.of(stated) * _TO_SI[: len(stated)]
         if (deviations[:, : len(stated)] <= 0.0).any():
             raise table.bad("a standard deviation is not positive", "leave out what is unknown")
+    swivels = _nothing()
+    if "swivel_1_deg" in table.names:
+        swivels = np.radians(table.of([f"swivel_{i}_deg" for i in range(1, cables + 1)]))
     return RigMeasurements(
         names=tuple(f"{path}, line {k + 2}" for k in range(n)),
         counts=read_only(counts),
@@ -269,6 +296,8 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
         positions=read_only(positions),
         rotations=read_only(rotations),
         covariances=read_only(np.einsum("ni,ij->nij", deviations**2, np.eye(6))),
+        swivels=read_only(swivels),
+        verticals=read_only(_verticals(table)),
     )
 
 
@@ -291,6 +320,29 @@ def _rotations(table: CsvTable) -> Array:
     return np.array(
         [matrix_from_quaternion(q / s) for q, s in zip(quaternions, sizes, strict=True)]
     )
+
+
+_AT_REST = {"m_s2": STANDARD_GRAVITY, "g": 1.0}
+"""What accelerometers read at rest together, by the unit in the names of their columns."""
+_NOT_AT_REST = 0.05
+"""A platform at rest has no acceleration that differs from it by more, as a share."""
+
+
+def _verticals(table: CsvTable) -> Array:
+    """Upward directions by accelerometers, shape (n, 3); empty where there are none."""
+    units = [unit for unit in _AT_REST if f"accel_x_{unit}" in table.names]
+    if not units:
+        return _nothing()
+    unit, at_rest = units[0], _AT_REST[units[0]]
+    accelerations = table.of([f"accel_{axis}_{unit}" for axis in "xyz"])
+    sizes = np.linalg.norm(accelerations, axis=1)
+    wrong = np.flatnonzero(np.abs(sizes / at_rest - 1.0) > _NOT_AT_REST)
+    if len(wrong):
+        k = int(wrong[0])
+        what = f"line {table.line(k)}: accel_x_{unit}, accel_y_{unit}, accel_z_{unit} are"
+        what += f" {sizes[k]:.3g} together; at rest it is {at_rest:.3g}"
+        raise table.bad(what, "check the unit in the names of the columns, and leave out motion")
+    return np.asarray(accelerations / sizes[:, None])
 
 
 # Tensions of samples without a measurement of them, and their uncertainty.

@@ -1,149 +1,25 @@
-"""How far cables at estimated poses are from the encoders' lengths, with derivatives.
+"""How far measurements are from what estimated poses and numbers give, with derivatives.
 
 All derivatives are analytic: moving an anchor by d shortens its cable by u · d, u the direction
 from anchor to exit, with point exits and over pulleys alike; moving outlet and pulley lengthens it.
+Every kind of measurement is a few numbers at each place: cable lengths always, then what further
+sensors measure (`Sensor`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibration.geometry.measurements import RigMeasurements, nominal_tensions, tension_sigma
+from calibration.geometry.parameters import Parameters, RigGeometry, rig_with
 from model.kinematics import Cables, cable_lengths, cables_to
-from model.pose import Array, read_only
+from model.pose import Array, matrix_from_rotation_vector, skew
 from model.rig import Rig
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
-
-# The numbers of a rig that a calibration finds, in named groups, and what the rig file says.
-
-
-AXES = ("x", "y", "z")
-_OF_ALL_CABLES = {"pulleys": "pulley_radius", "stiffness": "stiffness"}
-"""Groups of one number, and its name."""
-
-DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
-    {
-        "outlets": 4e-3,
-        "anchors": 1e-3,
-        "pulleys": 0.5e-3,
-        "drum_scale": 0.005,
-        "offsets": 2e-3,
-        "stiffness": 0.2,
-    }
-)
-"""How far off a rig file may be, one standard deviation: [m]; drum_scale and stiffness as a share.
-"""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigGeometry:
-    """What decides how long cables are and what drives count, for m cables.
-
-    Attributes:
-        outlets: World frame, shape (m, 3), [m].
-        anchors: Platform frame, shape (m, 3), [m].
-        pulley_radius: [m]; 0 for point exits.
-        drum_scale: Cable paid out for a count, as a share of the rig file's, less 1, shape (m,).
-        offsets: Unstrained cable at the home counts beyond what reaches the home pose, shape (m,),
-            [m]: by how much the reference was off.
-        stiffness: Axial, of a cable, [N].
-    """
-
-    outlets: Array
-    anchors: Array
-    pulley_radius: float
-    drum_scale: Array
-    offsets: Array
-    stiffness: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Parameters:
-    """The layout of the vector of unknowns; each is a deviation from the rig file.
-
-    That of the stiffness is the logarithm of its share: near 0 the share less 1, never negative.
-
-    Attributes:
-        rig: As in its file.
-        groups: Names of the groups that are looked for, in order.
-        deviations: How far off each unknown may be, standard deviation, shape (p,), [m] or share.
-        names: Of the unknowns, such as ``outlet_3_x``; p texts.
-    """
-
-    rig: Rig
-    groups: tuple[str, ...]
-    deviations: Array
-    names: tuple[str, ...]
-
-    @classmethod
-    def of(cls, rig: Rig, deviations: Mapping[str, float]) -> Parameters:
-        """The unknowns of a rig.
-
-        Args:
-            rig: As in its file.
-            deviations: How far off it may be, by group; groups left out are taken as known.
-        """
-        groups = tuple(
-            group
-            for group in DEFAULT_DEVIATIONS
-            if group in deviations and (group != "pulleys" or rig.pulley_radius > 0.0)
-        )
-        names = tuple(name for group in groups for name in _names(group, rig.cable_count))
-        spread = [deviations[group] for group in groups for _ in _names(group, rig.cable_count)]
-        return cls(rig, groups, read_only(spread), names)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def slices(self) -> dict[str, slice]:
-        """Where each group is in the vector."""
-        found, begin = {}, 0
-        for group in self.groups:
-            end = begin + len(_names(group, self.rig.cable_count))
-            found[group], begin = slice(begin, end), end
-        return found
-
-    def geometry(self, values: Array) -> RigGeometry:
-        """The rig with the unknowns having values, shape (p,), [m] or share."""
-        m, found = self.rig.cable_count, self.slices()
-
-        def of(group: str, size: int) -> Array:
-            return values[found[group]] if group in found else np.zeros(size)
-
-        return RigGeometry(
-            outlets=self.rig.outlets + of("outlets", 3 * m).reshape(m, 3),
-            anchors=self.rig.anchors + of("anchors", 3 * m).reshape(m, 3),
-            pulley_radius=self.rig.pulley_radius + float(of("pulleys", 1)[0]),
-            drum_scale=of("drum_scale", m),
-            offsets=of("offsets", m),
-            stiffness=self.rig.cable_stiffness * math.exp(float(of("stiffness", 1)[0])),
-        )
-
-
-def _names(group: str, m: int) -> list[str]:
-    if group in _OF_ALL_CABLES:
-        return [_OF_ALL_CABLES[group]]
-    what = {"outlets": "outlet", "anchors": "anchor", "drum_scale": "drum", "offsets": "offset"}
-    if group in ("outlets", "anchors"):
-        return [f"{what[group]}_{i}_{axis}" for i in range(1, m + 1) for axis in AXES]
-    return [f"{what[group]}_{i}" for i in range(1, m + 1)]
-
-
-def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
-    """The rig file's rig with other outlets, anchors, pulleys and stiffness; its winches stay."""
-    return replace(
-        rig,
-        outlets=read_only(geometry.outlets),
-        anchors=read_only(geometry.anchors),
-        pulley_radius=geometry.pulley_radius,
-        cable_stiffness=geometry.stiffness,
-    )
 
 
 class CountedLengths:
@@ -203,13 +79,70 @@ class CountedLengths:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Linearised:
-    """The model at given values and poses.
+class RigAtPoses:
+    """A rig with some numbers, at n poses.
 
     Attributes:
-        residuals: Cable at the pose less the cable from the encoder, shape (n, m), [m].
-        by_values: Their derivative by the unknowns, shape (n, m, p).
-        by_pose: By the pose's twist (translation, rotation in the world), shape (n, m, 6).
+        geometry: The numbers.
+        positions: World frame, shape (n, 3), [m].
+        rotations: ``world_from_platform``, shape (n, 3, 3).
+        cables: At the poses.
+    """
+
+    geometry: RigGeometry
+    positions: Array
+    rotations: Array
+    cables: Cables
+
+    @classmethod
+    def of(cls, rig: Rig, geometry: RigGeometry, positions: Array, rotations: Array) -> RigAtPoses:
+        """Computes the cables.
+
+        Raises:
+            NoCable: An anchor lies at its outlet or inside its pulley.
+        """
+        anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, geometry.anchors)
+        return cls(geometry, positions, rotations, cables_to(rig_with(rig, geometry), anchors))
+
+    def by_pose(self, slopes: Array) -> Array:
+        """Derivative by the pose's twist of numbers that depend on anchors, shape (n, m, 6).
+
+        Args:
+            slopes: Derivative by the anchor in the world, shape (n, m, 3).
+        """
+        arms = self.cables.anchors - self.positions[:, None, :]
+        return np.concatenate([slopes, np.cross(arms, slopes)], axis=-1)
+
+    def by_points(self, slopes: Array, parameters: Parameters) -> Array:
+        """Derivative by outlets and anchors of numbers that depend on the way between them.
+
+        Args:
+            slopes: Derivative by the anchor in the world, shape (n, m, 3); by the outlet it is the
+                opposite.
+            parameters: The unknowns.
+
+        Returns:
+            Shape (n, m, p).
+        """
+        n, m, _ = slopes.shape
+        by_values, each = np.zeros((n, m, len(parameters))), np.arange(m)
+        own = {"outlets": -slopes, "anchors": slopes @ self.rotations}
+        for group, place in parameters.slices().items():
+            if group in own:
+                for axis in range(3):
+                    by_values[:, each, place.start + 3 * each + axis] = own[group][:, :, axis]
+        return by_values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearised:
+    """Measurements at given values and poses, k numbers a place.
+
+    Attributes:
+        residuals: What the pose gives less what was measured, shape (n, k); of cable lengths [m],
+            of angles [rad].
+        by_values: Their derivative by the unknowns, shape (n, k, p).
+        by_pose: By the pose's twist (translation, rotation in the world), shape (n, k, 6).
     """
 
     residuals: Array
@@ -217,8 +150,108 @@ class Linearised:
     by_pose: Array
 
 
+class Sensor(ABC):
+    """A kind of measurement beside cable lengths.
+
+    Attributes:
+        names: Of its numbers, k texts.
+        deviations: Standard deviations, shape (n, k), [rad]; infinite where nothing was measured.
+    """
+
+    names: tuple[str, ...]
+    deviations: Array
+
+    @abstractmethod
+    def residuals(self, state: RigAtPoses) -> Array:
+        """As in `Linearised`; 0 where nothing was measured."""
+
+    @abstractmethod
+    def linearised(self, state: RigAtPoses) -> Linearised:
+        """With derivatives."""
+
+
+class Swivels(Sensor):
+    """Swivel angles of the pulleys, which turn towards the anchors about their feed directions."""
+
+    def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
+        """The angles' zeros are where the rig file's platform is at home."""
+        rig, axes = parameters.rig, parameters.rig.feed_directions
+        self._parameters, self._measured = parameters, measured.swivels
+        home = rig.home.apply(rig.anchors) - rig.outlets
+        radial = home - np.sum(home * axes, axis=1, keepdims=True) * axes
+        self._x = radial / np.linalg.norm(radial, axis=1, keepdims=True)
+        self._y = np.cross(axes, self._x)
+        self._known = np.isfinite(measured.swivels)
+        self.deviations = np.where(self._known, measured.swivel_deviation, np.inf)
+        self.names = tuple(f"swivel {i}" for i in range(1, rig.cable_count + 1))
+
+    def residuals(self, state: RigAtPoses) -> Array:
+        """Angles less measured ones, the shorter way round."""
+        x, y = self._across(state)
+        apart = np.arctan2(y, x) + state.geometry.swivel_zeros - self._measured
+        return np.where(self._known, np.mod(apart + np.pi, 2.0 * np.pi) - np.pi, 0.0)
+
+    def linearised(self, state: RigAtPoses) -> Linearised:
+        """An anchor's motion across the pulley's plane turns it; along the plane it does not."""
+        x, y = (part[..., None] for part in self._across(state))
+        slopes = (x * self._y - y * self._x) / (x**2 + y**2)
+        by_values = state.by_points(slopes, self._parameters)
+        zeros, each = self._parameters.slices().get("swivel_zeros"), np.arange(slopes.shape[1])
+        if zeros is not None:
+            by_values[:, each, zeros.start + each] = 1.0
+        return Linearised(self.residuals(state), by_values, state.by_pose(slopes))
+
+    def _across(self, state: RigAtPoses) -> tuple[Array, Array]:
+        """Anchors from their outlets, across the feed directions, shape (n, m) both, [m]."""
+        way = state.cables.anchors - state.geometry.outlets
+        return np.sum(way * self._x, axis=-1), np.sum(way * self._y, axis=-1)
+
+
+class Verticals(Sensor):
+    """The vertical in the axes of an IMU on the platform: two angles, about axes across it."""
+
+    names = ("IMU 1", "IMU 2")
+
+    def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
+        """The IMU's axes are the platform's, but for its mounting."""
+        known = np.asarray(np.isfinite(measured.verticals).all(axis=1))
+        upwards = np.where(known[:, None], measured.verticals, np.eye(3)[2])
+        self._across = np.linalg.svd(upwards[:, None, :])[2][:, 1:]
+        self._across[~known] = 0.0
+        deviation = np.where(known, measured.imu_deviation, np.inf)
+        self.deviations = np.stack([deviation, deviation], axis=1)
+        self._parameters = parameters
+
+    def residuals(self, state: RigAtPoses) -> Array:
+        """The vertical of the pose along axes across the measured one."""
+        upwards = self._world_from_imu(state)[:, 2]
+        return np.asarray((self._across @ upwards[..., None])[..., 0])
+
+    def linearised(self, state: RigAtPoses) -> Linearised:
+        """Only rotations of the platform and of the IMU on it count."""
+        world_from_imu = self._world_from_imu(state)
+        turns = np.cross(self._across, world_from_imu[:, None, 2])
+        n, k, _ = turns.shape
+        by_values, by_pose = np.zeros((n, k, len(self._parameters))), np.zeros((n, k, 6))
+        by_pose[:, :, 3:] = turns @ np.swapaxes(world_from_imu, 1, 2)
+        place = self._parameters.slices().get("imu_mounting")
+        if place is not None:
+            around = skew(state.geometry.imu_mounting)
+            mounted = matrix_from_rotation_vector(state.geometry.imu_mounting)
+            left = np.eye(3) + around / 2.0 + around @ around / 6.0  # left Jacobian of SO(3)
+            by_values[:, :, place] = turns @ mounted.T @ left
+        return Linearised(self.residuals(state), by_values, by_pose)
+
+    def _world_from_imu(self, state: RigAtPoses) -> Array:
+        return state.rotations @ matrix_from_rotation_vector(state.geometry.imu_mounting)
+
+
 class RigModel:
-    """Lengths of cables of a rig with unknown numbers, at n poses."""
+    """What is measured of a rig with unknown numbers, at n poses: cable lengths first.
+
+    Attributes:
+        sensors: What else was measured.
+    """
 
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
         """Takes the measurements; tensions that were not measured are those of `nominal_tensions`.
@@ -233,6 +266,16 @@ class RigModel:
         self._stretch_is_told = bool(self._told.all())
         tensions = nominal_tensions(parameters.rig, measured)
         self.counted = CountedLengths(parameters.rig, measured.counts, tensions)
+        self.sensors: list[Sensor] = []
+        if np.isfinite(measured.swivels).any():
+            self.sensors.append(Swivels(parameters, measured))
+        if np.isfinite(measured.verticals).any():
+            self.sensors.append(Verticals(parameters, measured))
+
+    def deviations(self, length_deviation: float) -> Array:
+        """Standard deviation of every measurement, shape (n, k); see `length_deviations`."""
+        lengths = self.length_deviations(length_deviation)
+        return np.concatenate([lengths, *(one.deviations for one in self.sensors)], axis=1)
 
     def length_deviations(self, length_deviation: float) -> Array:
         """Standard deviation of the lengths from the encoders, shape (n, m), [m].
@@ -248,10 +291,9 @@ class RigModel:
 
     def residuals(self, values: Array, positions: Array, rotations: Array) -> Array:
         """As in `Linearised`."""
-        geometry = self.parameters.geometry(values)
-        lengths = self._cables(geometry, positions, rotations).lengths
-        residuals: Array = lengths - self.counted.by(geometry)
-        return residuals
+        state = self._state(values, positions, rotations)
+        lengths = state.cables.lengths - self.counted.by(state.geometry)
+        return np.concatenate([lengths, *(one.residuals(state) for one in self.sensors)], axis=1)
 
     def linearised(self, values: Array, positions: Array, rotations: Array) -> Linearised:
         """The model and its derivatives.
@@ -264,48 +306,49 @@ class RigModel:
         Raises:
             NoCable: An anchor lies at its outlet or inside its pulley.
         """
-        geometry = self.parameters.geometry(values)
-        cables = self._cables(geometry, positions, rotations)
-        arms = cables.anchors - positions[:, None, :]
-        by_pose = -np.concatenate([cables.directions, np.cross(arms, cables.directions)], axis=-1)
-        home = self.parameters.rig.home
-        at_home = self._cables(geometry, home.position[None], home.rotation[None])
+        state = self._state(values, positions, rotations)
+        parts = [self._lengths(state), *(one.linearised(state) for one in self.sensors)]
+        return Linearised(
+            np.concatenate([part.residuals for part in parts], axis=1),
+            np.concatenate([part.by_values for part in parts], axis=1),
+            np.concatenate([part.by_pose for part in parts], axis=1),
+        )
+
+    def _lengths(self, state: RigAtPoses) -> Linearised:
+        """Of the cables: that of the pose less that from the encoder."""
+        geometry, rig = state.geometry, self.parameters.rig
+        at_home = RigAtPoses.of(rig, geometry, rig.home.position[None], rig.home.rotation[None])
         stretch = self.counted.stretch(geometry)
         counted = (stretch / self.counted.stretch_at_home(geometry))[..., None]
-        by_values = self._by_geometry(geometry, cables, rotations)
-        by_values -= counted * self._by_geometry(geometry, at_home, home.rotation[None])
-        each, places = np.arange(cables.lengths.shape[1]), self.parameters.slices()
+        by_values = self._by_geometry(state)
+        by_values -= counted * self._by_geometry(at_home)
+        each, places = np.arange(rig.cable_count), self.parameters.slices()
         if "drum_scale" in places:
             by_values[:, each, places["drum_scale"].start + each] = -self.counted.paid_out * stretch
         if "offsets" in places:
             by_values[:, each, places["offsets"].start + each] = -stretch
-        if "stiffness" in places and self._stretch_is_told:
-            by_values[:, :, places["stiffness"].start] = (
-                self.counted.by_compliance(geometry) / geometry.stiffness
-            )
-        return Linearised(cables.lengths - self.counted.by(geometry), by_values, by_pose)
+        if self._stretch_is_told:
+            by_logarithm = self.counted.by_compliance(geometry) / geometry.stiffness
+            if "stiffness" in places:
+                by_values[:, :, places["stiffness"].start] = by_logarithm
+            if "cable_stiffness" in places:
+                by_values[:, each, places["cable_stiffness"].start + each] = by_logarithm
+        residuals = state.cables.lengths - self.counted.by(geometry)
+        return Linearised(residuals, by_values, state.by_pose(-state.cables.directions))
 
-    def _by_geometry(self, geometry: RigGeometry, cables: Cables, rotations: Array) -> Array:
+    def _by_geometry(self, state: RigAtPoses) -> Array:
         """Derivative of cables' lengths by the unknowns, without what drives count, (n, m, p)."""
-        away = cables.directions
-        n, m = cables.lengths.shape
-        by_values, each = np.zeros((n, m, len(self.parameters))), np.arange(m)
-        for group, place in self.parameters.slices().items():
-            if group == "pulleys":
-                by_values[:, :, place.start] = _by_pulley_radius(self._rig(geometry), cables)
-            elif group in ("outlets", "anchors"):
-                inward = -np.einsum("nji,nmj->nmi", rotations, away)
-                own = away if group == "outlets" else inward
-                for axis in range(3):
-                    by_values[:, each, place.start + 3 * each + axis] = own[:, :, axis]
+        by_values = state.by_points(-state.cables.directions, self.parameters)
+        pulleys = self.parameters.slices().get("pulleys")
+        if pulleys is not None:
+            rig = rig_with(self.parameters.rig, state.geometry)
+            by_values[:, :, pulleys.start] = _by_pulley_radius(rig, state.cables)
         return by_values
 
-    def _rig(self, geometry: RigGeometry) -> Rig:
-        return rig_with(self.parameters.rig, geometry)
-
-    def _cables(self, geometry: RigGeometry, positions: Array, rotations: Array) -> Cables:
-        anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, geometry.anchors)
-        return cables_to(self._rig(geometry), anchors)
+    def _state(self, values: Array, positions: Array, rotations: Array) -> RigAtPoses:
+        return RigAtPoses.of(
+            self.parameters.rig, self.parameters.geometry(values), positions, rotations
+        )
 
 
 def _by_pulley_radius(rig: Rig, cables: Cables) -> Array:

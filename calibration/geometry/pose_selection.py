@@ -9,7 +9,8 @@ from math import ceil, degrees, radians
 import numpy as np
 
 from calibration.geometry.measurements import RigMeasurements
-from calibration.geometry.model import DEFAULT_DEVIATIONS, Parameters, RigModel
+from calibration.geometry.model import RigModel
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from model.clearance import ClearanceModel
 from model.errors import NoSolution
 from model.files.documents import PoseDocument

@@ -31,7 +31,7 @@ LEAST_CHANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """Estimate of the cables' compliance, 1 / stiffness.
+    """Estimate of the cables' compliance, 1 / stiffness; of their mean where they differ.
 
     Attributes:
         drawn: By the rig file, to first order about the fit, [1/N].
@@ -89,9 +89,10 @@ def compliance_told(result: RigCalibration) -> Compliance | None:
     if not np.isfinite(result.measured.tensions).all():
         return None
     information, pull = _told(result, np.ones((result.rig.cable_count, 1)))
-    drawn = _drawn(result)
-    own = float(information[0, 0])
-    return Compliance(drawn, drawn - float(pull[0]) / own, own**-0.5)
+    drawn, own = float(_drawn(result).mean()), float(information[0, 0])
+    compliance = float(np.mean(1.0 / result.rig.cable_stiffness))
+    change, deviation = -float(pull[0]) / own, own**-0.5
+    return Compliance(drawn * compliance, (drawn + change) * compliance, deviation * compliance)
 
 
 def differences_told(result: RigCalibration) -> Differences | None:
@@ -106,34 +107,38 @@ def differences_told(result: RigCalibration) -> Differences | None:
     information, pull = _told(result, np.eye(cables))
     change = -np.asarray(np.linalg.solve(information, pull))
     chance = float(chi2.sf(-pull @ change, cables))
-    estimated: Array = _drawn(result) + change
+    estimated: Array = (_drawn(result) + change) / result.rig.cable_stiffness
     return Differences(estimated, chance)
 
 
-def _drawn(result: RigCalibration) -> float:
-    """The rig file's compliance as the fit sees it, [1/N].
+def _drawn(result: RigCalibration) -> Array:
+    """The rig file's compliances as the fit sees them, as a share of themselves, shape (m,).
 
     Changes are solved about the fit, whose unknown is the logarithm of the stiffness: the rig
     file is as far off as the tangent there says, not as the reciprocal of its own number.
     """
-    fit = result.geometry.stiffness
-    return (1.0 + math.log(fit / result.rig.cable_stiffness)) / fit
+    ratio = result.geometry.stiffness / result.rig.cable_stiffness
+    shares: Array = (1.0 + np.log(ratio)) / ratio
+    return shares
 
 
 def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
-    """Information on compliances beside all other parameters and the poses, per variance.
+    """Information on compliances, as shares of the rig file's, beside all else, per variance.
 
     Args:
         result: The fit.
         groups: Which cables share a compliance, shape (m, q).
 
     Returns:
-        Information, shape (q, q), [N²], and half the slope of the squares, shape (q,), [N].
+        Information, shape (q, q), and half the slope of the squares, shape (q,).
     """
     data, fit, parameters = result.measured, result.fit, result.parameters
     model = RigModel(parameters, data)
     line = model.linearised(fit.values, fit.positions, fit.rotations)
-    by_compliance = -model.counted.by_compliance(result.geometry)[..., None] * groups
+    m = result.rig.cable_count
+    by_shares = -model.counted.by_compliance(result.geometry) / result.rig.cable_stiffness
+    by_compliance = np.zeros((*line.residuals.shape, groups.shape[1]))
+    by_compliance[:, :m] = by_shares[..., None] * groups
     free = parameters.deviations[:, None] * result.observability.known
     by_all = np.concatenate([line.by_values @ free, by_compliance], axis=2)
     weights = fit.weights / fit.deviations**2
@@ -158,6 +163,8 @@ def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
 
 FAR = 5.0
 """No number should be farther from the rig file, in the standard deviations that were stated."""
+SCATTERED = 2.0
+"""Residuals of a sensor should be smaller, RMS, in the standard deviations that were stated."""
 _INSET = 0.15
 """The workspace is judged at its centre and this share inside its corners."""
 
@@ -214,6 +221,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
     lacks = _far_numbers(result) + _other_stiffness(result) + _unknown_stretch(result)
+    lacks += _scattered_sensors(result)
     if missed > wanted:
         what = "samples" if out.poses else "cable lengths of samples"
         lacks.append(
@@ -261,8 +269,7 @@ def _far_numbers(result: RigCalibration) -> list[Issue]:
     if times[k] <= FAR:
         return []
     group = next(g for g, place in parameters.slices().items() if place.start <= k < place.stop)
-    share = group in ("drum_scale", "stiffness")
-    option = f"--{group.replace('_', '-')}-{'percent' if share else 'mm'}"
+    option = f"--{group.replace('_', '-').removeprefix('cable-')}-{_UNITS.get(group, 'mm')}"
     return [
         Issue(
             f"{parameters.names[k]} is {_far(group, float(values[k]))},"
@@ -273,9 +280,18 @@ def _far_numbers(result: RigCalibration) -> list[Issue]:
     ]
 
 
+_UNITS = {
+    **dict.fromkeys(("drum_scale", "stiffness", "cable_stiffness"), "percent"),
+    **dict.fromkeys(("swivel_zeros", "imu_mounting"), "deg"),
+}
+"""Of the options of groups; of the others it is mm."""
+
+
 def _far(group: str, value: float) -> str:
     """How far a number is from the rig file, in words; of a stiffness it is the logarithm."""
-    if group == "stiffness":
+    if _UNITS.get(group) == "deg":
+        return f"{math.degrees(abs(value)):.3g}°"
+    if group in ("stiffness", "cable_stiffness"):
         return f"{math.exp(value):.3g} times that of the rig file, as a logarithm"
     if group == "drum_scale":
         return f"{abs(value) * 1e2:.3g} % from the rig file"
@@ -284,14 +300,14 @@ def _far(group: str, value: float) -> str:
 
 def _other_stiffness(result: RigCalibration) -> list[Issue]:
     compliance = compliance_told(result)
-    if compliance is None:
+    if compliance is None or "cable_stiffness" in result.parameters.groups:
         return []
     if not compliance.contradicts:
         return _cables_that_differ(result)
     return [
         Issue(
             f"the data give a cable stiffness of {compliance}, the rig file"
-            f" {result.rig.cable_stiffness:.6g} N",
+            f" {result.rig.cable_stiffness.mean():.6g} N",
             "check cables: stiffness_n of the rig file, and the measured tensions;"
             " if it is truly that far off, pass a larger --stiffness-percent",
         )
@@ -305,9 +321,9 @@ def _cables_that_differ(result: RigCalibration) -> list[Issue]:
     return [
         Issue(
             f"the cables differ: the data give stiffnesses of {differences}; the result has"
-            f" {result.geometry.stiffness:.4g} N for all",
+            f" {result.geometry.stiffness.mean():.4g} N for all",
             "check for a cable that is worn, loose on its drum or of another kind, and check its"
-            " measured tensions",
+            " measured tensions; if they truly differ, pass --stiffness-per-cable",
         )
     ]
 
@@ -315,7 +331,8 @@ def _cables_that_differ(result: RigCalibration) -> list[Issue]:
 def _unknown_stretch(result: RigCalibration) -> list[Issue]:
     """Tensions that were not measured and matter: they err alike in many places."""
     usual = result.length_deviation
-    stretch = float(np.sqrt(np.max(result.fit.deviations**2) - usual**2))
+    lengths = result.fit.deviations[:, : result.rig.cable_count]
+    stretch = float(np.sqrt(np.max(lengths**2) - usual**2))
     if stretch <= usual:
         return []
     places = int((~np.isfinite(result.measured.tensions)).any(axis=1).sum())
@@ -324,6 +341,23 @@ def _unknown_stretch(result: RigCalibration) -> list[Issue]:
             f"tensions were not measured at {places} poses, which makes cable lengths"
             f" uncertain by {stretch * 1e3:.2g} mm; --length-mm is {usual * 1e3:.2g}",
             "measure tensions as well: use run folders, or tables with the columns tension_1_n …",
+        )
+    ]
+
+
+def _scattered_sensors(result: RigCalibration) -> list[Issue]:
+    """Angles that scatter more than stated, as all of a pulley do whose axis is another."""
+    fit, m = result.fit, result.rig.cable_count
+    times = fit.sensor_rms / fit.deviations[:, m:].min(axis=0)
+    bad = np.flatnonzero(times > SCATTERED)
+    if not len(bad):
+        return []
+    names = ", ".join(fit.sensors[k] for k in bad)
+    return [
+        Issue(
+            f"residuals of {names} are up to {times[bad].max():.2g} times their stated deviation",
+            "check feed_directions in the rig file and the axes of the IMU (--imu-mounting-deg"
+            " finds its mounting), or pass a larger --swivel-deg or --imu-deg",
         )
     ]
 

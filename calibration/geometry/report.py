@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from calibration.geometry.calibrate import RigCalibration
-from calibration.geometry.model import AXES
+from calibration.geometry.parameters import AXES
 from calibration.geometry.quality import RigQuality
 from calibration.report import Section, drawing, page_of, table_of
 from calibration.statistics import Interval
@@ -59,6 +59,7 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
             _cables(result) + chart_grid(_residuals(result)),
             "Cable length at the fitted pose minus its encoder length, pose by pose.",
         ),
+        *_sensor_sections(result),
         Section(
             "What cannot be identified",
             bullets(told) if told else paragraph("All parameters were identified."),
@@ -131,7 +132,10 @@ def numbers_in_file(rig: Rig) -> dict[str, float]:
     found["pulley_radius_mm"] = rig.pulley_radius * 1e3
     for i, winch in enumerate(rig.document.winches, start=1):
         found |= {f"drum_{i}_mm_per_rev": winch.drum_mm_per_rev, f"offset_{i}_mm": 0.0}
-    return {**found, "stiffness_n": rig.cable_stiffness}
+        found |= {f"stiffness_{i}_n": float(rig.cable_stiffness[i - 1])}
+        found |= {f"swivel_zero_{i}_deg": 0.0}
+    found |= {f"imu_mounting_{axis}_deg": 0.0 for axis in AXES}
+    return {**found, "stiffness_n": float(rig.cable_stiffness.mean())}
 
 
 def number_rows(result: RigCalibration) -> list[tuple[str, str, str, str, str, str]]:
@@ -166,7 +170,10 @@ def _number_sections(result: RigCalibration) -> list[Section]:
             "Cable length at the home counts beyond that of the home pose; 0 in the rig file."
             " The result's home counts include it.",
         ),
-        ("Pulleys and cables", ("pulley_", "stiffness_"), ""),
+        ("Pulleys and cables", ("pulley_", "stiffness_n"), ""),
+        ("Stiffness of each cable [N]", tuple(f"stiffness_{d}" for d in range(1, 10)), "E·A."),
+        ("Zeros of swivel angles [°]", "swivel_", "Reading at the angle of the home pose."),
+        ("Mounting of the IMU [°]", "imu_", "Rotation vector from its axes to the platform's."),
     )
     return [
         Section(title, _numbers(chosen), note)
@@ -283,7 +290,7 @@ def _by_pose(result: RigCalibration) -> Chart:
 
 def _residuals(result: RigCalibration) -> list[Chart]:
     """A chart a cable, all of one height."""
-    residuals = result.fit.residuals * 1e3
+    residuals = result.fit.cables * 1e3
     number = np.arange(1.0, len(residuals) + 1.0)
     largest = float(np.abs(residuals).max())
     return [
@@ -305,8 +312,25 @@ def _residuals(result: RigCalibration) -> list[Chart]:
     ]
 
 
+def _sensor_sections(result: RigCalibration) -> list[Section]:
+    """Residuals of what was measured beside cable lengths, a row a sensor."""
+    fit = result.fit
+    if not fit.sensors:
+        return []
+    residuals = np.degrees(np.abs(fit.residuals[:, fit.cables.shape[1] :]))
+    rows = [
+        (name, f"{rms:.3f}", f"{column.max():.3f}", f"pose {int(column.argmax()) + 1}")
+        for name, rms, column in zip(
+            fit.sensors, np.degrees(fit.sensor_rms), residuals.T, strict=True
+        )
+    ]
+    text = list_table(("", "RMS [°]", "largest [°]", "at"), rows, "numbers")
+    note = "Angle at the fitted pose minus the measured one; of an IMU about both axes."
+    return [Section("Residuals of swivel angles and IMU", text, note)]
+
+
 def _cables(result: RigCalibration) -> str:
-    residuals = result.fit.residuals * 1e3
+    residuals = result.fit.cables * 1e3
     rows = [
         (
             f"cable {i}",
@@ -331,7 +355,7 @@ def _held_out(quality: RigQuality) -> str:
 
 def _poses(result: RigCalibration) -> str:
     """Every pose in a line, folded up."""
-    out, residuals = result.held_out, np.abs(result.fit.residuals) * 1e3
+    out, residuals = result.held_out, np.abs(result.fit.cables) * 1e3
     each = zip(result.measured.names, out.before * 1e3, out.after * 1e3, residuals, strict=True)
     rows = [
         (

@@ -26,7 +26,10 @@ class RigResult(ResultDocument):
     """Outlets, anchors, pulleys, winches and cables' stiffness, in the keys of the rig file."""
 
     order: ClassVar[int] = 3
-    added: ClassVar[tuple[str, ...]] = ("outlets_error_mm", "anchors_error_mm")
+    added: ClassVar[tuple[str, ...]] = (
+        *("outlets_error_mm", "anchors_error_mm"),
+        *("cable_stiffness_n", "sensor_residuals_deg"),
+    )
 
     kind: Literal["rig"] = "rig"
     outlets_mm: list[Vector]
@@ -39,7 +42,10 @@ class RigResult(ResultDocument):
     )
     pulley_radius_mm: Positive | None
     drums_mm_per_rev: list[Positive]
-    stiffness_n: Positive = Field(description="E·A of a cable")
+    stiffness_n: Positive = Field(description="E·A of a cable, or the mean where they differ")
+    cable_stiffness_n: list[Positive] | None = Field(
+        default=None, description="E·A of each cable; null: of all stiffness_n"
+    )
     home_counts: list[AnyNumber] = Field(description="drive positions with the platform at home")
     groups: list[str] = Field(description="of parameters that were calibrated")
     not_identified: list[str] = Field(description="kept as in the rig file, in words")
@@ -58,6 +64,9 @@ class RigResult(ResultDocument):
         " centre of the workspace and near its corners"
     )
     cable_residuals_mm: list[AnyNonNegative] = Field(description="RMS, one per cable")
+    sensor_residuals_deg: dict[str, AnyNonNegative] = Field(
+        default={}, description="RMS of swivel angles and of the IMU's vertical, by name"
+    )
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Those of every result, and one entry a cable."""
@@ -66,10 +75,11 @@ class RigResult(ResultDocument):
     def _one_a_cable(self) -> list[Finding]:
         cables = len(self.outlets_mm)
         keys = ("anchors_mm", "drums_mm_per_rev", "home_counts", "cable_residuals_mm")
+        lists = {key: getattr(self, key) for key in (*keys, "cable_stiffness_n")}
         return [
-            ((key,), f"has {len(getattr(self, key))} entries, outlets_mm has {cables}")
-            for key in keys
-            if len(getattr(self, key)) != cables
+            ((key,), f"has {len(entries)} entries, outlets_mm has {cables}")
+            for key, entries in lists.items()
+            if entries is not None and len(entries) != cables
         ]
 
     def apart_mm(self, other: Self) -> float:
@@ -109,6 +119,7 @@ class RigResult(ResultDocument):
             self.pulley_radius_mm,
             self.drums_mm_per_rev,
             self.stiffness_n,
+            self.cable_stiffness_n,
             [round(home) for home in self.home_counts],
         )
         stated = {
@@ -126,12 +137,22 @@ def _with_numbers(
     pulley_radius_mm: float | None,
     drums_mm_per_rev: list[float],
     stiffness_n: float,
+    cable_stiffness_n: list[float] | None,
     home_counts: list[int],
 ) -> RigDocument:
     """The rig file's content with other numbers."""
+    one_for_all: list[float | None] = [None] * len(rig.winches)
     winches = [
-        winch.model_copy(update={"drum_mm_per_rev": drum, "home_counts": home})
-        for winch, drum, home in zip(rig.winches, drums_mm_per_rev, home_counts, strict=True)
+        winch.model_copy(
+            update={"drum_mm_per_rev": drum, "home_counts": home, "cable_stiffness_n": stiffness}
+        )
+        for winch, drum, home, stiffness in zip(
+            rig.winches,
+            drums_mm_per_rev,
+            home_counts,
+            cable_stiffness_n or one_for_all,
+            strict=True,
+        )
     ]
     changes: dict[str, Any] = {
         "outlets_mm": outlets_mm,
@@ -160,7 +181,8 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
         "anchors_mm": _rows(geometry.anchors),
         "pulley_radius_mm": geometry.pulley_radius * 1e3 if rig.pulley_radius else None,
         "drums_mm_per_rev": [float(x) for x in drums],
-        "stiffness_n": float(geometry.stiffness),
+        "stiffness_n": float(geometry.stiffness.mean()),
+        "cable_stiffness_n": geometry.stiffness.tolist() if np.ptp(geometry.stiffness) else None,
     }
     data = result.measured
     return RigResult(
@@ -188,9 +210,10 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
         turned_mm=quality.turned * 1e3,
         tilt_deg=float(np.degrees(quality.tilt)),
         reached_mm=_rows(result.reached(*judged_places(rig, 0.0))),
-        cable_residuals_mm=[
-            float(x) * 1e3 for x in np.sqrt(np.mean(result.fit.residuals**2, axis=0))
-        ],
+        cable_residuals_mm=[float(x) * 1e3 for x in np.sqrt(np.mean(result.fit.cables**2, axis=0))],
+        sensor_residuals_deg=dict(
+            zip(result.fit.sensors, np.degrees(result.fit.sensor_rms).tolist(), strict=True)
+        ),
     )
 
 
@@ -202,7 +225,10 @@ def drawing_of(rig: RigDocument) -> object:
     document = rig.model_dump(mode="json")
     parts = {key: document[key] for key in ("outlets_mm", "anchors_mm", "pulleys", "cables")}
     home_counts = {"home_counts"}
-    winches = [{k: v for k, v in w.items() if k not in home_counts} for w in document["winches"]]
+    winches = [
+        {k: v for k, v in w.items() if k not in home_counts and v is not None}
+        for w in document["winches"]
+    ]
     return {**parts, "winches": winches, "home": document["platform"]["home"]}
 
 

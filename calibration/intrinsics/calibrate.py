@@ -34,7 +34,7 @@ from calibration.statistics import (
     rms_bound,
     widened,
 )
-from calibration.targets.board import Board, Seen, mirrored
+from calibration.targets.boards import Board, Seen, mirrored
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only

@@ -19,7 +19,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from calibration.targets.board import Seen
+from calibration.targets.boards import Seen
 from model.files.camera_file import LensName
 from model.pose import Array
 from tracking.camera_model import rays_of

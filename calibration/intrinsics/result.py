@@ -25,7 +25,7 @@ from calibration.intrinsics.quality import (
 )
 from calibration.report import Section, drawing, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
-from calibration.targets.board import Seen
+from calibration.targets.boards import Seen
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument, LensCovariance, LensName
 from model.files.documents import AnyNonNegative, AnyNumber, Positive

@@ -10,10 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.targets.board import Board
-from calibration.targets.chessboards import Charuco, Chessboard
-from calibration.targets.circle_grid import CircleGrid
-from calibration.targets.tag_grid import TagGrid
+from calibration.targets.boards import Board, Charuco, Chessboard
+from calibration.targets.grids import CircleGrid, TagGrid
 from model.errors import BadInput
 from model.pose import Array
 from model.rig import Rig

@@ -7,6 +7,7 @@ import gc
 import io
 import json
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -15,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import islice
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -27,174 +29,76 @@ from model.files.reading import shown
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """A line of the help text, and where the verb is.
+    """A verb or a group of verbs.
 
     Attributes:
         name: As it is typed.
-        help: The first line of the verb's own help, or all of a group's.
         target: ``module:function`` below `cdpr.cli`; nothing for a group.
         verbs: Of a group.
+        about: Help text of a group.
     """
 
     name: str
-    help: str
     target: str = ""
     verbs: tuple[Verb, ...] = ()
+    about: str = ""
+
+    @property
+    def help(self) -> str:
+        """A group's help text, or the first line of a verb's docstring; imports nothing."""
+        if self.verbs:
+            return self.about
+        module, _, function = self.target.partition(":")
+        file = Path(__file__).parent.joinpath(*module.split(".")).with_suffix(".py")
+        found = re.search(rf'^def {function}\(.*?"""(.*?)\n', file.read_text("utf-8"), re.M | re.S)
+        assert found is not None, f"no docstring of {self.target}"
+        return found.group(1)
 
 
-def _in(module: str, **helps: str) -> tuple[Verb, ...]:
-    """Verbs of a module below `cdpr.cli`: their functions, with an underscore after a Python word.
+def _verbs(*targets: str) -> tuple[Verb, ...]:
+    """Verbs by modules below `cdpr.cli` and their functions, ``module:function,function``.
 
-    Args:
-        module: That has them.
-        helps: The first line of each one's help, by the name of its function.
+    A function has an underscore after a word of Python.
     """
-    return tuple(Verb(name.rstrip("_"), text, f"{module}:{name}") for name, text in helps.items())
+    split = [(module, names) for module, _, names in (one.partition(":") for one in targets)]
+    return tuple(
+        Verb(name.rstrip("_"), f"{module}:{name}")
+        for module, names in split
+        for name in names.split(",")
+    )
 
 
-CALIBRATE = (
-    *_in(
-        "calibrate.camera",
-        camera="Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.",
-    ),
-    *_in(
-        "calibrate.extrinsics",
-        extrinsics="Find a camera's pose, from surveyed tags on the frame or from the rig's"
-        " motion.",
-    ),
-    *_in(
-        "calibrate.camera",
-        readout="Measure a rolling shutter, from images of the platform while it moves.",
-    ),
-    *_in(
-        "calibrate.extrinsics",
-        tags="Find the tags' poses on the platform, from images that show two or more at once.",
-    ),
-    *_in(
-        "calibrate.rig",
-        poses="Choose the most informative poses for calibration, and plan a path with stops at"
-        " them.",
-        rig="Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.",
-    ),
-    *_in(
-        "calibrate.boards",
-        print_="Make a calibration board, or the tags of a rig, as a PDF in exact size.",
-    ),
-    *_in(
-        "calibrate.results",
-        diff="Compare two calibration results: every number against its interval, and the effect"
-        " in mm.",
-        apply="Write a new rig file with calibration results in place of its own values.",
-        export="Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.",
-        import_="Write a new rig file with a camera's matrix and lens from another program.",
-    ),
+CALIBRATE = _verbs(
+    "calibrate.camera:camera",
+    "calibrate.extrinsics:extrinsics",
+    "calibrate.camera:readout",
+    "calibrate.extrinsics:tags",
+    "calibrate.rig:poses,rig",
+    "calibrate.boards:print_",
+    "calibrate.results:diff,apply,export,import_",
 )
-BENCH = (
-    *_in(
-        "bench",
-        paper="Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.",
-    ),
-)
-PLAN = (
-    *_in(
-        "operate.demo",
-        demo="Plan, check, run on simulated drives, track with a synthetic camera, and report.",
-    ),
-    *_in(
-        "start",
-        examples="List the ready rigs, scenes and recorded sessions, or copy some of them.",
-        new="Ask for the essentials of a rig, and write a commented rig file.",
-    ),
-    *_in(
-        "plan",
-        plan="Plan a collision-free path and write it to a file.",
-    ),
-    *_in(
-        "check",
-        check="Check a plan with an independent method: distances at dense poses, with bounds.",
-    ),
-)
-OPERATE = (
-    *_in(
-        "operate.run",
-        run="Run a plan: check it, compute set-points, arm the drives, move, measure, report.",
-    ),
-    *_in(
-        "operate.requests",
-        stop="Stop every run of this user: all drives slow down together along the path, then"
-        " hold.",
-        hold="Feed hold: the platform slows down along the path and waits there under tension.",
-        resume="Continue after `cdpr hold`, at the last requested speed.",
-        speed="Scale the speed along the path to a percentage of the planned one.",
-    ),
-    *_in(
-        "operate.console",
-        console="Open the operator's page: see the robot live, jog, teach, preview, run, hold,"
-        " stop.",
-    ),
-    *_in(
-        "operate.monitor",
-        monitor="Show a run live: state, pose, clearance, tensions, drives, lateness, progress and"
-        " events.",
-    ),
-    *_in(
-        "operate.service",
-        status="Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.",
-        reset="Release a latched fault once its cause is removed: resets drives in fault, moves"
-        " nothing.",
-    ),
-    *_in(
-        "operate.home",
-        home="Pretension all cables, then set the encoder reference at a known pose.",
-    ),
-    *_in(
-        "operate.jog",
-        jog="Move the platform straight slowly by a few millimetres from its present pose.",
-    ),
-    *_in(
-        "operate.service",
-        release="Release the drives with the platform on a support: close brakes, remove torque.",
-    ),
-)
-SET_UP = (
-    *_in(
-        "doctor",
-        doctor="Check that this machine can run a rig; with a rig file, also its bus and cameras.",
-    ),
-    *_in(
-        "sim",
-        sim="Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.",
-    ),
-    Verb("calibrate", "Calibrate and compare.", verbs=CALIBRATE),
-)
-MEASURE = (
-    *_in(
-        "track",
-        track="Measure the platform's pose from its tags, image by image.",
-    ),
-)
-ANALYSE = (
-    *_in(
-        "report",
-        report="Write the report of a run folder again from its files.",
-    ),
-    *_in(
-        "explain",
-        explain="Explain a fault that a run reported: meaning, likely cause, state of the machine,"
-        " next step.",
-    ),
-    *_in(
-        "workspace",
-        workspace="Map the workspace: feasibility, wrench closure, capacity margin and dexterity.",
-    ),
-    Verb("bench", "Measure the planner.", verbs=BENCH),
-)
+BENCH = _verbs("studies:paper")
 PANELS: dict[str, tuple[Verb, ...]] = {
-    "Plan": PLAN,
-    "Operate": OPERATE,
-    "Set up": SET_UP,
-    "Measure": MEASURE,
-    "Analyse": ANALYSE,
+    "Plan": _verbs("operate.demo:demo", "start:examples,new", "plan:plan", "check:check"),
+    "Operate": _verbs(
+        "operate.run:run",
+        "operate.requests:stop,hold,resume,speed",
+        "operate.console:console",
+        "operate.monitor:monitor",
+        "operate.service:status,reset",
+        "operate.home:home",
+        "operate.jog:jog",
+        "operate.service:release",
+    ),
+    "Set up": (
+        *_verbs("doctor:doctor", "sim:sim"),
+        Verb("calibrate", verbs=CALIBRATE, about="Calibrate and compare."),
+    ),
+    "Measure": _verbs("track:track"),
+    "Analyse": (
+        *_verbs("report:report", "explain:explain", "studies:workspace"),
+        Verb("bench", verbs=BENCH, about="Measure the planner."),
+    ),
 }
 VERBS = tuple(verb for verbs in PANELS.values() for verb in verbs)
 
@@ -280,9 +184,6 @@ def _guarded(verb: Callable[..., None]) -> Callable[..., None]:
             raise StoppedByOperator("interrupted") from None
 
     return guarded
-
-
-# The `cdpr` command: its verbs, and what happens to errors.
 
 
 EPILOG = (

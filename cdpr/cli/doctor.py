@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from cdpr.cli.options import JsonOption
-from cdpr.cli.output import out, show_json
+from cdpr.cli.output import out, show_json, show_line
 from executor.doctor import MachineCheck, check_machine, check_rig, examine, stopping_text
 from model.errors import BadInput
 from model.rig import Rig, load_rig
@@ -80,7 +80,7 @@ def _show_checks(checks: Iterable[MachineCheck]) -> None:
         mark = "[green]ok  [/]" if check.good else "[red]miss[/]"
         out.print(f"{mark} {check.name}: {check.text}", soft_wrap=True)
         if not check.good and check.fix:
-            out.print(f"     next: {check.fix}", soft_wrap=True)
+            show_line(f"     next: {check.fix}")
 
 
 def _show_table(found: Examined, rig: Rig) -> None:
@@ -103,4 +103,4 @@ def _show_table(found: Examined, rig: Rig) -> None:
         f"{len(found.rows)} objects of {len(found.nodes)} drives read, nothing written;"
         f" {wrong} to change"
     )
-    out.print(stopping_text(rig), soft_wrap=True)
+    show_line(stopping_text(rig))

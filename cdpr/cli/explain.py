@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.output import out
+from cdpr.cli.output import show_line
 from executor.recording.verdict import fault_titles, page_of_fault
 
 
@@ -25,6 +25,6 @@ def explain(
     """
     if code is None:
         for known, title in fault_titles().items():
-            out.print(f"  {known:<22} {title}", markup=False, soft_wrap=True)
+            show_line(f"  {known:<22} {title}")
         return
-    out.print(page_of_fault(code).rstrip(), markup=False, soft_wrap=True)
+    show_line(page_of_fault(code).rstrip())

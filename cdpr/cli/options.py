@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
 
+import calibration  # loads nothing yet: `cdpr stop` must not wait for scientific libraries
 from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.files.documents import millimetres
@@ -23,12 +24,6 @@ SceneArgument = Annotated[Path, typer.Argument(help="scene file (YAML)", metavar
 PlanFileOption = Annotated[Path, typer.Option("-o", "--output", help="plan file to write (JSON)")]
 ReplacePlanOption = Annotated[bool, typer.Option("--force", help="replace an existing plan file")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
-WorkersOption = Annotated[
-    int | None, typer.Option(min=1, help="number of processes (default: one per core)", metavar="N")
-]
-DaskOption = Annotated[
-    str | None, typer.Option(help="compute on this Dask cluster", metavar="ADDRESS")
-]
 Triple = tuple[float, float, float]
 
 
@@ -94,17 +89,21 @@ CalibrationOption = Annotated[
 
 
 def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
-    """See `calibration.result_files.with_calibrations`.
+    """The rig with the results of files in place of its file's numbers, in memory only.
+
+    The verdict of each result that is not good enough is reported: it may be used all the same.
 
     Raises:
         BadInput: A file cannot be used, or is not about this rig.
     """
     if not files:
         return rig
-    # Scientific libraries, of which `cdpr stop` and others without this option must not wait.
-    from calibration.result_files import with_calibrations
-
-    return with_calibrations(rig, files, Terminal())
+    results = [calibration.load_result(file) for file in files]
+    better = rig.with_calibration(*results)
+    for one in results:
+        if not one.good_enough:
+            Terminal().remark(f"calibration {one.kind} {one.name}, {one.date}: {one.verdict}")
+    return better
 
 
 # Verbs that reach drives: the rig, its bus, and how its drives are moved.
@@ -124,6 +123,22 @@ WithoutRealTimeOption = Annotated[
     typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
 ]
 SummaryJsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON")]
+
+
+@dataclass(frozen=True, slots=True)
+class BusOptions:
+    """Where the drives of a rig are, and what was calibrated; every field is an option."""
+
+    interface: InterfaceOption = None
+    channel: ChannelOption = None
+    calibration: CalibrationOption = None
+
+    def rig(self, path: Path) -> Rig:
+        """See `rig_on_bus`."""
+        return rig_on_bus(path, self.interface, self.channel, self.calibration)
+
+
+RIGS_OWN = BusOptions()
 
 
 def rig_on_bus(

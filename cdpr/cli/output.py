@@ -46,6 +46,11 @@ def show_json(document: Any) -> None:
     typer.echo(json.dumps(document, indent=1, allow_nan=False))
 
 
+def show_line(text: str, on: Console = out) -> None:
+    """Plain text, of which no terminal wraps a line."""
+    on.print(text, markup=False, soft_wrap=True)
+
+
 def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> None:
     """A result for people: names on the left, values on the right; a line each in a file.
 
@@ -114,7 +119,7 @@ class Terminal(Listener):
     def note(self, text: str) -> None:
         """See `Listener`."""
         if self._shown:
-            err.print(text, markup=False, soft_wrap=True)
+            show_line(text, err)
 
     def remark(self, text: str) -> None:
         """See `Listener`."""

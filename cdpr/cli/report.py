@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.output import Terminal, out, show_json
+from cdpr.cli.output import Terminal, show_json, show_line
 from executor.evaluation import rewrite_report
 from executor.recording.run_folder import RunFolder
 
@@ -31,4 +31,4 @@ def report(
     if as_json:
         show_json(folder.summary())
         return
-    out.print(f"report: {folder.report}", markup=False, soft_wrap=True)
+    show_line(f"report: {folder.report}")

@@ -18,7 +18,7 @@ from cdpr.cli.options import (
     level_pose,
     rig_on_bus,
 )
-from cdpr.cli.output import Terminal, out
+from cdpr.cli.output import Terminal, out, show_line
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
 from executor.kernels import ready_to_simulate
 from executor.realtime.scheduling import real_time
@@ -110,11 +110,10 @@ def sim(
             loss = PowerLoss.drawn(the_rig, power_lost, slack_mm / 1000.0, on_a_stand=on_a_stand)
             loss.apply_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         x, y, z = rehearsal.pose.position * 1000.0
-        out.print(
+        show_line(
             f"{the_rig.cable_count} simulated drives of {the_rig.name} on"
             f" {BusSettings.of(the_rig)}; platform at {x:z.1f}, {y:z.1f}, {z:z.1f} mm;"
-            " Ctrl-C ends it",
-            soft_wrap=True,
+            " Ctrl-C ends it"
         )
         board = LocalRequests()
         with stop_requests(board), real_time() as denied:

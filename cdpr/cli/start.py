@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cdpr.cli.output import out, show_json
+from cdpr.cli.output import out, show_json, show_line
 from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_atomic
 from model.files.examples import copy_examples, find_examples, ready_folder, select_examples
@@ -55,7 +55,7 @@ def examples(
             return
         for example in known:
             line = f"  {example.kind:<8} {example.name:<22} {example.about}"
-            out.print(line, markup=False, soft_wrap=True)
+            show_line(line)
         out.print("next: copy one with `cdpr examples NAME`, or all with `cdpr examples --all`")
         return
     wanted = known if everything else select_examples(known, names or [])
@@ -64,7 +64,7 @@ def examples(
         show_json([str(path) for path in copies])
         return
     for path in copies:
-        out.print(f"copied {path}", markup=False, soft_wrap=True)
+        show_line(f"copied {path}")
 
 
 # `cdpr new`: asks what a rig file needs to know, and writes it.
@@ -129,12 +129,8 @@ def new(
         answers = collect_answers(rig.stem, given | read_coordinates(coordinates))
     write_atomic(rig, rig_text(answers))
     name = shlex.quote(str(rig))
-    out.print(f"wrote {rig}: {answers['cables']} cables", markup=False, soft_wrap=True)
-    out.print(
-        f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE",
-        markup=False,
-        soft_wrap=True,
-    )
+    show_line(f"wrote {rig}: {answers['cables']} cables")
+    show_line(f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE")
 
 
 def _ask(question: RigQuestion, default: str) -> str:

@@ -3,3 +3,24 @@
 A client of the command socket and of the public API in a process of its own: what moves is started
 as a verb of the command line, and goes on whatever becomes of the console.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from model.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cdpr.console.foxglove import FoxgloveStream, foxglove_stream, layout_text
+    from cdpr.console.server import run_server
+
+__all__ = ["FoxgloveStream", "foxglove_stream", "layout_text", "run_server"]
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "cdpr.console.foxglove": "FoxgloveStream foxglove_stream layout_text",
+            "cdpr.console.server": "run_server",
+        },
+    )

@@ -288,6 +288,9 @@ class PageControl:
     def hold(self, page: int, hold: int, motion: int) -> int | None:
         """The press that a page's control is held with; None where it may not, or no longer.
 
+        A press that is heard of while the page may not operate is over: who gets control later has
+        to press again, and nothing that was said before moves anything.
+
         Args:
             page: Which.
             hold: The page's own number of the press, rising from 1.
@@ -295,9 +298,9 @@ class PageControl:
                 which it began, and at once where there is none (0).
         """
         mine = self._pages[page]
-        if self.holder != page or hold <= mine.over or hold < mine.hold:
+        if hold <= mine.over or hold < mine.hold:
             return None
-        if motion == 0 or (hold == mine.hold and motion != mine.motion):
+        if self.holder != page or motion == 0 or (hold == mine.hold and motion != mine.motion):
             mine.over = hold
             return None
         if hold > mine.hold:

@@ -27,7 +27,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from cdpr.console.commands import Held, LetGo, NotAMessage, parse_message
 from cdpr.console.session import MADE, Console
 from cdpr.console.view import scene_of
-from executor.recording.run_course import RUNS
+from executor.recording.record_files import RUNS
 from executor.recording.verdict import fault_codes, page_text
 from model.errors import BadInput
 

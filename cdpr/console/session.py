@@ -29,15 +29,16 @@ from cdpr.console.commands import (
     SpeedCommand,
     TakeCommand,
 )
-from cdpr.console.preview import preview
-from cdpr.console.started import StartedVerb, file_here
 from cdpr.console.state import (
     Kept,
+    StartedVerb,
     cable_state,
+    file_here,
     jog_state,
     kept_state,
     measured_state,
     outcome_state,
+    preview,
 )
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data

@@ -1,15 +1,147 @@
-"""Parts of the state that every page is sent alike, as JSON; pure."""
+"""What every page is sent: verbs that were started, rig and session, and the preview of a plan."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdpr.console.started import VerbOutcome
-from cdpr.console.view import measured_data
+import numpy as np
+
+from cdpr.console.view import measured_data, scene_figure
 from executor.jogging import FASTEST
-from executor.recording.run_course import RUNS
+from executor.recording.record_files import RUNS
+from executor.report.scene import plan_labels
+from executor.runner import prepare_plan
+from executor.trajectory.prepare import PreparedRun
+from model.clearance import ClearanceModel
+from model.errors import BadInput, CdprError, Refused
+from model.kinematics import cables_at
+from model.pages.scene import Moment, Stroke, scene_data
+from model.plan import Plan, load_plan, require_same_rig
+from model.pose import Pose
+from model.rig import Rig
+
+#: Of what a verb printed, this much is shown, [characters].
+SHOWN = 4000
+_REPORT = re.compile(r"(\S+/report\.html)")
+_HELP = re.compile(r"docs/faults/(\w+)\.md")
+
+
+@dataclass(frozen=True, slots=True)
+class VerbOutcome:
+    """How a verb ended.
+
+    Attributes:
+        verb: Its name.
+        exit_code: Of the process.
+        text: The end of what it printed.
+        report: The run's report, if it wrote one.
+        fault: Code of the fault whose page it names.
+    """
+
+    verb: str
+    exit_code: int
+    text: str
+    report: Path | None
+    fault: str | None
+
+
+class StartedVerb:
+    """One verb at a time; it writes to a file, so that no pipe ends with the console."""
+
+    def __init__(self) -> None:
+        """Nothing was started."""
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._output = Path()
+        self.verb: str | None = None
+        """What is under way."""
+        self.outcome: VerbOutcome | None = None
+        """How the last one ended."""
+
+    def start(self, verb: str, arguments: Sequence[str]) -> None:
+        """Starts a verb without a terminal.
+
+        Raises:
+            Refused: Another one is under way.
+        """
+        with self._lock:
+            self._look()
+            if self.verb is not None:
+                raise Refused(
+                    f"`cdpr {self.verb}` is still under way",
+                    where="console",
+                    next_step="wait until it has ended, or stop it",
+                )
+            self._start(verb, arguments)
+
+    def look(self) -> str:
+        """The newest line that the verb printed; notices its end."""
+        with self._lock:
+            return self._look()
+
+    def _start(self, verb: str, arguments: Sequence[str]) -> None:
+        descriptor, name = tempfile.mkstemp(prefix=f"cdpr-{verb}-", suffix=".log")
+        command = [sys.executable, "-c", "from cdpr.cli import main; main()", verb, *arguments]
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=descriptor,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "NO_COLOR": "1", "COLUMNS": "100"},
+                start_new_session=True,
+            )
+        finally:
+            os.close(descriptor)
+        self._output, self.verb, self.outcome = Path(name), verb, None
+
+    def _look(self) -> str:
+        if self._process is None or self.verb is None:
+            return ""
+        text = self._output.read_text(encoding="utf-8", errors="replace")
+        code = self._process.poll()
+        if code is not None:
+            self.outcome = _outcome(self.verb, code, text)
+            self._output.unlink(missing_ok=True)
+            self._process = self.verb = None
+        lines = text.strip().splitlines()
+        return lines[-1].strip() if lines else ""
+
+
+def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
+    report, fault = _REPORT.findall(text), _HELP.findall(text)
+    return VerbOutcome(
+        verb=verb,
+        exit_code=code,
+        text=text.strip()[-SHOWN:],
+        report=Path(report[-1]) if report else None,
+        fault=fault[-1] if fault else None,
+    )
+
+
+def file_here(name: str) -> Path:
+    """A file below the folder that the console was started in.
+
+    Raises:
+        BadInput: It is elsewhere.
+    """
+    path = Path(name)
+    if not path.resolve().is_relative_to(Path.cwd().resolve()):
+        raise BadInput(
+            f"{name} is not below the folder in which the console runs",
+            where="console",
+            next_step="copy it there, or start the console elsewhere",
+        )
+    return path
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,3 +239,103 @@ def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] 
     if status is None or measured is None or status["elapsed_s"] is None:
         return None
     return measured_data(measured, max(0.0, status["elapsed_s"] - measured["time_s"]) + age)
+
+
+# A plan before it is run: its path, its proof, and how clearance and tensions go along it.
+
+
+#: Poses that are drawn, and at which clearance is computed.
+POSES = 200
+
+
+def preview(path: Path, rig: Rig) -> dict[str, Any]:
+    """What the page shows of a plan; one that does not pass says why.
+
+    Raises:
+        BadInput: It cannot be read, or is for another rig.
+    """
+    plan = load_plan(path)
+    require_same_rig(plan, rig, path)
+    try:
+        prepared = prepare_plan(plan, rig)
+    except CdprError as error:
+        return {
+            "name": str(path),
+            "passed": False,
+            "verdict": error.what,
+            "checks": [],
+            "duration_s": None,
+            "length_mm": None,
+            "least_clearance_mm": None,
+            "largest_tension_n": None,
+            **_drawn(rig, plan, []),
+            "curves": None,
+        }
+    report = prepared.checked.report
+    rows = _rows(prepared)
+    table = prepared.checked.table
+    poses = [Pose(table.positions[row], table.rotations[row]) for row in rows]
+    times = [round(row * table.cycle, 3) for row in rows]
+    return {
+        "name": str(path),
+        "passed": True,
+        "verdict": "passed every check",
+        "checks": _checks(prepared),
+        "duration_s": round(prepared.duration, 1),
+        "length_mm": round(prepared.length * 1e3, 1),
+        "least_clearance_mm": _in_mm(report.proved_obstacle_clearance),
+        "largest_tension_n": round(report.max_tension, 1),
+        **_drawn(rig, plan, list(zip(times, poses, strict=True))),
+        "curves": {
+            "time_s": times,
+            "clearance_mm": _clearances(rig, plan, poses),
+            "required_mm": round(report.required_obstacle_clearance * 1e3, 2),
+            "tensions_n": np.round(table.tensions[rows].T, 2).tolist(),
+        },
+    }
+
+
+def _in_mm(distance: float) -> float | None:
+    """A distance [m] as the page takes it; None where nothing is near."""
+    return round(distance * 1e3, 1) if np.isfinite(distance) else None
+
+
+def _rows(prepared: PreparedRun) -> list[int]:
+    count = len(prepared.checked.table)
+    even = np.linspace(0, count - 1, min(count, POSES))
+    return sorted({round(float(row)) for row in even})
+
+
+def _checks(prepared: PreparedRun) -> list[str]:
+    report = prepared.checked.report
+    told = []
+    if np.isfinite(report.proved_obstacle_clearance):
+        told.append(
+            f"clearance to obstacles at least {report.proved_obstacle_clearance * 1e3:.1f} mm,"
+            f" required {report.required_obstacle_clearance * 1e3:.1f} mm"
+        )
+    told.append(
+        f"clearance of cables to each other and to the platform at least"
+        f" {report.proved_self_clearance * 1e3:.1f} mm,"
+        f" required {report.required_self_clearance * 1e3:.1f} mm"
+    )
+    told.append(f"tensions {report.min_tension:.1f} to {report.max_tension:.1f} N")
+    return told
+
+
+def _clearances(rig: Rig, plan: Plan, poses: list[Pose]) -> list[float | None] | None:
+    if not plan.scene.obstacles:
+        return None
+    model = ClearanceModel(rig, plan.scene)
+    near = [model.smallest(pose) for pose in poses]
+    return [None if one is None else round(one.distance * 1e3, 2) for one in near]
+
+
+def _drawn(rig: Rig, plan: Plan, moments: list[tuple[float, Pose]]) -> dict[str, Any]:
+    points = np.array([pose.position for pose in plan.waypoints])
+    figure = scene_figure(rig, plan.scene, Stroke.along("path", "ink", points, 4.5))
+    drawn = tuple(
+        Moment(time, pose.position, pose.rotation, cables_at(rig, pose).exits)
+        for time, pose in moments
+    )
+    return scene_data(replace(figure, labels=plan_labels(plan), moments=drawn))

@@ -47,8 +47,10 @@ def scene_figure(rig: Rig, scene: Scene | None, *strokes: Stroke) -> SceneFigure
 
 
 def scene_of(rig: Rig, scene: Scene | None) -> dict[str, Any]:
-    """What the page draws at first; see `model.pages.scene.scene_data`."""
-    return scene_data(scene_figure(rig, scene))
+    """What the page draws at first, as `model.pages.scene.scene_data`, and where goals may be."""
+    corners = [rig.workspace_lower, rig.workspace_upper]
+    workspace = [(1e3 * corner).round(3).tolist() for corner in corners]
+    return {**scene_data(scene_figure(rig, scene)), "workspace_mm": workspace}
 
 
 def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:

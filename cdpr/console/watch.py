@@ -201,7 +201,7 @@ class CameraPictures:
 def _compressed(newest: LiveImage, rig: Rig, name: str) -> bytes:
     import cv2  # a console that shows no image does not load it
 
-    from tracking.overlay import outlined
+    from tracking.track import outlined
 
     drawn = outlined(newest.image, rig, rig.camera(name), newest.found)
     height, width = newest.image.shape

@@ -84,6 +84,18 @@ def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
     )
 
 
+def how_to_set(expected: Expectation) -> str:
+    """The next step where a drive holds another value."""
+    if expected.index == 0x6502:
+        return (
+            "none: a drive without cyclic synchronous position (CSP) cannot be used; Technosoft"
+            " iPOS and Pilz PRBT do not have it"
+        )
+    if expected.index in (0x1000, 0x1018):
+        return "check the node id, and vendor_id and product_code of the rig file"
+    return "set it with the maker's tool and store it"
+
+
 # Questions to one drive, each of which refuses it; asked before anything is written.
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import can
 import numpy as np
 
-from drivers.can_bus import EchoFilter, SentFrame, echoes_own_frames
-from drivers.can_load import TESTED_HZ, check_bus_load, heartbeat_cycles, heartbeat_timeout
+from drivers.can_bus import SentFrame
+from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.inspection import say_simulated
 from drivers.cia402.monitor import DriveMonitor
@@ -47,7 +47,7 @@ from drivers.drive_group import (
     Pace,
     Pump,
 )
-from drivers.plausibility import largest_steps, require_within_limits, winding_signs
+from drivers.plausibility import require_within_limits, winding_signs
 from model.errors import HardwareMissing, Refused
 from model.rig import Rig
 
@@ -72,7 +72,6 @@ class Cia402Group(CyclicGroup):
     ) -> None:
         """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
         super().__init__(rig, bus, pump)
-        check_bus_load(rig)
         self._signs = winding_signs(rig)
         cycle = rig.cycle
         self._cycle_s, self._profile = cycle, profile_of(rig)
@@ -81,17 +80,13 @@ class Cia402Group(CyclicGroup):
         self._patience = max(3, round(self._profile.enable_timeout_ms / 1000.0 / cycle))
         self._again_after = max(1, round(ASKED_AGAIN_AFTER / cycle))
         self._max_tension = max_tension
-        self._max_steps = largest_steps(rig, cycle)
         self._restarted: tuple[int, ...] = ()
         self._simulated, self._heartbeats = False, (1,) * rig.cable_count
         self._reset_memory()
 
     def _reset_memory(self) -> None:
         count = len(self._nodes)
-        own = EchoFilter(
-            commanding_ids(self._nodes), echoes_own_frames=echoes_own_frames(self._bus)
-        )
-        self._cyclic = CyclicBus(self._bus, own, foreign_master_message)
+        self._cyclic = CyclicBus(self._bus, commanding_ids(self._nodes), foreign_master_message)
         self._frames = CyclicFrames(self._nodes)
         is_warning = self._profile.is_warning
         self._watch = DriveMonitor(self._rig.drive_names, self._max_steps, is_warning)

@@ -17,6 +17,7 @@ from drivers.cia402.expected_objects import (
     MODE_DISPLAY,
     Expectation,
     expected_by,
+    how_to_set,
     identifiers,
     identity,
 )
@@ -164,6 +165,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         look.at_state()
         for index, form, name, why in _PROCESS_DATA:
             look.at_setting(Setting(index, 0, form, 0, name, why), "readable")
+        look.at_scale(rig.document.winches[drive].counts_per_rev)
         look.at_heartbeats(profile, rig.cable_count)
         for setting in _last_of_each(settings_for(rig, drive, winch_map, None)):
             look.at_setting(setting, _needed(setting))
@@ -208,7 +210,7 @@ class _Look:
             return
         value = int.from_bytes(data, "little")
         good = value & expected.mask == expected.expected
-        change = "" if good else _how_to_set(expected)
+        change = "" if good else how_to_set(expected)
         row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
 
     def at_state(self) -> None:
@@ -261,6 +263,21 @@ class _Look:
         else:
             row.note(self._node, str(count))
 
+    def at_scale(self, counts_per_turn: int) -> None:
+        """Position counts of a motor turn, as far as the drive says; CiA 402-2, factor group."""
+        row = self._row(0x6092, 1, "feed constant, 6091h gear ratio, 608Fh encoder resolution", "")
+        row.meaning = "position counts of a motor turn: winches[].counts_per_rev"
+        row.needed = row.needed or f"{counts_per_turn} a turn, where the drive has them"
+        feed, gear, encoder = (self._quotient(index) for index in (0x6092, 0x6091, 0x608F))
+        turns = [feed / (gear or 1.0)] if feed else []
+        found = {"6092h/6091h": turns, "608Fh": [encoder] if encoder else []}
+        said = {name: value for name, values in found.items() for value in values}
+        text = ", ".join(f"{value:.10g} by {name}" for name, value in said.items()) or "absent"
+        if not said or counts_per_turn in said.values():
+            row.note(self._node, text)
+        else:
+            row.note(self._node, text, "remark", "compare with 6064h over a motor turn by hand")
+
     def at_setting(self, setting: Setting, needed: str) -> None:
         """An object that is written at set-up: it must be there, and of that length."""
         row = self._row(setting.index, setting.sub, str(setting), needed)
@@ -306,6 +323,17 @@ class _Look:
             row.note(self._node, f"{int.from_bytes(data, 'little'):X}h")
         return data is not None
 
+    def _quotient(self, index: int) -> float | None:
+        """Sub-index 1 by sub-index 2; None where there is no such object, or no number."""
+        try:
+            data = [self._client.read_if_there(index, sub, "position scale") for sub in (1, 2)]
+        except Refused as error:
+            if "abort_code" not in error.values:
+                raise
+            return None
+        above, below = (int.from_bytes(each or b"", "little") for each in data)
+        return above / below if above and below else None
+
     def _row(self, index: int, sub: int, name: str, needed: str) -> ObjectRow:
         text = name if name.startswith(f"{index:04X}h") else f"{object_name(index, sub)} {name}"
         return self._rows.setdefault((index, sub), ObjectRow(text, needed, ""))
@@ -337,17 +365,6 @@ class _Look:
         else:
             row.note(self._node, text, "wrong", _how_without(index, sub))
         return None
-
-
-def _how_to_set(expected: Expectation) -> str:
-    if expected.index == 0x6502:
-        return (
-            "none: a drive without cyclic synchronous position (CSP) cannot be used; Technosoft"
-            " iPOS and Pilz PRBT do not have it"
-        )
-    if expected.index in (0x1000, 0x1018):
-        return "check the node id, and vendor_id and product_code of the rig file"
-    return "set it with the maker's tool and store it"
 
 
 _BESIDE = {

@@ -16,8 +16,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from drivers.can_bus import EchoFilter, echoes_own_frames
-from drivers.can_load import TESTED_HZ, check_bus_load
+from drivers.can_load import TESTED_HZ
 from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
     Capabilities,
@@ -77,7 +76,6 @@ class OdriveGroup(CyclicGroup):
         if not isinstance(document, OdriveDocument):
             raise TypeError("the rig has no ODrives")
         super().__init__(rig, bus, pump)
-        check_bus_load(rig)
         self._document = document
         self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
         self._frames = OdriveFrames(rig, self._layouts)
@@ -85,14 +83,12 @@ class OdriveGroup(CyclicGroup):
         self._patience = max(3, round(STEP_TIMEOUT / cycle))
         self._settling = max(1, round(SETTLING / cycle))
         self._max_tension = rig.max_tension if max_tension is None else max_tension
-        self._max_steps = largest_steps(rig, cycle)
         self._per_mille = winding_signs(rig) * 1000.0 / [w.rated_torque for w in rig.winches]
         self._reset_memory()
 
     def _reset_memory(self) -> None:
         ids = commanding_ids(self._layouts, self._nodes)
-        own = EchoFilter(ids, echoes_own_frames=echoes_own_frames(self._bus))
-        self._cyclic = CyclicBus(self._bus, own, foreign_master_message)
+        self._cyclic = CyclicBus(self._bus, ids, foreign_master_message)
         self._watch = OdriveWatch(self._rig, self._document, self._layouts, self._max_steps)
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
         self._stop = _Stop.NONE
@@ -373,8 +369,7 @@ def read_axes(
     """State, position and torque of every axis; see `drivers.factory.read_drives`."""
     layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
     nodes = [winch.node_id for winch in rig.winches]
-    own = EchoFilter(commanding_ids(layouts, nodes), echoes_own_frames=echoes_own_frames(bus))
-    cyclic = CyclicBus(bus, own, foreign_master_message)
+    cyclic = CyclicBus(bus, commanding_ids(layouts, nodes), foreign_master_message)
     watch = OdriveWatch(rig, document, layouts, largest_steps(rig, rig.cycle))
     cyclic.forget_waiting()
     for _ in range(ATTEMPTS):

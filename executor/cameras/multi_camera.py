@@ -8,7 +8,7 @@ from typing import Any
 
 from executor.cameras.client import BLIND_PICTURES, CameraClient
 from executor.cameras.process import CameraSample, FrameRequest, unseen
-from executor.recording.run_course import CameraRecord
+from executor.recording.record_files import CameraRecord
 from executor.remote.status import RunStatus
 from executor.supervision import RequestBoard, StopReason
 from model.clearance import ClearanceModel

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import LiveCamera
-from executor.cameras.client import CameraClient, wait_until_ready
+from executor.cameras.client import CameraClient, looks_at_rest, wait_until_ready
 from executor.cameras.live_image import ImageBoard, memory_for
 from executor.cameras.multi_camera import RunCameras
 from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, PictureSource
 from executor.cameras.sources import SYNTHETIC
-from executor.cameras.static_pose import looks_at_rest
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
 from executor.recording.run_folder import RunFolder

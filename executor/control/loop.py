@@ -14,8 +14,7 @@ import numpy as np
 
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.factory import stop_alone
-from executor.control.cycle import Cycle, CycleResult
-from executor.control.feed import Feed, targets_at
+from executor.control.cycle import Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, left_otherwise
 from executor.safety.gate import Purpose

@@ -11,9 +11,9 @@ from executor.control.loop import Loop
 from executor.control.path_job import PathMotion
 from executor.control.sync_master import SyncMaster
 from executor.interlock.interlock import MotionInterlock
-from executor.realtime.clock import Clock
 from executor.realtime.job import MakeDrives
 from executor.realtime.process import real_time_process
+from executor.realtime.scheduling import Clock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder, RunLog
 from executor.state_machine import ON_PATH, CycleRecord, State

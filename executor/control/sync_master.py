@@ -18,7 +18,7 @@ import numpy as np
 
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
 from drivers.factory import drive_states
-from executor.realtime.clock import Clock
+from executor.realtime.scheduling import Clock
 from executor.safety.monitor import MISSING_CYCLES, USUAL_TIMEOUT, SyncAge
 from executor.state_machine import together
 from model.errors import CdprError, Fault, HardwareMissing

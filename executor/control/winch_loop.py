@@ -14,13 +14,13 @@ from typing import Protocol
 import numpy as np
 
 from drivers.drive_group import CycleStatus
-from executor.control.feed import Feed
+from executor.control.cycle import Feed
 from executor.control.loop import Loop
 from executor.control.preconditions import with_reduced_limits
 from executor.control.sync_master import SyncMaster
 from executor.control.winch_laws import WinchLaw
-from executor.realtime.clock import Clock
 from executor.realtime.job import Armed, Ended, MotionTask, Procedure, ReadyDrives, Records
+from executor.realtime.scheduling import Clock
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
 from executor.supervision import OperatorRequests, RequestBoard

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.drive_group import CycleStatus
 from drivers.plausibility import position_limits
-from executor.control.feed import Feed
+from executor.control.cycle import Feed
 from executor.control.loop import SETTLING, Loop
 from executor.control.preconditions import with_reduced_limits
 from executor.control.sync_master import SyncMaster

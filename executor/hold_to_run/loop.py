@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from executor.control.feed import Feed, targets_at
+from executor.control.cycle import Feed, targets_at
 from executor.control.loop import Loop
 from executor.control.preconditions import require_still_referenced
 from executor.control.sync_master import SyncMaster

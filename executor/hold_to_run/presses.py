@@ -61,12 +61,12 @@ class PressState:
         step: Length of cable after which the jog ends by itself, [m]; None as long as it is held.
     """
 
-    press: int = 0
-    share: float = 1.0
-    ends: bool = False
-    cable: int = 0
-    pays_out: bool = False
-    step: float | None = None
+    press: int
+    share: float
+    ends: bool
+    cable: int
+    pays_out: bool
+    step: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

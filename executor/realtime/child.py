@@ -9,7 +9,6 @@ from multiprocessing.connection import Connection
 
 from drivers.drive_group import CycleStatus
 from executor.control.sync_master import SyncMaster
-from executor.realtime.clock import RealClock
 from executor.realtime.job import (
     CYCLE_SLOTS,
     EVENT_SLOTS,
@@ -22,7 +21,7 @@ from executor.realtime.job import (
     ReadDrives,
     ReadyDrives,
 )
-from executor.realtime.scheduling import real_time, require_real_time
+from executor.realtime.scheduling import RealClock, real_time, require_real_time
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, Supervised, pack_event
 from executor.state_machine import SIMULATED, CycleRecord, LoopEvent, State
 from model.errors import CdprError, Fault

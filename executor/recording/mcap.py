@@ -11,7 +11,6 @@ from foxglove.messages import CompressedImage, Log, LogLevel
 from mcap.writer import Writer
 
 from executor.recording.clearance import ClearanceTable, camera_of
-from executor.recording.cycle_table import CycleTable
 from executor.recording.mcap_channels import (
     OWN,
     TYPED,
@@ -29,9 +28,9 @@ from executor.recording.mcap_channels import (
     stamp_of,
     topic_of,
 )
-from executor.recording.pose_table import OK, FusedTable, PoseTable
 from executor.recording.run_folder import PLAN, RIG, RunFolder
 from executor.recording.summary import RunContext
+from executor.recording.tables import OK, CycleTable, FusedTable, PoseTable
 from model.errors import Fault
 from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from foxglove import messages as fox
 
-from executor.recording.cycle_table import CycleTable
 from executor.recording.summary import RunContext
+from executor.recording.tables import CycleTable
 from model.cameras import Camera
 from model.files.camera_file import FISHEYE
 from model.kinematics import cables_to

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from executor.recording.csv_columns import Integers
-from executor.recording.cycle_table import CycleTable, quaternions_of
 from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.tables import CycleTable, quaternions_of
 from executor.remote.status import RunStatus
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
 from executor.trajectory.dwell import legs_at, stop_events

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from executor.recording.cycle_table import CycleTable
 from executor.recording.run_folder import PLAN, RunFolder
+from executor.recording.tables import CycleTable
 from executor.recording.verdict import NOT_ENDED
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Refused

@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from executor.recording.clearance import ClearanceTable
-from executor.recording.cycle_table import CycleTable, no_cycles
-from executor.recording.pose_table import FusedTable, PoseTable
 from executor.recording.record_files import (
     AGAIN,
+    RunCourse,
     append_lines,
     read_events,
     read_summary,
     whole_lines,
 )
-from executor.recording.run_course import RunCourse
+from executor.recording.tables import CycleTable, FusedTable, PoseTable, no_cycles
 from model.errors import BadInput, Fault, InvalidFile
 from model.files.documents import problems_of, write_atomic
 from model.files.plan_file import PlanDocument

@@ -28,10 +28,9 @@ from numpy.typing import NDArray
 
 from drivers.can_bus import IN_PROCESS
 from executor.recording.clearance import ClearanceTable
-from executor.recording.cycle_table import CycleTable
-from executor.recording.pose_table import PoseTable
-from executor.recording.run_course import CameraRecord
+from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent
+from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import judge
 from model.plan import Plan
 from model.pose import Array

@@ -13,9 +13,8 @@ import numpy as np
 
 import executor
 from executor.recording.clearance import ClearanceTable
-from executor.recording.cycle_table import CycleTable
-from executor.recording.pose_table import PoseTable
-from executor.recording.run_course import CameraRecord
+from executor.recording.record_files import CameraRecord
+from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.limits import tension_limits
 from executor.state_machine import ON_PATH
 from model.errors import BadInput

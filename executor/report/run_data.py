@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from executor.recording.clearance import ClearanceTable
-from executor.recording.cycle_table import CycleTable
-from executor.recording.pose_table import PoseTable
 from executor.recording.record_files import AGAIN
 from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.tables import CycleTable, PoseTable
 from model.errors import BadInput
 from model.pages.page import prose
 from model.plan import Plan

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drivers.cameras.live import is_too_large
-from executor.recording.pose_table import PoseTable
+from executor.recording.tables import PoseTable
 from executor.recording.verdict import faults_among, page_of, page_text
 from executor.report.run_data import RunData, markdown
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument

@@ -153,6 +153,9 @@ class WinchDocument(Document):
     brake: bool = Field(
         default=False, description="a brake that closes when the drive has no torque"
     )
+    cable_stiffness_n: Positive | None = Field(
+        default=None, description="E·A of its cable; left out, cables.stiffness_n"
+    )
 
 
 class MotionDocument(Document):

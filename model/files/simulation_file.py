@@ -37,7 +37,7 @@ class AsBuiltDocument(Document):
     )
     pulley_radius_mm: Positive | None = None
     stiffness_n: list[Positive] | None = Field(
-        default=None, description="E·A of each cable; left out, cables.stiffness_n"
+        default=None, description="E·A of each cable; left out, that of the rig file"
     )
 
 

@@ -210,7 +210,11 @@ function sceneViewer(canvas, data, shown = () => true) {
     surface({ ...data.platform, vertices: data.platform.vertices.map(place) });
   }
 
+  const LINE = 14; // height of a text, px
+  let written = []; // where texts stand already: [left, right, base]
+
   function texts(project) {
+    written = [];
     for (const { layer, text, at, mark } of [...data.labels, ...(now?.labels ?? [])]) if (shown(layer)) write(text, project(at), mark);
     for (const solid of data.surfaces.filter((one) => one.name && shown(one.layer))) {
       const top = Math.max(...solid.vertices.map((v) => v[2]));
@@ -221,10 +225,15 @@ function sceneViewer(canvas, data, shown = () => true) {
       cables().ends.forEach(([start, end], i) => write(String(i + 1), project(start.map((v, c) => v + 0.25 * (end[c] - v)))));
   }
 
+  function placed(left, base, wide) { // beside what is written there already, one or two lines up or down
+    const free = (at) => written.every(([l, r, b]) => left + wide < l || left > r || Math.abs(at - b) >= LINE);
+    const at = [0, -LINE, LINE, -2 * LINE, 2 * LINE].map((off) => base + off).find(free) ?? base;
+    written.push([left, left + wide, at]);
+    return [left, at];
+  }
+
   function write(text, [x, y], mark = "") {
     context.font = "600 12px system-ui, sans-serif";
-    context.textAlign = mark ? "left" : "center";
-    context.lineWidth = 3;
     if (mark) {
       context.beginPath();
       context.arc(x, y, 5, 0, 2 * Math.PI);
@@ -232,7 +241,8 @@ function sceneViewer(canvas, data, shown = () => true) {
       context.fill();
       context.stroke();
     }
-    const [left, base] = mark ? [x + 9, y - 7] : [x, y + 4];
+    const wide = context.measureText(text).width, [left, base] = placed(mark ? x + 9 : x - wide / 2, mark ? y - 7 : y + 4, wide);
+    context.textAlign = "left";
     Object.assign(context, { strokeStyle: colours.surface, fillStyle: colours.ink, lineWidth: 3 });
     context.strokeText(text, left, base); // readable on lines and faces
     context.fillText(text, left, base);

@@ -21,8 +21,17 @@ from model.progress import SILENT, Listener
 from model.rig import Rig
 from model.scene import Scene
 from planner.campaign.page import page, save_figures
-from planner.campaign.results import COUNTED, MEASURED, Results, findings, summary
-from planner.campaign.studies import FIGURE_9, STUDIES, batches, run_all
+from planner.campaign.studies import (
+    COUNTED,
+    FIGURE_9,
+    MEASURED,
+    STUDIES,
+    Results,
+    batches,
+    findings,
+    run_all,
+    summary,
+)
 from planner.campaign.trial import SHARES, Arm, Case, box_text, run_batch, with_box
 from planner.kernels.jit import planner_compilation
 from planner.parallel import Count, worker_pool

@@ -11,28 +11,26 @@ import numpy as np
 from model.pages.page import list_table, picture, section, table
 from model.pages.page import page as html_page
 from model.pose import Array
-from planner.campaign.results import (
-    COUNTED,
-    MEASURED,
-    NODES,
-    PLACES,
-    Change,
-    Results,
-    findings,
-    summary,
-)
 from planner.campaign.studies import (
     BOXES,
     COMPARISONS,
     COSTS,
+    COUNTED,
     FIGURE_9,
+    MEASURED,
     NEAREST_TO_THE_CLAIM,
+    NODES,
+    PLACES,
     READINGS,
     SAMPLERS,
     VARIANTS,
+    Change,
+    Results,
     all_readings,
     arms_of,
     figure_9_arm,
+    findings,
+    summary,
 )
 from planner.campaign.trial import OWN, SHARES, WIDE, Arm, Case
 

@@ -17,9 +17,8 @@ from model.kinematics import Cables, NoCable, cables_to, structure_matrix_of
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
-from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.feasibility import WrenchBox, capacity_margin, closure_margin
 from model.statics.gravity import weight_wrench
-from model.statics.wrench_closure import closure_margin
 from model.statics.wrench_sets import (
     checked_length,
     condition_number,
@@ -189,7 +188,7 @@ OF_THE_ROBOT: Mapping[str, Callable[[_Robots], Array]] = {
     "force_volume": _volume,
     "self_clearance": _own_clearance,
 }
-"""Name → what computes it. ``closure_margin`` [-] (`model.statics.wrench_closure.closure_margin`),
+"""Name → what computes it. ``closure_margin`` [-] (`model.statics.feasibility.closure_margin`),
 ``capacity_margin`` [N], ``condition_number`` [-], ``force_volume`` [N³], ``self_clearance`` [m]."""
 
 

@@ -119,7 +119,7 @@ def true_numbers(rig: Rig) -> dict[str, float]:
     }
     drums = enumerate((w.drum_mm_per_rev for w in truth.document.winches), start=1)
     found |= {f"drum_{i}_mm_per_rev": drum for i, drum in drums}
-    return {**found, "stiffness_n": truth.cable_stiffness}
+    return {**found, "stiffness_n": float(truth.cable_stiffness.mean())}
 
 
 def share_inside(intervals: Mapping[str, Interval], true: Mapping[str, float]) -> float:

@@ -16,10 +16,8 @@ from hypothesis import strategies as st
 
 from calibration.intrinsics.calibrate import fit_camera
 from calibration.statistics import EvenSample
-from calibration.targets.board import mirrored
-from calibration.targets.chessboards import Charuco, Chessboard
-from calibration.targets.circle_grid import CircleGrid
-from calibration.targets.tag_grid import TagGrid
+from calibration.targets.boards import Charuco, Chessboard, mirrored
+from calibration.targets.grids import CircleGrid, TagGrid
 from model.errors import BadInput
 from model.pose import Pose
 from tests.calibration.board_pictures import (

@@ -19,8 +19,7 @@ from calibration.intrinsics.quality import is_below, judge_camera
 from calibration.intrinsics.result import camera_result
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.targets.board import Seen
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard, Seen
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, sample_rays

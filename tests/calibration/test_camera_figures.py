@@ -18,7 +18,7 @@ from calibration.intrinsics.result import (
     uncertainty_figure,
     worst_picture,
 )
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard
 from tests.calibration.board_pictures import picture_of, poses_before_the_camera, with_noise
 from tests.calibration.test_lens_models import SIZE, TRUTH, views
 

@@ -17,9 +17,8 @@ from calibration.extrinsics.camera_pairs import (
     locate_by_pairs,
     require_oriented,
 )
-from calibration.targets.board import Seen
-from calibration.targets.chessboards import Chessboard
-from calibration.targets.tag_grid import TagGrid
+from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.grids import TagGrid
 from model.errors import BadInput
 from model.files.documents import PoseDocument
 from model.pose import Pose, matrix_from_rotation_vector

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.pictures import CaptureGuide
-from calibration.targets.board import Seen
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard, Seen
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)

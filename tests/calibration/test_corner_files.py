@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from calibration.intrinsics.calibrate import calibrate_from_views
-from calibration.targets.board import Seen, read_corners
+from calibration.targets.boards import Seen, read_corners
 from model.errors import BadInput
 from tests.calibration.test_lens_models import SIZE, views
 from tests.cli.program import call, one_message

@@ -26,10 +26,10 @@ from model.rig import Rig, Tag, load_rig
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
 from tests.calibration.exact_sights import sights_at
-from tracking.camera_check import change_of_inverse
 from tracking.camera_model import project_undistorted
 from tracking.detection.tags import tag_corners
 from tracking.pnp import moved
+from tracking.shared_errors import change_of_inverse
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

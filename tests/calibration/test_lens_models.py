@@ -25,8 +25,7 @@ from calibration.intrinsics.quality import (
     judge_camera,
     picture_grid,
 )
-from calibration.targets.board import Seen
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard, Seen
 from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument
@@ -35,7 +34,6 @@ from model.rig import Camera, Rig, load_rig
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
 from tests.cli.program import call, one_message
-from tracking.camera_check import CameraMoved
 from tracking.camera_model import (
     WIDEST,
     ideal_from_pixels,
@@ -45,6 +43,7 @@ from tracking.camera_model import (
     rays_of,
 )
 from tracking.measurement import PoseMeasurement
+from tracking.shared_errors import CameraMoved
 from tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -10,7 +10,7 @@ import pytest
 
 from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
 from calibration.intrinsics.quality import judge_camera
-from calibration.targets.chessboards import Charuco, Chessboard
+from calibration.targets.boards import Charuco, Chessboard
 from drivers.cameras.files import OneCamerasPictures, read_picture
 from tests.calibration.exif import turned_by_exif
 from tracking.detection.detector import TagDetector

@@ -11,7 +11,7 @@ import pytest
 from calibration.geometry.calibrate import fit_rig
 from calibration.geometry.fit import RigFitter
 from calibration.geometry.measurements import RigMeasurements, read_rig_data
-from calibration.geometry.model import DEFAULT_DEVIATIONS, Parameters
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig
 from calibration.geometry.result import rig_result
 from model.errors import BadInput

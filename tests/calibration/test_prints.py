@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.targets.board import Board
-from calibration.targets.chessboards import Charuco, Chessboard
-from calibration.targets.circle_grid import CircleGrid
+from calibration.targets.boards import Board, Charuco, Chessboard
+from calibration.targets.grids import CircleGrid, TagGrid
 from calibration.targets.printing import (
     MARGIN_MM,
     PAPERS,
@@ -23,7 +22,6 @@ from calibration.targets.printing import (
     sheets_of,
     tag_print,
 )
-from calibration.targets.tag_grid import TagGrid
 from model.errors import BadInput
 from tests.calibration.pages import discs_in, drawn, pages_in
 from tracking.detection.detector import TagDetector

@@ -13,7 +13,7 @@ from calibration.pictures import Pictures, pictures_in
 from calibration.procedures import calibrate_camera
 from calibration.result_files import load_result
 from calibration.results import Destination
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard
 from model.errors import BadInput
 from model.progress import Listener
 from tests.cli.test_calibrate_camera import pictures
@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_folder_becomes_a_result_file_and_a_report(folder: Path, tmp_path: Path) -> None:
     heard = Heard()
     to = Destination(tmp_path, on=ON)
-    made = calibrate_camera(folder, BOARD, name="front", to=to, listener=heard)
+    made = calibrate_camera(folder, BOARD, name="front", output=to, listener=heard)
     assert heard.totals == [("detecting the board", 6)]
     assert [path.name for path in made.files] == [
         "calibration_camera_front_2026-03-01.yaml",
@@ -66,7 +66,7 @@ def test_a_result_that_exists_is_refused_before_any_picture_is_read(tmp_path: Pa
     (tmp_path / "calibration_camera_front_2026-03-01.yaml").write_text("mine")
     with pytest.raises(BadInput, match="exists already"):
         calibrate_camera(
-            Pictures(_unread(), 1), BOARD, name="front", to=Destination(tmp_path, on=ON)
+            Pictures(_unread(), 1), BOARD, name="front", output=Destination(tmp_path, on=ON)
         )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.geometry.model import DEFAULT_DEVIATIONS, Parameters
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.pose_selection import Wish, _in_order, _most_telling, chosen_poses
 from model.clearance import ClearanceModel
 from model.errors import NoSolution

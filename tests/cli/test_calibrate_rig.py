@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.geometry.model import DEFAULT_DEVIATIONS
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS
 from calibration.result_files import load_result
 from cdpr.cli.calibrate import rig as rig_verb
 from model.kinematics import poses_near
@@ -195,9 +195,11 @@ def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
     """The options have units of their own, so the defaults are written there once more."""
     options = inspect.signature(rig_verb.rig).parameters
     for group, deviation in DEFAULT_DEVIATIONS.items():
-        share = group in ("drum_scale", "stiffness")
-        name, unit = (f"{group}_percent", 1e2) if share else (f"{group}_mm", 1e3)
-        assert options[name].default == pytest.approx(deviation * unit), group
+        percent = group in ("drum_scale", "stiffness")
+        unit, scale = ("percent", 1e2) if percent else ("mm", 1e3)
+        if group == "swivel_zeros":
+            unit, scale = "deg", float(np.degrees(1.0))
+        assert options[f"{group}_{unit}"].default == pytest.approx(deviation * scale), group
 
 
 def test_a_run_with_too_few_rests_is_told_so(finished_run: Path) -> None:

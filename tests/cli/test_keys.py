@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 from cdpr.cli.operate import monitor
 from cdpr.cli.operate.jog import JogKeys
-from cdpr.cli.operate.keys import NAMES, Keys, names_of
-from cdpr.cli.operate.supervision import SignalSupervisor
+from cdpr.cli.operate.supervision import NAMES, Keys, SignalSupervisor, names_of
 from executor.hold_to_run.line import JogProver
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import jog_session

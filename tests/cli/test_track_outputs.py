@@ -19,8 +19,8 @@ from model.rig import load_rig
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 from tracking.measurement import NoPose
-from tracking.overlay import USED, drawn_over
 from tracking.pose_log import CLEARANCE_COLUMNS, POSE_COLUMNS
+from tracking.track import USED, drawn_over
 from tracking.track import track as tracked
 from tracking.tracker import Tracker
 

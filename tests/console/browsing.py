@@ -210,4 +210,4 @@ def visit(
     yield found
     context.close()
     unexpected = [text for text in found.errors if "WebSocket" not in text]
-    assert unexpected == []
+    assert unexpected == [], unexpected

@@ -32,6 +32,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from cdpr.console.view import scene_of
 from executor.report.scene import frame_surface, platform_surface
 from model.pages.page import resource
 from model.pages.scene import (
@@ -475,7 +476,8 @@ def application(fake: Fake) -> Starlette:
         return FileResponse(path) if inside else PlainTextResponse("no such file", 404)
 
     async def scene(request: Request) -> Response:
-        return JSONResponse({k: v for k, v in scene_data(figure()).items() if k != "moments"})
+        drawn = {k: v for k, v in scene_data(figure()).items() if k != "moments"}
+        return JSONResponse({**scene_of(RIG, None), **drawn})
 
     async def files(request: Request) -> Response:
         return JSONResponse(

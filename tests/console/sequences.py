@@ -36,8 +36,10 @@ from model.scene import load_scene
 from tests.cli.plans import RIG
 
 SCENE = RIG.parent / "environment_1.yaml"
-#: From the jog speed to rest, [s]; and what two processes may be apart, [cycles].
-RAMP, CYCLES_LATE = 0.35, 3
+#: Of a jog, [m/s].
+SPEED = 0.020
+#: What two processes may be apart, [cycles].
+CYCLES_LATE = 3
 #: A page says that it holds every so many cycles of 10 ms.
 SAID_EVERY = 5
 DIRECTIONS = [[*row] for sign in (1.0, -1.0) for row in (sign * np.eye(3)).tolist()]
@@ -49,12 +51,12 @@ class PageAtHand:
 
     number: int
     hold: int
+    said: int = 0  # the highest number that it named
     motion: dict[str, object] = field(default_factory=dict)
     step: float | None = None
     speed: float = 20.0
     pressed: bool = False
     silent: int = 0
-    had_control: bool = False
     is_over: bool = False
     over: list[str] = field(default_factory=list)
 
@@ -100,10 +102,13 @@ class Judge:
         """When a press was truly held last, [s]."""
         self.heard_of: dict[tuple[int, bool], float] | None = None
         """The same of each cable, from 1, and whether it was paid out; None of the platform."""
+        limits = self._rig.motion
+        # To rest, [s], from the jog speed and still speeding up at the limit of acceleration.
+        self._ramp = SPEED / limits.acceleration + 2.0 * limits.acceleration / limits.jerk
         cycle = self._rig.document.bus.cycle_ms / 1000.0
         # The anchor of a cable moves with the platform; nothing is wound in faster than it moves.
         self._step = [
-            1.5 * 0.020 * cycle * winch.counts_per_metre + 2 for winch in self._rig.winches
+            1.5 * SPEED * cycle * winch.counts_per_metre + 2 for winch in self._rig.winches
         ]
 
     def begin(self) -> None:
@@ -127,7 +132,7 @@ class Judge:
         since = record.at - self.heard
         if ahead.any():
             self._figures.moving_cycles += 1
-            if since > TIMEOUT + RAMP + late:
+            if since > TIMEOUT + self._ramp + late:
                 self._say(record, f"moves though nothing was held for {since:.3f} s")
             self._judge_cables(record, ahead, late)
             if np.any(np.abs(ahead) > self._step):
@@ -146,7 +151,7 @@ class Judge:
         for cable in np.flatnonzero(ahead):
             pays_out = bool(ahead[cable] * self._rig.winches[cable].counts_per_metre > 0.0)
             since = record.at - self.heard_of.get((int(cable) + 1, pays_out), float("-inf"))
-            if since > TIMEOUT + RAMP + late:
+            if since > TIMEOUT + self._ramp + late:
                 sense = "paid out" if pays_out else "wound in"
                 self._say(record, f"cable {cable + 1} is {sense}, held {since:.3f} s ago")
         most = float(np.max(self._rig.tensions_by(record.torques)))
@@ -214,10 +219,10 @@ class Sequences:
     def _session(self) -> None:
         rig, on_cycle = self.console.rig, self._on_cycle
         if self._cables:
-            cable_session(rig, speed=0.020, realtime=False, on_cycle=on_cycle)
+            cable_session(rig, speed=SPEED, realtime=False, on_cycle=on_cycle)
         else:
             scene = load_scene(SCENE)
-            jog_session(rig, scene, speed=0.020, realtime=False, on_cycle=on_cycle)
+            jog_session(rig, scene, speed=SPEED, realtime=False, on_cycle=on_cycle)
 
     def _start(self, verb: str, _arguments: object) -> None:
         self._started.append(verb)
@@ -247,9 +252,9 @@ class Sequences:
         control = self.console.control
         mine = control.holder == page.number
         if not mine or (self._cables and not control.is_service):
-            page.is_over |= page.had_control or mine  # who lost control has to press again
+            page.is_over = True  # it has to be pressed again
         elif not page.is_over:
-            page.had_control, self._judge.heard = True, self._now
+            self._judge.heard = self._now
             if self._judge.heard_of is not None:
                 cable, sense = page.motion["cable"], page.motion["sense"]
                 assert isinstance(cable, int)
@@ -259,6 +264,7 @@ class Sequences:
     def _held(self, page: PageAtHand, text: str) -> None:
         message = parse_message(text)
         assert isinstance(message, Held)
+        page.said = max(page.said, message.hold)
         self.console.held(page.number, message)
 
     def _command(self, page: PageAtHand, command: str, **values: object) -> str:
@@ -303,7 +309,7 @@ class Sequences:
         page.step = self._random.choice((None, None, None, 0.1, 1.0, 10.0))
         page.speed = self._random.choice((1.0, 5.0, 20.0, 900.0))
         page.pressed, page.silent = True, 0
-        page.had_control = page.is_over = False
+        page.is_over = False
         self._hold(page)
 
     def _let_go(self, page: PageAtHand) -> None:
@@ -313,6 +319,7 @@ class Sequences:
         page.pressed = False
         message = parse_message(json.dumps({"kind": "let_go", "hold": page.hold}))
         assert isinstance(message, LetGo)
+        page.said = max(page.said, message.hold)
         self.console.let_go(page.number, message)
 
     def _release(self, page: PageAtHand) -> None:
@@ -346,7 +353,7 @@ class Sequences:
         for text in self._random.sample(over, min(3, len(over))):
             message = json.loads(text)
             # A higher number would be a new press: of this page such words are over by now.
-            message["hold"] = min(message["hold"], page.hold - page.pressed)
+            message["hold"] = min(message["hold"], page.said - page.pressed)
             if message["hold"] > 0:
                 self._held(page, json.dumps(message))
 
@@ -366,7 +373,7 @@ class Sequences:
     def _change_mode(self, page: PageAtHand, command: str) -> None:
         if not self._command(page, command):
             self._release(page)
-            page.is_over |= page.pressed and page.had_control
+            page.is_over |= page.pressed
 
     def _feed(self, page: PageAtHand) -> None:
         self._command(page, "speed", percent=self._random.choice((1, 50, 100)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from cdpr.console.commands import PageControl
 
@@ -22,25 +22,28 @@ class ControlMachine(RuleBasedStateMachine):
         self.begun_in: dict[int, int] = {}
         self.begun: dict[int, tuple[int, int]] = {}
         self.ended: set[int] = set()
+        self.named: dict[int, int] = {}
+        self.refused: dict[int, int] = {}  # the highest number of a page's presses that were
         self.newest = 0
 
     @rule(jump=st.integers(-50, 200))
     def clock(self, jump: int) -> None:
         self.now += jump
 
+    @precondition(lambda self: len(self.pages) < 2)
     @rule()
     def join(self) -> None:
         page = self.control.join(f"page {len(self.pages)}")
         assert page not in self.pages
         self.pages.add(page)
 
-    @rule(number=st.integers(0, 5))
+    @rule(number=st.integers(0, 1))
     def leave(self, number: int) -> None:
         if page := self._page(number):
             self._end(self.control.leave(page))
             self.pages.discard(page)
 
-    @rule(number=st.integers(0, 5), moving=st.booleans(), force=st.booleans())
+    @rule(number=st.integers(0, 1), moving=st.booleans(), force=st.booleans())
     def take(self, number: int, moving: bool, force: bool) -> None:
         if page := self._page(number):
             before = self.control.holder
@@ -53,7 +56,7 @@ class ControlMachine(RuleBasedStateMachine):
                 if before is not None and before != page:
                     self._end_all_of(before)
 
-    @rule(number=st.integers(0, 5))
+    @rule(number=st.integers(0, 1))
     def give(self, number: int) -> None:
         if page := self._page(number):
             self._end(self.control.give(page))
@@ -64,12 +67,15 @@ class ControlMachine(RuleBasedStateMachine):
         """The session ended, and another one may have begun."""
         self.motion = motion and self.motion + motion
 
-    @rule(number=st.integers(0, 5), hold=st.integers(1, 5))
-    def hold(self, number: int, hold: int) -> None:
+    @rule(number=st.integers(0, 1), ahead=st.integers(-2, 2))
+    def hold(self, number: int, ahead: int) -> None:
         if page := self._page(number):
+            hold = self._hold_of(page, ahead)
             press = self.control.hold(page, hold, self.motion)
             if press is None:
+                self.refused[page] = max(hold, self.refused.get(page, 0))
                 return
+            assert hold > self.refused.get(page, 0), "what was refused has to be pressed again"
             assert self.motion, "there is something to move"
             begun_in = self.begun_in.setdefault(press, self.motion)
             assert begun_in == self.motion, "a press is over with its session"
@@ -79,9 +85,10 @@ class ControlMachine(RuleBasedStateMachine):
             assert press >= self.newest, "numbers rise"
             self.newest = press
 
-    @rule(number=st.integers(0, 5), hold=st.integers(1, 5))
-    def let_go(self, number: int, hold: int) -> None:
+    @rule(number=st.integers(0, 1), ahead=st.integers(-2, 1))
+    def let_go(self, number: int, ahead: int) -> None:
         if page := self._page(number):
+            hold = self._hold_of(page, ahead)
             self._end(self.control.let_go(page, hold))
             assert self.control.hold(page, hold, 1) is None
 
@@ -91,6 +98,11 @@ class ControlMachine(RuleBasedStateMachine):
 
     def _page(self, number: int) -> int | None:
         return sorted(self.pages)[number % len(self.pages)] if self.pages else None
+
+    def _hold_of(self, page: int, ahead: int) -> int:
+        """A number near the last one that this page named."""
+        self.named[page] = max(1, self.named.get(page, 0) + ahead)
+        return self.named[page]
 
     def _end(self, press: int | None) -> None:
         if press is not None:
@@ -111,6 +123,34 @@ def test_a_press_that_was_let_go_before_it_arrived_is_over(hold: int) -> None:
     control.let_go(page, hold)
     assert control.hold(page, hold, 1) is None
     assert control.hold(page, hold + 1, 1) is not None
+
+
+@given(st.integers(1, 1000), st.integers(0, 1000))
+def test_a_press_that_began_without_control_is_over(hold: int, earlier: int) -> None:
+    """Nor does one before it count: words of old presses may be sent again."""
+    control = PageControl(lambda: 1)
+    page = control.join("a")
+    assert control.hold(page, hold, 1) is None
+    control.take(page, moving=False)
+    assert control.hold(page, hold, 1) is None
+    assert control.hold(page, max(hold - earlier, 1), 1) is None
+    assert control.hold(page, hold + 1, 1) is not None
+
+
+def test_only_who_has_control_operates_and_service_mode_is_asked_for() -> None:
+    control = PageControl(lambda: 1)
+    first, second = control.join("a"), control.join("b")
+    assert first != second
+    assert [control.mode(page) for page in (first, second)] == ["observe", "observe"]
+    control.set_service(first, True)
+    assert control.mode(first) == "observe", "who has no control enters nothing"
+    control.take(first, moving=False)
+    assert [control.mode(page) for page in (first, second)] == ["operate", "observe"]
+    control.set_service(first, True)
+    assert [control.mode(page) for page in (first, second)] == ["service", "observe"]
+    control.give(first)
+    control.take(second, moving=False)
+    assert control.mode(second) == "operate", "service mode ends with control"
 
 
 @pytest.mark.parametrize("moving", [False, True])

@@ -125,13 +125,14 @@ def begin_to_pick(found: Visit) -> dict[str, Any]:
 def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None:
     """The goal is drawn, by the projection of the scene, under the pointer that picked it."""
     box = begin_to_pick(desk)
+    expect(desk.page.locator("#pick")).to_be_visible()  # the list stays: the scene is beside it
     desk.page.locator("#scene-canvas").focus()
     for _ in range(turned):
         desk.page.keyboard.press("ArrowLeft")
         desk.page.keyboard.press("ArrowUp")
-    for height in (300, 700):
+    for height in (300, 500):
         desk.page.locator("#pick-height").fill(str(height))
-        x, y = box["x"] + 0.55 * box["width"], box["y"] + 0.5 * box["height"]
+        x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.45 * box["height"]
         desk.page.mouse.click(x, y)
         expect(desk.page.locator("#pick-text")).to_contain_text(f", {height} mm")
         # The ring about the goal.
@@ -140,22 +141,33 @@ def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None
     expect(desk.page.locator("#pick-bar")).to_be_hidden()
     (pose,) = desk.fake.wait(desk.page, lambda f: bool(f["poses"]))["poses"]
     assert pose["name"] == "goal 1"
-    assert pose["position_mm"][2] == 700.0
+    assert pose["position_mm"][2] == 500.0
     expect(desk.page.locator("#poses li")).to_have_count(1)
 
 
 def test_turning_the_view_picks_nothing_and_cancel_keeps_nothing(desk: Visit) -> None:
     box = begin_to_pick(desk)
-    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+    x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.45 * box["height"]
     desk.page.mouse.move(x, y)
     desk.page.mouse.down()
     desk.page.mouse.move(x + 60, y, steps=4)
     desk.page.mouse.up()
-    expect(desk.page.locator("#pick-text")).to_have_text("Click where the platform is to go.")
+    expect(desk.page.locator("#pick-text")).to_have_text(
+        "Click on the grid where the platform is to go."
+    )
     desk.page.locator("#pick-keep").click()
     expect(desk.page.locator("#notice")).to_have_text("Click in the scene first.")
     desk.page.locator("#pick-cancel").click()
     expect(desk.page.locator("#pick-bar")).to_be_hidden()
+    assert desk.fake.ask()["poses"] == []
+
+
+def test_a_place_outside_the_workspace_is_told_before_it_is_kept(desk: Visit) -> None:
+    box = begin_to_pick(desk)
+    desk.page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 5)
+    expect(desk.page.locator("#pick-text")).to_contain_text("outside the workspace")
+    desk.page.locator("#pick-keep").click()
+    expect(desk.page.locator("#notice")).to_contain_text("click on the grid")
     assert desk.fake.ask()["poses"] == []
 
 

@@ -239,6 +239,49 @@ def test_doctor_finds_nothing_wrong_with_the_right_profile(rig: Rig, name: str) 
     assert found.good, [(row.object, row.found) for row in found.rows if row.verdict == "wrong"]
 
 
+def with_scale(objects: dict[int, tuple[int, int]]) -> ScriptedBus:
+    """Eight drives with these quotients of sub-index 1 and 2; see CiA 402-2, factor group."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        for index, values in objects.items():
+            for sub, value in enumerate(values, start=1):
+                drive.objects[index, sub] = drive.objects[0x1006, 0]  # another UNSIGNED32
+                drive.values[index, sub] = value
+    return bus
+
+
+TURN = 131072
+"""Counts of a motor turn by the rig file."""
+
+
+@pytest.mark.parametrize(
+    ("objects", "verdict", "text"),
+    [
+        ({}, "ok", "absent"),
+        ({0x608F: (TURN, 1)}, "ok", f"{TURN} by 608Fh"),
+        ({0x6092: (10 * TURN, 1), 0x6091: (10, 1)}, "ok", f"{TURN} by 6092h/6091h"),
+        ({0x6092: (3 * TURN, 3)}, "ok", f"{TURN} by 6092h/6091h"),
+        (
+            {0x6092: (TURN, 1), 0x608F: (1 << 22, 1)},
+            "ok",
+            f"{TURN} by 6092h/6091h, 4194304 by 608Fh",
+        ),
+        ({0x6092: (3600, 1), 0x608F: (2000, 1)}, "remark", "3600 by 6092h/6091h, 2000 by 608Fh"),
+        ({0x608F: (TURN + 1, 1)}, "remark", f"{TURN + 1} by 608Fh"),
+        ({0x608F: (TURN, 0)}, "ok", "absent"),
+    ],
+)
+def test_doctor_holds_the_drives_scale_against_the_rig_s(
+    rig: Rig, objects: dict[int, tuple[int, int]], verdict: str, text: str
+) -> None:
+    assert {winch.counts_per_rev for winch in rig.document.winches} == {TURN}
+    found = examined(rig, with_scale(objects))
+    (row,) = (row for row in found.rows if row.object.startswith("6092h"))
+    assert (row.verdict, row.found) == (verdict, {text: list(range(1, 9))})
+    assert found.good
+    assert bool(row.change) == (verdict == "remark")
+
+
 def test_doctor_reads_the_mode_that_a_set_up_waits_for(rig: Rig) -> None:
     bus = eight_of("cia402")
     bus.drives[5].aborts[0x6061, 0] = 0x06020000

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from executor.recording.clearance import ClearanceTable
-from executor.recording.cycle_table import CycleTable
 from executor.recording.mcap import write_mcap
-from executor.recording.pose_table import PoseTable, fused_table
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.recording.summary import RunContext, summarize
+from executor.recording.tables import CycleTable, PoseTable, fused_table
 from model.clearance import ClearanceModel
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument

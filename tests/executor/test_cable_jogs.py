@@ -303,7 +303,7 @@ def test_a_press_stays_within_the_positions_of_its_drive(
     limits = CableLimits(60.0, SPEED, 0.050, tuple([(low, high)] * 8))
     positions = [0] * 8
     positions[cable] = here
-    held = PressState(1, cable=cable + 1, pays_out=out, step=step)
+    held = PressState(1, 1.0, False, cable + 1, out, step)
     way = limits.way(robot, positions, held)
     assert way >= 0.0 if out else way <= 0.0
     assert abs(way) <= (step or 0.050)

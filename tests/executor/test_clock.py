@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.realtime import clock
-from executor.realtime.clock import RealClock, SimulatedClock
+from executor.realtime import scheduling
+from executor.realtime.scheduling import RealClock, SimulatedClock
 
 CYCLE = 0.01
 CYCLE_NS = 10_000_000
@@ -38,8 +38,8 @@ class _Time:
 @pytest.fixture
 def time(monkeypatch: pytest.MonkeyPatch) -> _Time:
     hand_moved = _Time()
-    monkeypatch.setattr(clock, "time", hand_moved)
-    monkeypatch.setattr(clock, "sleep_until", hand_moved.sleep_until)
+    monkeypatch.setattr(scheduling, "time", hand_moved)
+    monkeypatch.setattr(scheduling, "sleep_until", hand_moved.sleep_until)
     return hand_moved
 
 
@@ -86,8 +86,8 @@ def test_after_a_late_cycle_the_next_is_a_whole_cycle_away(time, late_cycles):
 def test_no_two_cycles_are_closer_than_nine_tenths(works):
     time, real = _Time(), RealClock(CYCLE)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(clock, "time", time)
-        patch.setattr(clock, "sleep_until", time.sleep_until)
+        patch.setattr(scheduling, "time", time)
+        patch.setattr(scheduling, "sleep_until", time.sleep_until)
         begins = []
         for work in works:
             assert real.next_cycle() >= 0.0
@@ -110,7 +110,7 @@ def test_the_time_of_a_cycle_is_when_it_truly_began(time):
 
 
 def test_a_moment_that_is_over_is_not_slept_for():
-    clock.sleep_until(1)
+    scheduling.sleep_until(1)
 
 
 def test_time_left_ends_before_the_cycle_does(time):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.control.feed import Feed, targets_at
+from executor.control.cycle import Feed, targets_at
 from executor.trajectory.time_scaling import speed_change
 from model.rig import Motion
 from tests.executor.routes import GACHON, HALL

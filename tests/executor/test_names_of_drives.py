@@ -13,7 +13,7 @@ from drivers.cia402.pdo import EMCY_BASE
 from drivers.drive_group import WHOLE_BUS, GroupState
 from executor.control.cycle import Cycle
 from executor.control.sync_master import SyncMaster
-from executor.realtime.clock import SimulatedClock
+from executor.realtime.scheduling import SimulatedClock
 from executor.safety.gate import Purpose
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.rig import load_rig

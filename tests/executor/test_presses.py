@@ -16,6 +16,7 @@ from executor.hold_to_run.presses import (
     PressBoard,
     PressReader,
     PressRule,
+    PressState,
 )
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -45,6 +46,55 @@ def board(time: Time) -> PressBoard:
 
 def hold(board: PressBoard, number: int, percent: int = 100) -> bool:
     return board.hold(number, UP, in_platform=False, step=None, percent=percent)
+
+
+def test_a_press_lasts_150_ms_without_a_word() -> None:
+    """The number of the safety page, not of the code."""
+    assert PressRule().held(1, heard=10.0, now=10.150 - 1e-9)
+    assert not PressRule().held(1, heard=10.0, now=10.151)
+    assert PressRule().held(1, heard=0.0, now=TIMEOUT), "up to the end of its time"
+
+
+def test_there_is_no_press_zero() -> None:
+    assert not PressRule().held(0, heard=10.0, now=10.0)
+
+
+def test_a_new_board_holds_nothing_and_ends_nothing(board: PressBoard, time: Time) -> None:
+    said = PressReader(board.memory).read(time.now)
+    assert said == PressState(0, 1.0, ends=False, cable=0, pays_out=False, step=None)
+    assert board.last_heard == time.now
+    assert board.held() is None
+
+
+def test_a_press_that_comes_after_its_time_is_over_for_every_reader(
+    board: PressBoard, time: Time
+) -> None:
+    """Also for one whose clock lags: what is written says that nothing is held."""
+    hold(board, 1)
+    time.now += 2.0 * TIMEOUT
+    assert not hold(board, 1)
+    assert PressReader(board.memory).read(time.now - 2.0 * TIMEOUT).press == 0
+
+
+def test_letting_go_of_an_earlier_press_leaves_the_newest_held(board: PressBoard) -> None:
+    hold(board, 1)
+    hold(board, 2)
+    board.let_go(1)
+    assert PressReader(board.memory).read(10.0).press == 2
+    board.let_go(3)
+    assert PressReader(board.memory).read(10.0).press == 0
+
+
+@pytest.mark.parametrize("cable", [0, 1, 8, 9])
+def test_cables_are_numbered_from_one(time: Time, cable: int) -> None:
+    board = PressBoard(time, cables=8)
+    if 1 <= cable <= 8:
+        assert board.hold_cable(1, cable, pays_out=True, step=None, percent=100)
+        assert PressReader(board.memory).read(time.now).cable == cable
+    else:
+        with pytest.raises(ValueError, match=f"no cable {cable}"):
+            board.hold_cable(1, cable, pays_out=True, step=None, percent=100)
+    board.close()
 
 
 @given(st.lists(st.tuples(NUMBERS, TIMES, TIMES), max_size=30))

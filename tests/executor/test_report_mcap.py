@@ -15,8 +15,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from executor.recording.mcap import write_mcap
 from executor.recording.mcap_channels import OWN, TYPED
-from executor.recording.pose_table import fused_table
 from executor.recording.run_folder import RunFolder
+from executor.recording.tables import fused_table
 from model.errors import Fault
 from tests.executor import fake_run
 

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from executor.recording.clearance import no_clearance
-from executor.recording.cycle_table import CycleTable
-from executor.recording.pose_table import no_poses
 from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.tables import CycleTable, no_poses
 from executor.report import build_report
 from model.errors import BadInput
 from model.files.rig_file import PulleysDocument

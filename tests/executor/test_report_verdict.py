@@ -10,11 +10,10 @@ import pytest
 
 from executor.evaluation import _context_of
 from executor.recording.clearance import ClearanceTable, no_clearance
-from executor.recording.cycle_table import CycleTable
-from executor.recording.pose_table import no_poses
-from executor.recording.run_course import RunCourse
+from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.summary import summarize
+from executor.recording.tables import CycleTable, no_poses
 from executor.recording.verdict import distances, following, replies, tensions
 from executor.report.tiles import chips
 from tests.executor import fake_run

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from executor.recording.clearance import ClearanceTable, no_clearance
-from executor.recording.cycle_table import CycleTable, quaternions_of
-from executor.recording.pose_table import PoseTable, no_poses
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
+from executor.recording.tables import CycleTable, PoseTable, no_poses, quaternions_of
 from model.errors import BadInput
 from tests.executor import fake_run
 from tracking.pose_log import POSE_COLUMNS

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from executor.recording.run_course import RunCourse
+from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunFolder
 from executor.report.run_data import read_run
 from model.errors import BadInput, InvalidFile

@@ -100,6 +100,19 @@ def test_reading_the_ready_files_is_light() -> None:
     assert loaded_by(code) == set()
 
 
+@pytest.mark.parametrize("module", ["operate.requests", "start"])
+def test_verbs_that_answer_at_once_are_light(module: str) -> None:
+    """`cdpr stop` above all."""
+    assert loaded_by(f"import cdpr.cli.{module}") == set()
+
+
+@pytest.mark.parametrize(
+    "module", ["cdpr.cli.check", "cdpr.cli.explain", "executor.trajectory.prepare"]
+)
+def test_what_neither_searches_nor_measures_nor_sends_loads_no_library_for_it(module: str) -> None:
+    assert not loaded_by(f"import {module}") & {"numba", "scipy", "cv2", "can"}
+
+
 def test_the_real_time_process_of_a_real_bus_loads_no_compiler_and_no_camera() -> None:
     """What it loads it loads before the drives are set up, while the operator waits."""
     code = "import executor.realtime.child, executor.control.path_job, executor.drives"

@@ -23,7 +23,18 @@ def with_home_counts() -> Rig:
     return rig_of(data)
 
 
-RIGS = {"paper": with_home_counts(), "ten cables": rig_of(hall_data())}
+def with_other_cables() -> Rig:
+    data = paper_data()
+    for number, winch in enumerate(data["winches"][1:], start=1):
+        winch["cable_stiffness_n"] = 5000.0 * number
+    return rig_of(data)
+
+
+RIGS = {
+    "paper": with_home_counts(),
+    "ten cables": rig_of(hall_data()),
+    "cables that differ": with_other_cables(),
+}
 MAPS = {name: WinchMap(rig) for name, rig in RIGS.items()}
 each = pytest.mark.parametrize("name", RIGS)
 
@@ -52,6 +63,11 @@ def test_lengths_and_tensions_come_back_from_rounded_counts(name: str, data: st.
     half = 0.51 * (1.0 + rig.max_tension / rig.cable_stiffness)
     half_count = half / np.abs([w.counts_per_metre for w in rig.winches])
     assert np.all(np.abs(back - lengths) <= half_count)
+
+
+def test_a_winch_may_have_a_cable_of_its_own_stiffness() -> None:
+    found, of_all = RIGS["cables that differ"].cable_stiffness, RIGS["paper"].cable_stiffness
+    assert found.tolist() == [of_all[0], *(5000.0 * np.arange(1, len(found)))]
 
 
 @each

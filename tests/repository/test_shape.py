@@ -22,7 +22,6 @@ CIRCLES: list[list[str]] = []
 INNER_IMPORTS: dict[str, set[str]] = {
     "a heavy library is loaded by the few calls that need it": {
         "cdpr/cli/app.py",
-        "cdpr/cli/operate/monitor.py",
         "cdpr/console/watch.py",
         "executor/recording/run_folder.py",
         "executor/report/figures.py",
@@ -32,7 +31,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "model/plan.py",
         "model/rig.py",
         "model/statics/tension_distribution.py",
-        "model/statics/wrench_closure.py",
+        "model/statics/feasibility.py",
         "planner/campaign/page.py",
         "planner/kernels/gjk.py",
         "planner/workspace/files.py",
@@ -48,7 +47,6 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "simulation/factory.py",
     },
     "an extra may not be installed": {
-        "cdpr/cli/operate/console.py",
         "drivers/odrive/messages.py",
         "planner/parallel.py",
         "tracking/detection/detector.py",
@@ -59,7 +57,6 @@ INNER_IMPORTS: dict[str, set[str]] = {
     },
     "an installation is examined of which a part may be missing": {"executor/doctor.py"},
     "the real-time process and the start of a run must not wait for it": {
-        "cdpr/cli/options.py",
         "executor/report/__init__.py",
         "executor/runner.py",
     },

@@ -18,8 +18,8 @@ from drivers.factory import make_drive_group
 from executor.cameras.multi_camera import CameraRecords
 from executor.control.path_runs import Outcome, run_in_process
 from executor.evaluation import evaluate, write_end
+from executor.recording.record_files import RunCourse
 from executor.recording.recorder import FrameTrigger, Recorder
-from executor.recording.run_course import RunCourse
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.status import RunStatus
 from executor.supervision import LocalRequests

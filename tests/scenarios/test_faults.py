@@ -14,7 +14,7 @@ import pytest
 
 from drivers.cia402.state_machine import DriveState
 from executor import evaluation as run_module
-from executor.realtime.clock import SimulatedClock
+from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.state_machine import State
 from executor.trajectory.prepare import PreparedRun, prepare

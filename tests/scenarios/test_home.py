@@ -17,7 +17,7 @@ from drivers.can_errors import BusDown
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup
 from drivers.factory import make_drive_group, read_drives
-from executor.cameras.static_pose import static_pose
+from executor.cameras.client import static_pose
 from executor.control.preconditions import counted_here, require_below, with_reduced_limits
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
 from executor.control.winch_loop import LawMotion, WinchesHere
@@ -26,8 +26,8 @@ from executor.drives import current_pose
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
 from executor.jogging import straight_way
-from executor.realtime.clock import SimulatedClock
 from executor.realtime.job import ReadyDrives
+from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests

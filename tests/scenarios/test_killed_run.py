@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from drivers.can_bus import BusSettings
 from executor.evaluation import evaluate_cut_short
 from executor.interlock.fault_latch import FaultLatch
+from executor.recording.record_files import RunCourse
 from executor.recording.resume import run_end
-from executor.recording.run_course import RunCourse
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.remote.client import ask_all
 from executor.remote.command_socket import find_runs
@@ -207,7 +207,7 @@ def test_the_end_of_a_run_has_room_on_a_full_disk(
     def full(path: Path, _text: str) -> None:
         raise BadInput("the file cannot be written", where=str(path))
 
-    monkeypatch.setattr("executor.recording.run_course.write_atomic", full)
+    monkeypatch.setattr("executor.recording.record_files.write_atomic", full)
     course = replace(folder.course(), final_state="latched", cause="Säule ✗ " * 1000, cycles=5)
     folder.write_end_of_course(course)
     assert (folder.path / "run.json").stat().st_size == size

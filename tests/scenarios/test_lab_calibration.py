@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.targets.chessboards import Chessboard
+from calibration.targets.boards import Chessboard
 from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, picture_of, with_noise
 from tests.calibration.pages import drawn, pages_in

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.cia402.state_machine import DriveState
 from executor.control.path_runs import Outcome
-from executor.realtime.clock import SimulatedClock
+from executor.realtime.scheduling import SimulatedClock
 from executor.state_machine import State
 from executor.trajectory.prepare import PreparedRun
 from simulation.drives.cia402_rig import SimulatedCia402Rig

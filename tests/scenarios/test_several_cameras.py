@@ -21,7 +21,7 @@ from executor.cameras import client as camera_sight
 from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
 from executor.cameras.sources import choose_cameras
-from executor.realtime.clock import SimulatedClock
+from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
 from model.errors import BadInput
 from model.plan import save_plan

@@ -15,7 +15,7 @@ from drivers.factory import make_drive_group, read_drives
 from executor.control.preconditions import set_up_here
 from executor.control.standstill import FaultReset, Release, Standstill
 from executor.control.sync_master import SyncMaster
-from executor.realtime.clock import SimulatedClock
+from executor.realtime.scheduling import SimulatedClock
 from executor.state_machine import CycleRecord, State
 from executor.supervision import OperatorRequests
 from model.errors import CdprError, Refused, StoppedByOperator

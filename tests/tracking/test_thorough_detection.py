@@ -9,7 +9,7 @@ import pytest
 from tests.tracking.hard_pictures import Condition, HardPrinter
 from tests.tracking.tag_pictures import FAMILY
 from tracking.camera_model import Region
-from tracking.detection.detector import TagDetector
+from tracking.detection.detector import TagDetector, is_blank
 from tracking.detection.tags import CORNER_SIGNS, TagDecoder, carries_tag, official_modules
 
 HARD = {
@@ -57,6 +57,36 @@ def test_a_region_is_searched_thoroughly_too(printer: HardPrinter, detector: Tag
     region = Region(40, 20, 280, 220)
     (found,) = detector.detect(picture.image, region, thorough=True)
     assert np.abs(found.corners - picture.corners).max() < 3.0
+
+
+def test_no_tag_that_can_be_read_is_in_a_blank_picture(
+    printer: HardPrinter, detector: TagDetector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A blank picture is not searched: no tag that a search would find may look so."""
+    rng, blank = np.random.default_rng(6), 0
+    for _ in range(60):
+        condition = Condition(
+            side_px=rng.uniform(11.0, 60.0),
+            tilt=rng.uniform(0.0, 1.2),
+            motion_px=rng.uniform(0.0, 8.0),
+            blur_px=rng.uniform(0.0, 3.0),
+            contrast=np.exp(rng.uniform(np.log(4.0), np.log(200.0))),
+            noise=rng.uniform(0.0, 12.0),
+        )
+        picture = printer.picture(condition, rng)
+        if is_blank(picture.image):
+            blank += 1
+            with monkeypatch.context() as context:
+                context.setattr("tracking.detection.detector.is_blank", lambda _image: False)
+                assert detector.detect(picture.image, thorough=True) == [], condition
+    assert blank > 10
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.5, 16.0])
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+def test_a_wall_is_blank_whatever_its_light(noise: float, slope: float) -> None:
+    grey = 60.0 + slope * np.arange(640) + np.random.default_rng(3).normal(0.0, noise, (480, 640))
+    assert is_blank(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
 
 
 def square_picture(modules: np.ndarray) -> np.ndarray:

@@ -20,9 +20,9 @@ from model.pose import (
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
-from tracking.camera_check import CameraMoved
 from tracking.estimator import TrackerSettings
 from tracking.measurement import NoPose, PoseMeasurement
+from tracking.shared_errors import CameraMoved
 from tracking.tracker import Tracker
 
 

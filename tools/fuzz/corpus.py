@@ -97,7 +97,7 @@ def _corners(folder: Path) -> Path:
 
 def _cut_short(run: Path, folder: Path) -> None:
     """The folder of a run whose program was killed."""
-    from executor.recording.run_course import RunCourse
+    from executor.recording.record_files import RunCourse
     from executor.recording.run_folder import RunFolder
 
     folder.mkdir()

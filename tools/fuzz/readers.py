@@ -33,7 +33,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     from calibration.geometry.measurements import read_rig_data
     from calibration.intrinsics.exchange import imported_camera
     from calibration.result_files import load_result
-    from calibration.targets.board import read_corners
+    from calibration.targets.boards import read_corners
     from cdpr.console.teach import TaughtPoses
     from drivers.cameras.files import read_picture
     from drivers.cameras.live import VideoFile

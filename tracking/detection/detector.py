@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,14 @@ from tracking.detection.tags import TagDecoder, dictionary, tag_corners, upright
 LEAST_SQUARE_PERIMETER = 30.0
 #: Larger images are not enlarged: their tags have pixels enough, and time is short, [px].
 MOST_PIXELS = 4_000_000
+#: Reduced so much, noise averages out and the smallest tag still spans two pixels.
+REDUCED = 4
+#: Least difference of ink and paper in the reduced image, [grey levels] and in units of its noise.
+LEAST_CONTRAST, LEAST_SIGNAL = 6.0, 8.0
+#: Every so many rows of it show its noise.
+NOISE_ROWS = 8
+#: Side of the surroundings in which they differ, [px of the reduced image].
+NEIGHBOURS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +67,24 @@ def squares_in(image: Image, family: str) -> list[Array]:
         family: Whose tags are looked for.
     """
     found: list[Array] = []
+    if is_blank(image):
+        return found
     for way in PASSES:
         if way.scale == 1 or image.size <= MOST_PIXELS:
             found += _squares(image, family, way)
     return found
+
+
+def is_blank(image: Image) -> bool:
+    """Whether it shows nothing but slow changes of brightness and noise."""
+    high, wide = (length // REDUCED for length in image.shape)
+    whole = image[: high * REDUCED, : wide * REDUCED]  # OpenCV is slow where it does not divide
+    reduced = np.asarray(cv2.resize(whole, (wide, high), interpolation=cv2.INTER_AREA))
+    square = np.ones((NEIGHBOURS, NEIGHBOURS), dtype=np.uint8)
+    contrast = float(cv2.subtract(cv2.dilate(reduced, square), cv2.erode(reduced, square)).max())
+    steps = np.abs(np.diff(reduced[::NOISE_ROWS].astype(np.int16), axis=1))
+    noise = float(np.median(steps)) / 0.954  # of a difference of two, each normally distributed
+    return contrast < max(LEAST_CONTRAST, LEAST_SIGNAL * noise)
 
 
 def _squares(image: Image, family: str, way: Pass) -> list[Array]:
@@ -147,13 +170,16 @@ class TagDetector:
             origin = np.array([region.left, region.top], dtype=np.float64)
             if min(image.shape) < LEAST_SIDE:
                 return []
-        found = self._detect(np.ascontiguousarray(image), thorough)
-        found.sort(key=lambda d: (d.id, _area(d.corners)))
-        return [Detection(d.id, read_only(d.corners + origin)) for d in found]
-
-    def _detect(self, image: Image, thorough: bool) -> list[Detection]:
+        image = np.ascontiguousarray(image)
         found = self._plainly(image)
-        return found + self._thoroughly(image, found) if thorough else found
+        if thorough:
+            found += self._thoroughly(image, found)
+        return _sorted([Detection(d.id, read_only(d.corners + origin)) for d in found])
+
+    def look_again(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
+        """As a thorough `detect_all` of an image in which a plain one found ``known``."""
+        image = np.ascontiguousarray(image)
+        return _sorted([*known, *self._thoroughly(image, known)])
 
     def _plainly(self, image: Image) -> list[Detection]:
         # OpenCV counts this limit in shares of the image: in a small region noise would pass it.
@@ -172,15 +198,24 @@ class TagDetector:
         """Further tags, of squares that OpenCV does not find or cannot read."""
         readings = [self._decoder.read(image, square) for square in squares_in(image, self.family)]
         better = sorted((r for r in readings if r is not None), key=lambda r: -r.correlation)
-        new: list[Detection] = []
-        for reading in better:
-            if not any(_overlap(reading.corners, d.corners) for d in (*known, *new)):
-                new.append(Detection(reading.id, reading.corners))
-        return new
+        return _new((Detection(r.id, r.corners) for r in better), known)
 
     @cached_property
     def _decoder(self) -> TagDecoder:
         return TagDecoder(self.family)
+
+
+def _new(found: Iterable[Detection], known: Sequence[Detection]) -> list[Detection]:
+    """Those that lie on none of the known ones, nor on one before them."""
+    new: list[Detection] = []
+    for one in found:
+        if not any(_overlap(one.corners, other.corners) for other in (*known, *new)):
+            new.append(one)
+    return new
+
+
+def _sorted(found: list[Detection]) -> list[Detection]:
+    return sorted(found, key=lambda d: (d.id, _area(d.corners)))
 
 
 def _overlap(a: Array, b: Array) -> bool:
@@ -319,10 +354,16 @@ class AprilTagLibrary(TagDetector):
         self._halved = Detector(families=family, nthreads=1, quad_decimate=2.0)
         self._full = Detector(families=family, nthreads=1, quad_decimate=1.0)
 
-    def _detect(self, image: Image, thorough: bool) -> list[Detection]:
-        detector = self._full if thorough else self._halved
-        found = detector.detect(np.ascontiguousarray(image))
-        return [Detection(int(tag.tag_id), _our_corners(tag.corners)) for tag in found]
+    def _plainly(self, image: Image) -> list[Detection]:
+        return _theirs(self._halved, image)
+
+    def _thoroughly(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
+        return _new(_theirs(self._full, image), known)
+
+
+def _theirs(detector: Any, image: Image) -> list[Detection]:
+    found = detector.detect(image)
+    return [Detection(int(tag.tag_id), _our_corners(tag.corners)) for tag in found]
 
 
 def _our_corners(corners: Array) -> Array:

@@ -8,11 +8,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from calibration.targets.board import Board
-from calibration.targets.chessboards import Charuco, Chessboard
-from calibration.targets.circle_grid import CircleGrid
+from calibration.targets.boards import Board, Charuco, Chessboard
+from calibration.targets.grids import CircleGrid, TagGrid, TagOrder
 from calibration.targets.printing import PaperName, printout
-from calibration.targets.tag_grid import TagGrid, TagOrder
 from cdpr.cli.options import JsonOption, with_option_groups
 from cdpr.cli.output import show_facts, show_json
 from model.errors import BadInput

@@ -15,7 +15,7 @@ from calibration.procedures import (
     measure_readout,
 )
 from calibration.results import require_file_name
-from calibration.targets.board import Board
+from calibration.targets.boards import Board
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
     NOWHERE,
@@ -31,7 +31,7 @@ from cdpr.cli.options import (
     finite,
     with_option_groups,
 )
-from cdpr.cli.output import err
+from cdpr.cli.output import err, show_line
 from executor.cameras.sources import require_camera_source
 from executor.supervision import LocalRequests
 from model.errors import BadInput
@@ -87,7 +87,6 @@ def camera(
       cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
     """
     require_file_name(name, "--name")
-    to = result.to
     if live is None and folder.suffix.lower() == ".csv":
         if size_px is None:
             raise BadInput(
@@ -102,7 +101,7 @@ def camera(
             wanted=wanted_mm / 1e3,
             distance=distance_m,
             lens=lens,
-            to=to,
+            output=result.to,
         )
         result.show(made)
         return
@@ -114,7 +113,7 @@ def camera(
             next_step="pass --live CAMERA as well, or leave them out",
         )
     if live is not None:
-        to.require_free("camera", name)
+        result.to.require_free("camera", name)
         if not Path(live).is_file():
             require_camera_source(live)
         make_folder(folder, result.force)
@@ -126,7 +125,7 @@ def camera(
         wanted=wanted_mm / 1e3,
         distance=distance_m,
         lens=lens,
-        to=to,
+        output=result.to,
         listener=result.listener,
     )
     result.show(made)
@@ -144,7 +143,7 @@ def _take_pictures(
             board,
             wanted=wanted,
             size=size,
-            on_advice=lambda text: err.print(text, soft_wrap=True),
+            on_advice=lambda text: show_line(text, err),
             stopped=lambda: requests.read().stop,
         )
     if requests.read().stop:
@@ -196,7 +195,7 @@ def readout(
         rate=rate_hz,
         speed=None if speed_mm_s is None else speed_mm_s / 1e3,
         wanted=wanted_mm / 1e3,
-        to=result.to,
+        output=result.to,
         listener=result.listener,
     )
     result.show(made)

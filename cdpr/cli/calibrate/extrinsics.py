@@ -109,26 +109,28 @@ def extrinsics(
             (_opener(source, the_camera, pictures), _opener(other, the_rig.camera(name), pictures)),
             board=printed.made() if printed != NO_BOARD else None,
             wanted=wanted_mm / 1e3,
-            to=result.to,
+            output=result.to,
             listener=result.listener,
         )
         result.show(made)
         return
     made = locate_camera(
         the_rig,
-        the_camera,
-        lambda: pictures_of(source, the_camera, pictures, USUAL_PICTURES),
+        _opener(source, the_camera, pictures),
+        camera=the_camera.name,
         poses=poses,
         survey=Survey(survey_mm / 1e3, None if survey_deg is None else radians(survey_deg)),
         wanted=wanted_mm / 1e3,
-        to=result.to,
+        output=result.to,
         listener=result.listener,
     )
     result.show(made)
 
 
-def _opener(source: str, camera: Camera, pictures: int | None) -> Callable[[], Pictures]:
-    return lambda: pictures_of(source, camera, pictures, USUAL_PICTURES)
+def _opener(
+    source: str, camera: Camera, pictures: int | None, usual: int = USUAL_PICTURES
+) -> Callable[[], Pictures]:
+    return lambda: pictures_of(source, camera, pictures, usual)
 
 
 # `cdpr calibrate tags`: where the tags are on the platform.
@@ -165,11 +167,11 @@ def tags(
     the_camera = the_rig.camera(camera)
     made = locate_tags(
         the_rig,
-        the_camera,
-        lambda: pictures_of(source, the_camera, pictures, USUAL_TAG_PICTURES),
+        _opener(source, the_camera, pictures, USUAL_TAG_PICTURES),
+        camera=the_camera.name,
         fixed_tag=fixed_tag,
         wanted=wanted_mm / 1e3,
-        to=result.to,
+        output=result.to,
         listener=result.listener,
     )
     result.show(made)

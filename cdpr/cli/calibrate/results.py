@@ -12,7 +12,7 @@ from calibration.intrinsics.result import camera_named
 from calibration.result_files import compare, load_result, write_calibrated_rig
 from cdpr.cli.calibrate.output import CameraOption
 from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
-from cdpr.cli.output import err, show_facts, show_json
+from cdpr.cli.output import err, show_facts, show_json, show_line
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
@@ -68,7 +68,7 @@ def apply(
     for result in loaded:
         if not result.good_enough:
             what = f"calibration {result.kind} {result.name}, {result.date}"
-            err.print(f"remark {what}: {result.verdict}", markup=False, soft_wrap=True)
+            show_line(f"remark {what}: {result.verdict}", err)
     if as_json:
         show_json({"rig": str(output), "results": [str(path) for path in results]})
         return

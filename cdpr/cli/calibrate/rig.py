@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -104,49 +104,40 @@ class GroupName(StrEnum):
     drum_scale = "drum_scale"
     offsets = "offsets"
     stiffness = "stiffness"
+    swivel_zeros = "swivel_zeros"
+
+
+def _deviation(of: str, most: float | None = None) -> Any:
+    """An option with a standard deviation."""
+    return typer.Option(min=1e-6, max=most, callback=finite, help=f"standard deviation of {of}")
 
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
     """How far off the rig file's numbers may be; every field is an option."""
 
-    outlets_mm: Annotated[
-        float,
+    outlets_mm: Annotated[float, _deviation("the outlets in the rig file")] = 4.0
+    anchors_mm: Annotated[float, _deviation("the anchors")] = 1.0
+    pulleys_mm: Annotated[float, _deviation("the pulleys' radius")] = 0.5
+    drum_scale_percent: Annotated[float, _deviation("the cable per drum turn")] = 0.5
+    offsets_mm: Annotated[float, _deviation("the cable length at home")] = 2.0
+    stiffness_percent: Annotated[float, _deviation("the cables' stiffness", 1000.0)] = 20.0
+    stiffness_per_cable: Annotated[
+        bool,
         typer.Option(
-            min=1e-6, callback=finite, help="standard deviation of the outlets in the rig file"
+            "--stiffness-per-cable", help="find the stiffness of each cable, by measured tensions"
         ),
-    ] = 4.0
-    anchors_mm: Annotated[
-        float, typer.Option(min=1e-6, callback=finite, help="standard deviation of the anchors")
-    ] = 1.0
-    pulleys_mm: Annotated[
-        float,
-        typer.Option(min=1e-6, callback=finite, help="standard deviation of the pulleys' radius"),
-    ] = 0.5
-    drum_scale_percent: Annotated[
-        float,
-        typer.Option(
-            min=1e-6, callback=finite, help="standard deviation of the cable per drum turn"
+    ] = False
+    swivel_zeros_deg: Annotated[float, _deviation("the zeros of swivel angles")] = 1.0
+    imu_mounting_deg: Annotated[
+        float | None,
+        _deviation(
+            "an IMU's mounting, which is found; left out, its axes are the platform's", 45.0
         ),
-    ] = 0.5
-    offsets_mm: Annotated[
-        float,
-        typer.Option(
-            min=1e-6, callback=finite, help="standard deviation of the cable length at home"
-        ),
-    ] = 2.0
-    stiffness_percent: Annotated[
-        float,
-        typer.Option(
-            min=1e-6,
-            max=1000.0,
-            callback=finite,
-            help="standard deviation of the cables' stiffness",
-        ),
-    ] = 20.0
+    ] = None
 
     def but(self, known: Sequence[GroupName]) -> dict[str, float]:
-        """By group, [m] or as a share, without those that are known."""
+        """By group, [m], [rad] or as a share, without those that are known."""
         deviations = {
             "outlets": self.outlets_mm / 1e3,
             "anchors": self.anchors_mm / 1e3,
@@ -154,11 +145,37 @@ class Deviations:
             "drum_scale": self.drum_scale_percent / 1e2,
             "offsets": self.offsets_mm / 1e3,
             "stiffness": self.stiffness_percent / 1e2,
+            "swivel_zeros": radians(self.swivel_zeros_deg),
         }
-        return {group: size for group, size in deviations.items() if group not in known}
+        sought = {group: size for group, size in deviations.items() if group not in known}
+        if self.stiffness_per_cable and "stiffness" in sought:
+            sought["cable_stiffness"] = sought.pop("stiffness")
+        if self.imu_mounting_deg is not None:
+            sought["imu_mounting"] = radians(self.imu_mounting_deg)
+        return sought
 
 
-DRAWING = Deviations()
+@dataclass(frozen=True, slots=True)
+class Accuracies:
+    """Of the measurements, one standard deviation; every field is an option."""
+
+    length_mm: Annotated[float, _deviation("cable lengths from the encoders")] = 0.1
+    pose_mm: Annotated[float, _deviation("positions, added to that of their file")] = 0.1
+    pose_deg: Annotated[float, _deviation("orientations, added to that of their file")] = 0.02
+    swivel_deg: Annotated[float, _deviation("swivel angles")] = 0.1
+    imu_deg: Annotated[float, _deviation("the vertical by an IMU")] = 0.1
+
+    def in_si(self) -> dict[str, Any]:
+        """As `calibrate_rig` takes them, [m] and [rad]."""
+        return {
+            "length_deviation": self.length_mm / 1e3,
+            "pose_deviations": (self.pose_mm / 1e3, radians(self.pose_deg)),
+            "swivel_deviation": radians(self.swivel_deg),
+            "imu_deviation": radians(self.imu_deg),
+        }
+
+
+DRAWING, USUAL = Deviations(), Accuracies()
 
 
 @with_option_groups
@@ -187,28 +204,7 @@ def rig(
         typer.Option(help="parameters to keep as in the rig file; repeatable"),
     ] = None,
     deviations: Deviations = DRAWING,
-    length_mm: Annotated[
-        float,
-        typer.Option(
-            min=1e-6, callback=finite, help="standard deviation of cable lengths from the encoders"
-        ),
-    ] = 0.1,
-    pose_mm: Annotated[
-        float,
-        typer.Option(
-            min=1e-6,
-            callback=finite,
-            help="standard deviation of positions, added to that of their file",
-        ),
-    ] = 0.1,
-    pose_deg: Annotated[
-        float,
-        typer.Option(
-            min=1e-6,
-            callback=finite,
-            help="standard deviation of orientations, added to that of their file",
-        ),
-    ] = 0.02,
+    accuracies: Accuracies = USUAL,
     tilt_deg: Annotated[
         float,
         typer.Option(
@@ -236,15 +232,14 @@ def rig(
         load_rig(rig),
         data,
         deviations=deviations.but(known or []),
-        length_deviation=length_mm / 1e3,
-        pose_deviations=(pose_mm / 1e3, radians(pose_deg)),
+        **accuracies.in_si(),
         without_poses=without_poses,
         reflector=[x / 1e3 for x in reflector_mm],
         tilt=radians(tilt_deg),
         wanted=wanted_mm / 1e3,
         name=name,
         rig_file=rig,
-        to=result.to,
+        output=result.to,
         listener=result.listener,
     )
     result.show(made)

@@ -7,15 +7,15 @@ from typing import Annotated
 
 import typer
 
+from cdpr import console as page  # loads the server where it is asked for
 from cdpr.cli.options import (
-    CalibrationOption,
-    ChannelOption,
-    InterfaceOption,
+    RIGS_OWN,
+    BusOptions,
     RigArgument,
     WithoutRealTimeOption,
-    rig_on_bus,
+    with_option_groups,
 )
-from cdpr.cli.output import out
+from cdpr.cli.output import show_line
 from cdpr.console.session import Console, ConsoleFiles
 from model.errors import BadInput, HardwareMissing
 
@@ -23,6 +23,7 @@ from model.errors import BadInput, HardwareMissing
 _LOCAL = ("127.0.0.1", "::1", "localhost")
 
 
+@with_option_groups
 def console(
     rig: RigArgument,
     scene: Annotated[
@@ -52,9 +53,7 @@ def console(
             metavar="SOURCE",
         ),
     ] = None,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    calibration: CalibrationOption = None,
+    bus: BusOptions = RIGS_OWN,
     without_real_time: WithoutRealTimeOption = False,
 ) -> None:
     """Open the operator's page: see the robot live, jog, teach, preview, run, hold, stop.
@@ -76,13 +75,13 @@ def console(
             why="the connection is not encrypted, and who knows the address can move the robot",
             next_step="use an SSH tunnel, or pass --allow-others in a network that you trust",
         )
-    options = [("--interface", interface), ("--channel", channel)]
+    options = [("--interface", bus.interface), ("--channel", bus.channel)]
     files = ConsoleFiles(
         rig_file=rig,
-        rig=rig_on_bus(rig, interface, channel, calibration),
+        rig=bus.rig(rig),
         bus_options=tuple(text for name, value in options if value for text in (name, value)),
         calibration_options=tuple(
-            text for path in calibration or () for text in ("--calibration", str(path))
+            text for path in bus.calibration or () for text in ("--calibration", str(path))
         ),
         cameras=tuple(camera or ()),
         scene_file=scene,
@@ -106,7 +105,7 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
         BadInput: The plan cannot be shown, or the address cannot be used.
     """
     try:
-        from cdpr.console.server import run_server
+        run_server = page.run_server
     except ImportError as error:
         raise HardwareMissing(
             f"the console needs {error.name}",
@@ -118,7 +117,7 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
         shown.load_plan(plan)
 
     def show_address(address: str) -> None:
-        out.print(f"console of {files.rig.name}: {address}", soft_wrap=True)
-        out.print("Ctrl-C ends the console, not what moves", soft_wrap=True)
+        show_line(f"console of {files.rig.name}: {address}")
+        show_line("Ctrl-C ends the console, not what moves")
 
     run_server(shown, host, port, show_address)

@@ -13,7 +13,7 @@ from cdpr.cli.operate.supervision import RunSupervisor
 from cdpr.cli.output import Terminal, out, show_facts
 from cdpr.console.session import ConsoleFiles
 from executor import runner
-from executor.recording.run_course import free_folder
+from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunFolder
 from model.files.examples import PAPER_RIG, ready_folder
 from model.plan import plan_facts, plan_from_document, save_plan

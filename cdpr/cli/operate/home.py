@@ -21,7 +21,7 @@ from cdpr.cli.options import (
     rig_on_bus,
     with_option_groups,
 )
-from cdpr.cli.output import Terminal, out, show_facts, show_json
+from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
 from executor import homing
 from executor.drives import is_simulated, require_own_time
 from executor.homing import (
@@ -158,9 +158,8 @@ def home(
         show_json({"file": file, **result.reference.model_dump(mode="json")})
     else:
         show_facts("drives homed; they hold", result.facts())
-        out.print(
-            "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`",
-            soft_wrap=True,
+        show_line(
+            "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,29 +15,33 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
-from cdpr.cli.operate.keys import Keys, speed_by_key
 from cdpr.cli.operate.run import agreement, show, show_files
-from cdpr.cli.operate.supervision import RunSupervisor, SignalSupervisor, confirmation
+from cdpr.cli.operate.supervision import (
+    Keys,
+    RunSupervisor,
+    SignalSupervisor,
+    confirmation,
+    speed_by_key,
+)
 from cdpr.cli.options import (
-    CalibrationOption,
-    ChannelOption,
+    RIGS_OWN,
+    BusOptions,
     FastOption,
-    InterfaceOption,
     RigArgument,
     SummaryJsonOption,
     WithoutRealTimeOption,
     YesOption,
     require_unused,
-    rig_on_bus,
     with_option_groups,
 )
-from cdpr.cli.output import Terminal, err, out, show_json
+from cdpr.cli.output import Terminal, err, out, show_json, show_line
 from executor import jogging
 from executor.drives import is_simulated, require_own_time
 from executor.hold_to_run.line import JogProver
 from executor.hold_to_run.presses import PressBoard
 from executor.hold_to_run.session import cable_session, jog_session
 from executor.jogging import FASTEST, SPEED
+from executor.proposals import Proposal
 from executor.state_machine import CycleRecord, State
 from model.errors import BadInput
 from model.files.documents import millimetres
@@ -107,6 +112,20 @@ class HeldOptions:
     ] = False
 
 
+@dataclass(frozen=True, slots=True)
+class DriveOptions:
+    """How drives are moved, and who reads the result; every field is an option of `cdpr jog`."""
+
+    fast: FastOption = False
+    yes: YesOption = False
+    without_real_time: WithoutRealTimeOption = False
+    as_json: SummaryJsonOption = False
+
+    def confirm(self, rig: Rig) -> Callable[[Proposal], bool]:
+        """See `confirmation`; simulated drives move unasked."""
+        return confirmation(asks=not (is_simulated(rig) or self.yes), as_json=self.as_json)
+
+
 #: Keys that hold a jog, and where to.
 DIRECTIONS = {
     "right": (1.0, 0.0, 0.0),
@@ -119,7 +138,7 @@ DIRECTIONS = {
 HELP = "arrows x and y · page up and down z · + and - speed · f frame · space stop · q end"
 #: The line with the position is renewed this often, [s].
 SHOWN_EVERY = 0.2
-DEFAULT_PATH, NOT_HELD = PathOptions(), HeldOptions()
+DEFAULT_PATH, NOT_HELD, MOVED = PathOptions(), HeldOptions(), DriveOptions()
 
 
 @with_option_groups
@@ -142,13 +161,8 @@ def jog(
     speed_mm_s: Annotated[
         float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
     ] = 1000.0 * SPEED,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    calibration: CalibrationOption = None,
-    fast: FastOption = False,
-    yes: YesOption = False,
-    without_real_time: WithoutRealTimeOption = False,
-    as_json: SummaryJsonOption = False,
+    bus: BusOptions = RIGS_OWN,
+    drives: DriveOptions = MOVED,
 ) -> None:
     """Move the platform straight slowly by a few millimetres from its present pose.
 
@@ -165,8 +179,8 @@ def jog(
 
       cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
     """
-    the_rig = rig_on_bus(rig, interface, channel, calibration)
-    require_own_time(the_rig, not fast)
+    the_rig = bus.rig(rig)
+    require_own_time(the_rig, not drives.fast)
     speed = speed_mm_s / 1000.0
     if cable is not None or mm is not None:
         require_unused(
@@ -174,21 +188,21 @@ def jog(
             path.given(),
             "a single cable is moved without a path, and obstacles are not checked",
         )
-        _one_cable(the_rig, cable, mm, limit_n, speed, fast, yes, without_real_time, as_json)
+        _one_cable(the_rig, cable, mm, limit_n, speed, drives)
         return
     if held.one_cable:
-        _held_cables(the_rig, path, held, limit_n, speed, fast, yes, without_real_time, as_json)
+        _held_cables(the_rig, path, held, limit_n, speed, drives)
         return
     require_unused(
         "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
     if held != NOT_HELD:
-        _held(the_rig, path, held, speed, fast, yes, without_real_time, as_json)
+        _held(the_rig, path, held, speed, drives)
         return
     by = None if path.by_mm is None else millimetres(list(path.by_mm))
     jogging.require_distance(by, to_home=path.to_home)
     the_scene = _scene(path.scene, path.no_scene, path.clearance_mm)
-    with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
+    with RunSupervisor(lambda result: show(result, drives.as_json)) as supervisor:
         result = jogging.jog(
             the_rig,
             the_scene,
@@ -196,13 +210,13 @@ def jog(
             to_home=path.to_home,
             speed=speed,
             folder=path.output,
-            realtime=not fast,
-            need_real_time_rights=not without_real_time,
-            listener=Terminal(quiet=as_json),
-            confirm=agreement(supervisor, the_rig, yes, as_json),
+            realtime=not drives.fast,
+            need_real_time_rights=not drives.without_real_time,
+            listener=Terminal(quiet=drives.as_json),
+            confirm=agreement(supervisor, the_rig, drives.yes, drives.as_json),
             supervisor=supervisor,
         )
-        show_files(result, as_json)
+        show_files(result, drives.as_json)
     raise typer.Exit(result.exit_code)
 
 
@@ -211,10 +225,7 @@ def _held(
     path: PathOptions,
     held: HeldOptions,
     speed: float,
-    fast: bool,
-    yes: bool,
-    without_real_time: bool,
-    as_json: bool,
+    drives: DriveOptions,
 ) -> None:
     require_unused(
         "cdpr jog",
@@ -222,8 +233,8 @@ def _held(
             "--by-mm": path.by_mm,
             "--to-home": path.to_home,
             "--output": path.output,
-            "--json": as_json,
-            "--fast": fast,
+            "--json": drives.as_json,
+            "--fast": drives.fast,
         },
         "held controls say where to go, in real time",
     )
@@ -233,9 +244,9 @@ def _held(
             rig,
             _scene(path.scene, path.no_scene, path.clearance_mm),
             speed=speed,
-            need_real_time_rights=not without_real_time,
+            need_real_time_rights=not drives.without_real_time,
             listener=Terminal(quiet=False),
-            confirm=confirmation(asks=not (is_simulated(rig) or yes), as_json=False),
+            confirm=drives.confirm(rig),
             supervisor=SignalSupervisor(),
             on_cycle=None if keys is None else keys.take_cycle,
         )
@@ -248,10 +259,7 @@ def _held_cables(
     held: HeldOptions,
     limit_n: float | None,
     speed: float,
-    fast: bool,
-    yes: bool,
-    without_real_time: bool,
-    as_json: bool,
+    drives: DriveOptions,
 ) -> None:
     if not held.hold_to_run or held.keys:
         raise BadInput(
@@ -260,15 +268,15 @@ def _held_cables(
             why="single cables are jogged by controls that are held, as of `cdpr console`",
             next_step="pass --hold-to-run --one-cable, or --cable N --mm X for a fixed length",
         )
-    unused = {**path.given(), "--json": as_json, "--fast": fast}
+    unused = {**path.given(), "--json": drives.as_json, "--fast": drives.fast}
     require_unused("cdpr jog", unused, "controls move one cable at a time, without a path")
     cable_session(
         rig,
         limit=limit_n,
         speed=speed,
-        need_real_time_rights=not without_real_time,
+        need_real_time_rights=not drives.without_real_time,
         listener=Terminal(quiet=False),
-        confirm=confirmation(asks=not (is_simulated(rig) or yes), as_json=False),
+        confirm=drives.confirm(rig),
         supervisor=SignalSupervisor(),
     )
     out.print("the session is over; the drives hold")
@@ -365,10 +373,7 @@ def _one_cable(
     mm: float | None,
     limit_n: float | None,
     speed: float,
-    fast: bool,
-    yes: bool,
-    without_real_time: bool,
-    as_json: bool,
+    drives: DriveOptions,
 ) -> None:
     if cable is None or mm is None:
         raise BadInput(
@@ -382,19 +387,19 @@ def _one_cable(
         mm / 1000.0,
         limit=limit_n,
         speed=speed,
-        realtime=not fast,
-        need_real_time_rights=not without_real_time,
-        listener=Terminal(quiet=as_json),
-        confirm=confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json),
+        realtime=not drives.fast,
+        need_real_time_rights=not drives.without_real_time,
+        listener=Terminal(quiet=drives.as_json),
+        confirm=drives.confirm(rig),
         supervisor=SignalSupervisor(),
     )
     moved_mm = done.moved * 1000.0
     tensions = [round(float(t), 2) for t in done.tensions]
-    if as_json:
+    if drives.as_json:
         show_json({"cable": cable, "moved_mm": round(moved_mm, 4), "tensions_n": tensions})
         return
     out.print(f"cable {cable} moved by {moved_mm:+.3f} mm, positive pays out; the drives hold")
-    out.print(f"tensions: {', '.join(f'{t:.1f}' for t in tensions)} N", soft_wrap=True)
+    show_line(f"tensions: {', '.join(f'{t:.1f}' for t in tensions)} N")
 
 
 def _scene(path: Path | None, without: bool, clearance_mm: float | None) -> Scene | None:

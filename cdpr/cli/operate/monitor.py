@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Group
@@ -18,8 +18,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from cdpr.cli.operate.keys import Keys, speed_by_key
-from cdpr.cli.output import err, out, show_json
+from cdpr import console  # loads Foxglove where it is asked for
+from cdpr.cli.operate.supervision import Keys, speed_by_key
+from cdpr.cli.output import err, out, show_json, show_line
 from cdpr.console.view import RobotNow, RobotView
 from executor.recording.run_folder import RIG, RunFolder
 from executor.remote.client import (
@@ -36,9 +37,6 @@ from executor.remote.protocol import make_line
 from model.errors import CdprError
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
-
-if TYPE_CHECKING:
-    from cdpr.console.foxglove import FoxgloveStream
 
 #: Of a run that ended so; what ends without a word was killed.
 _EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
@@ -95,10 +93,8 @@ def monitor(
       cdpr monitor --foxglove 8765 --rate-hz 20
     """
     if foxglove_layout is not None:
-        from cdpr.console.foxglove import layout_text
-
         require_new_file(foxglove_layout)
-        write_atomic(foxglove_layout, layout_text() + "\n")
+        write_atomic(foxglove_layout, console.layout_text() + "\n")
         return
     if once:
         status = _first(process, rate) if wait else request_run("status", process, verb="monitor")
@@ -126,20 +122,18 @@ def _first(process: int | None, rate: float) -> dict[str, Any]:
 
 
 @contextmanager
-def _foxglove(port: int | None) -> Iterator[FoxgloveStream | None]:
+def _foxglove(port: int | None) -> Iterator[console.FoxgloveStream | None]:
     """A server for Foxglove; none without a port."""
     if port is None:
         yield None
         return
-    from cdpr.console.foxglove import foxglove_stream
-
-    with foxglove_stream(port) as stream:
-        err.print(f"Foxglove: open the connection {stream.address}", soft_wrap=True)
+    with console.foxglove_stream(port) as stream:
+        show_line(f"Foxglove: open the connection {stream.address}", err)
         yield stream
 
 
 def _lines(
-    looks: Iterator[dict[str, Any]], as_json: bool, stream: FoxgloveStream | None = None
+    looks: Iterator[dict[str, Any]], as_json: bool, stream: console.FoxgloveStream | None = None
 ) -> None:
     """For a file or a program: a line a look, and each event once."""
     seen: list[dict[str, Any]] = []
@@ -162,7 +156,7 @@ def _lines(
     _tell_end(status, as_json)
 
 
-def _live(process: int | None, rate: float, stream: FoxgloveStream | None) -> None:
+def _live(process: int | None, rate: float, stream: console.FoxgloveStream | None) -> None:
     status: dict[str, Any] = {"state": "gone"}
     robot = _Robot()
     try:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from cdpr.cli.options import JsonOption
-from cdpr.cli.output import out, show_json
+from cdpr.cli.output import out, show_json, show_line
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.state_machine import State
 
@@ -92,11 +92,9 @@ def _request(verb: str, process: int | None, as_json: bool, percent: int | None 
         show_json(status)
         return
     if State(status["state"]) in OVER:
-        out.print(f"too late: process {status['process']} is {status['state']}", soft_wrap=True)
+        show_line(f"too late: process {status['process']} is {status['state']}")
         return
     wish = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
-    out.print(
-        f"asked process {status['process']} to {wish}; it is {status['state']}", soft_wrap=True
-    )
+    show_line(f"asked process {status['process']} to {wish}; it is {status['state']}")
     if verb == "speed" and status["wished"]["hold"]:
         out.print("it is on hold: the speed applies after `cdpr resume`")

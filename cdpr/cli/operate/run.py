@@ -23,7 +23,7 @@ from cdpr.cli.options import (
     require_unused,
     rig_on_bus,
 )
-from cdpr.cli.output import Terminal, err, out, show_json
+from cdpr.cli.output import Terminal, err, out, show_json, show_line
 from drivers.can_bus import IN_PROCESS
 from executor import runner
 from executor.drives import is_simulated
@@ -143,16 +143,16 @@ def show(result: RunResult, as_json: bool) -> None:
     verdict = f"[bold {COLOURS[result.verdict]}]{result.verdict}[/]"
     out.print(f"{verdict} {escape(result.sentence)}", soft_wrap=True)
     for line in result.details():
-        out.print(f"  {line}", markup=False, soft_wrap=True)
+        show_line(f"  {line}")
 
 
 def show_files(result: RunResult, as_json: bool) -> None:
     """The report of a run, and what could not be written."""
     if result.report is not None and not as_json:
         line = f"report: {result.report}"
-        say(lambda: out.print(line, markup=False, soft_wrap=True), result)
+        say(lambda: show_line(line), result)
     if missing := result.missing_text():
-        err.print(f"error: {missing}", markup=False, soft_wrap=True)
+        show_line(f"error: {missing}", err)
 
 
 def _simulated(rig: Rig, interface: str | None, channel: str | None) -> Rig:

@@ -6,24 +6,22 @@ from dataclasses import asdict
 
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
-    CalibrationOption,
-    ChannelOption,
-    InterfaceOption,
+    RIGS_OWN,
+    BusOptions,
     JsonOption,
     NoQuestionOption,
     RigArgument,
     WithoutRealTimeOption,
-    rig_on_bus,
+    with_option_groups,
 )
-from cdpr.cli.output import Terminal, out, show_facts, show_json
+from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
 from executor import service
 
 
+@with_option_groups
 def status(
     rig: RigArgument,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    calibration: CalibrationOption = None,
+    bus: BusOptions = RIGS_OWN,
     as_json: JsonOption = False,
 ) -> None:
     """Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.
@@ -35,14 +33,14 @@ def status(
 
       cdpr status configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
-    the_rig = rig_on_bus(rig, interface, channel, calibration)
+    the_rig = bus.rig(rig)
     result = service.status(the_rig)
     if as_json:
         show_json(result.as_dict())
     else:
         show_facts("state of the rig", result.facts(rig))
         for line in result.drive_lines(the_rig.drive_names):
-            out.print(f"  {line}", soft_wrap=True, markup=False)
+            show_line(f"  {line}")
     if result.missing is not None:
         raise result.missing
 
@@ -50,11 +48,10 @@ def status(
 # `cdpr reset`: the only way out of a latched fault.
 
 
+@with_option_groups
 def reset(
     rig: RigArgument,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    calibration: CalibrationOption = None,
+    bus: BusOptions = RIGS_OWN,
     yes: NoQuestionOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -67,7 +64,7 @@ def reset(
 
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
-    the_rig = rig_on_bus(rig, interface, channel, calibration)
+    the_rig = bus.rig(rig)
     result = service.reset(
         the_rig,
         confirm=confirmation(asks=not yes, as_json=as_json),
@@ -76,11 +73,11 @@ def reset(
     if as_json:
         show_json(asdict(result))
         return
-    out.print(f"drives: {', '.join(sorted(set(result.drives)))}", soft_wrap=True)
+    show_line(f"drives: {', '.join(sorted(set(result.drives)))}")
     if result.restarted:
         names = ", ".join(the_rig.drive_names[node] for node in result.restarted)
-        out.print(f"power-cycled since their last configuration: {names}", soft_wrap=True)
-    out.print(f"reference: {result.reference}", soft_wrap=True, markup=False)
+        show_line(f"power-cycled since their last configuration: {names}")
+    show_line(f"reference: {result.reference}")
     latch_now = "the fault latch is released" if result.was_latched else "no fault was latched"
     out.print(f"{latch_now}; the next run must start from the platform's present pose")
 
@@ -88,11 +85,10 @@ def reset(
 # `cdpr release`: the end of a day; brakes close and the torque goes, of all drives together.
 
 
+@with_option_groups
 def release(
     rig: RigArgument,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    calibration: CalibrationOption = None,
+    bus: BusOptions = RIGS_OWN,
     yes: NoQuestionOption = False,
     without_real_time: WithoutRealTimeOption = False,
     as_json: JsonOption = False,
@@ -107,7 +103,7 @@ def release(
       cdpr release configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
     result = service.release(
-        rig_on_bus(rig, interface, channel, calibration),
+        bus.rig(rig),
         need_real_time_rights=not without_real_time,
         listener=Terminal(quiet=as_json),
         confirm=confirmation(asks=not yes, as_json=as_json),
@@ -117,4 +113,4 @@ def release(
         show_json(asdict(result))
         return
     out.print(f"all drives are without torque: {', '.join(sorted(set(result.drives)))}")
-    out.print(f"reference: {result.reference}", soft_wrap=True, markup=False)
+    show_line(f"reference: {result.reference}")

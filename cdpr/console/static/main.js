@@ -36,7 +36,9 @@ async function command(name, fields) {
   return answer;
 }
 
-const page = { command, situation, say, scene, view };
+/** Brings the scene up where it is a view of its own. */
+const showScene = () => wide.matches || view("live");
+const page = { command, situation, say, scene, view, showScene };
 const stopBar = bindStop(connection, () => {
   cancelDialog();
   jog.end("STOP");

@@ -10,7 +10,7 @@ export class Pick {
   #point = null;
   #down = null;
 
-  /** `page` has `command(name, fields)`, `situation()`, `say(text)`, `scene`, and `view(name)`. */
+  /** `page` has `command(name, fields)`, `situation()`, `say(text)`, `scene`, `view(name)`, and `showScene()`. */
   constructor(page) {
     this.#page = page;
     at("pick").addEventListener("click", () => this.#begin());
@@ -39,14 +39,20 @@ export class Pick {
     return Number(at("pick-height").value);
   }
 
+  get #isInside() {
+    const [low, high] = this.#page.scene.workspace;
+    return this.#point.every((v, k) => low[k] <= v && v <= high[k]);
+  }
+
   #begin() {
     const { state } = this.#page.situation();
     const slider = at("pick-height");
-    slider.max = String(this.#page.scene.highest());
+    const [low, high] = this.#page.scene.workspace;
+    Object.assign(slider, { min: String(Math.ceil(low[2])), max: String(Math.floor(high[2])) });
     slider.value = String(Math.round(state.platform.position_mm[2]));
     at("pick-bar").hidden = false;
     this.#point = null;
-    this.#page.view("live");
+    this.#page.showScene();
     this.#show();
     at("pick-height").focus();
   }
@@ -59,6 +65,7 @@ export class Pick {
 
   async #keep() {
     if (!this.#point) return this.#page.say("Click in the scene first.");
+    if (!this.#isInside) return this.#page.say("The platform may not go there: click on the grid.", true);
     const name = freeName("goal", this.#page.situation().state.poses);
     const { ok } = await this.#page.command("teach_at", { name, position_mm: this.#point });
     if (!ok) return;
@@ -69,7 +76,8 @@ export class Pick {
   #show() {
     const point = this.#point;
     write(at("pick-height-shown"), known(this.#height, 0, "mm"));
-    write(at("pick-text"), point ? `${point.map((v) => known(v, 0)).join(", ")} mm` : "Click where the platform is to go.");
+    const place = point && `${point.map((v) => known(v, 0)).join(", ")} mm${this.#isInside ? "" : ": outside the workspace"}`;
+    write(at("pick-text"), place ?? "Click on the grid where the platform is to go.");
     this.#page.scene.showPick({ height: this.#height, point });
   }
 

@@ -12,6 +12,16 @@ const COLOURS = { obstacles: "obstacle", robot: "platform", numbers: "ink", fram
 const HIDDEN_AT_FIRST = ["tree", "raw"];
 const TRAIL_STEP_MM = 2, TRAIL_MOST = 600;
 
+const GRID_LINES = 8;
+
+/** Lines of a grid over the workspace at a height, [mm]. */
+function gridAt(height, [low, high]) {
+  return Array.from({ length: GRID_LINES + 1 }, (_, k) => {
+    const [x, y] = [0, 1].map((axis) => low[axis] + ((high[axis] - low[axis]) * k) / GRID_LINES);
+    return [[x, low[1], height, x, high[1], height], [low[0], y, height, high[0], y, height]];
+  }).flat();
+}
+
 /** Strokes and labels of several parts, each `{strokes, labels}` or null. */
 const drawn = (parts) => ({ strokes: parts.flatMap((part) => part?.strokes ?? []), labels: parts.flatMap((part) => part?.labels ?? []) });
 
@@ -113,10 +123,9 @@ export class Scene {
     return this.#view?.pick(clientX - box.left, clientY - box.top, height) ?? null;
   }
 
-  /** The highest that a goal may be picked, [mm]: the top of all that is drawn. */
-  highest() {
-    const heights = (this.#base?.surfaces ?? []).flatMap(({ vertices }) => vertices.map(([, , z]) => z));
-    return Math.ceil(Math.max(100, ...heights));
+  /** The lowest and the highest corner of where the platform may go, [mm]. */
+  get workspace() {
+    return this.#base.workspace_mm;
   }
 
   /** Shows a plane at a height, and a goal on it: `{height, point}`; null ends it. */
@@ -165,9 +174,7 @@ export class Scene {
       parts.strokes.push(...path.map((one) => ({ ...one, layer: "other", role: "raw", width: 3, ahead: true })));
     }
     if (this.#pick) {
-      const floor = this.#base.strokes.filter((one) => one.layer === "floor"), { height } = this.#pick;
-      const raised = ([x, y, , u, v]) => [x, y, height, u, v, height];
-      parts.strokes.push(...floor.map((one) => ({ ...one, layer: "pick", role: "encoder", opacity: 0.45, segments: one.segments.map(raised) })));
+      parts.strokes.push({ layer: "pick", role: "encoder", width: 1, opacity: 0.6, dash: [], segments: gridAt(this.#pick.height, this.workspace) });
     }
     const segments = this.#trail.slice(1).map((point, k) => [...this.#trail[k], ...point]);
     parts.strokes.push({ layer: "trail", role: "encoder", segments, width: 2.5, opacity: 1, dash: [], ahead: true });

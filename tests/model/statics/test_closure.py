@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from model.errors import BadInput
-from model.statics.wrench_closure import closure_margin, wrench_closure
+from model.statics.feasibility import closure_margin, wrench_closure
 from tests.model.statics.robots import PAPER_LENGTH, flat_matrix, paper_matrix, random_matrix
 
 

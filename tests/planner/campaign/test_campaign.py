@@ -18,8 +18,19 @@ import pytest
 
 from planner.campaign.evaluation import findings_json, summary_csv, trials_csv
 from planner.campaign.page import page, save_figures
-from planner.campaign.results import Change, Finding, Results, change_of_means, findings, summary
-from planner.campaign.studies import FIGURE_9, all_readings, batches, figure_9_arm, run_all
+from planner.campaign.studies import (
+    FIGURE_9,
+    Change,
+    Finding,
+    Results,
+    all_readings,
+    batches,
+    change_of_means,
+    figure_9_arm,
+    findings,
+    run_all,
+    summary,
+)
 from planner.campaign.trial import (
     OWN,
     SHARES,

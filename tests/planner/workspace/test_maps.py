@@ -11,7 +11,7 @@ import pytest
 from model.clearance import ClearanceModel
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector
-from model.statics.wrench_closure import wrench_closure
+from model.statics.feasibility import wrench_closure
 from planner.costs import KinematicCost, capacity_margins
 from planner.workspace import compute as computing
 from planner.workspace.compute import compute

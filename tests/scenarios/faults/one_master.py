@@ -11,8 +11,7 @@ from typing import Any
 from drivers.can_bus import BusSettings, open_bus
 from drivers.factory import make_drive_group
 from executor.control.path_runs import run_in_process
-from executor.realtime.clock import RealClock
-from executor.realtime.scheduling import real_time
+from executor.realtime.scheduling import RealClock, real_time
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.supervision import LocalRequests
 from executor.trajectory.prepare import PreparedRun

@@ -1,0 +1,157 @@
+"""The numbers of a rig that a calibration finds, in named groups, and what the rig file says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import radians
+from types import MappingProxyType
+
+import numpy as np
+
+from model.pose import Array, read_only
+from model.rig import Rig
+
+AXES = ("x", "y", "z")
+_OF_ALL_CABLES = {"pulleys": "pulley_radius", "stiffness": "stiffness"}
+"""Groups of one number, and its name."""
+_OF_EACH_CABLE = {
+    "drum_scale": "drum",
+    "offsets": "offset",
+    "cable_stiffness": "stiffness",
+    "swivel_zeros": "swivel_zero",
+}
+"""Groups of a number a cable, and its name."""
+_POINTS = {"outlets": "outlet", "anchors": "anchor"}
+"""Groups of a point a cable, and its name."""
+
+DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
+    {
+        "outlets": 4e-3,
+        "anchors": 1e-3,
+        "pulleys": 0.5e-3,
+        "drum_scale": 0.005,
+        "offsets": 2e-3,
+        "stiffness": 0.2,
+        "swivel_zeros": radians(1.0),
+    }
+)
+"""How far off a rig file may be, one standard deviation: [m], [rad]; drum_scale and stiffness as a
+share.
+"""
+_GROUPS = (*DEFAULT_DEVIATIONS, "cable_stiffness", "imu_mounting")
+"""All, in order: cable_stiffness in place of stiffness, and imu_mounting, are for who asks."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigGeometry:
+    """What decides how long cables are and what drives count, for m cables.
+
+    Attributes:
+        outlets: World frame, shape (m, 3), [m].
+        anchors: Platform frame, shape (m, 3), [m].
+        pulley_radius: [m]; 0 for point exits.
+        drum_scale: Cable paid out for a count, as a share of the rig file's, less 1, shape (m,).
+        offsets: Unstrained cable at the home counts beyond what reaches the home pose, shape (m,),
+            [m]: by how much the reference was off.
+        stiffness: Axial, of each cable, shape (m,), [N].
+        swivel_zeros: What swivel encoders read at angle 0, shape (m,), [rad].
+        imu_mounting: Rotation vector of ``platform_from_imu``, shape (3,), [rad].
+    """
+
+    outlets: Array
+    anchors: Array
+    pulley_radius: float
+    drum_scale: Array
+    offsets: Array
+    stiffness: Array
+    swivel_zeros: Array
+    imu_mounting: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parameters:
+    """The layout of the vector of unknowns; each is a deviation from the rig file.
+
+    That of the stiffness is the logarithm of its share: near 0 the share less 1, never negative.
+
+    Attributes:
+        rig: As in its file.
+        groups: Names of the groups that are looked for, in order.
+        deviations: How far off each unknown may be, standard deviation, shape (p,), [m] or share.
+        names: Of the unknowns, such as ``outlet_3_x``; p texts.
+    """
+
+    rig: Rig
+    groups: tuple[str, ...]
+    deviations: Array
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, rig: Rig, deviations: Mapping[str, float]) -> Parameters:
+        """The unknowns of a rig.
+
+        Args:
+            rig: As in its file.
+            deviations: How far off it may be, by group; groups left out are taken as known.
+        """
+        groups = tuple(
+            group
+            for group in _GROUPS
+            if group in deviations
+            and (group not in ("pulleys", "swivel_zeros") or rig.pulley_radius > 0.0)
+        )
+        names = tuple(name for group in groups for name in _names(group, rig.cable_count))
+        spread = [deviations[group] for group in groups for _ in _names(group, rig.cable_count)]
+        return cls(rig, groups, read_only(spread), names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def slices(self) -> dict[str, slice]:
+        """Where each group is in the vector."""
+        found, begin = {}, 0
+        for group in self.groups:
+            end = begin + len(_names(group, self.rig.cable_count))
+            found[group], begin = slice(begin, end), end
+        return found
+
+    def geometry(self, values: Array) -> RigGeometry:
+        """The rig with the unknowns having values, shape (p,), [m] or share."""
+        m, found = self.rig.cable_count, self.slices()
+
+        def of(group: str, size: int) -> Array:
+            return values[found[group]] if group in found else np.zeros(size)
+
+        return RigGeometry(
+            outlets=self.rig.outlets + of("outlets", 3 * m).reshape(m, 3),
+            anchors=self.rig.anchors + of("anchors", 3 * m).reshape(m, 3),
+            pulley_radius=self.rig.pulley_radius + float(of("pulleys", 1)[0]),
+            drum_scale=of("drum_scale", m),
+            offsets=of("offsets", m),
+            stiffness=self.rig.cable_stiffness
+            * np.exp(of("stiffness", 1) + of("cable_stiffness", m)),
+            swivel_zeros=of("swivel_zeros", m),
+            imu_mounting=of("imu_mounting", 3),
+        )
+
+
+def _names(group: str, m: int) -> list[str]:
+    if group in _OF_ALL_CABLES:
+        return [_OF_ALL_CABLES[group]]
+    if group in _POINTS:
+        return [f"{_POINTS[group]}_{i}_{axis}" for i in range(1, m + 1) for axis in AXES]
+    if group in _OF_EACH_CABLE:
+        return [f"{_OF_EACH_CABLE[group]}_{i}" for i in range(1, m + 1)]
+    return [f"{group}_{axis}" for axis in AXES]
+
+
+def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
+    """The rig file's rig with other outlets, anchors, pulleys and stiffness; its winches stay."""
+    return replace(
+        rig,
+        outlets=read_only(geometry.outlets),
+        anchors=read_only(geometry.anchors),
+        pulley_radius=geometry.pulley_radius,
+        cable_stiffness=geometry.stiffness,
+    )
