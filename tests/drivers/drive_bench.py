@@ -52,6 +52,17 @@ class Bench:
         faults = self.status.faults if self.status else ()
         pytest.fail(f"not {state} after {limit} cycles but {self.group.state}; {faults}")
 
+    def until_tensions_are_felt(self, limit: int = 1000) -> None:
+        """Cycles until every reply tells of a pulling cable.
+
+        Drives that are served feel their cables while nothing is to be answered, so how many cycles
+        that takes depends on how busy this computer is.
+        """
+        for _ in range(limit):
+            if (self.cycle().torques > 0).all():
+                return
+        pytest.fail(f"no torques after {limit} cycles: {self.status}")
+
     def enable(self) -> None:
         self.group.configure()
         self.status = self.group.read_positions()

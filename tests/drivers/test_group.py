@@ -36,6 +36,7 @@ class TestFromSetUpToPowerOff:
         group.command(GroupCommand.ENABLE)
         bench.until(GroupState.ENABLED)
         assert all(d.state is DriveState.OPERATION_ENABLED for d in bench.drives)
+        bench.until_tensions_are_felt()
 
         def height(cycle: int) -> float:
             """A millimetre up and down again, [m]."""
