@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.cia402.state_machine import (
     FAULTED,
+    HOLDS,
     TORQUE_ON,
     ControlWord,
     DriveState,
+    Goal,
     late_drives,
+    next_words,
     state_of,
 )
 
@@ -86,13 +92,24 @@ def test_no_control_word_is_disable_voltage() -> None:
         (0x0050, "remote"),
         (0x0250, "enable input"),
         (0x0217, "transition 16"),
-        (0x0233, ""),
+        (0x0218, ""),
     ],
 )
 def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said: str) -> None:
-    wanted = (DriveState.OPERATION_ENABLED,)
+    wanted = (DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED)
     (found,) = late_drives({4: "cable 1", 5: "cable 2"}, (word, 0x0237), wanted, 1.0)
     assert found[0] == 4
     assert found[1].startswith(f"cable 1 is in {state_of(word).value} on the way to operation")
     assert said in found[1]
     assert (";" in found[1]) == bool(said)
+    assert ("bit 9" in found[1]) == (said == "remote")
+
+
+def test_only_a_drive_with_torque_and_no_fault_holds() -> None:
+    assert {DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE} == HOLDS
+
+
+@given(st.lists(st.tuples(st.sampled_from(DriveState), st.booleans()), min_size=1, max_size=8))
+def test_a_stop_tells_every_drive_to_stop_whatever_it_said(drives: list[Any]) -> None:
+    states, told = zip(*drives, strict=True)
+    assert next_words(Goal.STOP, states, told) == (ControlWord.QUICK_STOP,) * len(states)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import stat
 from pathlib import Path
@@ -13,7 +14,7 @@ from drivers.can_bus import BusSettings
 from executor.interlock import fault_latch, locks
 from executor.interlock.fault_latch import FaultLatch
 from executor.state_machine import State
-from model.errors import Refused
+from model.errors import BadInput, Refused
 
 BUS = BusSettings("udp_multicast", "239.74.163.62")
 
@@ -162,3 +163,87 @@ def test_a_latch_that_cannot_be_removed_is_told_and_stays_held(folder: Path) -> 
     with pytest.raises(Refused, match="directory"):
         mine.disengage()
     assert other.held_by_another()
+
+
+def fails(*_: object, **__: object) -> None:
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
+def cannot_be_kept(*_: object) -> None:
+    raise BadInput("the file cannot be written", where="somewhere", why="Read-only file system")
+
+
+def test_nothing_moves_when_the_latch_cannot_be_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine, other = two()
+    monkeypatch.setattr(fault_latch, "write_atomic", cannot_be_kept)
+    with pytest.raises(Refused, match=r"fault latch cannot be written.*\n.*Read-only file system"):
+        mine.engage("a rig", folder)
+    assert mine.read() is None
+    assert not other.held_by_another(), "a refusal holds nothing"
+
+
+def test_nothing_moves_when_the_lock_or_its_folder_cannot_be_made(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine, other = two()
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "mkdir", fails)
+        with pytest.raises(Refused, match="Read-only file system"):
+            mine.engage("a rig", folder)
+    folder.mkdir()
+    with monkeypatch.context() as patched:
+        patched.setattr(fault_latch, "open_state_file", fails)
+        with pytest.raises(Refused, match="Read-only file system"):
+            mine.engage("a rig", folder)
+    assert mine.read() is None
+    assert not other.held_by_another()
+
+
+def test_a_motion_that_engages_between_two_looks_keeps_the_other_out(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first look is without the lock: what was engaged and settled since counts."""
+    mine, other = two()
+    hold = FaultLatch._hold
+
+    def late(latch: FaultLatch) -> None:
+        monkeypatch.setattr(FaultLatch, "_hold", hold)
+        other.engage("a rig", folder)
+        other.settle("a rig", State.LATCHED, "a drive failed", folder)
+        hold(latch)
+
+    monkeypatch.setattr(FaultLatch, "_hold", late)
+    with pytest.raises(Refused, match="a drive failed"):
+        mine.engage("a rig", folder)
+    assert not other.held_by_another()
+    latched = mine.read()
+    assert latched is not None
+    assert latched.cause == "a drive failed"
+
+
+def test_looks_and_refusals_leave_no_file_open(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    opened, closed = [], []
+    really_open, really_close = fault_latch.open_state_file, os.close
+
+    def opens(path: Path, *, create: bool = False) -> int:
+        opened.append(really_open(path, create=create))
+        return opened[-1]
+
+    def closes(handle: int) -> None:
+        closed.append(handle)
+        really_close(handle)
+
+    monkeypatch.setattr(fault_latch, "open_state_file", opens)
+    monkeypatch.setattr(os, "close", closes)
+    for _ in range(3):
+        assert other.held_by_another()
+        with pytest.raises(Refused):
+            other._hold()
+    assert len(opened) == 9  # a refusal looks once more
+    assert sorted(closed) == sorted(opened)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import threading
@@ -49,12 +50,18 @@ def test_every_cycle_and_event_is_there(tmp_path: Path) -> None:
 
 def full_from_the_start(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """The file of this name is on a disk without space."""
-    opened = Path.open
+    opened, synced = Path.open, os.fsync
 
     def opens(path: Path, *arguments: Any, **options: Any) -> Any:
         return opened(Path("/dev/full") if path.name == name else path, *arguments, **options)
 
+    def fsync(handle: int) -> None:
+        if os.readlink(f"/proc/self/fd/{handle}") == "/dev/full":  # the device itself says EINVAL
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        synced(handle)
+
     monkeypatch.setattr(Path, "open", opens)
+    monkeypatch.setattr(os, "fsync", fsync)
 
 
 def full_disk(full: str, name: str) -> AbstractContextManager[object]:

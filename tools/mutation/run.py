@@ -149,6 +149,10 @@ def forget(module: str) -> None:
     while more := {name for name, used in imports.items() if used & stale} - stale:
         stale |= more
     for name in stale & set(imports):
+        package, _, last = name.rpartition(".")
+        parent = sys.modules.get(package)
+        if parent is not None and vars(parent).get(last) is sys.modules[name]:
+            delattr(parent, last)  # `from package import last` would find it
         del sys.modules[name]
 
 
