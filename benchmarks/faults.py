@@ -16,6 +16,7 @@ is 1 when anything is not as it must be. Not a test: it takes minutes.
 from __future__ import annotations
 
 import argparse
+import csv
 import gc
 import json
 import os
@@ -149,12 +150,15 @@ def soak(plan: Path, output: Path, options: argparse.Namespace) -> int:
     """Random faults, at least as many and as long as asked; the number of runs with a violation."""
     begin, bad, passed, number = time.monotonic(), 0, 0.0, 0
     with (
-        (output / "soak.csv").open("w") as file,
+        (output / "soak.csv").open("w", newline="") as file,
         ProcessPoolExecutor(
             options.jobs, initializer=_get_ready, initargs=(plan, options.drive_behaviour)
         ) as pool,
     ):
-        file.write("seed,faults,ended,violations,simulated_s,resident_mb,objects\n")
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(
+            ("seed", "faults", "ended", "violations", "simulated_s", "resident_mb", "objects")
+        )
         while (
             number < options.seeds
             or time.monotonic() - begin < 60.0 * options.minutes
@@ -170,8 +174,8 @@ def soak(plan: Path, output: Path, options: argparse.Namespace) -> int:
                 )
                 bad += bool(done.violations)
                 passed += done.simulated_s
-                file.write(f"{seed},{faults},{ended},{'; '.join(done.violations)!r},")
-                file.write(f"{done.simulated_s:.2f},{size:.1f},{objects}\n")
+                broken, simulated = "; ".join(done.violations), f"{done.simulated_s:.2f}"
+                table.writerow((seed, faults, ended, broken, simulated, f"{size:.1f}", objects))
                 if done.violations:
                     print(seed, faults, done.violations[:3], flush=True)
             file.flush()
