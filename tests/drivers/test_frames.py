@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 
 from drivers.cia402 import pdo as frames
 from drivers.cia402.pdo import (
+    CyclicFrames,
     NmtCommand,
     NmtState,
+    commanding_ids,
+    foreign_master_message,
     make_emergency,
     make_heartbeat,
     make_nmt,
@@ -22,7 +25,9 @@ from drivers.cia402.pdo import (
     parse_heartbeat,
     parse_reply,
     parse_set_point,
+    set_up_ids,
 )
+from drivers.cia402.state_machine import ControlWord
 
 
 def test_golden_bytes() -> None:
@@ -106,3 +111,38 @@ def test_a_target_beyond_32_bits_is_not_packed(target: int) -> None:
 
 def test_heartbeat_toggle_bit_is_dropped() -> None:
     assert parse_heartbeat(b"\x85") == NmtState.OPERATIONAL
+
+
+def test_the_frames_of_a_cycle_are_those_of_the_standard() -> None:
+    """By literal identifiers; what was never filled in tells a drive to stop."""
+    cyclic = CyclicFrames([1, 8])
+    assert (cyclic.sync.arbitration_id, bytes(cyclic.sync.data)) == (0x080, b"")
+    assert (cyclic.heartbeat.arbitration_id, bytes(cyclic.heartbeat.data)) == (0x77F, b"\x05")
+    unfilled = [(frame.arbitration_id, frame.data.hex()) for frame in cyclic._set_points]
+    assert unfilled == [(0x201, "020000000000"), (0x208, "020000000000")]
+    sent = cyclic.set_points([ControlWord.ENABLE_OPERATION, ControlWord.QUICK_STOP], [258, -2])
+    assert [(frame.arbitration_id, frame.data.hex()) for frame in sent] == [
+        (0x201, "0f0002010000"),
+        (0x208, "0200feffffff"),
+    ]
+
+
+#: What another program does that sends each of these, beside a rig with drives 1 and 8.
+OF_ANOTHER_MASTER = {
+    0x000: "sends NMT commands on this bus",
+    0x080: "sends SYNC on this bus",
+    0x77F: "sends the master's heartbeat on this bus",
+    0x201: "sends set-points to drive 1",
+    0x208: "sends set-points to drive 8",
+}
+OF_ANOTHER_TOOL = {
+    0x601: "reads or writes objects of drive 1",
+    0x608: "reads or writes objects of drive 8",
+}
+
+
+def test_identifiers_of_a_master_are_told_by_what_it_does() -> None:
+    assert commanding_ids([1, 8]) == OF_ANOTHER_MASTER.keys()
+    assert set_up_ids([1, 8]) == OF_ANOTHER_MASTER.keys() | OF_ANOTHER_TOOL.keys()
+    for can_id, told in (OF_ANOTHER_MASTER | OF_ANOTHER_TOOL).items():
+        assert foreign_master_message(can_id) == f"another program {told}"
