@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import FrozenInstanceError, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from executor.trajectory.dwell import Dwell
 from executor.trajectory.path import rounded
 from executor.trajectory.setpoints import CheckedTrajectory, Trajectory, build_table, check_table
 from executor.trajectory.time_scaling import time_law
@@ -308,3 +310,98 @@ def test_a_curve_that_fails_the_independent_check_is_refused():
     rig, scene, table = _made("gachon_8_6")
     with pytest.raises(Refused, match="obstacle"):
         check_table(rig, scene.changed(clearance=0.1), table)
+
+
+# Each limit from both sides, and what is said of it.
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.001, 2.0])
+def test_a_table_for_another_cycle_is_refused(factor: float) -> None:
+    rig, _, table = _made("gachon_8_6")
+    what = _refused("gachon_8_6", replace(table, cycle=rig.cycle * factor))
+    assert what == f"the table is for a cycle of {rig.cycle * factor} s, the bus has {rig.cycle} s"
+
+
+def test_stands_that_the_scene_has_not_are_refused() -> None:
+    table = _made("gachon_8_6")[2]
+    said = "the table rests at 1 stops, the scene has 0"
+    assert _refused("gachon_8_6", replace(table, stands=(Dwell(3, 5),))) == said
+
+
+@names
+@pytest.mark.parametrize(("turn", "wrong"), [(0.5e-6, False), (3e-6, True)])
+def test_a_slightly_turned_end_is_refused_beyond_the_accuracy(
+    name: str, turn: float, wrong: bool
+) -> None:
+    rig, scene, table = _made(name)
+    rotations = table.rotations.copy()
+    rotations[-1] = rotations[-1] @ [[1, -turn, 0], [turn, 1, 0], [0, 0, 1]]
+    try:
+        check_table(rig, scene, replace(table, rotations=rotations))
+    except Refused as refused:  # as its tensions hold the load in a lesser turn only
+        assert ("the goal of the table is 0.0000 mm and 0.0002° off" in refused.what) is wrong
+    else:
+        assert not wrong
+
+
+@names
+def test_how_far_an_end_is_off_is_told_in_millimetres(name: str) -> None:
+    assert "is 0.2500 mm and" in _refused(name, _spoilt(name, "positions", 0, 0, 0.25e-3))
+
+
+@names
+def test_counts_beyond_32_bits_are_told_by_row_and_cable(name: str) -> None:
+    what = _refused(name, _spoilt(name, "counts", 7, 1, -(2.0**40)))
+    assert re.fullmatch(r"row 7, cable 2: -1\d{12} counts exceed 32 bits", what)
+
+
+@names
+@pytest.mark.parametrize(("counts", "wrong"), [(-0.45, False), (0.45, False), (1.6, True)])
+def test_a_set_point_is_less_than_a_count_off_its_pose(
+    name: str, counts: float, wrong: bool
+) -> None:
+    rig, scene, table = _made(name)
+    moved = _spoilt(name, "counts", 40, 1, counts)
+    if not wrong:
+        assert check_table(rig, scene, moved).report.passed
+        return
+    off = abs(moved.setpoints[40, 1] - table.counts[40, 1]) / abs(rig.winches[1].counts_per_metre)
+    said = re.fullmatch(
+        r"row 40: the set-point of cable 2 is (.*) mm off its pose", _refused(name, moved)
+    )
+    assert said is not None
+    assert float(said[1]) == pytest.approx(off * 1000, abs=1e-4)
+
+
+@names
+@pytest.mark.parametrize(("more", "wrong"), [(0, False), (1, False), (2, True)])
+def test_a_winch_may_be_faster_than_its_limit_by_the_rounding_of_a_count(
+    name: str, more: int, wrong: bool
+) -> None:
+    rig, _, table = _made(name)
+    winch = rig.winches[2]
+    per_cycle = abs(winch.counts_per_metre) * winch.max_speed * table.cycle
+    step = int(np.ceil(per_cycle)) - 1 + more
+    assert abs(per_cycle - round(per_cycle)) > 1e-6
+    counts = table.setpoints.astype(float)
+    counts[20:, 2] += step - (counts[20, 2] - counts[19, 2])
+    what = _refused(name, replace(table, counts=counts))
+    assert ("cable 3 would move at" in what) is wrong
+    if wrong:
+        speed = step / abs(winch.counts_per_metre) / table.cycle * 1000
+        allowed = winch.max_speed * 1000
+        said = f"cable 3 would move at {speed:.1f} mm/s, its winch allows {allowed:.1f} mm/s"
+        assert said in what
+
+
+@names
+@pytest.mark.parametrize(("beyond", "wrong"), [(-1e-7, False), (0.5e-6, False), (2e-6, True)])
+def test_tensions_are_within_their_limits_but_for_the_accuracy_of_solving(
+    name: str, beyond: float, wrong: bool
+) -> None:
+    rig, _, table = _made(name)
+    for bound in (rig.min_tension - beyond, rig.max_tension + beyond):
+        tensions = table.tensions.copy()
+        tensions[4, 1] = bound
+        what = _refused(name, replace(table, tensions=tensions))
+        assert ("planned tensions range" in what) is wrong
