@@ -269,9 +269,9 @@ class _Look:
         row.meaning = "position counts of a motor turn: winches[].counts_per_rev"
         row.needed = row.needed or f"{counts_per_turn} a turn, where the drive has them"
         feed, gear, encoder = (self._quotient(index) for index in (0x6092, 0x6091, 0x608F))
-        turns = [feed / (gear or 1.0)] if feed else []
-        found = {"6092h/6091h": turns, "608Fh": [encoder] if encoder else []}
-        said = {name: value for name, values in found.items() for value in values}
+        said = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
+        if encoder:
+            said["608Fh"] = encoder
         text = ", ".join(f"{value:.10g} by {name}" for name, value in said.items()) or "absent"
         if not said or counts_per_turn in said.values():
             row.note(self._node, text)

@@ -85,7 +85,7 @@ class CycleTable:
     tensions: Array
 
     def __post_init__(self) -> None:
-        """See `_require_equal_lengths`."""
+        """See `require_equal_lengths`."""
         require_equal_lengths(self)
 
     def __len__(self) -> int:
@@ -270,7 +270,7 @@ class PoseTable:
     picture: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """See `_require_equal_lengths`."""
+        """See `require_equal_lengths`."""
         require_equal_lengths(self)
 
     def __len__(self) -> int:

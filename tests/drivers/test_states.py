@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -110,6 +109,8 @@ def test_only_a_drive_with_torque_and_no_fault_holds() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(DriveState), st.booleans()), min_size=1, max_size=8))
-def test_a_stop_tells_every_drive_to_stop_whatever_it_said(drives: list[Any]) -> None:
+def test_a_stop_tells_every_drive_to_stop_whatever_it_said(
+    drives: list[tuple[DriveState, bool]],
+) -> None:
     states, told = zip(*drives, strict=True)
     assert next_words(Goal.STOP, states, told) == (ControlWord.QUICK_STOP,) * len(states)

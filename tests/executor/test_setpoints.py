@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from dataclasses import FrozenInstanceError, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -224,10 +223,11 @@ def _refused(name: str, table: Trajectory) -> str:
 def _said(name: str, table: Trajectory) -> str:
     """Why it is refused; nothing if it is not."""
     rig, scene, _ = _made(name)
-    with suppress(Refused):
+    try:
         check_table(rig, scene, table)
-        return ""
-    return _refused(name, table)
+    except Refused as refused:
+        return refused.what
+    return ""
 
 
 @names
