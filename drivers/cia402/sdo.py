@@ -14,6 +14,7 @@ import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from math import ceil
 
 import can
 
@@ -40,7 +41,7 @@ ATTEMPTS = 2
 """A request or its answer may be lost while a drive starts up."""
 
 CONTACT_REPEAT = 0.5
-"""After this time, [s], a drive that has not answered at first contact is asked again."""
+"""So often a drive that has not answered at first contact is asked again, [s]."""
 
 ECHO_WAIT = 0.05
 """A second device with the same node id answers within this time of the first, [s]."""
@@ -114,18 +115,18 @@ class SetupNetwork:
     def silent_nodes(self, nodes: Iterable[int]) -> list[int]:
         """Asks all nodes for their device type (1000h) at once; those that do not answer.
 
-        A silent drive costs one time-out, however many of them there are.
+        They are asked again and again, as a drive hears nothing before it has booted. A silent
+        drive costs one time-out, however many of them there are.
         """
-        clients = [self.client(node) for node in nodes]
-        for client in clients:
-            client.ask_device_type()
-        begin = self.clock()
-        self._await(clients, begin + min(CONTACT_REPEAT, self.timeout))
-        for client in clients:
-            if client.waits:
+        waiting = [self.client(node) for node in nodes]
+        begin, times = self.clock(), ATTEMPTS
+        if self._pump is None:  # drives of this process let their own time pass as they are asked
+            times = max(times, ceil(self.timeout / CONTACT_REPEAT))
+        for number in range(1, times + 1):
+            for client in waiting:
                 client.ask_device_type()
-        self._await(clients, begin + self.timeout)
-        waiting = [client for client in clients if client.waits]
+            self._await(waiting, begin + min(number * CONTACT_REPEAT, self.timeout))
+            waiting = [client for client in waiting if client.waits]
         for client in waiting:
             client.give_up()
         return [client.node for client in waiting]

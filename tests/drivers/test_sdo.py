@@ -117,6 +117,15 @@ def test_a_drive_that_answers_late_is_not_silent() -> None:
     assert network.silent_nodes([NODE]) == []
 
 
+@pytest.mark.parametrize("booted", [0.01, 0.6, 1.2, 1.49])
+def test_a_drive_that_boots_while_it_is_waited_for_is_not_silent(booted: float) -> None:
+    """What is asked before its boot-up message is lost."""
+    network, bus = network_of(lambda _node, _key: (0.001,) if bus.now > booted else ())
+    assert network.silent_nodes([NODE]) == []
+    assert bus.now < booted + CONTACT_REPEAT + 0.01
+    assert network.nodes_answering_twice() == []
+
+
 def test_a_first_request_that_is_lost_is_sent_again_to_drives_of_this_process_too() -> None:
     lost = {1, 2}
     network, bus = network_of(
