@@ -328,8 +328,8 @@ class Console:
         """Enters or leaves service mode; single cables are jogged in it alone."""
         status = self.watch.last.status
         jogs_cables = status is not None and "cable_jog" in status
-        if on and status is not None and not jogs_cables:
-            return "the robot moves; wait, or stop it"
+        if on and not jogs_cables and (why_not := self.watch.why_busy()):
+            return why_not
         page = self.control.holder
         with self._control_lock:
             press = None if page is None else self.control.set_service(page, on)
@@ -337,8 +337,8 @@ class Console:
         return self.watch.say("end") if jogs_cables and not on else ""
 
     def _start(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
-        if self.watch.last.status is not None:
-            return "the robot moves; wait, or stop it"
+        if why_not := self.watch.why_busy():
+            return why_not
         relaxed = ["--without-real-time"] if real_time and self.files.without_real_time else []
         rig = (*self.files.bus_options, *self.files.calibration_options)
         self.verbs.start(verb, [*arguments, *rig, *relaxed, "--yes"])

@@ -26,6 +26,7 @@ ANSWERED_WITHIN = 0.5
 #: Sent to a silent run as well: obeyed late, they make nothing move.
 _ALWAYS = frozenset({"let_go", "hold", "end"})
 _SILENT = "the run does not answer"
+_MOVES = "the robot moves; wait, or stop it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,7 @@ class RunWatch:
         self._run: RunLink | None = None
         self._looked = float("-inf")
         self._count = 0
+        self._unheard: list[int] = []
         self.last = Look(None, time.monotonic())
 
     @property
@@ -77,6 +79,21 @@ class RunWatch:
             return self.last
         finally:
             self._lock.release()
+
+    def why_busy(self) -> str:
+        """Why nothing may be started now, looked up afresh; or nothing.
+
+        A run that does not say which bus it moves may be one on this bus.
+        """
+        with self._lock:
+            if self._run is None:
+                self._connect()
+            if self._run is not None:
+                return _MOVES
+            if self._unheard:
+                numbers = ", ".join(map(str, self._unheard))
+                return f"process {numbers} moves a robot and does not answer; wait, or stop it"
+            return ""
 
     def say(self, command: str, **values: Any) -> str:
         """Sends the run a command; why it was not taken, or nothing.
@@ -112,7 +129,7 @@ class RunWatch:
             self.last = Look(None, time.monotonic())
 
     def _connect(self) -> None:
-        links = self._links.enter_context(ExitStack())
+        links, self._unheard = self._links.enter_context(ExitStack()), []
         for run in links.enter_context(find_runs()):
             link = RunLink(run)
             answer = link.ask(make_line("status"), PATIENCE)
@@ -120,6 +137,8 @@ class RunWatch:
                 self._run = link
                 self._count += 1
                 return
+            if answer.status is None and not answer.ended:
+                self._unheard.append(run.process)
         self._let_go()
 
     def _let_go(self) -> None:

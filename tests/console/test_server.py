@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import tempfile
 import threading
@@ -20,9 +21,13 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from cdpr.console.commands import Held, LetGo, parse_message
 from cdpr.console.server import ConsoleServer
 from cdpr.console.session import Console, ConsoleFiles
 from cdpr.console.watch import RunWatch
+from executor.remote.command_socket import advertised
+from executor.remote.command_socket import serving as commands
+from executor.supervision import LocalRequests
 from model.rig import load_rig
 from tests.cli.plans import RIG, write_short_plan
 from tests.console import fake_server
@@ -101,6 +106,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+class MovesOn:
+    """Stands in for `RunStatus`: of a run, nothing but its bus."""
+
+    def __init__(self, bus: str) -> None:
+        self._bus = bus
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"bus": self._bus}
+
+
 @pytest.fixture(autouse=True)
 def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No run of another test is seen here."""
@@ -151,6 +166,35 @@ def held(hold: int) -> str:
             "seq": 1,
         }
     )
+
+
+def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
+    served = Served()
+    console = served.console
+    page = console.control.join("test")
+
+    def asked(name: str) -> str:
+        message = parse_message(json.dumps({"kind": "command", "id": 1, "command": name}))
+        assert not isinstance(message, Held | LetGo)
+        return console.command(page, message)
+
+    assert asked("take_control") == ""
+    with advertised() as listeners:
+        silent = f"process {os.getpid()} moves a robot and does not answer; wait, or stop it"
+        assert [asked("reset"), asked("service_begin")] == [silent] * 2
+        state = console.look()
+        assert state["motion"] is None
+        here: Any = MovesOn(state["bus"])
+        with commands(listeners, LocalRequests(), here):
+            moves = "the robot moves; wait, or stop it"
+            assert [asked("reset"), asked("service_begin")] == [moves] * 2
+    assert served.started == []
+    console.watch.close()
+    elsewhere: Any = MovesOn("can can7")
+    with advertised() as listeners, commands(listeners, LocalRequests(), elsewhere):
+        assert [asked("service_begin"), asked("service_end"), asked("reset")] == [""] * 3
+    assert [verb for verb, _ in served.started] == ["reset"]
+    console.close()
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
