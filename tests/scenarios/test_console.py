@@ -114,11 +114,13 @@ class Operator:
 
 
 @contextmanager
-def console(rig: Path, bus: tuple[str, ...]) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def console(
+    rig: Path, bus: tuple[str, ...], within: float = ENDS_WITHIN_S
+) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The program, and the address that it prints."""
     scene = CONFIGS / "environment_1.yaml"
     options = ("--scene", scene, *bus, "--port", "0", "--without-real-time")
-    with program("console", rig, *options, within=ENDS_WITHIN_S) as process:
+    with program("console", rig, *options, within=within) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert "http://" in line, process.communicate()
@@ -136,11 +138,11 @@ def operator(address: str) -> Iterator[Operator]:
 
 
 @contextmanager
-def drives(slow_rig: Path, number: int) -> Iterator[tuple[str, ...]]:
+def drives(slow_rig: Path, number: int, within: float = ENDS_WITHIN_S) -> Iterator[tuple[str, ...]]:
     """Simulated ones in a process of their own; the options of their bus."""
     channel = f"239.74.163.{22 + number}:{40000 + os.getpid() % 20000}"
     options = ("--interface", "udp_multicast", "--channel", channel)
-    with program("sim", slow_rig, *options, within=ENDS_WITHIN_S) as simulated:
+    with program("sim", slow_rig, *options, within=within) as simulated:
         assert simulated.stdout is not None
         assert "8 simulated drives" in simulated.stdout.readline()
         yield options

@@ -4,7 +4,8 @@ Nothing is kept for later: a message that cannot be sent now is never sent. Afte
 by itself. Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed", "refused" (a
 message that the server did not understand; `detail` says why). */
 
-export const STALE_S = 0.5;
+/** One frame of the page and one state less than the 0.5 s within which it must say so. */
+export const STALE_S = 0.45;
 const TICK_MS = 50, ANSWER_MS = 5000, RECONNECT_MS = [250, 500, 1000, 2000];
 /** States of a run whose own report must be young; before and after them nothing moves. */
 const REPORTING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
