@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import zlib
 from collections.abc import Iterator
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -26,6 +27,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
+ROOT = Path(__file__).parents[1]
 GRACE_S = 2.0  # for a thread that was told to end and is just returning
 
 settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True)
@@ -63,8 +65,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Tests of root run for root alone; those that need more than a computer when asked.
 
     Of the latter `make hil` asks for those on a kernel CAN bus, `make test-quiet` for those in real
-    time at 100 Hz, which a computer that does something else at once holds up.
+    time at 100 Hz, which a computer that does something else at once holds up. Files come in an
+    order drawn once and for all: so those that wait in real time lie between those that compute.
     """
+    items.sort(key=lambda item: zlib.crc32(str(item.path.relative_to(ROOT)).encode()))
     if os.geteuid() != 0:
         for item in items:
             if item.get_closest_marker("root"):

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cdpr.console import watch
 from cdpr.console.commands import Held, LetGo, parse_message
 from cdpr.console.session import Console, ConsoleFiles
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
@@ -40,6 +41,8 @@ SCENE = RIG.parent / "environment_1.yaml"
 SPEED = 0.020
 #: What two processes may be apart, [cycles].
 CYCLES_LATE = 3
+#: The console waits so long for the session's answers, [s] of real time.
+PATIENCE = 60.0
 #: A page says that it holds every so many cycles of 10 ms.
 SAID_EVERY = 5
 DIRECTIONS = [[*row] for sign in (1.0, -1.0) for row in (sign * np.eye(3)).tolist()]
@@ -440,11 +443,15 @@ def with_soft_cables(rig: Rig) -> Rig:
 def sequences(count: int, seed: int, *, cables: bool = False) -> Figures:
     """So many sequences; threads, sockets and processes that are left count as wrong."""
     before, interval = held(), sys.getswitchinterval()
+    patience = watch.PATIENCE, watch.ANSWERED_WITHIN
     sys.setswitchinterval(1e-4)  # the session and its socket's thread take turns all the time
+    # Time stands still while the session is asked: a busy computer makes no word late in it.
+    watch.PATIENCE = watch.ANSWERED_WITHIN = PATIENCE
     try:
         figures = Sequences(seed, cables=cables).run(count)
     finally:
         sys.setswitchinterval(interval)
+        watch.PATIENCE, watch.ANSWERED_WITHIN = patience
     if left := held() - before:
         figures.wrong.append(f"left behind: {sorted(left)}")
     return figures
