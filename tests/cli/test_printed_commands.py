@@ -16,7 +16,7 @@ from model.files.new_rig import CSV_COLUMNS
 from model.rig import load_rig
 from tests.cli.plans import CONFIGS
 from tests.cli.program import call
-from tests.repository.test_commands_in_messages import COMMANDS
+from tests.repository.test_commands_in_messages import all_commands
 
 GROUPS = ("calibrate", "bench")
 CHARUCO = "--columns 7 --rows 5 --square-mm 35 --marker-mm 26 --paper a3"
@@ -104,7 +104,7 @@ def shape(command: str) -> tuple[str, frozenset[str]]:
     return verb, frozenset(options)
 
 
-PRINTED = {shape(command) for where, command in COMMANDS if where.endswith(".py")}
+PRINTED = {shape(command) for where, command in all_commands() if where.endswith(".py")}
 RUN = [shape(step) for _, step in STEPS]
 
 

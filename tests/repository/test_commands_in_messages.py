@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,9 @@ def commands_in(text: str) -> Iterator[str]:
         yield from (found.group(1).strip() for found in COMMAND.finditer(line.strip()))
 
 
+@cache
 def all_commands() -> list[tuple[str, str]]:
+    """Where, and what follows `cdpr` there."""
     found = set()
     sources = [p for package in PACKAGES for p in (ROOT / package).rglob("*.py")]
     pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
@@ -54,7 +57,6 @@ def all_commands() -> list[tuple[str, str]]:
     return sorted(found)
 
 
-COMMANDS = all_commands()
 APP: Any = typer.main.get_command(build_app())
 
 
@@ -74,12 +76,12 @@ def problem(command: str) -> str:
 
 
 def test_commands_are_found() -> None:
-    assert len(COMMANDS) > 100
+    assert len(all_commands()) > 100
     assert problem("run plan.json --rig rig.yaml -o RUNDIR") == ""
     assert problem("runn plan.json") == "no verb 'runn'"
     assert problem("run plan.json --rigg rig.yaml") == "no option ['--rigg']"
 
 
 def test_a_command_in_a_message_or_a_page_exists() -> None:
-    wrong = [f"{where}: cdpr {command}: {problem(command)}" for where, command in COMMANDS]
+    wrong = [f"{where}: cdpr {command}: {problem(command)}" for where, command in all_commands()]
     assert [line for line in wrong if not line.endswith(": ")] == []

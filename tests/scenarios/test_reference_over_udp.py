@@ -37,7 +37,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
     bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
     run = ("run", short_plan, "--rig", rig, "--no-camera", *bus)
     with drives_on(channel, slow_run) as rehearsal:
-        loss = PowerLoss.drawn(slow_run.rig, 4, 0.002, on_a_stand=True)
+        loss = PowerLoss.drawn(slow_run.rig, 4, 0.0005, on_a_stand=True)
         loss.apply_to(slow_run.rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         first = call(*run, "-o", tmp_path / "first")
         assert first.code == 3
