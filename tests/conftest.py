@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from multiprocessing import resource_tracker
 from pathlib import Path
 
-# Before NumPy is loaded: the suite runs on as many workers as there are cores, one thread each.
+# Before NumPy is loaded: the suite runs on several workers, one thread each.
 for variable in (
     "OPENBLAS_NUM_THREADS",
     "OMP_NUM_THREADS",
