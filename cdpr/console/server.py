@@ -6,6 +6,7 @@ import asyncio
 import secrets
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
 from ipaddress import ip_address
@@ -24,7 +25,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Respon
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from cdpr.console.commands import Held, LetGo, NotAMessage, parse_message
+from cdpr.console.commands import Held, LetGo, Message, NotAMessage, parse_message
 from cdpr.console.session import MADE, Console
 from cdpr.console.view import scene_of
 from executor.recording.record_files import RUNS
@@ -37,6 +38,9 @@ RATE = 20.0
 PATIENCE = 2.0
 #: Pages that may be open at a time; STOP by `POST /stop` needs none.
 MOST_PAGES = 64
+#: Commands of a page that may wait for the one before; STOP never does.
+MOST_WAITING = 8
+STOPS_AT_ONCE = 4
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:;"
     " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -72,6 +76,8 @@ class ConsoleServer:
         self._state: dict[str, Any] = {}
         self._news = asyncio.Condition()
         self._seq = 0
+        self._stops = ThreadPoolExecutor(STOPS_AT_ONCE, "cdpr-stop")
+        self._stopping: set[asyncio.Task[None]] = set()
 
     def app(self) -> Starlette:
         """The application for any ASGI server."""
@@ -102,6 +108,7 @@ class ConsoleServer:
             looking.cancel()
             with suppress(asyncio.CancelledError):
                 await looking
+            self._stops.shutdown()
             await run_in_threadpool(self._console.close)
 
     async def _look(self) -> None:
@@ -187,8 +194,12 @@ class ConsoleServer:
 
     async def _stop(self, _request: Request) -> Response:
         """For a page whose socket is lost; anybody may stop."""
-        why_not = await run_in_threadpool(self._console.stop)
+        why_not = await self._stop_now()
         return JSONResponse({"ok": not why_not, "what": why_not})
+
+    async def _stop_now(self) -> str:
+        """STOP waits for nothing else that pages ask for: it has threads of its own."""
+        return await asyncio.get_running_loop().run_in_executor(self._stops, self._console.stop)
 
     # The socket.
 
@@ -209,14 +220,19 @@ class ConsoleServer:
     async def _speak(self, page: WebSocket) -> None:
         await page.accept()
         number = self._console.control.join("?" if page.client is None else page.client.host)
-        telling = asyncio.create_task(self._tell(page, number))
+        commands: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
+        tasks = [
+            asyncio.create_task(self._tell(page, number)),
+            asyncio.create_task(self._obey(page, number, commands)),
+        ]
         try:
             while True:
-                await self._hear(page, number, await page.receive_text())
+                await self._hear(page, number, await page.receive_text(), commands)
         except (WebSocketDisconnect, RuntimeError, KeyError):  # the last for what is no text
             pass
         finally:
-            telling.cancel()
+            for task in tasks:
+                task.cancel()
             await run_in_threadpool(self._console.leave, number)
 
     async def _tell(self, page: WebSocket, number: int) -> None:
@@ -240,7 +256,10 @@ class ConsoleServer:
                     await page.close(1013)
                 return
 
-    async def _hear(self, page: WebSocket, number: int, text: str) -> None:
+    async def _hear(
+        self, page: WebSocket, number: int, text: str, commands: asyncio.Queue[Message]
+    ) -> None:
+        """What is held and let go counts at once, STOP too; other commands wait for each other."""
         try:
             message = parse_message(text)
         except NotAMessage as error:
@@ -250,10 +269,29 @@ class ConsoleServer:
             await run_in_threadpool(self._console.held, number, message)
         elif isinstance(message, LetGo):
             await run_in_threadpool(self._console.let_go, number, message)
+        elif message.command == "stop":
+            stopping = asyncio.create_task(self._stop_and_answer(page, message))
+            self._stopping.add(stopping)  # it is done even if the page is gone by then
+            stopping.add_done_callback(self._stopping.discard)
+        elif commands.full():
+            await _answer(page, message, "what this page asked for before is not done yet")
         else:
+            commands.put_nowait(message)
+
+    async def _stop_and_answer(self, page: WebSocket, message: Message) -> None:
+        await _answer(page, message, await self._stop_now())
+
+    async def _obey(self, page: WebSocket, number: int, commands: asyncio.Queue[Message]) -> None:
+        while True:
+            message = await commands.get()
             why_not = await run_in_threadpool(self._console.command, number, message)
-            answer = {"kind": "answer", "to": message.id, "ok": not why_not, "what": why_not}
-            await page.send_json(answer)
+            await _answer(page, message, why_not)
+
+
+async def _answer(page: WebSocket, message: Message, why_not: str) -> None:
+    answer = {"kind": "answer", "to": message.id, "ok": not why_not, "what": why_not}
+    with suppress(RuntimeError, WebSocketDisconnect):  # it is gone
+        await page.send_json(answer)
 
 
 def _resource(name: str) -> str:

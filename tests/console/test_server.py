@@ -10,7 +10,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from cdpr.console.commands import Held, LetGo, parse_message
-from cdpr.console.server import ConsoleServer
+from cdpr.console.server import MOST_PAGES, MOST_WAITING, ConsoleServer
 from cdpr.console.session import Console, ConsoleFiles
 from cdpr.console.watch import RunWatch
 from executor.remote.command_socket import advertised
@@ -166,6 +166,27 @@ def held(hold: int) -> str:
             "seq": 1,
         }
     )
+
+
+def test_stop_waits_for_no_other_command_of_any_page(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = threading.Event()
+    monkeypatch.setattr(served.console, "load_plan", lambda _: slow.wait(60) and None)
+    with ExitStack() as stack:
+        stack.callback(slow.set)
+        pages = [stack.enter_context(served.page()) for _ in range(MOST_PAGES)]
+        me = pages[0]
+        assert command(me, "take_control")["ok"]
+        load = {"kind": "command", "id": 1, "command": "load_plan", "file": "short.json"}
+        for page in pages:  # all but the first one wait in turn, in threads of the server
+            page.send(json.dumps(load))
+        for page in (me, pages[-1]):
+            answer = command(page, "stop")
+            assert (answer["to"], answer["what"]) == (7, "nothing moves")
+        for _ in range(2 * MOST_WAITING):
+            me.send(json.dumps(load))
+        assert "not done yet" in command(me, "hold")["what"]
 
 
 def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
