@@ -238,8 +238,12 @@ class Loop:
             self._fault("gate_denied", f"the safety gate denied a set-point: {done.verdict.reason}")
             return None
         self._record(done)
+        self._judge(done.findings)
+        # A fault stops the drives at once; what the operator wants counts up to the next cycle.
+        self._clock.wait_to_decide()
         wishes = self._wishes()
-        self._judge(done.findings, wishes.lost)
+        if wishes.lost:
+            self._judge((Alarm(StopReaction.PATH_STOP, "supervisor_lost", wishes.lost),))
         self._obey(wishes)
         return done.status
 
@@ -279,11 +283,11 @@ class Loop:
                 self._listener_error or f"recording failed: {_in_one_line(error)}"
             )
 
-    def _judge(self, findings: tuple[Alarm, ...], lost: str) -> None:
-        """Reacts to what the watch saw, and to the loss of those who watch over this loop."""
-        for code, text in (("recorder", self._listener_error), ("supervisor_lost", lost)):
-            if text:
-                findings = (*findings, Alarm(StopReaction.PATH_STOP, code, text))
+    def _judge(self, findings: tuple[Alarm, ...]) -> None:
+        """Reacts to what the watch saw, and to the loss of the record."""
+        if self._listener_error:
+            lost = Alarm(StopReaction.PATH_STOP, "recorder", self._listener_error)
+            findings = (*findings, lost)
         findings = shared_causes(findings, list(self._course.rig.drive_names.values()))
         for finding in findings:
             self._tell_once(finding)

@@ -70,7 +70,7 @@ class WinchLoop(Loop):
             tensions = self._course.rig.tensions_by(self._status.torques)
             targets, findings = self._law.next(pace, tensions.tolist())
             if findings:
-                self._judge(findings, "")
+                self._judge(findings)
             if self.machine.state is state:
                 self._status = self._send(Purpose.MOVE, targets)
 

@@ -179,7 +179,7 @@ class CableLoop(Loop):
         targets, findings = self._law.next(pace, tensions)
         if not findings:
             return targets
-        self._judge(findings, "")
+        self._judge(findings)
         self._law, self._feed = None, self._feed_at(0.0)  # no way on which to slow down
         return None
 

@@ -35,6 +35,9 @@ class Clock(Protocol):
     def time_left(self) -> float:
         """What is left of this cycle to wait for replies, [s]."""
 
+    def wait_to_decide(self) -> None:
+        """Waits until just enough of this cycle is left to decide on the next one."""
+
 
 class SimulatedClock:
     """Time that advances by one cycle a call and costs nothing."""
@@ -62,6 +65,9 @@ class SimulatedClock:
         """Replies are there already or will not come."""
         return 0.0
 
+    def wait_to_decide(self) -> None:
+        """Within a cycle no time passes."""
+
 
 class RealClock:
     """Absolute deadlines on the monotonic clock.
@@ -76,6 +82,9 @@ class RealClock:
     #: A cycle that is later than this is not caught up with, [cycles]: the drives would get two
     #: set-points closer to each other than the time in which they interpolate between them.
     CAUGHT_UP = 0.1
+
+    #: What the operator and a held control say counts until so much is left, [cycles].
+    DECIDING = 0.2
 
     def __init__(self, cycle: float, on_cycle: Callable[[], None] = lambda: None) -> None:
         """The first cycle begins with the first call of `next_cycle`.
@@ -120,6 +129,14 @@ class RealClock:
             return 0.0
         end = self._begin_ns + self._cycle_ns - round(self.RESERVE * 1e9)
         return max(0.0, (end - time.monotonic_ns()) / 1e9)
+
+    def wait_to_decide(self) -> None:
+        """Sleeps; not at all where too little is left already."""
+        if self._begin_ns is None:
+            return
+        latest = self._begin_ns + round((1.0 - self.DECIDING) * self._cycle_ns)
+        if time.monotonic_ns() < latest:
+            sleep_until(latest)
 
 
 class _Timespec(ctypes.Structure):

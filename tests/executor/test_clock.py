@@ -122,3 +122,25 @@ def test_time_left_ends_before_the_cycle_does(time):
     assert real.time_left() == pytest.approx(0.006 - RealClock.RESERVE)
     time.work(0.02)
     assert real.time_left() == 0.0
+
+
+@given(works=st.lists(st.floats(0.0, 0.02), min_size=1, max_size=20))
+def test_what_the_operator_says_counts_until_a_fifth_of_the_cycle_is_left(works):
+    time, real = _Time(), RealClock(CYCLE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scheduling, "time", time)
+        patch.setattr(scheduling, "sleep_until", time.sleep_until)
+        real.wait_to_decide()
+        assert time.slept == [], "before the first cycle there is nothing to wait for"
+        for work in works:
+            real.next_cycle()
+            begun = time.now
+            time.work(work)
+            after = time.now
+            real.wait_to_decide()
+            decided = round((1.0 - RealClock.DECIDING) * CYCLE_NS)
+            assert time.now >= after
+            if time.now > after:
+                assert 0.7 * CYCLE_NS <= time.now - begun <= decided
+            else:
+                assert time.now - begun >= 0.7 * CYCLE_NS

@@ -45,6 +45,9 @@ class Clock:
     def time_left(self) -> float:
         return 0.004
 
+    def wait_to_decide(self) -> None:
+        pass
+
 
 class Group:
     """Drives that are asked, and answer as they are told to here."""

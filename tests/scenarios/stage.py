@@ -78,6 +78,9 @@ class Stage:
         """Replies are there already."""
         return 0.0
 
+    def wait_to_decide(self) -> None:
+        """Within a cycle no time passes."""
+
     @property
     def drives(self) -> tuple[SimulatedDrive, ...]:
         return self.rehearsal.drives

@@ -44,6 +44,9 @@ class LateClock:
     def time_left(self) -> float:
         return 0.0
 
+    def wait_to_decide(self) -> None:
+        pass
+
 
 class Late:
     """Enabled drives and their master."""

@@ -80,6 +80,20 @@ def test_a_stop_begins_with_the_next_cycle(
     assert not any(event.code == "moving" for event in stage.events()) or phase != "approaching"
 
 
+def test_a_stop_that_comes_late_in_a_cycle_begins_with_the_next_one(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(stage: Stage) -> None:
+        if stage.cycle == PHASES["cruising"]:
+            stage.board.ask_stop()
+
+    monkeypatch.setattr(Stage, "wait_to_decide", late)
+    with staged(prepared, tmp_path / "run", at(0, lambda _: None)) as stage:
+        outcome = stage.run()
+    states = list(outcome.log.table().state)
+    assert states.index(State.STOPPING.value) == PHASES["cruising"] + 1
+
+
 def test_a_stop_at_rest_at_the_goal_changes_nothing(prepared: PreparedRun, tmp_path: Path) -> None:
     with staged(prepared, tmp_path / "free", lambda _stage: None) as free:
         assert free.run().state is State.FINISHED
