@@ -31,12 +31,12 @@ import can  # noqa: E402
 import numpy as np  # noqa: E402
 from alone import alone  # noqa: E402
 from playwright.sync_api import Page, expect  # noqa: E402
-from websockets.sync.client import ClientConnection, connect  # noqa: E402
+from websockets.sync.client import ClientConnection  # noqa: E402
 
 from drivers.cia402.pdo import RPDO1_BASE, SYNC_ID, parse_set_point  # noqa: E402
 from tests.cli.plans import RIG  # noqa: E402
 from tests.console.browsing import browser_at, chromium  # noqa: E402
-from tests.scenarios.test_console import Operator, console, drives, operator  # noqa: E402
+from tests.scenarios.test_console import Operator, console, drives, operator, page_at  # noqa: E402
 
 #: What the listener keeps, [frames]: some seconds.
 KEPT = 10_000
@@ -101,15 +101,15 @@ class Listener:
 class Holder(threading.Thread):
     """Holds a jog control until the session is over; towards the middle of the workspace."""
 
-    def __init__(self, me: Operator, number: int) -> None:
+    def __init__(self, me: Operator) -> None:
         super().__init__()
-        self._me, self._number = me, number
+        self._me = me
         self.moving, self.error = threading.Event(), ""
 
     def run(self) -> None:
         """Until the session slows down, or something is wrong."""
         me = self._me
-        me._press = self._number
+        me.press()
         x = me.state["platform"]["position_mm"][0]
         direction = [1.0 if x < 0.0 else -1.0, 0.0, 0.0]
 
@@ -128,22 +128,18 @@ class Holder(threading.Thread):
         self.moving.set()
 
 
-def first_slower(folder: Path) -> int:
+def first_slower(log: Path) -> int:
     """Set-point of drive 1 in the first cycle of a session's log that slows down for the stop."""
-    with (folder / "winches.csv").open() as stream:
+    with log.open() as stream:
         for row in csv.DictReader(stream):
             if row["state"] == "stopping":
                 return int(row["set_counts_1"])
-    raise SystemExit(f"{folder}: no cycle is stopping")
+    raise SystemExit(f"{log}: no cycle is stopping")
 
 
-def newest_folder() -> Path:
-    """Of the sessions' logs."""
-    return max((path.parent for path in Path("runs").glob("*/winches.csv")), key=_changed)
-
-
-def _changed(path: Path) -> float:
-    return path.stat().st_mtime
+def newest_log() -> Path:
+    """Of the sessions."""
+    return max(Path("runs").glob("*/winches.csv"), key=lambda path: path.stat().st_mtime)
 
 
 def by_click(page: Page) -> float:
@@ -177,8 +173,6 @@ def main() -> int:
         page.add_init_script(f"({WATCH})()")
         page.goto(address)
         expect(page.locator("#stale")).to_be_hidden(timeout=60_000)
-        host, _, token = address.removeprefix("http://").partition("/?token=")
-        url = f"ws://{host}/ws?token={token}"
         for number in range(options.presses):
             me.until(lambda state: state["motion"] is None and state["busy"] is None)
             if me.state["latched"]:
@@ -186,12 +180,12 @@ def main() -> int:
                 assert me.does("reset")["ok"]
             assert me.command("jog_begin")["ok"]
             me.until(lambda state: state["jog"]["ready"] or state["outcome"])
-            holder = Holder(me, number + 1)
+            holder = Holder(me)
             holder.start()
             holder.moving.wait()
             time.sleep(draw.uniform(EARLIEST, LATEST))
             if number % 2:
-                with connect(url, origin=f"http://{host}") as socket:  # type: ignore[arg-type]
+                with page_at(address) as socket:
                     pressed = by_socket(socket)
                     holder.join()
             else:
@@ -202,7 +196,7 @@ def main() -> int:
             me.until(lambda state: state["busy"] is None)
             if me.state["latched"]:
                 continue  # the computer was too busy for a cycle
-            slower = listener.sync_after(first_slower(newest_folder()))
+            slower = listener.sync_after(first_slower(newest_log()))
             found["socket" if number % 2 else "click"].append(1000.0 * (slower - pressed))
             if number % 50 == 49:
                 report(found)

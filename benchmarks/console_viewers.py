@@ -28,13 +28,12 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 from alone import alone  # noqa: E402
 from playwright.sync_api import Browser, expect  # noqa: E402
-from websockets.sync.client import connect  # noqa: E402
 
 from executor.remote.client import request_run  # noqa: E402
 from model.errors import Fault  # noqa: E402
 from tests.cli.plans import RIG, write_short_plan  # noqa: E402
 from tests.console.browsing import browser_at, chromium  # noqa: E402
-from tests.scenarios.test_console import console, drives  # noqa: E402
+from tests.scenarios.test_console import console, drives, page_at  # noqa: E402
 from tests.scenarios.test_processes import program  # noqa: E402
 
 #: After a change nothing is counted for so long, [s]: a page is loaded, the console catches up.
@@ -50,12 +49,10 @@ FRAMES = """() => {
 @contextmanager
 def viewers(address: str, count: int) -> Iterator[list[int]]:
     """So many sockets that take every state; how many each took."""
-    host, _, token = address.removeprefix("http://").partition("/?token=")
     taken, over = [0] * count, threading.Event()
 
     def view(number: int) -> None:
-        url = f"ws://{host}/ws?token={token}"
-        with connect(url, origin=f"http://{host}") as page:  # type: ignore[arg-type]
+        with page_at(address) as page:
             while not over.is_set():
                 page.recv(timeout=10)
                 taken[number] += 1

@@ -194,12 +194,12 @@ class ConsoleServer:
 
     async def _stop(self, _request: Request) -> Response:
         """For a page whose socket is lost; anybody may stop."""
-        why_not = await self._stop_now()
+        why_not = await self._at_once(self._console.stop)
         return JSONResponse({"ok": not why_not, "what": why_not})
 
-    async def _stop_now(self) -> str:
+    async def _at_once(self, stop: Callable[..., str], *arguments: Any) -> str:
         """STOP waits for nothing else that pages ask for: it has threads of its own."""
-        return await asyncio.get_running_loop().run_in_executor(self._stops, self._console.stop)
+        return await asyncio.get_running_loop().run_in_executor(self._stops, stop, *arguments)
 
     # The socket.
 
@@ -270,7 +270,7 @@ class ConsoleServer:
         elif isinstance(message, LetGo):
             await run_in_threadpool(self._console.let_go, number, message)
         elif message.command == "stop":
-            stopping = asyncio.create_task(self._stop_and_answer(page, message))
+            stopping = asyncio.create_task(self._stop_and_answer(page, number, message))
             self._stopping.add(stopping)  # it is done even if the page is gone by then
             stopping.add_done_callback(self._stopping.discard)
         elif commands.full():
@@ -278,8 +278,9 @@ class ConsoleServer:
         else:
             commands.put_nowait(message)
 
-    async def _stop_and_answer(self, page: WebSocket, message: Message) -> None:
-        await _answer(page, message, await self._stop_now())
+    async def _stop_and_answer(self, page: WebSocket, number: int, message: Message) -> None:
+        why_not = await self._at_once(self._console.command, number, message)
+        await _answer(page, message, why_not)
 
     async def _obey(self, page: WebSocket, number: int, commands: asyncio.Queue[Message]) -> None:
         while True:

@@ -53,7 +53,6 @@ class RunWatch:
         self._run: RunLink | None = None
         self._looked = float("-inf")
         self._count = 0
-        self._unheard: list[int] = []
         self.last = Look(None, time.monotonic())
 
     @property
@@ -86,12 +85,11 @@ class RunWatch:
         A run that does not say which bus it moves may be one on this bus.
         """
         with self._lock:
-            if self._run is None:
-                self._connect()
+            silent = self._connect() if self._run is None else []
             if self._run is not None:
                 return _MOVES
-            if self._unheard:
-                numbers = ", ".join(map(str, self._unheard))
+            if silent:
+                numbers = ", ".join(map(str, silent))
                 return f"process {numbers} moves a robot and does not answer; wait, or stop it"
             return ""
 
@@ -128,18 +126,20 @@ class RunWatch:
             self._let_go()
             self.last = Look(None, time.monotonic())
 
-    def _connect(self) -> None:
-        links, self._unheard = self._links.enter_context(ExitStack()), []
+    def _connect(self) -> list[int]:
+        """Finds the run on this bus; where there is none, which runs did not say how they stand."""
+        links, silent = self._links.enter_context(ExitStack()), []
         for run in links.enter_context(find_runs()):
             link = RunLink(run)
             answer = link.ask(make_line("status"), PATIENCE)
             if answer.status is not None and answer.status["bus"] == self._bus:
                 self._run = link
                 self._count += 1
-                return
+                return []
             if answer.status is None and not answer.ended:
-                self._unheard.append(run.process)
+                silent.append(run.process)
         self._let_go()
+        return silent
 
     def _let_go(self) -> None:
         self._run = None

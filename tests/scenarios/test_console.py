@@ -78,7 +78,7 @@ class Operator:
 
         def gone(state: dict[str, Any]) -> bool:
             if next(tries) % 40 == 0:
-                self._press += 1
+                self.press()
             self.held(direction)
             way = state["platform"]["position_mm"][axis] - begin
             return bool(way / way_mm >= 1.0)
@@ -86,6 +86,10 @@ class Operator:
         self.until(gone)
         self._page.send(json.dumps({"kind": "let_go", "hold": self._press}))
         self.until(lambda state: not state["jog"]["moving"])
+
+    def press(self) -> None:
+        """What is held from now on is a new press."""
+        self._press += 1
 
     def held(self, direction: list[float]) -> None:
         """One word of a press."""
@@ -98,7 +102,7 @@ class Operator:
         jog = state["cable"]
         self._words += 1
         if self._words % 40 == 1:
-            self._press += 1
+            self.press()
         word = {"kind": "held", "hold": self._press, "cable": cable, "sense": "wind_in"}
         self._page.send(json.dumps(word | {"step_mm": None, "speed_mm_s": 2.0, "seq": 1}))
         return float(jog["press_mm"]) if jog["cable"] == cable else 0.0
@@ -127,10 +131,15 @@ def console(
         yield process, "http://" + line.split("http://")[1].strip()
 
 
+def page_at(address: str) -> ClientConnection:
+    """The socket of a page, at the address that the console printed."""
+    host, _, token = address.removeprefix("http://").partition("/?token=")
+    return connect(f"ws://{host}/ws?token={token}", origin=f"http://{host}")  # type: ignore[arg-type]
+
+
 @contextmanager
 def operator(address: str) -> Iterator[Operator]:
-    host, _, token = address.removeprefix("http://").partition("/?token=")
-    with connect(f"ws://{host}/ws?token={token}", origin=f"http://{host}") as page:  # type: ignore[arg-type]
+    with page_at(address) as page:
         found = Operator(page)
         found.until(lambda _: True)
         assert found.command("take_control")["ok"]
